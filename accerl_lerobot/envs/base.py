@@ -1,0 +1,113 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The contract every world keeps, whatever simulator is behind it.
+
+Episode limits, auto-reset and task text are ours, because simulators disagree on them: a world never resets itself,
+`terminated` means the task is over (bootstrap 0), `truncated` means only that time ran out (bootstrap V).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from accerl_lerobot.experience import Observation
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldSpec:
+    """What a policy must fit to act in a world."""
+
+    images: dict[str, tuple[int, int, int]]
+    """``observation.images.<camera>`` → (H, W, 3)."""
+    state_dim: int
+    """Length of ``observation.state``."""
+    action_dim: int
+    action_low: np.ndarray
+    """float32 (A,). Actions outside are clipped by the world."""
+    action_high: np.ndarray
+    fps: int
+    """Control rate in Hz."""
+    max_steps: int
+    """Episode limit in env steps; reaching it truncates."""
+    tasks: tuple[str, ...]
+    """Names `World.reset` accepts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChunkResult:
+    """What happened while a chunk was executed; `rewards` has one entry per executed step, at most K."""
+
+    observation: Observation | None
+    """After the last executed step; None after a termination, which nobody looks at."""
+    rewards: np.ndarray
+    """float32 (k,), 1 ≤ k ≤ K: the episode may end before the chunk does."""
+    terminated: bool
+    truncated: bool
+    success: bool
+    """Whether the task has been achieved at any step of the episode so far."""
+    info: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def steps(self) -> int:
+        return len(self.rewards)
+
+    @property
+    def done(self) -> bool:
+        return self.terminated or self.truncated
+
+
+class World(ABC):
+    """One environment instance.
+
+    Example:
+        >>> world = make_world(MetaWorldConfig(task="drawer-open-v3"))
+        >>> observation = world.reset(seed=3, task="drawer-open-v3")
+        >>> result = world.step_chunk(np.zeros((10, 4), np.float32))
+        >>> result.steps, result.done, result.success
+        (10, False, False)
+    """
+
+    spec: WorldSpec
+
+    @abstractmethod
+    def reset(self, seed: int, task: str) -> Observation:
+        """Starts an episode. Equal (seed, task) give bit-equal episodes under equal actions, in any process.
+
+        Raises:
+            InputError: `task` is not in ``spec.tasks``.
+        """
+
+    @abstractmethod
+    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
+        """Executes up to K actions and observes once, after the last.
+
+        Gives the same states, rewards and successes as K calls with one action each.
+
+        Args:
+            actions: float32 (K, A).
+
+        Raises:
+            RuntimeError: the episode is over; call `reset`.
+            ValueError: wrong shape or a non-finite action.
+        """
+
+    @abstractmethod
+    def render(self, height: int, width: int) -> np.ndarray:
+        """A frame for people, uint8 (height, width, 3); does not change the state."""
+
+    def close(self) -> None:
+        """Frees the simulator. Safe to call twice."""

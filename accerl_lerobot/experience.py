@@ -1,0 +1,108 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The nouns that cross a process border.
+
+Shape letters: T decisions of a segment, K actions per chunk, A action dims, L log-prob factors of one decision.
+NumPy only: a rollout worker that imports this file stays free of torch and LeRobot.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+Observation = dict[str, np.ndarray | str]
+"""One observation under LeRobot's feature names.
+
+``observation.images.<camera>`` uint8 (H, W, 3), ``observation.state`` float32 (S,), ``task`` the instruction text.
+Values are raw: scaling and normalisation belong to the policy's own LeRobot processors.
+"""
+
+TASK = "task"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Decision:
+    """One policy call, as the inference service answers it.
+
+    Example:
+        A rollout worker submits an observation, gets a ``Decision``, hands ``chunk`` to ``World.step_chunk`` and keeps
+        the rest for the segment. ``version`` says which weights decided.
+    """
+
+    chunk: np.ndarray
+    """float32 (K, A), in the environment's action units (un-normalised); not clipped."""
+    latent: dict[str, np.ndarray]
+    """What the policy actually sampled; `log_prob` is the density of this, in normalised action space."""
+    log_prob: np.ndarray
+    """float32 (L,), one entry per factor (for a flow policy one per executed action); the chunk's is their sum."""
+    value: float
+    """V(observation) by the critic of the same version."""
+    version: int
+    """Number of optimiser steps behind the weights that decided."""
+
+
+@dataclass(kw_only=True)
+class Segment:
+    """T consecutive decisions of one episode, plus the observation after the last one.
+
+    Exactly one of three things ends a segment: the episode `terminated` (bootstrap 0), it was `truncated` by the time
+    limit (bootstrap with V of the last observation), or neither, when the segment is cut in mid-episode (same bootstrap).
+    """
+
+    observations: dict[str, np.ndarray]
+    """Each (T + 1, ...) under LeRobot's names, without the task; the last row is the bootstrap observation.
+
+    After a termination no observation is rendered and the last row repeats the one before; it is never bootstrapped from.
+    """
+    task: str
+    latent: dict[str, np.ndarray]
+    """Each (T, ...)."""
+    log_prob: np.ndarray
+    """float32 (T, L), of the behaviour policy."""
+    value: np.ndarray
+    """float32 (T,), of the behaviour critic; stale by the time it is trained on."""
+    reward: np.ndarray
+    """float32 (T,), summed over the steps of each chunk."""
+    version: np.ndarray
+    """int64 (T,), the weights behind each decision."""
+    steps: np.ndarray
+    """int64 (T,), env steps each decision executed."""
+    terminated: bool
+    truncated: bool
+    success: bool
+    """Whether the episode had succeeded when the segment ended."""
+    key: str
+    """Unique: worker, incarnation, sequence number. Makes an insert idempotent."""
+    source: str = "real"
+    """Which world it is from: ``real``, or the name of an imagined one."""
+    episode: dict[str, float] = field(default_factory=dict)
+    """Set on the last segment of an episode: ``return``, ``steps``, ``decisions``, ``success``."""
+
+    def __len__(self) -> int:
+        return len(self.reward)
+
+    def __post_init__(self) -> None:
+        t = len(self.reward)
+        if t == 0:
+            raise ValueError(f"segment {self.key}: holds no decision")
+        if self.terminated and self.truncated:
+            raise ValueError(f"segment {self.key}: terminated and truncated at once")
+        sizes = {"log_prob": len(self.log_prob), "value": len(self.value), "version": len(self.version)}
+        sizes |= {"steps": len(self.steps)} | {f"latent.{k}": len(v) for k, v in self.latent.items()}
+        sizes |= {k: len(v) - 1 for k, v in self.observations.items()}
+        wrong = {k: n for k, n in sizes.items() if n != t}
+        if wrong:
+            raise ValueError(f"segment {self.key}: {t} rewards but {wrong}")
