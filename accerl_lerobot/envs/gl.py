@@ -1,0 +1,100 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""An offscreen OpenGL for MuJoCo: pick a backend before the import, and say in one line what is missing.
+
+MuJoCo reads ``MUJOCO_GL`` once, when it is imported, so `import_mujoco` is the only way in.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import os
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from accerl_lerobot.errors import InputError
+
+_LIBRARIES = {
+    "egl": ("libEGL.so.1", "libEGL.so"),
+    "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"),
+}
+_GPU_NODES = ("/dev/nvidia0", "/dev/dri/renderD128")
+REMEDY = (
+    "install an offscreen OpenGL: apt-get install -y libosmesa6 (MUJOCO_GL=osmesa) "
+    "or apt-get install -y libegl1 libgl1-mesa-dri libgles2 (MUJOCO_GL=egl)"
+)
+
+
+def choose_backend() -> str | None:
+    """Names the backend for a headless Linux machine: EGL where there is a GPU, else OSMesa, else EGL.
+
+    Returns:
+        ``"egl"``, ``"osmesa"``, or None where MuJoCo's own default is right (a display, or not Linux).
+
+    Raises:
+        InputError: neither library is installed.
+    """
+    if sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        return None
+    order = ("egl", "osmesa") if any(Path(node).exists() for node in _GPU_NODES) else ("osmesa", "egl")
+    for backend in order:
+        if any(_loads(library) for library in _LIBRARIES[backend]):
+            return backend
+    raise InputError("MUJOCO_GL", "", REMEDY)
+
+
+def import_mujoco() -> ModuleType:
+    """Imports MuJoCo with a backend that works here; respects ``MUJOCO_GL`` if it is set.
+
+    Raises:
+        InputError: the backend's library is missing.
+    """
+    if "mujoco" not in sys.modules:
+        # One software-rendering thread per world: several worlds then share the cores without fighting.
+        os.environ.setdefault("LP_NUM_THREADS", "1")
+        if not os.environ.get("MUJOCO_GL"):
+            backend = choose_backend()
+            if backend is not None:
+                os.environ["MUJOCO_GL"] = backend
+    try:
+        return importlib.import_module("mujoco")
+    except (ImportError, AttributeError, RuntimeError) as error:
+        if isinstance(error, ModuleNotFoundError) and error.name == "mujoco":
+            raise
+        raise InputError("MUJOCO_GL", os.environ.get("MUJOCO_GL", ""), REMEDY) from error
+
+
+def new_renderer(model: Any, height: int, width: int) -> Any:
+    """A `mujoco.Renderer` whose framebuffer is exactly (height, width).
+
+    Raises:
+        InputError: no OpenGL context can be created here.
+    """
+    mujoco = import_mujoco()
+    model.vis.global_.offheight, model.vis.global_.offwidth = height, width
+    try:
+        return mujoco.Renderer(model, height, width)
+    except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+        raise InputError("MUJOCO_GL", os.environ.get("MUJOCO_GL", ""), REMEDY) from error
+
+
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,248 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""MetaWorld, stepped a chunk at a time and rendered once per decision.
+
+The same physics, state, camera and instruction as LeRobot's own wrapper, but the image has the size a small policy
+needs, lights are cheap to draw in software, and nothing is rendered that no policy looks at: about a hundred times
+the env steps per second. Importing this file loads neither MuJoCo nor metaworld.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec
+from accerl_lerobot.envs.config import EnvConfig
+from accerl_lerobot.envs.gl import import_mujoco, new_renderer
+from accerl_lerobot.envs.metaworld_tasks import description, resolve
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import TASK, Observation
+
+CAMERAS = ("topview", "corner", "corner2", "corner3", "corner4", "behindGripper", "gripperPOV")
+STATE_DIM = 4
+ACTION_DIM = 4
+FPS = 80
+STEP_LIMIT = 500
+
+
+@EnvConfig.register_subclass("metaworld")
+@dataclass(frozen=True, kw_only=True)
+class MetaWorldConfig(EnvConfig):
+    """Which MetaWorld tasks, seen how.
+
+    Example:
+        >>> MetaWorldConfig(task="drawer-open-v3,door-open-v3").tasks
+        ('drawer-open-v3', 'door-open-v3')
+    """
+
+    task: str = "drawer-open-v3"
+    """Task names separated by commas, or LeRobot's groups: easy, medium, hard, very_hard, all."""
+    camera: str = "corner2"
+    """Camera names separated by commas; each becomes ``observation.images.<name>``."""
+    image_size: int = 64
+    """Height and width of every image in pixels, 64 to 480."""
+    max_steps: int = 500
+    """Episode limit in env steps, 1 to 500; reaching it truncates."""
+    lighting: str = "cheap"
+    """``cheap`` (no shadows, reflections or multisampling: ten times faster in software) or ``default``."""
+    terminate_on_success: bool = True
+    """Whether the first success ends the episode."""
+    reward: str = "success"
+    """``success`` (1.0 at the first success, else 0.0) or ``dense`` (MetaWorld's shaped reward, 0 to 10 a step)."""
+
+    def __post_init__(self) -> None:
+        resolve(self.task)
+        if not self.cameras or len(set(self.cameras)) < len(self.cameras):
+            raise InputError("env.camera", self.camera, "name each camera once, separated by commas")
+        if unknown := [name for name in self.cameras if name not in CAMERAS]:
+            raise InputError("env.camera", self.camera, f"{unknown[0]!r} is none of: {', '.join(CAMERAS)}")
+        if not 64 <= self.image_size <= 480:
+            raise InputError("env.image_size", self.image_size, "use 64 to 480 pixels")
+        if not 1 <= self.max_steps <= STEP_LIMIT:
+            raise InputError("env.max_steps", self.max_steps, f"use 1 to {STEP_LIMIT} env steps")
+        if self.lighting not in ("cheap", "default"):
+            raise InputError("env.lighting", self.lighting, "use cheap or default")
+        if self.reward not in ("success", "dense"):
+            raise InputError("env.reward", self.reward, "use success or dense")
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """The task names `task` stands for."""
+        return resolve(self.task)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The camera names `camera` stands for."""
+        return tuple(name.strip() for name in self.camera.split(",") if name.strip())
+
+
+class MetaWorld(World):
+    """One MetaWorld instance; its simulators are built on first use of a task, then kept.
+
+    A simulator that diverges (non-finite state or reward, or one that MuJoCo had to reset on its own) ends the
+    episode as truncated, with ``info["nonfinite"] == 1.0``: such a segment must not be trained on.
+
+    Args:
+        config: What to simulate.
+    """
+
+    def __init__(self, config: MetaWorldConfig) -> None:
+        self.config = config
+        size = config.image_size
+        self.spec = WorldSpec(
+            images={f"observation.images.{camera}": (size, size, 3) for camera in config.cameras},
+            state_dim=STATE_DIM,
+            action_dim=ACTION_DIM,
+            action_low=np.full(ACTION_DIM, -1, np.float32),
+            action_high=np.full(ACTION_DIM, 1, np.float32),
+            fps=FPS,
+            max_steps=config.max_steps,
+            tasks=config.tasks,
+        )
+        self._sims: dict[str, Any] = {}
+        self._eyes: dict[str, Any] = {}
+        self._film: dict[str, Any] = {}
+        self._task = ""
+        self._raw = np.zeros(0)
+        self._steps = 0
+        self._success = False
+        self._done = True
+
+    @property
+    def raw_observation(self) -> np.ndarray:
+        """MetaWorld's own 39 numbers (objects and goal included), float64: for scripted experts, not for policies."""
+        return self._raw
+
+    def reset(self, seed: int, task: str) -> Observation:
+        if task not in self.spec.tasks:
+            raise InputError("task", task, f"this world has: {', '.join(self.spec.tasks)}")
+        if not 0 <= seed < 2**32:
+            raise InputError("seed", seed, "use 0 to 2**32 - 1")
+        self._done = True  # until the new episode stands: an error below leaves a world that must be reset
+        if task not in self._sims:
+            self._sims[task] = self._build(task)
+        sim = self._sims[task]
+        sim.seed(seed)
+        self._raw, _ = sim.reset()
+        self._task, self._steps, self._success, self._done = task, 0, False, False
+        return self._observe()
+
+    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
+        if self._done:
+            raise RuntimeError("the episode is over: call reset before step_chunk")
+        actions = checked_actions(actions, self.spec)
+        sim, rewards, nonfinite = self._sims[self._task], [], False
+        for action in actions:
+            self._raw, shaped, _, _, info = sim.step(action)
+            self._steps += 1
+            nonfinite = not (math.isfinite(shaped) and np.isfinite(self._raw).all()) or _diverged(sim)
+            succeeded = not nonfinite and bool(info["success"])
+            if self.config.reward == "dense":
+                rewards.append(shaped)
+            else:
+                rewards.append(1.0 if succeeded and not self._success else 0.0)
+            self._success |= succeeded
+            terminated = self._success and self.config.terminate_on_success
+            truncated = not terminated and (nonfinite or self._steps >= self.config.max_steps)
+            self._done = terminated or truncated
+            if self._done:
+                break
+        return ChunkResult(
+            observation=None if terminated else self._observe(),
+            rewards=np.asarray(rewards, np.float32),
+            terminated=terminated,
+            truncated=truncated,
+            success=self._success,
+            info={"nonfinite": 1.0} if nonfinite else {},
+        )
+
+    def render(self, height: int, width: int) -> np.ndarray:
+        if not self._task:
+            raise RuntimeError("nothing to render: call reset first")
+        renderer = self._film.get(self._task)
+        if renderer is None or (renderer.height, renderer.width) != (height, width):
+            if renderer is not None:
+                renderer.close()
+            renderer = self._film[self._task] = new_renderer(self._sims[self._task].model, height, width)
+        return self._frame(renderer, self.config.cameras[0])
+
+    def close(self) -> None:
+        for renderer in (*self._eyes.values(), *self._film.values()):
+            renderer.close()
+        for sim in self._sims.values():
+            sim.close()
+        self._eyes, self._film, self._sims = {}, {}, {}
+        self._task, self._done = "", True
+
+    def _build(self, task: str) -> Any:
+        import_mujoco()
+        from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+
+        sim = ALL_V3_ENVIRONMENTS[task]()
+        # What `set_task` of an MT1 benchmark task does, without first sampling its 50 goals (0.5 s): the goal is
+        # visible in the raw observation, and `seed` decides where things are.
+        sim._partially_observable = False
+        del sim.sawyer_observation_space  # a cached property that depends on the line above
+        sim._set_task_called = True
+        sim._freeze_rand_vec = False
+        sim.seeded_rand_vec = True
+        model = sim.model
+        model.cam("corner2").pos[:] = (0.75, 0.075, 0.7)  # as LeRobot's wrapper does
+        if self.config.lighting == "cheap":
+            model.vis.quality.offsamples = 0
+            model.vis.quality.shadowsize = 0
+            model.light_castshadow[:] = 0
+            model.mat_reflectance[:] = 0
+        self._eyes[task] = new_renderer(model, self.config.image_size, self.config.image_size)
+        return sim
+
+    def _observe(self) -> Observation:
+        observation: Observation = {
+            f"observation.images.{camera}": self._frame(self._eyes[self._task], camera)
+            for camera in self.config.cameras
+        }
+        observation["observation.state"] = self._raw[:STATE_DIM].astype(np.float32)
+        observation[TASK] = description(self._task)
+        return observation
+
+    def _frame(self, renderer: Any, camera: str) -> np.ndarray:
+        renderer.update_scene(self._sims[self._task].data, camera=camera)
+        image = renderer.render()
+        # corner2 hangs upside down in MetaWorld's scene; LeRobot turns it, and so do its datasets.
+        return np.ascontiguousarray(image[::-1, ::-1]) if camera == "corner2" else image
+
+
+def checked_actions(actions: np.ndarray, spec: WorldSpec) -> np.ndarray:
+    """The chunk as float32 within the world's bounds.
+
+    Raises:
+        ValueError: not (K ≥ 1, A), or a value is not finite.
+    """
+    actions = np.asarray(actions, np.float32)
+    if actions.ndim != 2 or len(actions) == 0 or actions.shape[1] != spec.action_dim:
+        raise ValueError(f"actions have shape {actions.shape}; expected (K >= 1, {spec.action_dim})")
+    if not np.isfinite(actions).all():
+        raise ValueError("actions hold a non-finite value")
+    return np.clip(actions, spec.action_low, spec.action_high)
+
+
+def _diverged(sim: Any) -> bool:
+    """Whether MuJoCo met non-finite numbers in this episode and silently reset itself."""
+    warning = import_mujoco().mjtWarning
+    numbers = sim.data.warning.number
+    return bool(numbers[warning.mjWARN_BADQPOS] or numbers[warning.mjWARN_BADQVEL] or numbers[warning.mjWARN_BADQACC])

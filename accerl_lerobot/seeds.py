@@ -1,0 +1,63 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Which seed is for what: demonstrations, training and evaluation never see the same episode.
+
+MetaWorld and Gymnasium take seeds below 2**32; each use owns one range of them.
+"""
+
+from __future__ import annotations
+
+from accerl_lerobot.errors import InputError
+
+DEMO_SEEDS = range(0, 1_000_000_000)
+TRAIN_SEEDS = range(1_000_000_000, 2_000_000_000)
+EVAL_SEEDS = range(2_000_000_000, 3_000_000_000)
+
+_DEMOS_PER_RUN = 1_000_000
+_WORKERS_PER_RUN = 1_000
+_EPISODES_PER_WORKER = 10_000
+_RUNS = 100
+
+
+def demo_seed(run_seed: int, index: int) -> int:
+    """Seed of the `index`-th demonstration tried by a recording with `run_seed`.
+
+    Raises:
+        InputError: `run_seed` is not in 0..999.
+    """
+    if not 0 <= run_seed < len(DEMO_SEEDS) // _DEMOS_PER_RUN:
+        raise InputError("demos.seed", run_seed, "use 0 to 999")
+    if not 0 <= index < _DEMOS_PER_RUN:
+        raise ValueError(f"demonstration {index}: one recording has at most {_DEMOS_PER_RUN} tries")
+    return DEMO_SEEDS.start + run_seed * _DEMOS_PER_RUN + index
+
+
+def train_seed(run_seed: int, worker: int, episode: int) -> int:
+    """Seed of a training episode; a worker starts over after 10,000 episodes.
+
+    Raises:
+        InputError: `run_seed` is not in 0..99.
+    """
+    if not 0 <= run_seed < _RUNS:
+        raise InputError("seed", run_seed, f"use 0 to {_RUNS - 1}")
+    if not 0 <= worker < _WORKERS_PER_RUN:
+        raise ValueError(f"worker {worker}: a run has at most {_WORKERS_PER_RUN}")
+    return TRAIN_SEEDS.start + (run_seed * _WORKERS_PER_RUN + worker) * _EPISODES_PER_WORKER + episode % _EPISODES_PER_WORKER
+
+
+def eval_seed(index: int) -> int:
+    """Seed of the `index`-th evaluation episode, the same in every run, so that runs are paired."""
+    if not 0 <= index < len(EVAL_SEEDS):
+        raise ValueError(f"evaluation episode {index}: use 0 to {len(EVAL_SEEDS) - 1}")
+    return EVAL_SEEDS.start + index
