@@ -1,0 +1,127 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A vision-language backbone of any size, with random weights, written offline.
+
+SmolVLA reads its backbone's architecture and tokeniser from a model directory. For policies small enough to train on a
+laptop this writes such a directory: SmolVLM's own classes, shrunk, with a byte-level tokeniser, so that the policy is
+LeRobot's `SmolVLAPolicy` on the same code path as ``lerobot/smolvla_base``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from accerl_lerobot.errors import InputError
+
+SPECIAL_TOKENS = (
+    "<|pad|>", "<|im_start|>", "<|im_end|>", "<image>", "<fake_token_around_image>", "<global-img>",
+    "<end_of_utterance>", "<video>",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class BackboneConfig:
+    """Sizes of a random SmolVLM. The defaults give a SmolVLA of about 0.4 M parameters."""
+
+    hidden: int = 96
+    """Width of the language model; a multiple of `heads`."""
+    layers: int = 2
+    """Language-model layers; the action expert has as many."""
+    heads: int = 4
+    kv_heads: int = 2
+    vision_hidden: int = 64
+    """Width of the image encoder."""
+    vision_layers: int = 2
+    vision_heads: int = 4
+    patch: int = 8
+    """Side of an image patch in pixels."""
+    image: int = 64
+    """Side of the image the encoder sees; a multiple of 2·patch."""
+
+    def __post_init__(self) -> None:
+        if self.image % (2 * self.patch):
+            raise InputError("sft.backbone.image", self.image, f"use a multiple of {2 * self.patch}, twice the patch")
+        for heads, width in (("heads", self.hidden), ("vision_heads", self.vision_hidden)):
+            if width % getattr(self, heads):
+                raise InputError(f"sft.backbone.{heads}", getattr(self, heads), f"use a divisor of the width {width}")
+
+
+def write_backbone(directory: Path, config: BackboneConfig) -> Path:
+    """Writes config, tokeniser and image processor; no weights. Returns `directory`."""
+    from tokenizers import Tokenizer, decoders, models, pre_tokenizers
+    from transformers import (
+        PreTrainedTokenizerFast,
+        SmolVLMConfig,
+        SmolVLMImageProcessor,
+        SmolVLMProcessor,
+        SmolVLMVideoProcessor,
+    )
+
+    vocabulary = {token: i for i, token in enumerate(SPECIAL_TOKENS)}
+    for byte in sorted(pre_tokenizers.ByteLevel.alphabet()):
+        vocabulary.setdefault(byte, len(vocabulary))
+    raw = Tokenizer(models.BPE(vocab=vocabulary, merges=[]))
+    raw.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
+    raw.decoder = decoders.ByteLevel()
+    tokenizer = PreTrainedTokenizerFast(
+        tokenizer_object=raw,
+        pad_token="<|pad|>",
+        bos_token="<|im_start|>",
+        eos_token="<|im_end|>",
+        extra_special_tokens={
+            "fake_image_token": "<fake_token_around_image>",
+            "global_image_token": "<global-img>",
+            "image_token": "<image>",
+            "end_of_utterance_token": "<end_of_utterance>",
+            "video_token": "<video>",
+        },
+    )
+    architecture = SmolVLMConfig(
+        image_token_id=vocabulary["<image>"],
+        pad_token_id=vocabulary["<|pad|>"],
+        scale_factor=2,
+        vision_config={
+            "hidden_size": config.vision_hidden,
+            "intermediate_size": 2 * config.vision_hidden,
+            "num_hidden_layers": config.vision_layers,
+            "num_attention_heads": config.vision_heads,
+            "image_size": config.image,
+            "patch_size": config.patch,
+        },
+        text_config={
+            "model_type": "llama",
+            "hidden_size": config.hidden,
+            "intermediate_size": 2 * config.hidden,
+            "num_hidden_layers": config.layers,
+            "num_attention_heads": config.heads,
+            "num_key_value_heads": config.kv_heads,
+            "head_dim": config.hidden // config.heads,
+            "vocab_size": len(vocabulary),
+            "pad_token_id": vocabulary["<|pad|>"],
+            "max_position_embeddings": 1024,
+            "rms_norm_eps": 1e-5,
+        },
+    )
+    architecture.architectures = ["SmolVLMForConditionalGeneration"]
+    directory.mkdir(parents=True, exist_ok=True)
+    architecture.save_pretrained(directory)
+    SmolVLMProcessor(
+        image_processor=SmolVLMImageProcessor(),
+        tokenizer=tokenizer,
+        video_processor=SmolVLMVideoProcessor(),
+        image_seq_len=(config.image // config.patch // 2) ** 2,
+        chat_template="{% for m in messages %}{{ m['content'] }}{% endfor %}",
+    ).save_pretrained(directory)
+    return directory

@@ -1,0 +1,139 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What the engine needs of a policy: π(chunk | observation) with a density, and V(observation).
+
+An adapter wraps one LeRobot policy with its processors. `decide` acts, `evaluate` re-scores what was stored; both run
+the same code on the same weights, so the ratio at equal weights is 1.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import TASK, Decision, Observation
+
+if TYPE_CHECKING:
+    from accerl_lerobot.envs.base import WorldSpec
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """A batch of stored decisions under the current weights."""
+
+    log_prob: Tensor
+    """(B, L), same factors as `Decision.log_prob`."""
+    entropy: Tensor
+    """(B,)."""
+    value: Tensor
+    """(B,)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """One observation that waits for a decision.
+
+    `noise_seed` fixes all randomness of the decision, so that it does not depend on which batch it lands in.
+    """
+
+    observation: Observation
+    noise_seed: int
+    explore: bool = True
+    """False asks for LeRobot's stock sampler, the one evaluation uses."""
+
+
+class PolicyAdapter(nn.Module, ABC):
+    """One LeRobot policy as a stochastic policy with a critic; one subclass per family of likelihood."""
+
+    policy: Any
+    """The LeRobot policy; holds the weights that are exported."""
+    device: torch.device
+
+    @abstractmethod
+    def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
+        """Acts on a batch, without gradient. Answers in the order of the requests."""
+
+    @abstractmethod
+    def evaluate(self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]) -> Evaluation:
+        """Re-scores stored latents, differentiably.
+
+        Args:
+            observations: each (B, ...), raw, as in `Segment.observations`.
+            tasks: B instruction texts.
+            latent: each (B, ...), as `decide` returned them.
+        """
+
+    @abstractmethod
+    def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
+        """V only, (B,), without gradient."""
+
+    @abstractmethod
+    def trainable(self) -> dict[str, nn.Parameter]:
+        """The parameters the trainer updates and publishes, critic included, by name."""
+
+    def load_trainable(self, tensors: dict[str, np.ndarray]) -> None:
+        """Copies published weights in place.
+
+        Raises:
+            ValueError: names or shapes differ from `trainable`.
+        """
+        parameters = self.trainable()
+        if parameters.keys() != tensors.keys():
+            raise ValueError(f"published weights differ by name: {sorted(parameters.keys() ^ tensors.keys())[:4]}")
+        with torch.no_grad():
+            for name, parameter in parameters.items():
+                if tuple(parameter.shape) != tensors[name].shape:
+                    raise ValueError(f"published {name} has shape {tensors[name].shape}, not {tuple(parameter.shape)}")
+                parameter.copy_(torch.from_numpy(tensors[name]))
+
+    def export_trainable(self) -> dict[str, np.ndarray]:
+        """A copy of `trainable` as NumPy arrays, safe to hand to another thread."""
+        return {k: p.detach().to("cpu", torch.float32).numpy().copy() for k, p in self.trainable().items()}
+
+
+def stack_observations(requests: Sequence[Request]) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Batches raw observations: each array (B, ...), and the B task texts."""
+    keys = [k for k in requests[0].observation if k != TASK]
+    arrays = {k: np.stack([r.observation[k] for r in requests]) for k in keys}
+    return arrays, [str(r.observation[TASK]) for r in requests]
+
+
+def check_fit(policy_config: Any, spec: WorldSpec, rename_map: dict[str, str]) -> None:
+    """Refuses a policy that cannot act in a world, before anything is started.
+
+    Raises:
+        InputError: a camera is missing, or state or action sizes differ.
+    """
+    offered = {rename_map.get(k, k): k for k in spec.images}
+    wanted = [k for k in policy_config.image_features if ".empty_camera_" not in k]
+    missing = [k for k in wanted if k not in offered]
+    if missing:
+        raise InputError(
+            "policy.path", missing[0],
+            f"the policy wants this camera but the world offers {', '.join(offered) or 'none'}; "
+            "choose env.camera accordingly or map names with --policy.rename_map",
+        )  # fmt: skip
+    state = policy_config.robot_state_feature
+    if state is not None and tuple(state.shape) != (spec.state_dim,):
+        raise InputError("policy.path", tuple(state.shape), f"the world's observation.state has ({spec.state_dim},) entries")
+    action = tuple(policy_config.action_feature.shape)
+    if action != (spec.action_dim,):
+        raise InputError("policy.path", action, f"the policy's action size differs from the world's ({spec.action_dim},)")

@@ -1,0 +1,245 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The flow family's likelihood: a denoising path whose density is known, from a velocity field that has none.
+
+A flow policy integrates x from t = 1 (noise) to t = 0 (action) in N Euler steps of δ = 1/N: x ← x − δ·v(x, t). That map
+has no usable density, so exploration makes some steps Gaussian and the log-prob is that of the path. Which steps:
+
+``last``  Every step but the last is the stock ODE; the last one adds N(0, s²). Given the initial noise x₀, whose
+          density does not depend on the weights, the executed action is exactly N(G_θ(x₀), s²). Padded action dims and
+          rows that are not executed are never fed back after the last step, so leaving them out marginalises them
+          exactly. Re-scoring replays the ODE from x₀: N velocity passes.
+``all``   Every step is Gaussian; the path density is the sum over steps (Flow-GRPO, arXiv 2505.05470; πRL, arXiv
+          2510.25889). Exact as well; N velocity passes. Padded dims feed back into real ones, so they belong to the
+          density: see `FlowSamplerConfig.padded`.
+``one``   One randomly drawn step is Gaussian, the rest ODE, and re-scoring takes its start point as given: one
+          velocity pass (the "mixed ODE-SDE" of MixGRPO, arXiv 2507.21802, and of πRL). The steps around the drawn one
+          move with the weights and are left out of the ratio, so importance weights are exact for the drawn transition
+          only. Cheap for large models; the ratio is still 1 at equal weights.
+
+Two noise laws, `FlowSamplerConfig.noise`: ``euler`` keeps the ODE's mean and adds a constant std, so that the executed
+mean is the stock action; ``flow_sde`` scales the noise with t and corrects the drift so that the marginals of the ODE are
+preserved. Everything here is a pure function of tensors; the velocity comes as a callable.
+
+Shapes: B batch, K actions per chunk, D = max_action_dim (real dims first, then padding), A real dims, N steps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from accerl_lerobot.errors import InputError
+
+Velocity = Callable[[Tensor, Tensor], Tensor]
+"""(x (B, K, D), t (B,)) → v (B, K, D)."""
+
+LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlowSamplerConfig:
+    """How a flow policy explores; saved with every checkpoint, since a stored latent means nothing without it."""
+
+    stochastic: str = "last"
+    """Which denoising steps are Gaussian: last, all or one."""
+    noise: str = "euler"
+    """euler (stock mean, constant std) or flow_sde (marginal-preserving, std grows with t)."""
+    noise_level: float = 0.2
+    """euler: total injected std in normalised action units, (0, 2]. flow_sde: the factor a of σ_t = a·√(t/(1−t))."""
+    padded: str = "joint"
+    """Padded action dims under ``all`` and ``one``: joint (noise in them, counted in the density; the stock sampler as
+    noise → 0) or analytic (overwritten by t·ε_pad after every step: exact given ε_pad and free of untrained
+    velocities' variance, but not the stock sampler). Without effect under ``last``."""
+
+    def __post_init__(self) -> None:
+        choices = {
+            "stochastic": ("last", "all", "one"),
+            "noise": ("euler", "flow_sde"),
+            "padded": ("joint", "analytic"),
+        }
+        for name, allowed in choices.items():
+            if getattr(self, name) not in allowed:
+                raise InputError(f"policy.sampler.{name}", getattr(self, name), f"use one of {', '.join(allowed)}")
+        if not 0 < self.noise_level <= 2:
+            raise InputError("policy.sampler.noise_level", self.noise_level, "use a value in (0, 2]; 0.2 is usual")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlowShape:
+    """The sizes a chunk is sampled in."""
+
+    num_steps: int
+    """N denoising steps."""
+    chunk_size: int
+    """K rows the network denoises."""
+    executed: int
+    """Rows that are sent to the world, ≤ K (LeRobot's n_action_steps)."""
+    padded_dim: int
+    """D, LeRobot's max_action_dim."""
+    action_dim: int
+    """A real dims."""
+
+    def action_mask(self) -> Tensor:
+        """(K, D) bool: the entries that reach the world."""
+        mask = torch.zeros(self.chunk_size, self.padded_dim, dtype=torch.bool)
+        mask[: self.executed, : self.action_dim] = True
+        return mask
+
+
+def step_time(k: Tensor | int, num_steps: int) -> Tensor | float:
+    """t at the start of denoising step k ∈ [0, N), as LeRobot's Euler loop counts it."""
+    return 1.0 + k * (-1.0 / num_steps)
+
+
+def transition(x: Tensor, v: Tensor, t: Tensor, shape: FlowShape, config: FlowSamplerConfig) -> tuple[Tensor, Tensor]:
+    """Mean and std of one Gaussian denoising step.
+
+    Args:
+        x: (B, K, D) at time t.
+        v: (B, K, D) velocity there.
+        t: (B,) in (0, 1].
+
+    Returns:
+        mean (B, K, D) and std (B, 1, 1).
+    """
+    delta = 1.0 / shape.num_steps
+    t = t.to(x)[:, None, None]
+    ode = x + (-delta) * v
+    if config.noise == "euler":
+        share = shape.num_steps if config.stochastic == "all" else 1
+        return ode, torch.full_like(t, config.noise_level / math.sqrt(share))
+    # 1 − t is 0 at the first step: the next grid time stands in, as in Flow-GRPO's discretisation.
+    sigma = config.noise_level * torch.sqrt(t / torch.clamp(1 - t, min=delta))
+    mean = ode - (delta * sigma**2 / (2 * t)) * (x + (1 - t) * v)
+    return mean, sigma * math.sqrt(delta)
+
+
+def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor, mask: Tensor) -> Tensor:
+    """Per-row log-density, summed over the dims `mask` (K, D) keeps. Returns (B, K)."""
+    z = (x - mean) / std
+    return torch.where(mask, -0.5 * z * z - torch.log(std) - LOG_SQRT_2PI, 0.0).sum(-1)
+
+
+def sample(
+    velocity: Velocity, x0: Tensor, eps: Tensor, index: Tensor, explore: Tensor, shape: FlowShape, config: FlowSamplerConfig
+) -> tuple[Tensor, dict[str, Tensor], Tensor]:
+    """Denoises a batch, some samples exploring and the others by the stock ODE.
+
+    Args:
+        x0: (B, K, D) initial noise.
+        eps: (B, N, K, D) standard normal, the step noise; only stochastic steps read it.
+        index: (B,) int64, the step drawn under ``one``; ignored otherwise.
+        explore: (B,) bool; False samples take the stock path, equal to LeRobot's sampler.
+
+    Returns:
+        x_N (B, K, D); the latent that `log_prob` re-scores; its log-prob (B, K), zero where not exploring.
+    """
+    n = shape.num_steps
+    mask = shape.action_mask().to(x0.device)
+    path, x = [x0], x0
+    logp = x0.new_zeros(x0.shape[:2])
+    for k in range(n):
+        t = x0.new_full((x0.shape[0],), step_time(k, n))
+        v = velocity(x, t)
+        noisy = explore & _is_stochastic(k, index, n, config)
+        mean, std = transition(x, v, t, shape, config)
+        step = torch.where(noisy[:, None, None], mean + std * eps[:, k], x + (-1.0 / n) * v)
+        if config.padded == "analytic" and config.stochastic != "last":
+            pad = step_time(k + 1, n) * x0[..., shape.action_dim :]
+            overwritten = torch.cat([step[..., : shape.action_dim], pad], -1)
+            step = torch.where(explore[:, None, None], overwritten, step)
+        counted = gaussian_log_prob(step, mean, std, _counted(k, mask, shape, config))
+        logp = logp + torch.where(noisy[:, None], counted, 0.0)
+        x = step
+        path.append(x)
+    return x, _latent(path, index, config), logp
+
+
+def log_prob(velocity: Velocity, latent: dict[str, Tensor], shape: FlowShape, config: FlowSamplerConfig) -> Tensor:
+    """Log-density of stored latents under the current velocity field, (B, K), differentiable."""
+    path, n = latent["path"], shape.num_steps
+    b = path.shape[0]
+    mask = shape.action_mask().to(path.device)
+    if config.stochastic == "one":
+        index = latent["index"]
+        t = step_time(index.to(path.dtype), n)
+        mean, std = transition(path[:, 0], velocity(path[:, 0], t), t, shape, config)
+        # The last step's density covers executed entries only; earlier ones feed back, so all of them count.
+        rows = torch.stack([_counted(k, mask, shape, config) for k in range(n)])[index]
+        return gaussian_log_prob(path[:, 1], mean, std, rows)
+    if config.stochastic == "last":
+        x = path[:, 0]
+        for k in range(n - 1):
+            x = x + (-1.0 / n) * velocity(x, x.new_full((b,), step_time(k, n)))
+        t = x.new_full((b,), step_time(n - 1, n))
+        mean, std = transition(x, velocity(x, t), t, shape, config)
+        return gaussian_log_prob(path[:, 1], mean, std, mask)
+    total = path.new_zeros(b, shape.chunk_size)
+    for k in range(n):
+        t = path.new_full((b,), step_time(k, n))
+        mean, std = transition(path[:, k], velocity(path[:, k], t), t, shape, config)
+        total = total + gaussian_log_prob(path[:, k + 1], mean, std, _counted(k, mask, shape, config))
+    return total
+
+
+def entropy(latent: dict[str, Tensor], shape: FlowShape, config: FlowSamplerConfig) -> Tensor:
+    """Differential entropy (B,) of the Gaussian steps that were drawn; the stds do not depend on the weights."""
+    path, n = latent["path"], shape.num_steps
+    b = path.shape[0]
+    mask = shape.action_mask().to(path.device)
+    zero = path.new_zeros(b, 1, 1)
+    per_step = []
+    for k in range(n):
+        t = path.new_full((b,), step_time(k, n))
+        _, std = transition(zero, zero, t, shape, config)
+        count = _counted(k, mask, shape, config).sum()
+        per_step.append(count * (torch.log(std[:, 0, 0]) + LOG_SQRT_2PI + 0.5))
+    steps = torch.stack(per_step, 1)
+    if config.stochastic == "all":
+        return steps.sum(1)
+    if config.stochastic == "last":
+        return steps[:, -1]
+    return steps.gather(1, latent["index"][:, None])[:, 0]
+
+
+def _is_stochastic(k: int, index: Tensor, n: int, config: FlowSamplerConfig) -> Tensor:
+    if config.stochastic == "one":
+        return index == k
+    return torch.full_like(index, config.stochastic == "all" or k == n - 1, dtype=torch.bool)
+
+
+def _counted(k: int, action_mask: Tensor, shape: FlowShape, config: FlowSamplerConfig) -> Tensor:
+    """(K, D) entries of step k's outcome that belong to the density."""
+    if k == shape.num_steps - 1:
+        return action_mask
+    counted = torch.ones_like(action_mask)
+    if config.padded == "analytic":
+        counted[:, shape.action_dim :] = False
+    return counted
+
+
+def _latent(path: list[Tensor], index: Tensor, config: FlowSamplerConfig) -> dict[str, Tensor]:
+    """What replay must keep: the whole path, its two ends, or the drawn transition."""
+    if config.stochastic == "all":
+        return {"path": torch.stack(path, 1)}
+    if config.stochastic == "last":
+        return {"path": torch.stack([path[0], path[-1]], 1)}
+    stacked = torch.stack(path, 1)
+    rows = torch.arange(len(index), device=index.device)
+    return {"path": torch.stack([stacked[rows, index], stacked[rows, index + 1]], 1), "index": index}

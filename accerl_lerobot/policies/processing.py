@@ -1,0 +1,60 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""LeRobot's own processors around a batch of raw observations: they hold the tokeniser and the normalisation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+IMAGES = "observation.images."
+
+
+class Processing:
+    """A policy's pre- and post-processor, fed with what worlds observe.
+
+    Only observations and tasks pass through: a LeRobot preprocessor silently drops keys it does not know, so log-probs,
+    rewards and versions travel beside it.
+
+    Args:
+        preprocessor: LeRobot's `PolicyProcessorPipeline` for inputs.
+        postprocessor: the one for actions.
+        device: where the network lives.
+        rename_map: world feature name → policy feature name.
+    """
+
+    def __init__(
+        self, preprocessor: Any, postprocessor: Any, device: torch.device, rename_map: dict[str, str] | None = None
+    ) -> None:
+        self.preprocessor, self.postprocessor = preprocessor, postprocessor
+        self.device = device
+        self.rename_map = rename_map or {}
+
+    def prepare(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> dict[str, Tensor]:
+        """Normalises and tokenises. Images go from uint8 (B, H, W, 3) to float (B, 3, H, W) in [0, 1]."""
+        batch: dict[str, Any] = {"task": list(tasks)}
+        for key, array in observations.items():
+            tensor = torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
+            if key.startswith(IMAGES):
+                tensor = tensor.permute(0, 3, 1, 2).contiguous().float() / 255.0
+            batch[self.rename_map.get(key, key)] = tensor
+        return self.preprocessor(batch)
+
+    def unnormalise(self, chunk: Tensor) -> Tensor:
+        """(B, K, A) from normalised to environment units."""
+        return self.postprocessor(chunk)
