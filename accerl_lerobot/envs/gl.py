@@ -13,7 +13,7 @@
 # limitations under the License.
 """An offscreen OpenGL for MuJoCo: pick a backend before the import, and say in one line what is missing.
 
-MuJoCo reads ``MUJOCO_GL`` once, when it is imported, so `import_mujoco` is the only way in.
+MuJoCo reads ``MUJOCO_GL`` once, when it is imported, so go through `import_mujoco` before anything else that uses it.
 """
 
 from __future__ import annotations
@@ -63,15 +63,18 @@ def import_mujoco() -> ModuleType:
     Raises:
         InputError: the backend's library is missing.
     """
-    if "mujoco" not in sys.modules:
-        # One software-rendering thread per world: several worlds then share the cores without fighting.
-        os.environ.setdefault("LP_NUM_THREADS", "1")
-        if not os.environ.get("MUJOCO_GL"):
-            backend = choose_backend()
-            if backend is not None:
-                os.environ["MUJOCO_GL"] = backend
+    imported = "mujoco" in sys.modules
+    # One software-rendering thread per world: several worlds then share the cores without fighting.
+    os.environ.setdefault("LP_NUM_THREADS", "1")
+    chosen = None if os.environ.get("MUJOCO_GL") else choose_backend()
+    if chosen is not None:
+        os.environ["MUJOCO_GL"] = chosen
     try:
-        return importlib.import_module("mujoco")
+        mujoco = importlib.import_module("mujoco")
+        if imported and chosen is not None:
+            # Somebody imported MuJoCo before us, without a backend; only this module of it has read the variable.
+            importlib.reload(mujoco.gl_context)
+        return mujoco
     except (ImportError, AttributeError, RuntimeError) as error:
         if isinstance(error, ModuleNotFoundError) and error.name == "mujoco":
             raise

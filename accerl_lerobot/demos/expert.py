@@ -1,0 +1,131 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""One demonstrated episode: a scripted expert, disturbed on purpose, in a world.
+
+Runs in the recorder's worker processes: NumPy and a simulator, no LeRobot, no torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from accerl_lerobot.envs.base import World
+from accerl_lerobot.envs.config import EnvConfig
+from accerl_lerobot.envs.gl import import_mujoco
+from accerl_lerobot.envs.metaworld import MetaWorld, MetaWorldConfig
+from accerl_lerobot.envs.metaworld_tasks import expert_name
+from accerl_lerobot.errors import InputError
+
+Expert = Callable[[], np.ndarray]
+"""Gives the next action for the state its world is in."""
+
+_DRIFT_MEMORY = 0.9
+_DRIFT_SCALE = 0.5
+_DRIFT_FROM = 60
+
+
+@dataclass(kw_only=True)
+class Episode:
+    """What one episode showed; every array has one row per env step."""
+
+    observations: dict[str, np.ndarray]
+    """Before each step, under LeRobot's names."""
+    actions: np.ndarray
+    """float32 (T, A), as executed: noise included, clipped to the world's bounds."""
+    rewards: np.ndarray
+    """float32 (T,)."""
+    task: str
+    """The instruction text."""
+    done: bool
+    """Whether the last step ended the episode."""
+    success_at: int
+    """Index of the first step after which the task was achieved; -1 for never."""
+    seed: int
+
+    @property
+    def success(self) -> bool:
+        return self.success_at >= 0
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+
+def make_expert(config: EnvConfig, world: World, task: str) -> Expert:
+    """The scripted expert of `task`, reading the simulator's own state.
+
+    Raises:
+        InputError: there is no scripted expert for this kind of environment.
+    """
+    if type(config) not in _EXPERTS:
+        names = ", ".join(kind.get_choice_name(kind) for kind in _EXPERTS)
+        raise InputError("env.type", config.type, f"scripted experts exist for: {names}")
+    return _EXPERTS[type(config)](world, task)
+
+
+def play(world: World, expert: Expert, *, task: str, seed: int, noise: float, fail: bool) -> Episode:
+    """Plays one episode to its end; equal arguments give equal episodes.
+
+    Args:
+        world: Reset here with `seed`.
+        expert: Reads `world`.
+        task: Name of the task.
+        seed: Of the world and of the noise.
+        noise: Standard deviation of the Gaussian added to each action.
+        fail: Whether to let go of the task: from a random early step on, actions are a random drift.
+    """
+    rng = np.random.default_rng((seed, 1))
+    low, high = world.spec.action_low, world.spec.action_high
+    drift_from = int(rng.integers(0, _DRIFT_FROM)) if fail else world.spec.max_steps
+    drift = np.zeros(world.spec.action_dim)
+    observation, done, success_at = world.reset(seed, task), False, -1
+    seen, actions, rewards = [], [], []
+    while not done:
+        if len(actions) < drift_from:
+            wanted = np.asarray(expert(), np.float64)
+        else:
+            drift = _DRIFT_MEMORY * drift + _DRIFT_SCALE * rng.standard_normal(len(drift))
+            wanted = drift
+        action = np.clip(wanted, low, high) + noise * rng.standard_normal(len(wanted))
+        action = np.clip(action, low, high).astype(np.float32)
+        result = world.step_chunk(action[None])
+        seen.append(observation)
+        actions.append(action)
+        rewards.append(result.rewards[0])
+        if result.success and success_at < 0:
+            success_at = len(actions) - 1
+        observation, done = result.observation, result.done
+    return Episode(
+        observations={key: np.stack([row[key] for row in seen]) for key in seen[0] if key != "task"},
+        actions=np.stack(actions),
+        rewards=np.asarray(rewards, np.float32),
+        task=str(seen[0]["task"]),
+        done=done,
+        success_at=success_at,
+        seed=seed,
+    )
+
+
+def _metaworld_expert(world: World, task: str) -> Expert:
+    import_mujoco()
+    from metaworld import policies
+
+    assert isinstance(world, MetaWorld)
+    policy = getattr(policies, expert_name(task))()
+    return lambda: policy.get_action(world.raw_observation)
+
+
+_EXPERTS: dict[type[EnvConfig], Callable[[World, str], Expert]] = {MetaWorldConfig: _metaworld_expert}

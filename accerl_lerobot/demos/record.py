@@ -1,0 +1,256 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Scripted experts in parallel processes, recorded as one LeRobotDataset.
+
+Worker processes simulate and send arrays; the parent writes. Each episode's seed follows from its place in the
+dataset alone, so the content does not depend on how many processes worked on it.
+"""
+
+from __future__ import annotations
+
+import collections
+import concurrent.futures
+import dataclasses
+import json
+import logging
+import math
+import multiprocessing
+import shutil
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import draccus
+import numpy as np
+from rich.progress import Progress
+
+from accerl_lerobot.demos.expert import Episode, make_expert, play
+from accerl_lerobot.envs import make_world
+from accerl_lerobot.envs.base import World, WorldSpec
+from accerl_lerobot.envs.config import EnvConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.seeds import demo_seed
+
+SIDECAR = Path("meta") / "accerl_demos.json"
+"""Inside the dataset: the two configs and what came of them."""
+
+_logger = logging.getLogger(__name__)
+_MAX_EPISODES = 10_000
+_MAX_TRIES = 50
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemosConfig:
+    """How many demonstrations, how disturbed, written where.
+
+    Example:
+        >>> record_demos(MetaWorldConfig(task="drawer-open-v3"), DemosConfig(episodes=25, root="outputs/drawer"))
+    """
+
+    episodes: int = 25
+    """Episodes in the dataset, 1 to 10,000; spread evenly over the tasks."""
+    action_noise: float = 0.1
+    """Standard deviation of the Gaussian added to the expert's action before clipping, 0 to 1. The noisy action is
+    executed and recorded, so the dataset also shows how to recover."""
+    failure_share: float = 0.0
+    """Share of episodes that drift at random from an early step on and fail, 0 to 1; for success and world models."""
+    keep_failures: bool = False
+    """Whether an expert episode that failed is kept; otherwise it is tried again with another seed."""
+    max_steps: int = 500
+    """Episode limit in env steps; the environment's own limit holds too."""
+    seed: int = 0
+    """0 to 999; disjoint demonstrations for different seeds."""
+    processes: int = 2
+    """Simulator processes, 1 to 64; does not change the content."""
+    repo_id: str = "accerl/demos"
+    """Name of the dataset, ``owner/name``; also its place on the Hub if it is pushed."""
+    root: str = "outputs/demos"
+    """Folder to create; must not exist."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.episodes <= _MAX_EPISODES:
+            raise InputError("demos.episodes", self.episodes, f"use 1 to {_MAX_EPISODES}")
+        if not 0 <= self.action_noise <= 1:
+            raise InputError("demos.action_noise", self.action_noise, "use 0 to 1")
+        if not 0 <= self.failure_share <= 1:
+            raise InputError("demos.failure_share", self.failure_share, "use a share between 0 and 1")
+        if self.max_steps < 1:
+            raise InputError("demos.max_steps", self.max_steps, "use at least 1 env step")
+        if not 1 <= self.processes <= 64:
+            raise InputError("demos.processes", self.processes, "use 1 to 64")
+        if len(parts := self.repo_id.split("/")) != 2 or not all(parts):
+            raise InputError("demos.repo_id", self.repo_id, "use the form owner/name")
+        if not self.root:
+            raise InputError("demos.root", self.root, "name a folder to create")
+        demo_seed(self.seed, 0)
+
+
+def record_demos(env_config: EnvConfig, config: DemosConfig) -> Path:
+    """Records demonstrations.
+
+    The dataset appears at ``config.root`` only when it is complete.
+
+    Returns:
+        The dataset's folder; open it with ``LeRobotDataset(config.repo_id, root=...)``.
+
+    Raises:
+        InputError: the folder exists, the environment has no scripted expert, or its expert keeps failing.
+    """
+    root = Path(config.root)
+    if root.exists():
+        raise InputError("demos.root", config.root, "exists already: remove it or name another folder")
+    if hasattr(env_config, "max_steps"):
+        env_config = dataclasses.replace(env_config, max_steps=min(env_config.max_steps, config.max_steps))
+    world = make_world(env_config)
+    spec = world.spec
+    make_expert(env_config, world, spec.tasks[0])  # refuses an environment without experts before any work
+    world.close()
+    partial = root.with_name(root.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        tally = _write(env_config, config, spec, partial)
+        sidecar = {
+            "env": draccus.encode(env_config, EnvConfig),
+            "demos": {k: v for k, v in draccus.encode(config).items() if k not in ("root", "processes")},
+            **tally,
+        }
+        (partial / SIDECAR).write_text(json.dumps(sidecar, indent=2) + "\n")
+        partial.rename(root)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    _logger.info("%s: %s", root, tally)
+    return root
+
+
+def _write(env_config: EnvConfig, config: DemosConfig, spec: WorldSpec, root: Path) -> dict[str, Any]:
+    context = multiprocessing.get_context("spawn")
+    tally = {"episodes": 0, "frames": 0, "successes": 0, "discarded": 0}
+    with (
+        concurrent.futures.ProcessPoolExecutor(
+            config.processes, context, initializer=_start, initargs=(env_config, config)
+        ) as pool,
+        Progress(transient=True) as progress,
+    ):
+        episodes = _in_order(pool, config.episodes, ahead=2 * config.processes)
+        # The first episodes are already being simulated while LeRobot is imported.
+        from datasets.utils.logging import disable_progress_bar
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        disable_progress_bar()  # one per episode would bury ours
+        dataset = LeRobotDataset.create(
+            config.repo_id,
+            fps=spec.fps,
+            features=features(spec),
+            root=root,
+            robot_type=env_config.type,
+            use_videos=False,
+            video_backend="pyav",  # unused, but the default probes for FFmpeg and complains at length
+        )
+        bar = progress.add_task("recording", total=config.episodes)
+        for episode, discarded in episodes:
+            for frame in frames(episode):
+                dataset.add_frame(frame)
+            dataset.save_episode()
+            tally["episodes"] += 1
+            tally["frames"] += len(episode)
+            tally["successes"] += episode.success
+            tally["discarded"] += discarded
+            progress.advance(bar)
+        dataset.finalize()
+    return tally
+
+
+def features(spec: WorldSpec) -> dict[str, dict[str, Any]]:
+    """LeRobot's feature table for a world; reward, done and success under LeRobot's own names."""
+    table: dict[str, dict[str, Any]] = {
+        key: {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
+        for key, shape in spec.images.items()
+    }
+    vectors = {"observation.state": ("state", spec.state_dim), "action": ("action", spec.action_dim)}
+    for key, (name, size) in vectors.items():
+        table[key] = {"dtype": "float32", "shape": (size,), "names": [f"{name}_{i}" for i in range(size)]}
+    table["next.reward"] = {"dtype": "float32", "shape": (1,), "names": None}
+    table["next.done"] = {"dtype": "bool", "shape": (1,), "names": None}
+    table["next.success"] = {"dtype": "bool", "shape": (1,), "names": None}
+    return table
+
+
+def frames(episode: Episode) -> Iterator[dict[str, Any]]:
+    """The rows of `episode` as ``LeRobotDataset.add_frame`` takes them."""
+    for t in range(len(episode)):
+        yield {
+            **{key: rows[t] for key, rows in episode.observations.items()},
+            "action": episode.actions[t],
+            "next.reward": episode.rewards[t : t + 1],
+            "next.done": np.array([episode.done and t == len(episode) - 1]),
+            "next.success": np.array([episode.success and t >= episode.success_at]),
+            "task": episode.task,
+        }
+
+
+_world: World
+_env_config: EnvConfig
+_config: DemosConfig
+
+
+def _start(env_config: EnvConfig, config: DemosConfig) -> None:
+    """Makes a worker process ready: one world for all its episodes."""
+    global _world, _env_config, _config
+    # The experts' gains are too high on purpose, and `play` clips.
+    warnings.filterwarnings("ignore", message="Constant.s. may be too high", category=UserWarning)
+    _world, _env_config, _config = make_world(env_config), env_config, config
+
+
+def _in_order(pool: concurrent.futures.Executor, count: int, ahead: int) -> Iterator[tuple[Episode, int]]:
+    """Results of `_record_one` for 0 … count-1, with at most `ahead` finished ones waiting in memory."""
+    waiting = collections.deque(pool.submit(_record_one, slot) for slot in range(min(ahead, count)))
+    return _drain(pool, count, waiting)
+
+
+def _drain(pool: concurrent.futures.Executor, count: int, waiting: collections.deque) -> Iterator[tuple[Episode, int]]:
+    submitted = len(waiting)
+    while waiting:
+        result = waiting.popleft().result()
+        if submitted < count:
+            waiting.append(pool.submit(_record_one, submitted))
+            submitted += 1
+        yield result
+
+
+def _record_one(slot: int) -> tuple[Episode, int]:
+    """The episode at place `slot` of the dataset, and how many tries were thrown away for it."""
+    tasks = _world.spec.tasks
+    task, rank = tasks[slot % len(tasks)], slot // len(tasks)
+    share = _config.failure_share
+    fail = math.floor((rank + 1) * share) > math.floor(rank * share)
+    for attempt in range(_MAX_TRIES):
+        episode = play(
+            _world,
+            make_expert(_env_config, _world, task),
+            task=task,
+            seed=demo_seed(_config.seed, slot + attempt * _MAX_EPISODES),
+            noise=_config.action_noise,
+            fail=fail,
+        )
+        if episode.success != fail or (_config.keep_failures and not fail):
+            return episode, attempt
+    raise InputError(
+        "demos.failure_share" if fail else "demos.action_noise",
+        share if fail else _config.action_noise,
+        f"{_MAX_TRIES} tries of {task} in a row did not {'fail' if fail else 'succeed'}; "
+        "lower it, or allow more env steps (env.max_steps, demos.max_steps)",
+    )

@@ -1,0 +1,173 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Warm start: hands a LeRobotDataset to LeRobot's own trainer and returns a LeRobot checkpoint.
+
+The trainer is stock ``lerobot-train`` in a process of its own; the exact command is logged, so that anyone can repeat it
+without us.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.backbone import BackboneConfig, write_backbone
+
+logger = logging.getLogger(__name__)
+
+LOG_EVERY = 25
+"""Optimiser steps between two lines of progress."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SFTConfig:
+    """Supervised fine-tuning before RL."""
+
+    steps: int = 0
+    """Optimiser steps; 0 skips this stage."""
+    batch_size: int = 64
+    """Frames per step."""
+    lr: float = 1e-3
+    """Peak learning rate; LeRobot's preset warms up and decays it over `steps`."""
+    warmup_steps: int = 20
+    num_workers: int = 1
+    """Data-loading processes; 0 loads in the trainer."""
+    num_threads: int = 2
+    """CPU threads of the trainer."""
+    init_path: str | None = None
+    """LeRobot checkpoint to start from; None starts a new policy from `policy`."""
+    policy: dict[str, Any] = field(default_factory=lambda: {"type": "smolvla"})
+    """Fields of LeRobot's own policy config for a new policy, ``type`` among them."""
+    backbone: BackboneConfig | None = None
+    """Write a random backbone of this size for the new policy instead of loading one from the Hub."""
+    extra_args: list[str] = field(default_factory=list)
+    """Further ``lerobot-train`` arguments, e.g. ``--dataset.image_transforms.enable=true``."""
+
+    def __post_init__(self) -> None:
+        if self.steps < 0:
+            raise InputError("sft.steps", self.steps, "use 0 (skip) or more")
+        if not 0 < self.lr < 1:
+            raise InputError("sft.lr", self.lr, "use a value in (0, 1)")
+        if self.batch_size < 1:
+            raise InputError("sft.batch_size", self.batch_size, "use at least 1")
+        if self.init_path is None and "type" not in self.policy:
+            raise InputError("sft.policy", self.policy, "name LeRobot's policy type, e.g. {type: smolvla}")
+
+
+def sft_command(
+    config: SFTConfig, repo_id: str, root: str | None, output_dir: Path, seed: int, device: str
+) -> list[str]:
+    """The ``lerobot-train`` command line of this warm start."""
+    fields: dict[str, Any]
+    if config.init_path is not None:
+        fields = {"path": config.init_path}
+    else:
+        fields = dict(config.policy)
+        if config.backbone is not None:
+            fields["vlm_model_name"] = str((output_dir.parent / "backbone").resolve())
+            fields["load_vlm_weights"] = False
+    fields |= {"device": device, "push_to_hub": False, "optimizer_lr": config.lr}
+    fields |= {"scheduler_warmup_steps": config.warmup_steps, "scheduler_decay_steps": config.steps}
+    command = [sys.executable, "-m", "lerobot.scripts.lerobot_train"]
+    command += [f"--policy.{key}={_as_argument(value)}" for key, value in fields.items()]
+    command += [f"--dataset.repo_id={repo_id}"] + ([f"--dataset.root={root}"] if root else [])
+    command += [
+        f"--output_dir={output_dir}",
+        f"--steps={config.steps}",
+        f"--batch_size={config.batch_size}",
+        f"--num_workers={config.num_workers}",
+        f"--seed={seed}",
+        f"--save_freq={config.steps}",
+        f"--log_freq={LOG_EVERY}",
+        "--env_eval_freq=0",
+        "--wandb.enable=false",
+        "--dataset.video_backend=pyav",
+    ]
+    return command + list(config.extra_args)
+
+
+def run_sft(
+    config: SFTConfig,
+    repo_id: str,
+    root: str | None,
+    output_dir: Path,
+    seed: int,
+    device: str = "cpu",
+    on_step: Callable[[int, float], None] | None = None,
+) -> Path:
+    """Trains and returns the ``pretrained_model`` folder.
+
+    Args:
+        repo_id: dataset id, on the Hub or a label for `root`.
+        root: local dataset folder, or None to use the Hub cache.
+        output_dir: must not exist; its parent gets ``sft.log``.
+        on_step: called with (step, loss) as progress is reported.
+
+    Raises:
+        InputError: `output_dir` exists.
+        RuntimeError: the trainer failed; carries the end of its log.
+    """
+    if output_dir.exists():
+        raise InputError("output_dir", str(output_dir), "the folder exists; choose another or remove it")
+    output_dir.parent.mkdir(parents=True, exist_ok=True)
+    if config.init_path is None and config.backbone is not None:
+        write_backbone(output_dir.parent / "backbone", config.backbone)
+    command = sft_command(config, repo_id, root, output_dir, seed, device)
+    logger.info("%s", shlex.join(command))
+    environment = os.environ | {
+        "OMP_NUM_THREADS": str(config.num_threads),
+        "OMP_WAIT_POLICY": "PASSIVE",
+        "TOKENIZERS_PARALLELISM": "false",
+    }
+    log = output_dir.parent / "sft.log"
+    with log.open("w") as file:
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment, errors="replace"
+        )
+        assert process.stdout is not None
+        for line in process.stdout:
+            file.write(line)
+            if on_step is not None and (parsed := _parse_progress(line)):
+                on_step(*parsed)
+        code = process.wait()
+    if code != 0:
+        tail = "".join(log.read_text().splitlines(keepends=True)[-15:])
+        raise RuntimeError(f"lerobot-train ended with exit code {code}; the end of {log}:\n{tail}")
+    return output_dir / "checkpoints" / "last" / "pretrained_model"
+
+
+def _as_argument(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _parse_progress(line: str) -> tuple[int, float] | None:
+    """LeRobot logs lines such as ``step:50 smpl:3K ep:40 epch:1.2 loss:0.512 grdn:… lr:…``."""
+    fields = dict(part.split(":", 1) for part in line.split() if part.count(":") == 1)
+    if "step" not in fields or "loss" not in fields:
+        return None
+    try:
+        step = fields["step"]
+        number = float(step[:-1]) * 1000 if step.endswith("K") else float(step)
+        return int(number), float(fields["loss"])
+    except ValueError:
+        return None
