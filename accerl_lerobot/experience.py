@@ -34,6 +34,19 @@ TASK = "task"
 
 
 @dataclass(frozen=True, kw_only=True)
+class Request:
+    """One observation that waits for a decision.
+
+    `noise_seed` fixes all randomness of the decision, so that it does not depend on which batch it lands in.
+    """
+
+    observation: Observation
+    noise_seed: int
+    explore: bool = True
+    """False asks for LeRobot's stock sampler, the one evaluation uses."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Decision:
     """One policy call, as the inference service answers it.
 

@@ -29,7 +29,7 @@ import torch
 from torch import Tensor, nn
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import TASK, Decision, Observation
+from accerl_lerobot.experience import TASK, Decision, Request
 
 if TYPE_CHECKING:
     from accerl_lerobot.envs.base import WorldSpec
@@ -45,19 +45,6 @@ class Evaluation:
     """(B,)."""
     value: Tensor
     """(B,)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Request:
-    """One observation that waits for a decision.
-
-    `noise_seed` fixes all randomness of the decision, so that it does not depend on which batch it lands in.
-    """
-
-    observation: Observation
-    noise_seed: int
-    explore: bool = True
-    """False asks for LeRobot's stock sampler, the one evaluation uses."""
 
 
 class PolicyAdapter(nn.Module, ABC):

@@ -27,9 +27,9 @@ import torch
 from torch import Tensor, nn
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import Decision
+from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.policies import flow
-from accerl_lerobot.policies.base import Evaluation, PolicyAdapter, Request, stack_observations
+from accerl_lerobot.policies.base import Evaluation, PolicyAdapter, stack_observations
 from accerl_lerobot.policies.processing import Processing
 from accerl_lerobot.policies.value_head import ValueHead, ValueHeadConfig
 

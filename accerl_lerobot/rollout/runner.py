@@ -1,0 +1,219 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Several worlds, each somewhere between a decision and the next: the rollout worker without its process.
+
+A slot is one world. `start` resets it and `advance` executes a decision in it; both return the request for the next
+decision, and whoever drives the runner decides when that is answered: the Ray worker goes on with other slots meanwhile,
+the single-process mode answers at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from accerl_lerobot.envs.base import World
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import Decision, Observation, Request, Segment
+from accerl_lerobot.rollout.segments import SegmentBuilder
+
+
+@dataclass(frozen=True, kw_only=True)
+class RolloutConfig:
+    """How experience is collected."""
+
+    workers: int = 1
+    """Rollout processes."""
+    worlds: int = 8
+    """Worlds per process; while some wait for a decision the others step."""
+    segment_length: int = 16
+    """Largest number of decisions in a segment."""
+    decision_cost: float = 0.01
+    """Subtracted from the reward of every decision, so that faster is better; ≥ 0."""
+    max_restarts: int = 3
+    """How often a rollout worker that died is started again before the run ends with its error."""
+
+    def __post_init__(self) -> None:
+        for name in ("workers", "worlds", "segment_length"):
+            if getattr(self, name) < 1:
+                raise InputError(f"rollout.{name}", getattr(self, name), "use at least 1")
+        for name in ("decision_cost", "max_restarts"):
+            if getattr(self, name) < 0:
+                raise InputError(f"rollout.{name}", getattr(self, name), "use 0 or more")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodePlan:
+    """One episode to run."""
+
+    task: str
+    seed: int
+    explore: bool
+    """True: sample and learn from it. False: LeRobot's stock sampler, for evaluation; no segment is made."""
+    index: int = 0
+    """Position in the evaluation it belongs to."""
+    group: str = "train"
+    """Which evaluation it belongs to."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeResult:
+    """How an episode went."""
+
+    plan: EpisodePlan
+    success: bool
+    episode_return: float
+    steps: int
+    decisions: int
+    versions: tuple[int, int]
+    """Oldest and newest weights that decided in it."""
+
+
+@dataclass
+class Counters:
+    """What a runner has done so far."""
+
+    env_steps: int = 0
+    decisions: int = 0
+    episodes: int = 0
+    dropped_nonfinite: int = 0
+    """Decisions thrown away because the world returned NaN or infinity."""
+
+
+@dataclass
+class _Slot:
+    world: World
+    plan: EpisodePlan | None = None
+    builder: SegmentBuilder | None = None
+    episode_return: float = 0.0
+    steps: int = 0
+    decisions: int = 0
+    versions: list[int] = field(default_factory=list)
+
+
+class RolloutRunner:
+    """Drives a set of worlds through planned episodes.
+
+    Args:
+        worlds: one per slot.
+        next_plan: called for each new episode; None leaves the slot idle until `start` is called again.
+        config: segment length and decision cost.
+        name: unique per incarnation of a worker; the prefix of its segments' keys.
+        on_segment: receives finished segments of exploring episodes.
+        on_episode: receives every finished episode.
+    """
+
+    def __init__(
+        self,
+        worlds: Sequence[World],
+        next_plan: Callable[[], EpisodePlan | None],
+        config: RolloutConfig,
+        name: str,
+        on_segment: Callable[[Segment], None],
+        on_episode: Callable[[EpisodeResult], None],
+    ) -> None:
+        self.config, self.name = config, name
+        self.counters = Counters()
+        self._slots = [_Slot(world) for world in worlds]
+        self._next_plan, self._on_segment, self._on_episode = next_plan, on_segment, on_episode
+        self._sequence = 0
+
+    def __len__(self) -> int:
+        return len(self._slots)
+
+    def start(self, slot: int) -> Request | None:
+        """Begins the next planned episode in `slot`; None when nothing is planned."""
+        state, plan = self._slots[slot], self._next_plan()
+        if plan is None:
+            state.plan = None
+            return None
+        observation = state.world.reset(plan.seed, plan.task)
+        if not _finite(observation):
+            raise RuntimeError(f"{plan.task} with seed {plan.seed}: the first observation is not finite")
+        self._slots[slot] = _Slot(state.world, plan, SegmentBuilder(observation, self.config.segment_length))
+        return self._request(self._slots[slot])
+
+    def advance(self, slot: int, decision: Decision) -> Request | None:
+        """Executes `decision`; the request is about the same episode, or the first of the next one."""
+        state = self._slots[slot]
+        plan, builder = state.plan, state.builder
+        assert plan is not None and builder is not None
+        result = state.world.step_chunk(decision.chunk)
+        self.counters.env_steps += result.steps
+        self.counters.decisions += 1
+        if result.info.get("nonfinite") or not (np.isfinite(result.rewards).all() and _finite(result.observation)):
+            self.counters.dropped_nonfinite += len(builder.decisions) + 1
+            if not plan.explore:  # an evaluation counts every episode it planned
+                self._finish(state, plan, success=False)
+            return self.start(slot)
+        reward = float(result.rewards.sum()) - self.config.decision_cost
+        state.episode_return += reward
+        state.steps += result.steps
+        state.decisions += 1
+        state.versions.append(decision.version)
+        builder.add(decision, reward, result.steps, result.observation)
+        if result.done or builder.full:
+            self._emit(state, plan, builder, result.terminated, result.truncated, result.success)
+        if result.done:
+            self._finish(state, plan, result.success)
+            return self.start(slot)
+        return self._request(state)
+
+    def close(self) -> None:
+        """Closes the worlds."""
+        for state in self._slots:
+            state.world.close()
+
+    def _request(self, state: _Slot) -> Request:
+        plan, builder = state.plan, state.builder
+        assert plan is not None and builder is not None
+        seed = plan.seed * 1_000_003 + state.decisions  # one stream per (episode, decision), however requests are batched
+        return Request(observation=builder.latest, noise_seed=seed, explore=plan.explore)
+
+    def _emit(
+        self, state: _Slot, plan: EpisodePlan, builder: SegmentBuilder, terminated: bool, truncated: bool, success: bool
+    ) -> None:
+        self._sequence += 1
+        episode = {}
+        if terminated or truncated:
+            episode = {
+                "return": state.episode_return, "steps": state.steps, "decisions": state.decisions,
+                "success": float(success),
+            }  # fmt: skip
+        key = f"{self.name}.{self._sequence}"
+        segment = builder.cut(key, terminated, truncated, success, episode)
+        if plan.explore:
+            self._on_segment(segment)
+
+    def _finish(self, state: _Slot, plan: EpisodePlan, success: bool) -> None:
+        self.counters.episodes += 1
+        versions = state.versions or [0]
+        self._on_episode(
+            EpisodeResult(
+                plan=plan,
+                success=success,
+                episode_return=state.episode_return,
+                steps=state.steps,
+                decisions=state.decisions,
+                versions=(min(versions), max(versions)),
+            )
+        )
+
+
+def _finite(observation: Observation | None) -> bool:
+    if observation is None:
+        return True
+    return all(np.isfinite(v).all() for v in observation.values() if isinstance(v, np.ndarray) and v.dtype.kind == "f")

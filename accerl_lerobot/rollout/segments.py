@@ -1,0 +1,89 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""From decisions to segments: the bookkeeping of one episode, without any process around it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from accerl_lerobot.experience import TASK, Decision, Observation, Segment
+
+
+class SegmentBuilder:
+    """Collects the decisions of one episode and cuts them into segments of at most `length` decisions.
+
+    Example:
+        >>> builder = SegmentBuilder(observation, length=8)
+        >>> builder.add(decision, reward=0.0, steps=10, following=next_observation)   # repeated
+        >>> segment = builder.cut(key="rollout0.0.17", terminated=True, success=True)
+
+    Args:
+        observation: what `World.reset` returned.
+        length: largest T of a segment.
+        source: stamped on every segment.
+    """
+
+    def __init__(self, observation: Observation, length: int, source: str = "real") -> None:
+        self.length, self.source = length, source
+        self.observations = [observation]
+        self.decisions: list[Decision] = []
+        self.rewards: list[float] = []
+        self.steps: list[int] = []
+
+    @property
+    def latest(self) -> Observation:
+        """The observation the next decision is about."""
+        return self.observations[-1]
+
+    @property
+    def full(self) -> bool:
+        return len(self.decisions) >= self.length
+
+    def add(self, decision: Decision, reward: float, steps: int, following: Observation | None) -> None:
+        """Records one executed decision; `following` None (after a termination) repeats the observation before."""
+        self.decisions.append(decision)
+        self.rewards.append(reward)
+        self.steps.append(steps)
+        self.observations.append(self.latest if following is None else following)
+
+    def cut(
+        self,
+        key: str,
+        terminated: bool = False,
+        truncated: bool = False,
+        success: bool = False,
+        episode: dict[str, float] | None = None,
+    ) -> Segment:
+        """Hands out what was collected as one segment and goes on from its last observation."""
+        keys = [k for k in self.observations[0] if k != TASK]
+        names = self.decisions[0].latent.keys()
+        segment = Segment(
+            observations={k: np.stack([np.asarray(o[k]) for o in self.observations]) for k in keys},
+            task=str(self.observations[0][TASK]),
+            latent={k: np.stack([d.latent[k] for d in self.decisions]) for k in names},
+            log_prob=np.stack([d.log_prob for d in self.decisions]).astype(np.float32),
+            value=np.array([d.value for d in self.decisions], np.float32),
+            reward=np.array(self.rewards, np.float32),
+            version=np.array([d.version for d in self.decisions], np.int64),
+            steps=np.array(self.steps, np.int64),
+            terminated=terminated,
+            truncated=truncated,
+            success=success,
+            key=key,
+            source=self.source,
+            episode=episode or {},
+        )
+        self.observations = [self.latest]
+        self.decisions, self.rewards, self.steps = [], [], []
+        return segment
