@@ -1,0 +1,64 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The objectives as the papers state them: typed tensors in, loss and diagnostics out.
+
+To add one: write a file with its config (registered under `AlgorithmConfig`) and its function, then add one
+line to `ALGORITHMS`. No file that this package imports pulls in torch, so a run can be parsed before torch
+is loaded.
+
+Order of use inside an update::
+
+    advantages, returns = gae(...)                    # gae.py, with values of the current critic
+    advantages = normalise(advantages, moments)       # normalise.py, moments summed over all ranks
+    output = compute_loss(LossInputs(...), config)    # one file per algorithm
+    output.loss.backward()
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from accerl_lerobot.algorithms.contract import AlgorithmConfig, Level, LossInputs, LossOutput
+from accerl_lerobot.algorithms.gipo import GIPOConfig, gipo_loss
+from accerl_lerobot.algorithms.ppo import PPOConfig, ppo_loss
+
+ALGORITHMS: dict[str, Callable[[LossInputs, Any], LossOutput]] = {
+    "gipo": gipo_loss,
+    "ppo": ppo_loss,
+}
+"""Name on the command line → loss; the second argument is the config registered under the same name."""
+
+
+def compute_loss(inputs: LossInputs, config: AlgorithmConfig) -> LossOutput:
+    """The loss that belongs to `config`.
+
+    Raises:
+        KeyError: `config` is registered but has no line in `ALGORITHMS`.
+    """
+    return ALGORITHMS[config.type](inputs, config)
+
+
+__all__ = [
+    "ALGORITHMS",
+    "AlgorithmConfig",
+    "GIPOConfig",
+    "Level",
+    "LossInputs",
+    "LossOutput",
+    "PPOConfig",
+    "compute_loss",
+    "gipo_loss",
+    "ppo_loss",
+]

@@ -1,0 +1,96 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""GIPO: a Gaussian trust weight on the log-ratio instead of a clip (arXiv 2603.03955, used by AcceRL,
+2603.18464).
+
+    ρ = π(a|o) / μ(a|o)
+    ω = exp(−½ (log ρ̄ / σ)²)          ρ̄ = ρ without gradient
+    L = −E[ω · ρ · Â]  +  the shared terms of `objective`
+
+The gradient is −E[ω ρ Â ∇log π]. At ρ = 1 it is the plain policy gradient; ω·ρ never exceeds exp(σ²/2) and
+fades to 0 the further the current policy has moved from the one that acted, in both directions. PPO drops
+such samples at an edge, and only on one side.
+
+Deviations from the paper:
+    * the KL to the behaviour policy is estimated from samples (`ratio.kl_from_behaviour`), not summed over
+      token bins, because a flow policy has no bins;
+    * log ρ is clamped, see `ratio.LOG_RATIO_CLAMP`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput
+from accerl_lerobot.algorithms.objective import advantage_column, assemble
+from accerl_lerobot.algorithms.ratio import log_ratio, masked_mean, ratio
+from accerl_lerobot.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+REFERENCE_CLIP = (0.2, 0.2)
+"""GIPO clips nothing; its clip fraction counts what PPO's usual range would, so that runs can be compared."""
+
+
+@AlgorithmConfig.register_subclass("gipo")
+@dataclass(frozen=True, kw_only=True)
+class GIPOConfig(AlgorithmConfig):
+    """Settings of GIPO; the defaults are the paper's."""
+
+    sigma: float = 1.0
+    """Width of the trust weight in nats of log ρ, > 0; ``inf`` is importance sampling without any clip."""
+    sigma_negative: float | None = None
+    """The width where Â ≤ 0, > 0; None is the paper's symmetric form, a later variant halves `sigma`."""
+    kl_coef: float = 0.1
+    """Weight of KL(μ‖π), the distance from the behaviour policy, ≥ 0."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("sigma", "sigma_negative"):
+            value = getattr(self, name)
+            if value is not None and not value > 0.0:
+                raise InputError(f"algorithm.{name}", value, "use a number above 0")
+
+
+def trust_weight(log_ratio: Tensor, advantage: Tensor, config: GIPOConfig) -> Tensor:
+    """ω in [0, 1], (N, F), without gradient.
+
+    Args:
+        log_ratio: (N, F).
+        advantage: (N, 1), only its sign is used.
+        config: the widths.
+    """
+    positive = (-0.5 * (log_ratio.detach() / config.sigma).square()).exp()
+    if config.sigma_negative is None:
+        return positive
+    negative = (-0.5 * (log_ratio.detach() / config.sigma_negative).square()).exp()
+    return positive.where(advantage > 0.0, negative)
+
+
+def gipo_loss(inputs: LossInputs, config: GIPOConfig) -> LossOutput:
+    """See the top of the file. E is the mean over decisions, and over their factors at level ``action``.
+
+    Args:
+        inputs: the batch; `LossInputs` states the shapes.
+        config: widths and coefficients.
+    """
+    advantage = advantage_column(inputs)
+    logs = log_ratio(inputs.log_prob_new, inputs.log_prob_old.detach(), config.level, inputs.mask)
+    weight = trust_weight(logs, advantage, config)
+    policy_loss = -masked_mean(weight * ratio(logs) * advantage, inputs.mask)
+    return assemble(
+        inputs, config, policy_loss=policy_loss, log_ratio=logs, weight=weight, clip=REFERENCE_CLIP
+    )

@@ -1,0 +1,70 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""PPO with a clip (Schulman et al., arXiv 1707.06347), asymmetric as in DAPO (arXiv 2503.14476, section 3.1).
+
+    L = −E[min(ρ Â, clip(ρ, 1 − low, 1 + high) Â)]  +  the shared terms of `objective`
+
+The ratio is taken against the behaviour policy, so under asynchrony the clip range is also the staleness
+budget: at a large lag most samples are outside and their gradient is gone. That is what GIPO is for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput
+from accerl_lerobot.algorithms.objective import advantage_column, assemble
+from accerl_lerobot.algorithms.ratio import log_ratio, masked_mean, ratio
+from accerl_lerobot.errors import InputError
+
+
+@AlgorithmConfig.register_subclass("ppo")
+@dataclass(frozen=True, kw_only=True)
+class PPOConfig(AlgorithmConfig):
+    """Settings of PPO."""
+
+    clip_low: float = 0.2
+    """How far ρ may fall below 1 before a sample with Â < 0 stops counting, in (0, 1)."""
+    clip_high: float = 0.28
+    """How far ρ may rise above 1 before a sample with Â > 0 stops counting, > 0."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0.0 < self.clip_low < 1.0:
+            raise InputError("algorithm.clip_low", self.clip_low, "use a number between 0 and 1")
+        if not self.clip_high > 0.0:
+            raise InputError("algorithm.clip_high", self.clip_high, "use a number above 0")
+
+
+def ppo_loss(inputs: LossInputs, config: PPOConfig) -> LossOutput:
+    """See the top of the file. E is the mean over decisions, and over their factors at level ``action``.
+
+    Args:
+        inputs: the batch; `LossInputs` states the shapes.
+        config: clip range and coefficients.
+    """
+    low, high = 1.0 - config.clip_low, 1.0 + config.clip_high
+    advantage = advantage_column(inputs)
+    logs = log_ratio(inputs.log_prob_new, inputs.log_prob_old.detach(), config.level, inputs.mask)
+    rho = ratio(logs)
+    surrogate = (rho * advantage).minimum(rho.clamp(low, high) * advantage)
+    dropped = ((advantage > 0.0) & (rho > high)) | ((advantage < 0.0) & (rho < low))
+    return assemble(
+        inputs,
+        config,
+        policy_loss=-masked_mean(surrogate, inputs.mask),
+        log_ratio=logs,
+        weight=(~dropped).to(rho.dtype),
+        clip=(config.clip_low, config.clip_high),
+    )

@@ -1,0 +1,322 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""GIPO and PPO against slow oracles, by hand, and by the sign and size of their gradients."""
+
+import math
+import subprocess
+import sys
+from typing import Any
+
+import draccus
+import numpy as np
+import pytest
+import torch
+
+from accerl_lerobot.algorithms import (
+    ALGORITHMS,
+    AlgorithmConfig,
+    GIPOConfig,
+    LossInputs,
+    PPOConfig,
+    compute_loss,
+    gipo_loss,
+    ppo_loss,
+)
+from accerl_lerobot.algorithms.ratio import KL_LINEAR_ABOVE, LOG_RATIO_CLAMP, kl_from_behaviour
+from accerl_lerobot.errors import InputError
+from tests.algorithms import oracle
+from tests.algorithms.inputs import gradient, make_inputs, one
+
+CONFIGS: list[AlgorithmConfig] = [
+    GIPOConfig(level="action", sigma=0.5, sigma_negative=0.25, entropy_coef=0.01),
+    GIPOConfig(level="chunk"),
+    PPOConfig(level="action", kl_coef=0.2),
+    PPOConfig(level="chunk", clip_low=0.1, clip_high=0.4, entropy_coef=0.01),
+]
+each_config = pytest.mark.parametrize("config", CONFIGS, ids=lambda c: f"{c.type}-{c.level}")
+each_algorithm = pytest.mark.parametrize(
+    "config", [GIPOConfig(kl_coef=0.0), PPOConfig()], ids=lambda c: c.type
+)
+
+
+def logs_of(inputs: LossInputs, level: str) -> np.ndarray:
+    return oracle.log_ratios(inputs.log_prob_new.detach().numpy(), inputs.log_prob_old.numpy(), level)
+
+
+@each_config
+def test_equals_the_oracle(config: AlgorithmConfig) -> None:
+    inputs = make_inputs()
+    logs = logs_of(inputs, config.level)
+    advantage = inputs.advantage.numpy()
+    if isinstance(config, GIPOConfig):
+        expected = oracle.gipo(logs, advantage, config.sigma, config.sigma_negative or config.sigma)
+    else:
+        assert isinstance(config, PPOConfig)
+        expected = oracle.ppo(logs, advantage, config.clip_low, config.clip_high)
+    output = compute_loss(inputs, config)
+    assert output.metrics["policy_loss"].item() == pytest.approx(expected, abs=1e-12)
+    value, entropy = inputs.value.detach().numpy(), inputs.entropy.detach().numpy()
+    expected += oracle.shared(value, inputs.returns.numpy(), logs, entropy, config)
+    assert output.loss.item() == pytest.approx(expected, abs=1e-12)
+
+
+def test_gipo_by_hand() -> None:
+    # ρ = 2: log ρ = 0.693147, ω = exp(−½·0.480453) = 0.786450, −ω·ρ·Â = −0.786450·2·3
+    loss = gipo_loss(one(math.log(2.0), 3.0), GIPOConfig(sigma=1.0, kl_coef=0.0)).loss
+    assert loss.item() == pytest.approx(-4.718699, abs=1e-6)
+    # σ₋ = 0.5: ω = exp(−½·(1.386294)²) = 0.382546
+    config = GIPOConfig(sigma=1.0, sigma_negative=0.5, kl_coef=0.0)
+    assert gipo_loss(one(math.log(2.0), -3.0), config).loss.item() == pytest.approx(2.295277, abs=1e-6)
+    assert gipo_loss(one(math.log(2.0), 3.0), config).loss.item() == pytest.approx(-4.718699, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("rho", "advantage", "expected", "moves"),
+    [
+        (2.0, 1.0, -1.28, False),  # clipped above
+        (2.0, -1.0, 2.0, True),  # a bad action that became likelier is never clipped
+        (0.5, -1.0, 0.8, False),  # clipped below
+        (0.5, 1.0, -0.5, True),
+        (1.1, 1.0, -1.1, True),
+    ],
+)
+def test_ppo_by_hand(rho: float, advantage: float, expected: float, moves: bool) -> None:
+    inputs = one(math.log(rho), advantage)
+    output = ppo_loss(inputs, PPOConfig())
+    assert output.loss.item() == pytest.approx(expected, abs=1e-12)
+    assert (gradient(inputs, output.loss).abs().item() > 0) is moves
+    assert output.metrics["low_weight"].item() == float(not moves)
+
+
+@each_algorithm
+@pytest.mark.parametrize("log_ratio", [-0.1, 0.0, 0.1])
+def test_good_actions_become_likelier_and_bad_ones_less(config: AlgorithmConfig, log_ratio: float) -> None:
+    for advantage in (2.0, -2.0):
+        inputs = one(log_ratio, advantage)
+        slope = gradient(inputs, compute_loss(inputs, config).loss).item()
+        assert math.copysign(1.0, -slope) == math.copysign(1.0, advantage)  # descent: minus the gradient
+
+
+@pytest.mark.parametrize("level", ["action", "chunk"])
+def test_gipo_gradient_is_that_of_importance_sampling_with_the_weight_held_still(level: Any) -> None:
+    """−E[ω ρ Â ∇log π], with ω a constant: by its formula, and by finite differences over a policy
+    parameter."""
+    inputs = make_inputs(spread=0.6)
+    config = GIPOConfig(level=level, sigma=0.7, sigma_negative=0.4, kl_coef=0.0, value_coef=0.0)
+    got = gradient(inputs, gipo_loss(inputs, config).loss)
+    advantage = inputs.advantage.numpy()[:, None]
+    width = np.where(advantage > 0, 0.7, 0.4)
+
+    def surrogate(new: np.ndarray, weight: np.ndarray) -> float:
+        logs = oracle.log_ratios(new, inputs.log_prob_old.numpy(), level)
+        return float(-np.mean(weight * np.exp(logs) * advantage))
+
+    new = inputs.log_prob_new.detach().numpy()
+    logs = oracle.log_ratios(new, inputs.log_prob_old.numpy(), level)
+    weight = np.exp(-0.5 * (logs / width) ** 2)
+    formula = np.broadcast_to(-weight * np.exp(logs) * advantage / logs.size, new.shape)
+    np.testing.assert_allclose(got.numpy(), formula, atol=1e-12)
+    for i, j in [(0, 0), (5, 2), (11, 1)]:
+        step = np.zeros_like(new)
+        step[i, j] = 1e-5
+        slope = (surrogate(new + step, weight) - surrogate(new - step, weight)) / 2e-5
+        assert got[i, j].item() == pytest.approx(slope, abs=1e-9)
+
+
+@each_algorithm
+@pytest.mark.parametrize("level", ["action", "chunk"])
+def test_on_policy_both_are_the_plain_policy_gradient(config: AlgorithmConfig, level: Any) -> None:
+    """At ρ = 1 the gradient is −E[Â ∇log π]: of the chunk, or of its factors one by one (1/L of it)."""
+    inputs = make_inputs(spread=0.0)
+    config = type(config)(level=level, kl_coef=0.3)  # the KL has no gradient there
+    terms = inputs.log_prob_new.mean(1) if level == "action" else inputs.log_prob_new.sum(1)
+    expected = gradient(inputs, -(terms * inputs.advantage).mean())
+    torch.testing.assert_close(gradient(inputs, compute_loss(inputs, config).loss), expected)
+
+
+def test_a_wide_sigma_is_importance_sampling_without_clip() -> None:
+    inputs = make_inputs(spread=1.0)
+    plain = -((inputs.log_prob_new - inputs.log_prob_old).exp() * inputs.advantage[:, None]).mean()
+    for sigma in (1e6, math.inf):
+        loss = gipo_loss(inputs, GIPOConfig(sigma=sigma, kl_coef=0.0, value_coef=0.0)).loss
+        assert loss.item() == pytest.approx(plain.item(), rel=1e-9)
+
+
+def test_gipo_bounds_what_one_sample_can_do() -> None:
+    """ω·ρ ≤ exp(σ²/2), reached at log ρ = σ²; far samples fade on both sides."""
+    config = GIPOConfig(sigma=0.8, kl_coef=0.0)
+    pull = [-gipo_loss(one(x, 1.0), config).loss.item() for x in np.linspace(-6, 6, 241)]
+    assert max(pull) <= math.exp(0.32) + 1e-12
+    assert -gipo_loss(one(0.64, 1.0), config).loss.item() == pytest.approx(math.exp(0.32))
+    assert pull[0] < 1e-9 and pull[-1] < 1e-9
+
+
+def test_levels_differ_off_policy_and_agree_for_one_factor() -> None:
+    off = make_inputs(factors=3)
+    single = make_inputs(factors=1)
+    for config in (GIPOConfig, PPOConfig):
+        action, chunk = config(level="action"), config(level="chunk")
+        assert compute_loss(off, action).loss.item() != pytest.approx(compute_loss(off, chunk).loss.item())
+        assert torch.equal(compute_loss(single, action).loss, compute_loss(single, chunk).loss)
+
+
+def test_chunk_level_sees_only_the_product() -> None:
+    inputs = make_inputs(factors=2, spread=0.0)
+    shift = torch.tensor([[0.3, -0.3]], dtype=torch.float64)
+    moved = make_inputs(factors=2, spread=0.0, log_prob_new=(inputs.log_prob_new + shift).detach())
+    chunk, action = GIPOConfig(level="chunk"), GIPOConfig(level="action")
+    assert compute_loss(moved, chunk).loss.item() == pytest.approx(compute_loss(inputs, chunk).loss.item())
+    assert compute_loss(moved, action).loss.item() != pytest.approx(compute_loss(inputs, action).loss.item())
+
+
+@each_config
+def test_padding_changes_neither_loss_nor_metrics_nor_gradient(config: AlgorithmConfig) -> None:
+    inputs = make_inputs(n=8)
+    expected = compute_loss(inputs, config)
+    names = ("log_prob_new", "log_prob_old", "advantage", "value", "returns", "entropy")
+    padded = {}
+    for name in names:
+        tensor: torch.Tensor = getattr(inputs, name).detach()
+        tail = torch.full((3, *tensor.shape[1:]), torch.nan, dtype=tensor.dtype)
+        padded[name] = torch.cat([tensor, tail])
+    leaves = {k: padded[k].requires_grad_() for k in ("log_prob_new", "value", "entropy")}
+    mask = torch.arange(11) < 8
+    got = compute_loss(LossInputs(**padded, mask=mask), config)
+    assert got.metrics.keys() == expected.metrics.keys()
+    for name, metric in expected.metrics.items():
+        torch.testing.assert_close(got.metrics[name], metric, msg=name)
+    got.loss.backward()
+    expected.loss.backward()
+    for name, leaf in leaves.items():
+        reference: torch.Tensor = getattr(inputs, name)
+        if reference.grad is None:  # entropy, where it has no coefficient
+            continue
+        assert leaf.grad is not None
+        torch.testing.assert_close(leaf.grad[:8], reference.grad)
+        assert (leaf.grad[8:] == 0).all()
+
+
+def test_only_the_value_term_moves_the_critic() -> None:
+    inputs = make_inputs()
+    loss = gipo_loss(inputs, GIPOConfig(value_coef=0.5)).loss
+    (slope,) = torch.autograd.grad(loss, inputs.value)
+    torch.testing.assert_close(slope, 0.5 * 2 * (inputs.value - inputs.returns).detach() / 12)
+
+
+def test_the_entropy_bonus_raises_entropy() -> None:
+    inputs = make_inputs()
+    (slope,) = torch.autograd.grad(gipo_loss(inputs, GIPOConfig(entropy_coef=0.1)).loss, inputs.entropy)
+    assert torch.allclose(slope, torch.full_like(slope, -0.1 / 12))
+
+
+def test_an_unused_entropy_may_be_undefined() -> None:
+    inputs = make_inputs(entropy=torch.full((12,), torch.nan, dtype=torch.float64))
+    assert gipo_loss(inputs, GIPOConfig()).loss.isfinite()
+
+
+def test_kl_estimates_behaviour_to_policy_in_value_and_gradient() -> None:
+    """μ = N(0, 1), π = N(m, s): samples of μ, KL(μ‖π) = log s + (1 + m²)/(2s²) − ½ and its slope m/s² in
+    m."""
+    noise = torch.randn(200_000, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    mean = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+    s = 1.2
+    policy = torch.distributions.Normal(mean, s)
+    logs = policy.log_prob(noise) - torch.distributions.Normal(0.0, 1.0).log_prob(noise)
+    kl = kl_from_behaviour(logs).mean()
+    assert kl.item() == pytest.approx(math.log(s) + (1 + 0.09) / (2 * s * s) - 0.5, rel=0.02)
+    (slope,) = torch.autograd.grad(kl, mean)
+    assert slope.item() == pytest.approx(0.3 / (s * s), rel=0.02)
+
+
+def test_kl_pulls_back_from_both_sides_with_a_bounded_slope() -> None:
+    far = [-50.0, -1.0, 0.0, 1.0, KL_LINEAR_ABOVE, 50.0]
+    logs = torch.tensor(far, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(kl_from_behaviour(logs).sum(), logs)
+    edge = math.expm1(KL_LINEAR_ABOVE)
+    expected = [-1.0, math.expm1(-1.0), 0.0, math.expm1(1.0), edge, edge]
+    np.testing.assert_allclose(slope.numpy(), expected, atol=1e-12)
+
+
+@each_config
+def test_absurd_ratios_stay_finite_in_float32(config: AlgorithmConfig) -> None:
+    new = torch.tensor([[300.0], [-300.0], [LOG_RATIO_CLAMP], [0.0]], requires_grad=True)
+    ones = torch.ones(4)
+    inputs = LossInputs(
+        log_prob_new=new,
+        log_prob_old=torch.zeros(4, 1),
+        advantage=torch.tensor([1.0, -1.0, 1.0, 1.0]),
+        value=ones,
+        returns=ones,
+        entropy=ones,
+    )
+    output = compute_loss(inputs, config)
+    assert output.loss.isfinite() and all(m.isfinite() for m in output.metrics.values())
+    assert gradient(inputs, output.loss).isfinite().all()
+
+
+def test_metrics_are_detached_scalars_under_the_same_names() -> None:
+    outputs = [compute_loss(make_inputs(), config) for config in CONFIGS]
+    assert len({tuple(sorted(o.metrics)) for o in outputs}) == 1
+    for output in outputs:
+        assert output.loss.requires_grad
+        for metric in output.metrics.values():
+            assert metric.shape == () and metric.is_floating_point() and not metric.requires_grad
+
+
+def test_inputs_are_left_as_they_were() -> None:
+    inputs = make_inputs(mask=torch.arange(12) < 9)
+    before = {k: v.detach().clone() for k, v in vars(inputs).items()}
+    compute_loss(inputs, GIPOConfig()).loss.backward()
+    assert all(torch.equal(before[k], v) for k, v in vars(inputs).items())
+
+
+def test_every_registered_config_has_a_loss() -> None:
+    assert AlgorithmConfig.get_known_choices().keys() == ALGORITHMS.keys()
+    for name in ALGORITHMS:
+        config = draccus.decode(AlgorithmConfig, {"type": name, "gamma": 0.9})
+        assert config.type == name and config.gamma == 0.9
+        assert compute_loss(make_inputs(), config).loss.isfinite()
+
+
+@pytest.mark.parametrize(
+    ("config", "settings"),
+    [
+        (GIPOConfig, {"sigma": 0.0}),
+        (GIPOConfig, {"sigma": math.nan}),
+        (GIPOConfig, {"sigma_negative": -1.0}),
+        (GIPOConfig, {"gamma": 1.01}),
+        (GIPOConfig, {"lam": -0.1}),
+        (GIPOConfig, {"kl_coef": math.inf}),
+        (GIPOConfig, {"level": "token"}),
+        (PPOConfig, {"clip_low": 1.0}),
+        (PPOConfig, {"clip_high": 0.0}),
+        (PPOConfig, {"value_coef": -0.5}),
+    ],
+)
+def test_impossible_settings_are_refused(config: type[AlgorithmConfig], settings: dict[str, Any]) -> None:
+    with pytest.raises(InputError) as caught:
+        config(**settings)
+    assert caught.value.field == f"algorithm.{next(iter(settings))}"
+
+
+def test_mismatched_shapes_are_refused() -> None:
+    with pytest.raises(ValueError, match="must be"):
+        make_inputs(log_prob_old=torch.zeros(12, 2))
+    with pytest.raises(ValueError, match="advantage has shape"):
+        make_inputs(advantage=torch.zeros(12, 1))
+
+
+def test_parsing_a_config_does_not_import_torch() -> None:
+    code = "import sys, accerl_lerobot.algorithms; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

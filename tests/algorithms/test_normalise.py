@@ -1,0 +1,54 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Global advantage normalisation: parts of a batch, merged, equal the whole."""
+
+import torch
+
+from accerl_lerobot.algorithms.normalise import moments, normalise
+
+
+def test_parts_of_different_size_equal_the_whole() -> None:
+    x = torch.randn(5, 8, generator=torch.Generator().manual_seed(0)) * 3 + 7
+    mask = torch.rand(5, 8, generator=torch.Generator().manual_seed(1)) < 0.7
+    total = moments(x[:1], mask[:1]) + moments(x[1:], mask[1:])
+    torch.testing.assert_close(total, moments(x, mask))
+    got = torch.cat([normalise(x[:1], total, mask[:1]), normalise(x[1:], total, mask[1:])])
+    valid = x[mask].double()
+    expected = (valid - valid.mean()) / valid.std(correction=0)
+    torch.testing.assert_close(got[mask].double(), expected, rtol=1e-5, atol=1e-6)
+    assert (got[~mask] == 0).all() and got.dtype == x.dtype
+
+
+def test_by_hand() -> None:
+    x = torch.tensor([1.0, 3.0])
+    assert moments(x).tolist() == [4.0, 10.0, 2.0]
+    torch.testing.assert_close(normalise(x, moments(x)), torch.tensor([-1.0, 1.0]))
+
+
+def test_padding_may_be_nan() -> None:
+    x, mask = torch.tensor([1.0, torch.nan, 3.0]), torch.tensor([True, False, True])
+    assert normalise(x, moments(x, mask), mask).tolist()[1] == 0.0
+    assert moments(x, mask).tolist() == [4.0, 10.0, 2.0]
+
+
+def test_equal_advantages_and_empty_batches_become_zero() -> None:
+    x = torch.full((64,), 0.1)
+    assert normalise(x, moments(x)).abs().max() == 0
+    nothing = torch.zeros(3, dtype=torch.bool)
+    assert normalise(torch.ones(3), moments(torch.ones(3), nothing), nothing).abs().max() == 0
+
+
+def test_a_large_mean_does_not_eat_the_variance() -> None:
+    x = 1e4 + torch.tensor([-1.0, 1.0] * 50)
+    torch.testing.assert_close(normalise(x, moments(x)).abs(), torch.ones(100), rtol=1e-4, atol=1e-4)
