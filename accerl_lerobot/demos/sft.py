@@ -50,8 +50,10 @@ class SFTConfig:
     lr: float = 1e-3
     """Peak learning rate; LeRobot's preset warms up and decays it over `steps`."""
     warmup_steps: int = 20
-    num_workers: int = 1
-    """Data-loading processes; 0 loads in the trainer."""
+    cache: bool = True
+    """Keep the dataset's items in memory (see `cached_train`); ignored above 4 GiB and with image transforms."""
+    num_workers: int = 0
+    """Data-loading processes; 0 loads in the trainer, which is what `cache` wants."""
     num_threads: int = 2
     """CPU threads of the trainer."""
     init_path: str | None = None
@@ -88,7 +90,8 @@ def sft_command(
             fields["load_vlm_weights"] = False
     fields |= {"device": device, "push_to_hub": False, "optimizer_lr": config.lr}
     fields |= {"scheduler_warmup_steps": config.warmup_steps, "scheduler_decay_steps": config.steps}
-    command = [sys.executable, "-m", "lerobot.scripts.lerobot_train"]
+    module = "accerl_lerobot.demos.cached_train" if config.cache else "lerobot.scripts.lerobot_train"
+    command = [sys.executable, "-m", module]
     command += [f"--policy.{key}={_as_argument(value)}" for key, value in fields.items()]
     command += [f"--dataset.repo_id={repo_id}"] + ([f"--dataset.root={root}"] if root else [])
     command += [
@@ -142,7 +145,12 @@ def run_sft(
     log = output_dir.parent / "sft.log"
     with log.open("w") as file:
         process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment, errors="replace"
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env=environment,
+            errors="replace",
         )
         assert process.stdout is not None
         for line in process.stdout:
