@@ -53,7 +53,8 @@ def train_seed(run_seed: int, worker: int, episode: int) -> int:
         raise InputError("seed", run_seed, f"use 0 to {_RUNS - 1}")
     if not 0 <= worker < _WORKERS_PER_RUN:
         raise ValueError(f"worker {worker}: a run has at most {_WORKERS_PER_RUN}")
-    return TRAIN_SEEDS.start + (run_seed * _WORKERS_PER_RUN + worker) * _EPISODES_PER_WORKER + episode % _EPISODES_PER_WORKER
+    place = run_seed * _WORKERS_PER_RUN + worker
+    return TRAIN_SEEDS.start + place * _EPISODES_PER_WORKER + episode % _EPISODES_PER_WORKER
 
 
 def eval_seed(index: int) -> int:

@@ -28,7 +28,9 @@ from accerl_lerobot.envs.config import EnvConfig
 from accerl_lerobot.envs.gl import import_mujoco
 from accerl_lerobot.envs.metaworld import MetaWorld, MetaWorldConfig
 from accerl_lerobot.envs.metaworld_tasks import expert_name
+from accerl_lerobot.envs.simulated import SimulatedConfig, SimulatedWorld
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import Observation
 
 Expert = Callable[[], np.ndarray]
 """Gives the next action for the state its world is in."""
@@ -90,9 +92,12 @@ def play(world: World, expert: Expert, *, task: str, seed: int, noise: float, fa
     rng = np.random.default_rng((seed, 1))
     low, high = world.spec.action_low, world.spec.action_high
     drift_from = int(rng.integers(0, _DRIFT_FROM)) if fail else world.spec.max_steps
-    drift = np.zeros(world.spec.action_dim)
-    observation, done, success_at = world.reset(seed, task), False, -1
-    seen, actions, rewards = [], [], []
+    drift: np.ndarray = np.zeros(world.spec.action_dim)
+    observation: Observation | None = world.reset(seed, task)
+    done, success_at = False, -1
+    seen: list[Observation] = []
+    actions: list[np.ndarray] = []
+    rewards: list[float] = []
     while not done:
         if len(actions) < drift_from:
             wanted = np.asarray(expert(), np.float64)
@@ -102,6 +107,7 @@ def play(world: World, expert: Expert, *, task: str, seed: int, noise: float, fa
         action = np.clip(wanted, low, high) + noise * rng.standard_normal(len(wanted))
         action = np.clip(action, low, high).astype(np.float32)
         result = world.step_chunk(action[None])
+        assert observation is not None
         seen.append(observation)
         actions.append(action)
         rewards.append(result.rewards[0])
@@ -128,4 +134,12 @@ def _metaworld_expert(world: World, task: str) -> Expert:
     return lambda: policy.get_action(world.raw_observation)
 
 
-_EXPERTS: dict[type[EnvConfig], Callable[[World, str], Expert]] = {MetaWorldConfig: _metaworld_expert}
+def _simulated_expert(world: World, task: str) -> Expert:
+    assert isinstance(world, SimulatedWorld)
+    return lambda: world.solution
+
+
+_EXPERTS: dict[type[EnvConfig], Callable[[World, str], Expert]] = {
+    MetaWorldConfig: _metaworld_expert,
+    SimulatedConfig: _simulated_expert,
+}

@@ -13,15 +13,14 @@
 # limitations under the License.
 """Scripted experts in parallel processes, recorded as one LeRobotDataset.
 
-Worker processes simulate and send arrays; the parent writes. Each episode's seed follows from its place in the
-dataset alone, so the content does not depend on how many processes worked on it.
+Worker processes simulate and send arrays; the parent writes. An episode's seed follows from its place in the
+dataset, so the content does not depend on how many processes worked on it.
 """
 
 from __future__ import annotations
 
 import collections
 import concurrent.futures
-import dataclasses
 import json
 import logging
 import math
@@ -50,6 +49,7 @@ SIDECAR = Path("meta") / "accerl_demos.json"
 _logger = logging.getLogger(__name__)
 _MAX_EPISODES = 10_000
 _MAX_TRIES = 50
+_Results = Iterator[tuple[Episode, int]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,16 +57,16 @@ class DemosConfig:
     """How many demonstrations, how disturbed, written where.
 
     Example:
-        >>> record_demos(MetaWorldConfig(task="drawer-open-v3"), DemosConfig(episodes=25, root="outputs/drawer"))
+        >>> record_demos(MetaWorldConfig(), DemosConfig(episodes=25, root="outputs/drawer"))
     """
 
     episodes: int = 25
     """Episodes in the dataset, 1 to 10,000; spread evenly over the tasks."""
     action_noise: float = 0.1
-    """Standard deviation of the Gaussian added to the expert's action before clipping, 0 to 1. The noisy action is
-    executed and recorded, so the dataset also shows how to recover."""
+    """Standard deviation of the Gaussian added to the expert's action before clipping, 0 to 1. The noisy
+    action is executed and recorded, so the dataset also shows how to recover."""
     failure_share: float = 0.0
-    """Share of episodes that drift at random from an early step on and fail, 0 to 1; for success and world models."""
+    """Share of episodes that drift at random from early on and fail, 0 to 1; for success and world models."""
     keep_failures: bool = False
     """Whether an expert episode that failed is kept; otherwise it is tried again with another seed."""
     max_steps: int = 500
@@ -112,8 +112,7 @@ def record_demos(env_config: EnvConfig, config: DemosConfig) -> Path:
     root = Path(config.root)
     if root.exists():
         raise InputError("demos.root", config.root, "exists already: remove it or name another folder")
-    if hasattr(env_config, "max_steps"):
-        env_config = dataclasses.replace(env_config, max_steps=min(env_config.max_steps, config.max_steps))
+    env_config = env_config.shortened(config.max_steps)
     world = make_world(env_config)
     spec = world.spec
     make_expert(env_config, world, spec.tasks[0])  # refuses an environment without experts before any work
@@ -215,13 +214,13 @@ def _start(env_config: EnvConfig, config: DemosConfig) -> None:
     _world, _env_config, _config = make_world(env_config), env_config, config
 
 
-def _in_order(pool: concurrent.futures.Executor, count: int, ahead: int) -> Iterator[tuple[Episode, int]]:
+def _in_order(pool: concurrent.futures.Executor, count: int, ahead: int) -> _Results:
     """Results of `_record_one` for 0 … count-1, with at most `ahead` finished ones waiting in memory."""
     waiting = collections.deque(pool.submit(_record_one, slot) for slot in range(min(ahead, count)))
     return _drain(pool, count, waiting)
 
 
-def _drain(pool: concurrent.futures.Executor, count: int, waiting: collections.deque) -> Iterator[tuple[Episode, int]]:
+def _drain(pool: concurrent.futures.Executor, count: int, waiting: collections.deque) -> _Results:
     submitted = len(waiting)
     while waiting:
         result = waiting.popleft().result()

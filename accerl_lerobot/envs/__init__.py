@@ -23,12 +23,28 @@ from typing import Any
 
 from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec
 from accerl_lerobot.envs.config import EnvConfig
+from accerl_lerobot.envs.lerobot_env import LeRobotEnvConfig, LeRobotWorld
 from accerl_lerobot.envs.metaworld import MetaWorld, MetaWorldConfig
+from accerl_lerobot.envs.simulated import SimulatedConfig, SimulatedWorld
 
-__all__ = ["ChunkResult", "EnvConfig", "MetaWorld", "MetaWorldConfig", "World", "WorldSpec", "make_world"]
+__all__ = [
+    "ChunkResult",
+    "EnvConfig",
+    "LeRobotEnvConfig",
+    "LeRobotWorld",
+    "MetaWorld",
+    "MetaWorldConfig",
+    "SimulatedConfig",
+    "SimulatedWorld",
+    "World",
+    "WorldSpec",
+    "make_world",
+]
 
 _WORLDS: dict[type[EnvConfig], Callable[[Any], World]] = {
+    LeRobotEnvConfig: LeRobotWorld,
     MetaWorldConfig: MetaWorld,
+    SimulatedConfig: SimulatedWorld,
 }
 
 

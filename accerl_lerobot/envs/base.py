@@ -13,8 +13,8 @@
 # limitations under the License.
 """The contract every world keeps, whatever simulator is behind it.
 
-Episode limits, auto-reset and task text are ours, because simulators disagree on them: a world never resets itself,
-`terminated` means the task is over (bootstrap 0), `truncated` means only that time ran out (bootstrap V).
+Episode limits, auto-reset and task text are ours, because simulators disagree on them: a world never resets
+itself, `terminated` means the task is over (bootstrap 0), `truncated` that only time ran out (bootstrap V).
 """
 
 from __future__ import annotations
@@ -109,5 +109,19 @@ class World(ABC):
     def render(self, height: int, width: int) -> np.ndarray:
         """A frame for people, uint8 (height, width, 3); does not change the state."""
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 - most worlds hold nothing
         """Frees the simulator. Safe to call twice."""
+
+
+def checked_actions(actions: np.ndarray, spec: WorldSpec) -> np.ndarray:
+    """The chunk as float32 within the world's bounds.
+
+    Raises:
+        ValueError: not (K ≥ 1, A), or a value is not finite.
+    """
+    actions = np.asarray(actions, np.float32)
+    if actions.ndim != 2 or len(actions) == 0 or actions.shape[1] != spec.action_dim:
+        raise ValueError(f"actions have shape {actions.shape}; expected (K >= 1, {spec.action_dim})")
+    if not np.isfinite(actions).all():
+        raise ValueError("actions hold a non-finite value")
+    return np.clip(actions, spec.action_low, spec.action_high)

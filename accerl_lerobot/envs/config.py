@@ -15,7 +15,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
+from typing import Self
 
 import draccus
 
@@ -29,7 +31,14 @@ class EnvConfig(draccus.ChoiceRegistry):
         'metaworld'
     """
 
+    max_steps: int = 500
+    """Episode limit in env steps; reaching it truncates."""
+
     @property
     def type(self) -> str:
         """The registered name."""
         return self.get_choice_name(self.__class__)
+
+    def shortened(self, max_steps: int) -> Self:
+        """This config with its episode limit lowered to `max_steps`, if it is longer."""
+        return dataclasses.replace(self, max_steps=min(self.max_steps, max_steps))

@@ -13,15 +13,17 @@
 # limitations under the License.
 """An offscreen OpenGL for MuJoCo: pick a backend before the import, and say in one line what is missing.
 
-MuJoCo reads ``MUJOCO_GL`` once, when it is imported, so go through `import_mujoco` before anything else that uses it.
+MuJoCo reads ``MUJOCO_GL`` once, when it is imported: call `import_mujoco` before importing what uses it.
 """
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import importlib
 import os
 import sys
+import weakref
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -37,6 +39,7 @@ REMEDY = (
     "install an offscreen OpenGL: apt-get install -y libosmesa6 (MUJOCO_GL=osmesa) "
     "or apt-get install -y libegl1 libgl1-mesa-dri libgles2 (MUJOCO_GL=egl)"
 )
+_open: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
 def choose_backend() -> str | None:
@@ -72,7 +75,7 @@ def import_mujoco() -> ModuleType:
     try:
         mujoco = importlib.import_module("mujoco")
         if imported and chosen is not None:
-            # Somebody imported MuJoCo before us, without a backend; only this module of it has read the variable.
+            # Somebody imported MuJoCo before us, without a backend; only this module reads the variable.
             importlib.reload(mujoco.gl_context)
         return mujoco
     except (ImportError, AttributeError, RuntimeError) as error:
@@ -90,9 +93,18 @@ def new_renderer(model: Any, height: int, width: int) -> Any:
     mujoco = import_mujoco()
     model.vis.global_.offheight, model.vis.global_.offwidth = height, width
     try:
-        return mujoco.Renderer(model, height, width)
+        renderer = mujoco.Renderer(model, height, width)
     except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
         raise InputError("MUJOCO_GL", os.environ.get("MUJOCO_GL", ""), REMEDY) from error
+    _open.add(renderer)
+    return renderer
+
+
+@atexit.register
+def _close_all() -> None:
+    """Frees every context while the interpreter still can; otherwise OSMesa complains at exit."""
+    for renderer in tuple(_open):
+        renderer.close()
 
 
 def _loads(library: str) -> bool:

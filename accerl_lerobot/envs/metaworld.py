@@ -13,9 +13,9 @@
 # limitations under the License.
 """MetaWorld, stepped a chunk at a time and rendered once per decision.
 
-The same physics, state, camera and instruction as LeRobot's own wrapper, but the image has the size a small policy
-needs, lights are cheap to draw in software, and nothing is rendered that no policy looks at: about a hundred times
-the env steps per second. Importing this file loads neither MuJoCo nor metaworld.
+The same physics, state, camera and instruction as LeRobot's own wrapper, but the image has the size a small
+policy needs, lights are cheap to draw in software, and nothing is rendered that no policy looks at.
+Importing this file loads neither MuJoCo nor metaworld.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec
+from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec, checked_actions
 from accerl_lerobot.envs.config import EnvConfig
 from accerl_lerobot.envs.gl import import_mujoco, new_renderer
 from accerl_lerobot.envs.metaworld_tasks import description, resolve
@@ -63,7 +63,7 @@ class MetaWorldConfig(EnvConfig):
     terminate_on_success: bool = True
     """Whether the first success ends the episode."""
     reward: str = "success"
-    """``success`` (1.0 at the first success, else 0.0) or ``dense`` (MetaWorld's shaped reward, 0 to 10 a step)."""
+    """``success`` (1.0 at the first success, else 0.0) or ``dense`` (MetaWorld's own, 0 to 10 a step)."""
 
     def __post_init__(self) -> None:
         resolve(self.task)
@@ -94,8 +94,8 @@ class MetaWorldConfig(EnvConfig):
 class MetaWorld(World):
     """One MetaWorld instance; its simulators are built on first use of a task, then kept.
 
-    A simulator that diverges (non-finite state or reward, or one that MuJoCo had to reset on its own) ends the
-    episode as truncated, with ``info["nonfinite"] == 1.0``: such a segment must not be trained on.
+    A simulator that diverges (non-finite state or reward, or MuJoCo had to reset it) ends the episode as
+    truncated, with ``info["nonfinite"] == 1.0``: such a segment must not be trained on.
 
     Args:
         config: What to simulate.
@@ -125,7 +125,7 @@ class MetaWorld(World):
 
     @property
     def raw_observation(self) -> np.ndarray:
-        """MetaWorld's own 39 numbers (objects and goal included), float64: for scripted experts, not for policies."""
+        """MetaWorld's own 39 numbers, float64, objects and goal included: for experts, not for policies."""
         return self._raw
 
     def reset(self, seed: int, task: str) -> Observation:
@@ -139,6 +139,9 @@ class MetaWorld(World):
         sim = self._sims[task]
         sim.seed(seed)
         self._raw, _ = sim.reset()
+        # MetaWorld moves the goal marker after its last forward pass, so that the first frame would show an
+        # older goal. This places the markers and leaves the physics as it is.
+        import_mujoco().mj_kinematics(sim.model, sim.data)
         self._task, self._steps, self._success, self._done = task, 0, False, False
         return self._observe()
 
@@ -194,8 +197,8 @@ class MetaWorld(World):
         from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
         sim = ALL_V3_ENVIRONMENTS[task]()
-        # What `set_task` of an MT1 benchmark task does, without first sampling its 50 goals (0.5 s): the goal is
-        # visible in the raw observation, and `seed` decides where things are.
+        # What `set_task` with a task of the MT1 benchmark does, without first sampling its 50 goals: the goal
+        # is visible in the raw observation, and `seed` decides where things are.
         sim._partially_observable = False
         del sim.sawyer_observation_space  # a cached property that depends on the line above
         sim._set_task_called = True
@@ -227,22 +230,8 @@ class MetaWorld(World):
         return np.ascontiguousarray(image[::-1, ::-1]) if camera == "corner2" else image
 
 
-def checked_actions(actions: np.ndarray, spec: WorldSpec) -> np.ndarray:
-    """The chunk as float32 within the world's bounds.
-
-    Raises:
-        ValueError: not (K ≥ 1, A), or a value is not finite.
-    """
-    actions = np.asarray(actions, np.float32)
-    if actions.ndim != 2 or len(actions) == 0 or actions.shape[1] != spec.action_dim:
-        raise ValueError(f"actions have shape {actions.shape}; expected (K >= 1, {spec.action_dim})")
-    if not np.isfinite(actions).all():
-        raise ValueError("actions hold a non-finite value")
-    return np.clip(actions, spec.action_low, spec.action_high)
-
-
 def _diverged(sim: Any) -> bool:
     """Whether MuJoCo met non-finite numbers in this episode and silently reset itself."""
     warning = import_mujoco().mjtWarning
-    numbers = sim.data.warning.number
-    return bool(numbers[warning.mjWARN_BADQPOS] or numbers[warning.mjWARN_BADQVEL] or numbers[warning.mjWARN_BADQACC])
+    bad = (warning.mjWARN_BADQPOS, warning.mjWARN_BADQVEL, warning.mjWARN_BADQACC)
+    return any(sim.data.warning.number[kind] for kind in bad)

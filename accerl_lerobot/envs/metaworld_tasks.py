@@ -13,8 +13,8 @@
 # limitations under the License.
 """LeRobot's MetaWorld tables (instructions, difficulty groups, experts), read without importing LeRobot.
 
-They are one JSON file inside the LeRobot package; importing ``lerobot.envs`` to reach it would cost a rollout worker
-four seconds and several hundred megabytes.
+They are one JSON file inside the LeRobot package; importing ``lerobot.envs`` to reach it would cost a rollout
+worker four seconds and several hundred megabytes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from accerl_lerobot.errors import InputError
 def _tables() -> dict[str, Any]:
     spec = importlib.util.find_spec("lerobot")
     if spec is None or not spec.submodule_search_locations:
-        raise ModuleNotFoundError("lerobot is not installed: pip install 'lerobot[metaworld]'", name="lerobot")
+        raise ModuleNotFoundError("LeRobot is not installed: pip install lerobot[metaworld]", name="lerobot")
     path = Path(spec.submodule_search_locations[0]) / "envs" / "metaworld_config.json"
     return json.loads(path.read_text())
 
@@ -81,7 +81,8 @@ def resolve(text: str, field: str = "env.task") -> tuple[str, ...]:
 
 
 def _remedy(name: str, tasks: list[str], group_names: list[str]) -> str:
-    close = difflib.get_close_matches(name.replace("metaworld-", "").replace("-v2", "-v3"), tasks, n=3, cutoff=0.5)
+    wanted = name.replace("metaworld-", "").replace("-v2", "-v3")
+    close = difflib.get_close_matches(wanted, tasks, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(close)}? Otherwise " if close else ""
     return (
         f"{name!r} is not a MetaWorld task; {hint}use names such as drawer-open-v3, separated by commas, "

@@ -1,0 +1,230 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Any environment LeRobot can make, as a world.
+
+LeRobot's environments disagree on autoreset, truncation and success, so this takes the single environment out
+of LeRobot's vector one and keeps episode limits itself. Observations and actions pass through LeRobot's own
+per-environment processors: a policy sees exactly what ``lerobot-eval`` would show it.
+Importing this file loads no LeRobot; making the world does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec, checked_actions
+from accerl_lerobot.envs.config import EnvConfig
+from accerl_lerobot.envs.gl import import_mujoco
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import TASK, Observation
+
+_STATE = "observation.state"
+_IMAGE = "observation.image"
+_NEEDS_MUJOCO = ("aloha", "libero", "libero_plus", "metaworld", "robocasa")
+
+
+@EnvConfig.register_subclass("lerobot")
+@dataclass(frozen=True, kw_only=True)
+class LeRobotEnvConfig(EnvConfig):
+    """Which of LeRobot's environments.
+
+    Example:
+        >>> LeRobotEnvConfig(name="pusht", kwargs={"obs_type": "pixels_agent_pos"})
+    """
+
+    name: str = "pusht"
+    """LeRobot's own name of the environment: what ``lerobot-eval --env.type`` takes."""
+    kwargs: dict[str, Any] = field(default_factory=dict)
+    """Fields of LeRobot's config of that environment, such as ``task`` or ``obs_type``."""
+    task: str = ""
+    """Instruction text, for environments that have none of their own."""
+    camera: str = ""
+    """A lone camera becomes ``observation.images.<camera>``; if empty, LeRobot's ``observation.image``."""
+    max_steps: int = 300
+    """Episode limit in env steps; reaching it truncates."""
+    reward: str = "success"
+    """``success`` (1.0 at the first success, else 0.0) or ``env`` (the environment's own)."""
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise InputError("env.name", self.name, "name one of LeRobot's environments, such as pusht")
+        if self.max_steps < 1:
+            raise InputError("env.max_steps", self.max_steps, "use at least 1 env step")
+        if self.reward not in ("success", "env"):
+            raise InputError("env.reward", self.reward, "use success or env")
+
+
+class LeRobotWorld(World):
+    """One of LeRobot's environments; a suite of several tasks has one simulator for each.
+
+    Args:
+        config: Which one.
+
+    Raises:
+        InputError: LeRobot does not know the name or a field, or the environment shows no image and state.
+    """
+
+    def __init__(self, config: LeRobotEnvConfig) -> None:
+        if config.name in _NEEDS_MUJOCO:
+            import_mujoco()
+        from lerobot.envs.configs import EnvConfig as LeRobotConfig
+        from lerobot.envs.factory import make_env
+
+        self.config = config
+        known = LeRobotConfig.get_known_choices()
+        if config.name not in known:
+            raise InputError("env.name", config.name, f"LeRobot has: {', '.join(known)}")
+        try:
+            self._lerobot_config = known[config.name](**config.kwargs)
+        except (TypeError, ValueError) as error:
+            raise InputError("env.kwargs", config.kwargs, str(error)) from error
+        self._before, self._after = self._lerobot_config.get_env_processors()
+        self._vectors = make_env(self._lerobot_config, n_envs=1, use_async_envs=False)
+        self._envs = _single_envs(self._vectors)
+        self._task = ""
+        self._steps = 0
+        self._success = False
+        self._done = True
+        self.spec = self._look()
+
+    def reset(self, seed: int, task: str) -> Observation:
+        if task not in self._envs:
+            raise InputError("task", task, f"this world has: {', '.join(self._envs)}")
+        self._done = True
+        raw, _ = self._envs[task].reset(seed=seed)
+        self._task, self._steps, self._success, self._done = task, 0, False, False
+        return self._observe(raw)
+
+    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
+        if self._done:
+            raise RuntimeError("the episode is over: call reset before step_chunk")
+        actions = checked_actions(actions, self.spec)
+        env, rewards, nonfinite = self._envs[self._task], [], False
+        for action in self._processed(actions):
+            raw, reward, ended, cut, info = env.step(action)
+            self._steps += 1
+            nonfinite = not (math.isfinite(reward) and _finite(raw))
+            succeeded = not nonfinite and bool(info.get("is_success", False))
+            first = succeeded and not self._success
+            rewards.append(float(reward) if self.config.reward == "env" else float(first))
+            self._success |= succeeded
+            terminated = bool(ended) and not nonfinite
+            truncated = not terminated and (nonfinite or bool(cut) or self._steps >= self.config.max_steps)
+            self._done = terminated or truncated
+            if self._done:
+                break
+        return ChunkResult(
+            observation=None if terminated else self._observe(raw),
+            rewards=np.asarray(rewards, np.float32),
+            terminated=terminated,
+            truncated=truncated,
+            success=self._success,
+            info={"nonfinite": 1.0} if nonfinite else {},
+        )
+
+    def render(self, height: int, width: int) -> np.ndarray:
+        from PIL import Image
+
+        frame = np.asarray(self._envs[self._task].render(), np.uint8)
+        return np.asarray(Image.fromarray(frame).resize((width, height), Image.Resampling.BILINEAR))
+
+    def close(self) -> None:
+        for suite in self._vectors.values():
+            for vector in suite.values():
+                vector.close()
+        self._vectors, self._envs, self._done = {}, {}, True
+
+    def _look(self) -> WorldSpec:
+        """Learns shapes from a first observation."""
+        task, env = next(iter(self._envs.items()))
+        self._task = task
+        observation = self._observe(env.reset(seed=0)[0])
+        images: dict[str, tuple[int, int, int]] = {
+            key: (image.shape[0], image.shape[1], image.shape[2])
+            for key, image in observation.items()
+            if isinstance(image, np.ndarray) and key.startswith(_IMAGE)
+        }
+        if not images or _STATE not in observation:
+            shown = ", ".join(k for k in observation if k != TASK) or "neither"
+            raise InputError(
+                "env.kwargs",
+                self.config.kwargs,
+                f"a policy needs images and a state, {self.config.name} shows {shown}; try "
+                "obs_type=pixels_agent_pos",
+            )
+        space = env.action_space
+        return WorldSpec(
+            images=images,
+            state_dim=len(observation[_STATE]),
+            action_dim=space.shape[0],
+            action_low=np.asarray(space.low, np.float32),
+            action_high=np.asarray(space.high, np.float32),
+            fps=int(self._lerobot_config.fps),
+            max_steps=self.config.max_steps,
+            tasks=tuple(self._envs),
+        )
+
+    def _observe(self, raw: dict[str, Any]) -> Observation:
+        from lerobot.envs.utils import preprocess_observation
+
+        batch = self._before({**preprocess_observation(_batched(raw)), TASK: [self._instruction()]})
+        observation: Observation = {TASK: self._instruction()}
+        for key, value in batch.items():
+            if key == _STATE:
+                observation[key] = value[0].numpy().astype(np.float32)
+            elif key.startswith(_IMAGE):
+                renamed = key == _IMAGE and self.config.camera
+                name = f"observation.images.{self.config.camera}" if renamed else key
+                # LeRobot has divided by 255; rounding brings every one of the 256 values back.
+                observation[name] = (value[0].permute(1, 2, 0) * 255).round().byte().numpy().copy()
+        return observation
+
+    def _processed(self, actions: np.ndarray) -> np.ndarray:
+        import torch
+
+        return self._after({"action": torch.from_numpy(actions)})["action"].numpy()
+
+    def _instruction(self) -> str:
+        env = self._envs[self._task]
+        for name in ("task_description", "task"):
+            if isinstance(text := getattr(env, name, None), str) and text:
+                return text
+        return self.config.task
+
+
+def _single_envs(vectors: dict[str, dict[int, Any]]) -> dict[str, Any]:
+    """Names each single environment ``suite`` or, where there are several, ``suite/number``."""
+    flat = [(suite, number, vector) for suite, tasks in vectors.items() for number, vector in tasks.items()]
+    # `unwrapped` leaves out Gymnasium's time limit: ours counts, and it truncates.
+    if len(flat) == 1:
+        return {flat[0][0]: flat[0][2].envs[0].unwrapped}
+    return {f"{suite}/{number}": vector.envs[0].unwrapped for suite, number, vector in flat}
+
+
+def _batched(raw: Any) -> Any:
+    """Adds the leading dimension a vector environment would have added."""
+    if isinstance(raw, dict):
+        return {key: _batched(value) for key, value in raw.items()}
+    return np.asarray(raw)[None]
+
+
+def _finite(raw: Any) -> bool:
+    if isinstance(raw, dict):
+        return all(_finite(value) for value in raw.values())
+    array = np.asarray(raw)
+    return array.dtype.kind != "f" or bool(np.isfinite(array).all())

@@ -1,0 +1,236 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A world made of nothing but time: known latency, a problem learnt in seconds, and faults on request.
+
+For tests and for measuring the machinery around a world without a simulator's cost or noise.
+"""
+
+from __future__ import annotations
+
+import collections
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec, checked_actions
+from accerl_lerobot.envs.config import EnvConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import TASK, Observation
+
+CAMERA = "front"
+INSTRUCTIONS = {"match": "Match the target", "mirror": "Mirror the target"}
+_SIGN = {"match": 1.0, "mirror": -1.0}
+_REACH = 0.8
+
+
+@EnvConfig.register_subclass("simulated")
+@dataclass(frozen=True, kw_only=True)
+class SimulatedConfig(EnvConfig):
+    """How slow, how hard, how broken.
+
+    The state holds a target; an episode succeeds as soon as the mean of the last `hold` actions is within
+    `tolerance` of it in every dimension.
+
+    Example:
+        >>> SimulatedConfig(task="match", step_ms=0.2, frame_ms=6.0, latency="lognormal", latency_cv=0.5)
+    """
+
+    task: str = "match"
+    """``match`` (the action is the target), ``mirror`` (its negative), or both separated by a comma."""
+    action_dim: int = 2
+    """1 to 32."""
+    state_dim: int = 4
+    """At least twice `action_dim`: the target, the mean of the last actions, then zeros."""
+    image_size: int = 32
+    """Height and width of ``observation.images.front`` in pixels, 8 to 480: target green, mean action red."""
+    max_steps: int = 40
+    """Episode limit in env steps; reaching it truncates."""
+    hold: int = 4
+    """Number of last actions averaged, 1 or more; no success before so many steps."""
+    tolerance: float = 0.25
+    """Largest distance in any dimension, above 0; targets lie within ±0.8."""
+    reward: str = "success"
+    """``success`` (1.0 at the first success, else 0.0) or ``dense`` (1 − distance, each step)."""
+    terminate_on_success: bool = True
+    """Whether the first success ends the episode."""
+    step_ms: float = 0.0
+    """Mean time an env step takes, in milliseconds; slept, so it costs no processor."""
+    frame_ms: float = 0.0
+    """Mean time an observation takes, in milliseconds."""
+    latency: str = "constant"
+    """``constant`` or ``lognormal``; drawn from the episode's seed."""
+    latency_cv: float = 0.5
+    """Standard deviation over mean of the lognormal law, 0 to 10."""
+    crash_after: int = 0
+    """Env steps of this instance after which it raises; 0 for never."""
+    nan_after: int = 0
+    """Env steps of this instance after which one state is NaN and its episode ends; 0 for never."""
+
+    def __post_init__(self) -> None:
+        if not self.tasks or any(name not in INSTRUCTIONS for name in self.tasks):
+            raise InputError("env.task", self.task, f"use names from: {', '.join(INSTRUCTIONS)}")
+        if not 1 <= self.action_dim <= 32:
+            raise InputError("env.action_dim", self.action_dim, "use 1 to 32")
+        if self.state_dim < 2 * self.action_dim:
+            raise InputError("env.state_dim", self.state_dim, f"use at least {2 * self.action_dim}")
+        if not 8 <= self.image_size <= 480:
+            raise InputError("env.image_size", self.image_size, "use 8 to 480 pixels")
+        if self.max_steps < 1:
+            raise InputError("env.max_steps", self.max_steps, "use at least 1 env step")
+        if not 1 <= self.hold <= self.max_steps:
+            raise InputError("env.hold", self.hold, f"use 1 to env.max_steps ({self.max_steps})")
+        if not self.tolerance > 0:
+            raise InputError("env.tolerance", self.tolerance, "use a positive distance")
+        if self.reward not in ("success", "dense"):
+            raise InputError("env.reward", self.reward, "use success or dense")
+        if self.latency not in ("constant", "lognormal"):
+            raise InputError("env.latency", self.latency, "use constant or lognormal")
+        if not 0 <= self.latency_cv <= 10:
+            raise InputError("env.latency_cv", self.latency_cv, "use 0 to 10")
+        for name in ("step_ms", "frame_ms", "crash_after", "nan_after"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"env.{name}", getattr(self, name), "use 0 or more")
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """The task names `task` stands for."""
+        return tuple(dict.fromkeys(name.strip() for name in self.task.split(",") if name.strip()))
+
+
+class SimulatedWorld(World):
+    """One instance; `crash_after` and `nan_after` count over all its episodes.
+
+    Args:
+        config: What to simulate.
+    """
+
+    def __init__(self, config: SimulatedConfig) -> None:
+        self.config = config
+        size, dims = config.image_size, config.action_dim
+        self.spec = WorldSpec(
+            images={f"observation.images.{CAMERA}": (size, size, 3)},
+            state_dim=config.state_dim,
+            action_dim=dims,
+            action_low=np.full(dims, -1, np.float32),
+            action_high=np.full(dims, 1, np.float32),
+            fps=80,
+            max_steps=config.max_steps,
+            tasks=config.tasks,
+        )
+        self._lifetime = 0
+        self._task = ""
+        self._target: np.ndarray = np.zeros(dims, np.float32)
+        self._recent: collections.deque[np.ndarray] = collections.deque(maxlen=config.hold)
+        self._clock = np.random.default_rng(0)
+        self._steps = 0
+        self._success = False
+        self._done = True
+        self._nan = False
+
+    @property
+    def solution(self) -> np.ndarray:
+        """float32 (A,): the action that solves this episode when it is held; for scripted experts."""
+        return self._target * np.float32(_SIGN[self._task])
+
+    def reset(self, seed: int, task: str) -> Observation:
+        if task not in self.spec.tasks:
+            raise InputError("task", task, f"this world has: {', '.join(self.spec.tasks)}")
+        rng = np.random.default_rng((seed, 0))
+        self._clock = np.random.default_rng((seed, 1))
+        self._task = task
+        self._target = rng.uniform(-_REACH, _REACH, self.config.action_dim).astype(np.float32)
+        self._recent.clear()
+        self._steps, self._success, self._done, self._nan = 0, False, False, False
+        _wait(self._delay(self.config.frame_ms))
+        return self._observe()
+
+    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
+        if self._done:
+            raise RuntimeError("the episode is over: call reset before step_chunk")
+        actions = checked_actions(actions, self.spec)
+        config, rewards, delay = self.config, [], 0.0
+        for action in actions:
+            delay += self._delay(config.step_ms)
+            self._steps += 1
+            self._lifetime += 1
+            if self._lifetime == config.crash_after:
+                raise RuntimeError(f"simulated crash after {self._lifetime} env steps")
+            self._nan = self._lifetime == config.nan_after
+            self._recent.append(action)
+            distance = float(np.abs(self._mean() - self.solution).max())
+            succeeded = len(self._recent) == config.hold and distance <= config.tolerance
+            first = succeeded and not self._success
+            rewards.append(1.0 - distance if config.reward == "dense" else float(first))
+            self._success |= succeeded
+            terminated = not self._nan and self._success and config.terminate_on_success
+            truncated = not terminated and (self._nan or self._steps >= config.max_steps)
+            self._done = terminated or truncated
+            if self._done:
+                break
+        if not terminated:
+            delay += self._delay(config.frame_ms)
+        _wait(delay)
+        return ChunkResult(
+            observation=None if terminated else self._observe(),
+            rewards=np.asarray(rewards, np.float32),
+            terminated=terminated,
+            truncated=truncated,
+            success=self._success,
+            info={"nonfinite": 1.0} if self._nan else {},
+        )
+
+    def render(self, height: int, width: int) -> np.ndarray:
+        image = np.full((height, width, 3), 40, np.uint8)
+        for channel, point in ((1, self._target), (0, self._mean())):
+            row, column = (_pixel(point[i % len(point)], size) for i, size in ((0, height), (1, width)))
+            radius = max(1, min(height, width) // 16)
+            rows = slice(max(0, row - radius), row + radius + 1)
+            image[rows, max(0, column - radius) : column + radius + 1, channel] = 255
+        return image
+
+    def _mean(self) -> np.ndarray:
+        if not self._recent:
+            return np.zeros_like(self._target)
+        return np.asarray(np.mean(self._recent, axis=0, dtype=np.float32))
+
+    def _observe(self) -> Observation:
+        size, dims = self.config.image_size, self.config.action_dim
+        state = np.zeros(self.config.state_dim, np.float32)
+        state[:dims], state[dims : 2 * dims] = self._target, self._mean()
+        if self._nan:
+            state[:] = np.nan
+        return {
+            f"observation.images.{CAMERA}": self.render(size, size),
+            "observation.state": state,
+            TASK: INSTRUCTIONS[self._task],
+        }
+
+    def _delay(self, mean_ms: float) -> float:
+        """Seconds, drawn anew for each step and each observation."""
+        if mean_ms == 0 or self.config.latency == "constant":
+            return mean_ms / 1000
+        variance = math.log1p(self.config.latency_cv**2)
+        return mean_ms / 1000 * math.exp(self._clock.normal(-variance / 2, math.sqrt(variance)))
+
+
+def _wait(delay: float) -> None:
+    if delay > 0:
+        time.sleep(delay)
+
+
+def _pixel(value: float, size: int) -> int:
+    """Where −1 … 1 lies among `size` pixels."""
+    return round((float(value) + 1) / 2 * (size - 1))
