@@ -1,0 +1,175 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""How far rollouts and trainer may run apart: two predicates, and the staleness they imply.
+
+Everything is counted in decisions. On entering the store each segment gets a whole number of draws, ⌊r⌋ or
+⌈r⌉ with r = samples_per_insert, such that the average is r (`entitle`). A segment with draws left is
+*available*:
+
+    may_sample = stored ≥ min_decisions  and  available ≥ batch
+    may_insert = stored < min_decisions  or   available < ahead
+
+*No deadlock*, whatever happened before: if stored < min_decisions, inserting is allowed. Otherwise either
+available ≥ batch, and sampling is allowed; or available < batch ≤ ahead, and inserting is. The condition
+batch ≤ ahead is checked by `ReplayConfig.check`. Nothing here depends on totals since the run began, so
+evicting, retiring or resuming with an empty store cannot upset the pace.
+
+*No over-use*: trained ≤ samples_per_insert · inserted, and no decision is trained on more than
+⌈samples_per_insert⌉ times.
+
+*Bounded staleness*: see `lag_bound`. Rollouts wait at the door instead of having their segments thrown away
+later, because what is thrown away first is what took longest, and those are the failures.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from accerl_lerobot.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayConfig:
+    """Size and pace of one replay.
+
+    Example:
+        >>> config = ReplayConfig(capacity=4096, min_decisions=256, samples_per_insert=2.0, ahead=512)
+        >>> config.check(batch_decisions=256, segment_decisions=16)
+    """
+
+    capacity: int = 4096
+    """Decisions held at most; the oldest segments leave first. At least `ahead` plus one segment."""
+    min_decisions: int = 256
+    """Decisions that must be held before the trainer starts (warm start), from 1 to `capacity`."""
+    samples_per_insert: float = 1.0
+    """How often a decision is trained on, on average; at least 1: collect less rather than throw away."""
+    max_lag: int = 50
+    """A segment whose oldest decision is more updates behind the trainer than this is retired, at least 0.
+
+    A safety net: choose the pace so that `lag_bound` stays below it, and nothing is thrown away.
+    """
+    ahead: int = 512
+    """Decisions the rollouts may be ahead of the trainer, from one batch to `capacity`."""
+
+    def __post_init__(self) -> None:
+        if self.capacity < 1:
+            raise InputError("replay.capacity", self.capacity, "use at least 1 decision")
+        if not 1 <= self.min_decisions <= self.capacity:
+            raise InputError(
+                "replay.min_decisions", self.min_decisions, f"use 1 to capacity, {self.capacity}"
+            )
+        if not 1.0 <= self.samples_per_insert < math.inf:
+            raise InputError("replay.samples_per_insert", self.samples_per_insert, "use a number from 1 up")
+        if self.max_lag < 0:
+            raise InputError("replay.max_lag", self.max_lag, "use 0 or more updates")
+        if not 1 <= self.ahead <= self.capacity:
+            raise InputError("replay.ahead", self.ahead, f"use 1 to capacity, {self.capacity}")
+
+    def check(self, *, batch_decisions: int, segment_decisions: int) -> None:
+        """Refuses a pace that could stall or waste, once the batch size and the segment length are known.
+
+        Args:
+            batch_decisions: decisions one update asks for.
+            segment_decisions: T of the longest segment.
+
+        Raises:
+            InputError: both sides could wait for each other forever, or the trainer for the warm start, or
+                segments would be evicted unused.
+        """
+        if self.ahead < batch_decisions:
+            remedy = f"use at least one batch, {batch_decisions}, or both sides wait for each other"
+            raise InputError("replay.ahead", self.ahead, remedy)
+        least = max(self.min_decisions, self.ahead) + segment_decisions - 1
+        if self.capacity < least:
+            remedy = f"use at least {least}: the larger of min_decisions and ahead, and one segment"
+            raise InputError("replay.capacity", self.capacity, remedy)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pace:
+    """Where collecting and learning stand, in decisions."""
+
+    stored: int
+    available: int
+    """Of those, the ones whose segment has draws left."""
+
+
+def entitle(samples_per_insert: float, n: int, carry: float) -> tuple[int, float]:
+    """How often a new segment may be drawn, so that the average over decisions is `samples_per_insert`.
+
+    Args:
+        samples_per_insert: r ≥ 1.
+        n: decisions of the segment.
+        carry: draws, in decisions, that rounding has withheld so far.
+
+    Returns:
+        ⌊r⌋ or ⌈r⌉, and the new carry, in [0, longest segment]: the sum of draws · n never exceeds r ·
+        inserted.
+    """
+    carry += samples_per_insert * n
+    draws = min(math.floor(carry / n), math.ceil(samples_per_insert))
+    return draws, carry - draws * n
+
+
+def may_sample(config: ReplayConfig, pace: Pace, batch_decisions: int) -> bool:
+    """Whether the trainer may draw a batch now."""
+    return pace.stored >= config.min_decisions and pace.available >= batch_decisions
+
+
+def may_insert(config: ReplayConfig, pace: Pace) -> bool:
+    """Whether rollouts may bring another segment now."""
+    return pace.stored < config.min_decisions or pace.available < config.ahead
+
+
+def lag_bound(
+    config: ReplayConfig,
+    *,
+    batch_decisions: int,
+    in_flight: int,
+    publish_every: int = 1,
+    pickup: int = 0,
+    prefetch: int = 0,
+) -> int:
+    """The largest lag an update can see, in updates.
+
+        lag ≤ min(max_lag, published + drawn) + prefetch
+        published = publish_every − 1 + pickup
+        drawn     = ⌊⌈samples_per_insert⌉ · (max(ahead, min_decisions) + 2·in_flight + capacity) / batch⌋ − 1
+
+    The version counts the updates behind the weights. Take a segment's first decision, at time 0, and the
+    moment it is drawn. The weights that decided were `published` updates old at most. Each update since
+    then has drawn a batch, at most ⌈samples_per_insert⌉ times each, out of
+
+    * what was available at time 0, at most max(ahead, min_decisions) + in_flight: the door shuts at the
+      first term, and what was under way still comes in;
+    * what was inserted since: in_flight until the segment itself was in, and capacity after that, or it
+      would have been evicted.
+
+    One batch is subtracted for the update that draws the segment.
+
+    Args:
+        config: the replay.
+        batch_decisions: decisions one update draws at least.
+        in_flight: most decisions inserted, by all workers, from the first decision of a segment until it is
+            inserted itself, its own included, and not less than what may be under way when the door shuts.
+            With environments of about equal speed: environments × segment length, twice that to be safe.
+            One worker that hangs breaks this assumption; `max_lag` then retires its segment.
+        publish_every: updates from one publication of the weights to the next.
+        pickup: updates made while a publication travels to the inference service.
+        prefetch: batches drawn ahead of the update that uses them.
+    """
+    decisions = max(config.ahead, config.min_decisions) + 2 * in_flight + config.capacity
+    drawn = math.ceil(config.samples_per_insert) * decisions // batch_decisions - 1
+    return min(config.max_lag, publish_every - 1 + pickup + drawn) + prefetch

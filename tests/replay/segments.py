@@ -1,0 +1,42 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Small segments for the replay tests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from accerl_lerobot.experience import Segment
+
+
+def make_segment(key: str, n: int = 4, version: int | list[int] = 0, **replace: Any) -> Segment:
+    """A segment of `n` decisions with one state, one latent and two log-prob factors."""
+    versions = np.broadcast_to(np.asarray(version, np.int64), (n,)).copy()
+    fields: dict[str, Any] = {
+        "observations": {"observation.state": np.zeros((n + 1, 2), np.float32)},
+        "task": "push",
+        "latent": {"x": np.zeros((n, 3), np.float32)},
+        "log_prob": np.zeros((n, 2), np.float32),
+        "value": np.zeros(n, np.float32),
+        "reward": np.ones(n, np.float32),
+        "version": versions,
+        "steps": np.ones(n, np.int64),
+        "terminated": False,
+        "truncated": False,
+        "success": False,
+        "key": key,
+    }
+    return Segment(**{**fields, **replace})

@@ -1,0 +1,229 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The store: order, bounds, idempotence, age, and books that balance."""
+
+import json
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.replay import Replay, ReplayConfig
+from accerl_lerobot.replay import buffer as buffer_module
+from tests.replay.segments import make_segment
+
+
+def make_replay(**settings: Any) -> Replay:
+    return Replay(ReplayConfig(**{"capacity": 40, "min_decisions": 4, "ahead": 20, "max_lag": 5, **settings}))
+
+
+def keys(segments: list[Any]) -> list[str]:
+    return [s.key for s in segments]
+
+
+def assert_books_balance(replay: Replay) -> None:
+    c = replay.counters
+    for unit in ("segments", "decisions"):
+        gone = sum(getattr(c, f"{how}_{unit}") for how in ("evicted", "retired", "lost"))
+        assert getattr(c, f"inserted_{unit}") == getattr(replay, f"stored_{unit}") + gone
+    uses = replay.uses_histogram()
+    assert sum(uses.values()) == c.inserted_segments
+    assert c.unique_decisions <= c.trained_decisions
+    assert replay.stored_decisions <= replay.config.capacity
+
+
+def test_the_oldest_leave_first_and_by_decisions() -> None:
+    replay = make_replay(capacity=10, ahead=10)
+    for i, n in enumerate([4, 4, 3]):
+        assert replay.insert(make_segment(f"k{i}", n))
+    assert replay.stored_decisions == 7 and replay.counters.evicted_decisions == 4
+    assert sorted(keys(replay.sample(7, 0, np.random.default_rng(0)))) == ["k1", "k2"]
+    assert replay.counters.evicted_unused == 1
+    assert_books_balance(replay)
+
+
+def test_one_large_segment_may_push_out_all_others() -> None:
+    replay = make_replay(capacity=10, ahead=10)
+    for i in range(3):
+        replay.insert(make_segment(f"k{i}", 3))
+    replay.insert(make_segment("long", 10))
+    assert replay.stored_segments == 1 and replay.counters.evicted_segments == 3
+    with pytest.raises(InputError, match=r"replay\.capacity=10: use at least 11"):
+        replay.insert(make_segment("longer", 11))
+    assert_books_balance(replay)
+
+
+def test_a_key_is_stored_once_even_after_it_has_left() -> None:
+    replay = make_replay(capacity=8, ahead=8)
+    assert replay.insert(make_segment("a"))
+    assert not replay.insert(make_segment("a"))
+    replay.insert(make_segment("b"))
+    replay.insert(make_segment("c"))  # evicts a
+    assert not replay.insert(make_segment("a"))
+    assert replay.counters.duplicates == 2 and replay.counters.inserted_segments == 3
+    assert_books_balance(replay)
+
+
+def test_key_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(buffer_module, "KEY_MEMORY", 2)
+    replay = make_replay()
+    for key in "abcde":
+        assert replay.insert(make_segment(key, 2))
+    assert len(replay._keys) == 2
+    assert not replay.insert(make_segment("a", 2))  # forgotten as sent, but still held
+    assert_books_balance(replay)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("field", ["log_prob", "value", "reward", "latent", "observations"])
+def test_nonfinite_segments_are_dropped_and_counted(field: str, bad: float) -> None:
+    replay = make_replay()
+    segment = make_segment("a")
+    target = getattr(segment, field)
+    array = next(iter(target.values())) if isinstance(target, dict) else target
+    array.flat[1] = bad
+    assert not replay.insert(segment)
+    assert replay.counters.dropped_nonfinite == 1 and replay.counters.inserted_segments == 0
+    assert replay.insert(make_segment("a"))  # a repaired one is welcome
+
+
+def test_integer_observations_are_not_searched_for_nan() -> None:
+    images = {"observation.images.top": np.zeros((5, 2, 2, 3), np.uint8)}
+    assert make_replay().insert(make_segment("a", observations=images))
+
+
+def test_the_least_used_are_drawn_first() -> None:
+    replay = make_replay(samples_per_insert=3.0)
+    rng = np.random.default_rng(0)
+    replay.insert(make_segment("old"))
+    assert keys(replay.sample(4, 0, rng)) == ["old"]
+    replay.insert(make_segment("new"))
+    assert keys(replay.sample(4, 0, rng)) == ["new"]
+    assert sorted(keys(replay.sample(8, 0, rng))) == ["new", "old"]
+    assert replay.uses_histogram() == {2: 2}
+    assert replay.counters.trained_decisions == 16 and replay.counters.unique_decisions == 8
+
+
+def test_ties_are_broken_at_random_and_reproducibly() -> None:
+    def first(seed: int) -> str:
+        replay = make_replay()
+        for key in "abcd":
+            replay.insert(make_segment(key))
+        return keys(replay.sample(1, 0, np.random.default_rng(seed)))[0]
+
+    counts = Counter(first(seed) for seed in range(400))
+    assert set(counts) == set("abcd") and min(counts.values()) > 60
+    assert [first(s) for s in range(5)] == [first(s) for s in range(5)]
+
+
+def test_whole_segments_until_there_are_enough() -> None:
+    replay = make_replay()
+    for i in range(5):
+        replay.insert(make_segment(f"k{i}", 3))
+    drawn = replay.sample(7, 0, np.random.default_rng(0))
+    assert len(drawn) == 3 and len(set(keys(drawn))) == 3
+    assert replay.sample(7, 0, np.random.default_rng(0)) == []  # 6 are left
+    assert replay.counters.trained_decisions == 9
+    assert len(replay.sample(6, 0, np.random.default_rng(0))) == 2
+    with pytest.raises(ValueError, match="at least 1"):
+        replay.sample(0, 0, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(("per_insert", "expected"), [(1.0, {1: 8}), (2.0, {2: 8}), (1.5, {1: 4, 2: 4})])
+def test_each_segment_is_drawn_as_often_as_its_share(per_insert: float, expected: dict[int, int]) -> None:
+    replay = make_replay(samples_per_insert=per_insert)
+    for i in range(8):
+        replay.insert(make_segment(f"k{i}"))
+    rng = np.random.default_rng(0)
+    while replay.sample(4, 0, rng):
+        pass
+    assert replay.uses_histogram() == expected
+    assert replay.pace.available == 0 and replay.stored_decisions == 32
+    assert replay.counters.trained_decisions == per_insert * 32
+
+
+def test_nothing_older_than_max_lag_is_drawn() -> None:
+    replay = make_replay(max_lag=5, samples_per_insert=2.0)
+    replay.insert(make_segment("mixed", version=[4, 9, 9, 9]))
+    replay.insert(make_segment("edge", version=5))
+    rng = np.random.default_rng(0)
+    assert keys(replay.sample(4, 10, rng)) == ["edge"]  # lag 5 is allowed, one decision with lag 6 is not
+    assert replay.counters.retired_segments == 1 and replay.counters.retired_unused == 1
+    assert replay.sample(4, 11, rng) == []
+    assert replay.counters.retired_segments == 2 and replay.counters.retired_unused == 1
+    assert replay.counters.unspent_draws == 8 + 4
+    assert_books_balance(replay)
+
+
+def test_a_trainer_that_resumed_behind_its_samples_retires_nothing() -> None:
+    replay = make_replay()
+    replay.insert(make_segment("a", version=30))
+    assert keys(replay.sample(4, 10, np.random.default_rng(0))) == ["a"]
+
+
+def test_books_balance_under_random_use() -> None:
+    rng = np.random.default_rng(3)
+    replay = make_replay(samples_per_insert=1.7, max_lag=3)
+    version, entitled = 0, 0
+    for i in range(3000):
+        if rng.random() < 0.6:
+            key = f"k{i - (rng.random() < 0.1)}"  # sometimes a repetition
+            n = int(rng.integers(1, 7))
+            replay.insert(make_segment(key, n, version=max(0, version - int(rng.integers(0, 4)))))
+        else:
+            drawn = replay.sample(int(rng.integers(1, 12)), version, rng)
+            assert len(set(keys(drawn))) == len(drawn)
+            assert all(version - s.version.min() <= 3 for s in drawn)
+            version += bool(drawn)
+        assert_books_balance(replay)
+        c = replay.counters
+        entries = replay._entries.values()
+        assert replay.pace.available == sum(len(e.segment) for e in entries if e.uses < e.draws)
+        assert all(e.uses <= e.draws <= 2 for e in entries)
+        entitled = c.trained_decisions + c.unspent_draws + sum(e.unspent for e in entries)
+        assert -1e-6 < 1.7 * c.inserted_decisions - entitled < 6 + 1e-6
+    assert c.duplicates > 20 and c.retired_segments > 20 and c.evicted_segments > 20 and version > 200
+
+
+def test_counters_survive_a_resumption_and_what_was_held_is_lost() -> None:
+    rng = np.random.default_rng(0)
+    replay = make_replay(capacity=16, ahead=16)
+    for i in range(6):
+        replay.insert(make_segment(f"k{i}"))
+    replay.sample(4, 0, rng)
+    before = replay.metrics()
+    state = json.loads(json.dumps(replay.state()))
+    assert replay.metrics() == before  # asking changes nothing
+
+    resumed = make_replay(capacity=16, ahead=16)
+    resumed.restore(state)
+    c = resumed.counters
+    assert (c.inserted_segments, c.evicted_segments, c.lost_segments, c.lost_unused) == (6, 2, 4, 3)
+    assert c.trained_decisions == 4 and resumed.uses_histogram() == replay.uses_histogram()
+    assert resumed.may_insert() and not resumed.may_sample(4)  # warm start again
+    resumed.insert(make_segment("k9"))
+    assert resumed.may_sample(4)
+    assert_books_balance(resumed)
+    with pytest.raises(RuntimeError):
+        resumed.restore(state)
+
+
+def test_every_counter_is_logged() -> None:
+    replay = make_replay()
+    replay.insert(make_segment("a"))
+    metrics = replay.metrics()
+    assert metrics["inserted_decisions"] == 4.0 and metrics["available_decisions"] == 4.0
+    assert all(isinstance(v, float) for v in metrics.values())

@@ -1,0 +1,271 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Pacing under thousands of random and hostile steps: never stuck, never over-used, never staler than
+stated."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.replay import Pace, Replay, ReplayConfig, lag_bound, may_insert, may_sample
+from accerl_lerobot.replay.pacing import entitle
+from tests.replay.segments import make_segment
+
+CONFIG = ReplayConfig(capacity=100, min_decisions=10, samples_per_insert=2.0, ahead=30)
+
+
+def test_the_door_and_the_warm_start() -> None:
+    assert may_insert(CONFIG, Pace(stored=9, available=9))
+    assert may_insert(CONFIG, Pace(stored=50, available=29))
+    assert not may_insert(CONFIG, Pace(stored=50, available=30))
+    assert not may_sample(CONFIG, Pace(stored=9, available=9), 8)
+    assert may_sample(CONFIG, Pace(stored=10, available=8), 8)
+    assert not may_sample(CONFIG, Pace(stored=50, available=7), 8)
+
+
+def test_one_side_may_always_move_in_every_state() -> None:
+    config = ReplayConfig(capacity=40, min_decisions=7, ahead=12)
+    for batch in (1, 5, 12):
+        config.check(batch_decisions=batch, segment_decisions=4)
+        for stored in range(41):
+            for available in range(stored + 1):
+                pace = Pace(stored=stored, available=available)
+                assert may_insert(config, pace) or may_sample(config, pace, batch)
+
+
+def test_without_the_checked_condition_both_sides_wait() -> None:
+    config = ReplayConfig(capacity=40, min_decisions=7, ahead=10)
+    pace = Pace(stored=20, available=11)
+    assert not may_insert(config, pace) and not may_sample(config, pace, 12)
+    with pytest.raises(InputError) as caught:
+        config.check(batch_decisions=12, segment_decisions=4)
+    assert caught.value.field == "replay.ahead"
+
+
+@pytest.mark.parametrize("rate", [1.0, 1.1, 1.5, 2.0, 3.9])
+def test_entitlement_averages_to_the_rate_and_never_exceeds_it(rate: float) -> None:
+    rng = np.random.default_rng(0)
+    carry, inserted, granted = 0.0, 0, 0
+    for _ in range(5000):
+        n = int(rng.integers(1, 17))
+        draws, carry = entitle(rate, n, carry)
+        assert draws in (math.floor(rate), math.ceil(rate)) and -1e-6 < carry < 16 + 1e-6
+        inserted, granted = inserted + n, granted + draws * n
+        assert -1e-6 < rate * inserted - granted < 16 + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("settings", "field"),
+    [
+        ({"capacity": 0}, "capacity"),
+        ({"min_decisions": 0}, "min_decisions"),
+        ({"min_decisions": 5000}, "min_decisions"),
+        ({"samples_per_insert": 0.5}, "samples_per_insert"),
+        ({"samples_per_insert": math.inf}, "samples_per_insert"),
+        ({"samples_per_insert": math.nan}, "samples_per_insert"),
+        ({"max_lag": -1}, "max_lag"),
+        ({"ahead": 0}, "ahead"),
+        ({"ahead": 5000}, "ahead"),
+    ],
+)
+def test_impossible_settings_are_refused(settings: dict[str, Any], field: str) -> None:
+    with pytest.raises(InputError) as caught:
+        ReplayConfig(**settings)
+    assert caught.value.field == f"replay.{field}"
+
+
+def test_a_store_without_room_for_the_pace_is_refused() -> None:
+    config = ReplayConfig(capacity=32, min_decisions=8, ahead=30)
+    config.check(batch_decisions=30, segment_decisions=3)
+    with pytest.raises(InputError, match="use at least 33"):
+        config.check(batch_decisions=30, segment_decisions=4)
+
+
+def test_lag_bound_by_hand() -> None:
+    # ⌊2·(30 + 2·12 + 100)/8⌋ − 1 = 37; published 4 − 1 + 1 = 4; prefetch 2
+    arguments = {"batch_decisions": 8, "in_flight": 12, "publish_every": 4, "pickup": 1, "prefetch": 2}
+    assert lag_bound(CONFIG, **arguments) == 4 + 37 + 2
+    capped = ReplayConfig(capacity=100, min_decisions=10, samples_per_insert=2.0, ahead=30, max_lag=9)
+    assert lag_bound(capped, **arguments) == 9 + 2
+
+
+@dataclass(kw_only=True)
+class Simulation:
+    """Workers, a trainer and a publisher that are moved one event at a time; asserts the promises at each.
+
+    A worker decides with the published version, then carries its segment around for as long as the schedule
+    likes, within `in_flight`. `gate` says where it waits: before it starts collecting or before it inserts.
+    """
+
+    config: ReplayConfig
+    batch: int
+    longest: int
+    workers: int
+    in_flight: int
+    publish_every: int
+    gate: str
+    seed: int
+    version: int = 0
+    published: int = 0
+    worst_lag: int = 0
+    carried: dict[int, tuple[Any, int]] = field(default_factory=dict)
+    """Worker → its segment and the decisions inserted by all when it began."""
+
+    def __post_init__(self) -> None:
+        self.config.check(batch_decisions=self.batch, segment_decisions=self.longest)
+        self.rng = np.random.default_rng(self.seed)
+        self.replay = Replay(self.config)
+        self.bound = lag_bound(
+            self.config,
+            batch_decisions=self.batch,
+            in_flight=self.in_flight,
+            publish_every=self.publish_every,
+        )
+        self.started = 0
+
+    def begin(self, worker: int) -> None:
+        if worker in self.carried or (self.gate == "begin" and not self.replay.may_insert()):
+            return
+        n = int(self.rng.integers(1, self.longest + 1))
+        segment = make_segment(f"s{self.started}", n, version=self.published)
+        self.started += 1
+        self.carried[worker] = (segment, self.replay.counters.inserted_decisions)
+
+    def insert(self, worker: int) -> None:
+        """Inserts, unless another worker would be carrying for longer than assumed: then that one goes
+        first."""
+        if worker not in self.carried or (self.gate == "insert" and not self.replay.may_insert()):
+            return
+        oldest = min(self.carried, key=lambda w: self.carried[w][1])
+        under_way = sum(len(segment) for segment, _ in self.carried.values())
+        inserted = self.replay.counters.inserted_decisions
+        if inserted + under_way - self.carried[oldest][1] > self.in_flight:
+            worker = oldest
+        segment, since = self.carried.pop(worker)
+        assert self.replay.insert(segment)
+        assert self.replay.counters.inserted_decisions - since <= self.in_flight, "the premise of the bound"
+
+    def update(self) -> None:
+        if not self.replay.may_sample(self.batch):
+            return
+        available = self.replay.pace.available
+        drawn = self.replay.sample(self.batch, self.version, self.rng)
+        if not drawn:  # too old ones were retired: that is progress as well
+            assert self.replay.pace.available < available
+            return
+        self.worst_lag = max(self.worst_lag, *(self.version - int(s.version.min()) for s in drawn))
+        self.version += 1
+        if self.version % self.publish_every == 0:
+            self.published = self.version
+
+    def assert_promises(self) -> None:
+        c = self.replay.counters
+        assert self.replay.may_insert() or self.replay.may_sample(self.batch), "deadlock"
+        assert c.trained_decisions <= self.config.samples_per_insert * c.inserted_decisions + 1e-6
+        assert self.worst_lag <= self.bound <= self.config.max_lag
+        gone = c.evicted_decisions + c.retired_decisions
+        assert c.inserted_decisions == self.replay.stored_decisions + gone
+
+    def run(self, events: int) -> None:
+        """Phases in which one side is favoured, sometimes totally; the favour changes at random."""
+        favour = 0.5
+        for _ in range(events):
+            if self.rng.random() < 0.02:
+                favour = float(self.rng.choice([0.0, 0.05, 0.5, 0.95, 1.0]))
+            worker = int(self.rng.integers(self.workers))
+            if self.rng.random() < favour:
+                self.update()
+            elif self.rng.random() < 0.5:
+                self.begin(worker)
+            else:
+                self.insert(worker)
+            self.assert_promises()
+
+
+@pytest.mark.parametrize("gate", ["begin", "insert"])
+@pytest.mark.parametrize(
+    ("settings", "batch", "longest"),
+    [
+        ({"capacity": 64, "min_decisions": 16, "samples_per_insert": 1.0, "ahead": 32}, 16, 4),
+        ({"capacity": 48, "min_decisions": 40, "samples_per_insert": 2.0, "ahead": 8}, 8, 9),
+        ({"capacity": 200, "min_decisions": 1, "samples_per_insert": 3.5, "ahead": 12}, 12, 6),
+        ({"capacity": 31, "min_decisions": 16, "samples_per_insert": 1.25, "ahead": 30}, 7, 2),
+    ],
+)
+def test_promises_hold_under_hostile_schedules(
+    gate: str, settings: dict[str, Any], batch: int, longest: int
+) -> None:
+    for seed in range(3):
+        simulation = Simulation(
+            config=ReplayConfig(max_lag=10_000, **settings),
+            batch=batch,
+            longest=longest,
+            workers=5,
+            in_flight=2 * 5 * longest,
+            publish_every=1 + seed,
+            gate=gate,
+            seed=seed,
+        )
+        simulation.run(4000)
+        assert simulation.version > 30
+
+
+@pytest.mark.parametrize("max_lag", [0, 1, 4])
+def test_a_tight_max_lag_retires_but_never_stalls(max_lag: int) -> None:
+    config = ReplayConfig(capacity=64, min_decisions=16, samples_per_insert=2.0, ahead=32, max_lag=max_lag)
+    simulation = Simulation(
+        config=config, batch=8, longest=4, workers=5, in_flight=40, publish_every=1, gate="insert", seed=1
+    )
+    simulation.run(12_000)
+    assert simulation.replay.counters.retired_segments > 0
+    assert simulation.version > 100 and simulation.worst_lag == max_lag
+
+
+def test_the_bound_is_not_idle_talk() -> None:
+    """A trainer that always waits for a full store gets close to it: the formula is no astronomically safe
+    number."""
+    config = ReplayConfig(capacity=40, min_decisions=8, samples_per_insert=4.0, ahead=32, max_lag=10_000)
+    simulation = Simulation(
+        config=config, batch=8, longest=4, workers=4, in_flight=32, publish_every=1, gate="insert", seed=0
+    )
+    for _ in range(300):
+        while simulation.replay.may_insert():
+            worker = int(simulation.rng.integers(4))
+            simulation.begin(worker)
+            simulation.insert(worker)
+        for _ in range(40):
+            simulation.begin(0)
+            simulation.update()
+        simulation.assert_promises()
+    assert simulation.worst_lag > 0.25 * simulation.bound
+
+
+def test_evenly_matched_sides_waste_nothing() -> None:
+    """With room to spare, every decision is trained on exactly as often as asked, none evicted or retired
+    unused."""
+    config = ReplayConfig(capacity=128, min_decisions=16, samples_per_insert=2.0, ahead=32, max_lag=200)
+    simulation = Simulation(
+        config=config, batch=16, longest=4, workers=4, in_flight=32, publish_every=1, gate="insert", seed=0
+    )
+    for i in range(6000):
+        simulation.begin(i % 4)
+        simulation.insert(i % 4)
+        simulation.update()
+    c = simulation.replay.counters
+    assert c.evicted_unused == 0 and c.retired_segments == 0 and c.unspent_draws < 0.01 * c.trained_decisions
+    assert c.trained_decisions > 0.98 * 2.0 * c.inserted_decisions
