@@ -146,7 +146,7 @@ class AccerlMetaWorldEnvConfig(EnvConfig):
         """One vector environment per task, as ``{task: {0: vector}}``."""
         config, vectors = self.world_config, {}
         for task in config.tasks:
-            # A finished environment waits for the rest of its batch without simulating an episode nobody sees.
+            # A finished environment waits for its batch without simulating an episode nobody sees.
             make = freeze_after_episode_end(functools.partial(AccerlMetaWorldEnv, config, task))
             if use_async_envs and n_envs > 1:
                 vector = gym.vector.AsyncVectorEnv([make] * n_envs, context="forkserver")

@@ -1,0 +1,157 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Recording: deterministic, complete, and readable by LeRobot."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.demos.expert import make_expert, play
+from accerl_lerobot.demos.record import SIDECAR, DemosConfig, record_demos
+from accerl_lerobot.envs import LeRobotEnvConfig, MetaWorldConfig, SimulatedConfig, make_world
+from accerl_lerobot.errors import InputError
+
+TASKS = "handle-press-v3,reach-v3"
+
+
+def rows(root: Path) -> list[dict]:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset("accerl/demos", root=root, video_backend="pyav")
+    return [{key: np.asarray(value) for key, value in dataset[i].items()} for i in range(len(dataset))]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("metaworld")
+    root = tmp_path_factory.mktemp("demos") / "two"
+    config = DemosConfig(episodes=2, root=str(root), processes=2)
+    assert record_demos(MetaWorldConfig(task=TASKS, max_steps=100), config) == root
+    return root
+
+
+def test_lerobot_reads_it(recorded: Path):
+    data = rows(recorded)
+    frame = data[0]
+    assert frame["observation.images.corner2"].shape == (3, 64, 64)
+    assert frame["observation.state"].shape == frame["action"].shape == (4,)
+    assert {row["episode_index"].item(): str(row["task"]) for row in data} == {
+        0: "Press a handle down",
+        1: "Reach a goal position",
+    }
+    info = json.loads((recorded / "meta" / "info.json").read_text())
+    assert info["fps"] == 80 and info["total_episodes"] == 2
+    assert info["features"]["observation.images.corner2"]["dtype"] == "image"
+    assert info["features"]["next.success"] | {"names": None} == {
+        "dtype": "bool",
+        "shape": [1],
+        "names": None,
+    }
+
+
+def test_the_expert_succeeds_at_the_last_frame_of_each_episode(recorded: Path):
+    data = rows(recorded)
+    last = [i for i, row in enumerate(data) if i + 1 == len(data) or data[i + 1]["frame_index"] == 0]
+    assert len(last) == 2
+    for name in ("next.reward", "next.done", "next.success"):
+        assert [i for i, row in enumerate(data) if row[name]] == last, name
+
+
+def test_frames_are_what_the_world_showed_when_the_action_was_chosen(recorded: Path):
+    data = rows(recorded)
+    world = make_world(MetaWorldConfig(task=TASKS))
+    observation = world.reset(0, "handle-press-v3")
+    for row in data[:10]:
+        stored = (row["observation.images.corner2"] * 255).round().astype(np.uint8).transpose(1, 2, 0)
+        assert np.array_equal(stored, observation["observation.images.corner2"])
+        assert np.array_equal(row["observation.state"], observation["observation.state"])
+        observation = world.step_chunk(row["action"][None]).observation
+    world.close()
+
+
+def test_the_content_does_not_depend_on_the_processes(recorded: Path, tmp_path: Path):
+    config = DemosConfig(episodes=2, root=str(tmp_path / "one"), processes=1)
+    record_demos(MetaWorldConfig(task=TASKS, max_steps=100), config)
+    one, two = rows(tmp_path / "one"), rows(recorded)
+    assert len(one) == len(two)
+    assert all(np.array_equal(a[key], b[key]) for a, b in zip(one, two, strict=True) for key in a)
+    assert (tmp_path / "one" / SIDECAR).read_text() == (recorded / SIDECAR).read_text()
+
+
+def test_failures_are_recorded_on_request_spread_over_tasks(tmp_path: Path):
+    env = SimulatedConfig(task="match,mirror", max_steps=12, tolerance=0.3)
+    config = DemosConfig(episodes=8, root=str(tmp_path / "mixed"), failure_share=0.5, processes=1, seed=3)
+    record_demos(env, config)
+    data = rows(tmp_path / "mixed")
+    outcome: dict[str, list[bool]] = {"Match the target": [], "Mirror the target": []}
+    for row in data:
+        if row["next.done"]:
+            outcome[str(row["task"])].append(bool(row["next.success"]))
+    assert {task: sorted(wins) for task, wins in outcome.items()} == {
+        task: [False, False, True, True] for task in outcome
+    }
+    sidecar = json.loads((tmp_path / "mixed" / SIDECAR).read_text())
+    assert sidecar["successes"] == 4 and sidecar["env"]["type"] == "simulated"
+
+
+def test_noise_is_in_the_recorded_action_and_seeded():
+    config = SimulatedConfig(tolerance=0.01, max_steps=20)
+    world = make_world(config)
+    expert = make_expert(config, world, "match")
+    one, again, clean = (
+        play(world, expert, task="match", seed=5, noise=noise, fail=False) for noise in (0.1, 0.1, 0.0)
+    )
+    assert np.array_equal(one.actions, again.actions) and one.actions.dtype == np.float32
+    assert clean.success_at == 3 and np.ptp(clean.actions, axis=0).max() == 0
+    assert 0.05 < (one.actions - clean.actions[0]).std() < 0.2
+    assert np.abs(one.actions).max() <= 1
+
+
+def test_an_expert_that_cannot_succeed_is_reported_and_leaves_nothing(tmp_path: Path):
+    config = DemosConfig(episodes=1, root=str(tmp_path / "none"), processes=1, action_noise=1.0)
+    with pytest.raises(InputError, match="demos.action_noise=1.0: .*match"):
+        record_demos(SimulatedConfig(tolerance=1e-6, max_steps=8), config)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_folder_is_never_touched(tmp_path: Path):
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(InputError, match="exists already"):
+        record_demos(SimulatedConfig(), DemosConfig(root=str(tmp_path / "mine")))
+
+
+def test_an_environment_without_experts_is_refused(tmp_path: Path):
+    pytest.importorskip("gym_pusht")
+    with pytest.raises(InputError, match="env.type='lerobot'"):
+        record_demos(LeRobotEnvConfig(name="pusht"), DemosConfig(root=str(tmp_path / "x")))
+
+
+@pytest.mark.parametrize(
+    ("values", "field"),
+    [
+        ({"episodes": 0}, "demos.episodes"),
+        ({"action_noise": -0.1}, "demos.action_noise"),
+        ({"failure_share": 1.5}, "demos.failure_share"),
+        ({"processes": 0}, "demos.processes"),
+        ({"repo_id": "plain"}, "demos.repo_id"),
+        ({"seed": 1_000}, "demos.seed"),
+    ],
+)
+def test_bad_values_name_their_field(values: dict, field: str):
+    with pytest.raises(InputError, match=f"^{field}="):
+        DemosConfig(**values)

@@ -1,0 +1,145 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Both directions: LeRobot's environments as our worlds, our MetaWorld as LeRobot's environment."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.envs import LeRobotEnvConfig, LeRobotWorld, MetaWorldConfig, make_world
+from accerl_lerobot.errors import InputError
+
+pytest.importorskip("lerobot")
+
+
+class Scripted:
+    """Stands in for a simulator that succeeds at its third step."""
+
+    def __init__(self, env) -> None:
+        self.env, self.count = env, 0
+
+    def reset(self, seed: int):
+        self.count = 0
+        return self.env.reset(seed=seed)
+
+    def step(self, action: np.ndarray):
+        self.count += 1
+        raw, _, _, _, info = self.env.step(action)
+        won = self.count >= 3
+        return raw, 0.5, won, False, info | {"is_success": won}
+
+
+@pytest.fixture
+def pusht():
+    pytest.importorskip("gym_pusht")
+    world = LeRobotWorld(LeRobotEnvConfig(name="pusht", camera="top"))
+    yield world
+    world.close()
+
+
+def test_success_terminates_with_one_reward(pusht: LeRobotWorld):
+    pusht._envs["pusht"] = Scripted(pusht._envs["pusht"])
+    pusht.reset(0, "pusht")
+    result = pusht.step_chunk(np.full((5, 2), 256, np.float32))
+    assert result.terminated and result.success and result.observation is None
+    assert result.rewards.tolist() == [0, 0, 1]
+
+
+def test_images_are_what_the_environment_drew(pusht: LeRobotWorld):
+    ours = pusht.reset(7, "pusht")
+    raw, _ = pusht._envs["pusht"].reset(seed=7)
+    assert np.array_equal(ours["observation.images.top"], raw["pixels"])
+    assert np.array_equal(ours["observation.state"], raw["agent_pos"].astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"name": "nope"}, "env.name='nope': LeRobot has: .*pusht"),
+        ({"kwargs": {"colour": 1}}, "env.kwargs=.*colour"),
+        ({"kwargs": {"obs_type": "environment_state_agent_pos"}}, "pixels_agent_pos"),
+    ],
+)
+def test_bad_values_name_field_and_remedy(values: dict, message: str):
+    pytest.importorskip("gym_pusht")
+    with pytest.raises(InputError, match=message):
+        make_world(LeRobotEnvConfig(**values))
+
+
+@pytest.fixture
+def plugin():
+    pytest.importorskip("metaworld")
+    from lerobot.configs.parser import load_plugin
+
+    load_plugin("accerl_lerobot.envs.lerobot_plugin")
+    from lerobot.envs.factory import make_env_config
+
+    return lambda **values: make_env_config("accerl_metaworld", **values)
+
+
+def test_stock_lerobot_loads_and_describes_the_plugin(plugin):
+    from lerobot.envs.utils import env_to_policy_features
+
+    features = env_to_policy_features(plugin(image_size=72, camera="corner2,topview"))
+    assert {key: tuple(value.shape) for key, value in features.items()} == {
+        "action": (4,),
+        "observation.state": (4,),
+        "observation.images.corner2": (3, 72, 72),
+        "observation.images.topview": (3, 72, 72),
+    }
+    with pytest.raises(InputError, match="env.image_size"):
+        plugin(image_size=10)
+
+
+def test_stock_lerobot_sees_our_world(plugin):
+    from lerobot.envs.factory import make_env
+    from lerobot.envs.utils import NEW_ROLLOUT_OPTION, preprocess_observation
+
+    vectors = make_env(plugin(task="handle-press-v3", max_steps=6), n_envs=2)
+    vector = vectors["handle-press-v3"][0]
+    seen = preprocess_observation(vector.reset(seed=[3, 4], options={NEW_ROLLOUT_OPTION: True})[0])
+    world = make_world(MetaWorldConfig(task="handle-press-v3", max_steps=6))
+    ours = world.reset(3, "handle-press-v3")
+    image = (seen["observation.images.corner2"][0] * 255).round().byte().permute(1, 2, 0).numpy()
+    assert np.array_equal(image, ours["observation.images.corner2"])
+    assert np.array_equal(seen["observation.state"][0].numpy(), ours["observation.state"])
+    assert vector.call("task_description") == (ours["task"],) * 2
+    assert vector.call("_max_episode_steps") == (6, 6)
+    idle = np.zeros((2, 4), np.float32)
+    for step in range(6):
+        _, _, terminated, truncated, info = vector.step(idle)
+        assert not terminated.any() and not info["is_success"].any()
+        assert truncated.all() == (step == 5)
+    for _ in range(3):
+        vector.step(idle)
+    assert all(env.is_frozen for env in vector.envs), "an episode that is over is not played again"
+    assert vector.envs[0].render().shape == (256, 256, 3)
+    vector.close()
+    world.close()
+
+
+def test_the_expert_succeeds_through_the_plugin(plugin):
+    from accerl_lerobot.demos.expert import make_expert
+    from accerl_lerobot.envs.lerobot_plugin import AccerlMetaWorldEnv
+
+    config = MetaWorldConfig(task="handle-press-v3")
+    env = AccerlMetaWorldEnv(config, "handle-press-v3")
+    env.reset(seed=0)
+    expert, terminated = make_expert(config, env._world, "handle-press-v3"), False
+    while not terminated:
+        seen, reward, terminated, truncated, info = env.step(np.clip(expert(), -1, 1))
+        assert not truncated and info["is_success"] == terminated
+    assert reward == 1.0 and env.observation_space["pixels"].contains(seen["pixels"])
+    env.close()

@@ -1,0 +1,171 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""MetaWorld: same world as LeRobot's, cheaper; success, termination, divergence, tasks."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.demos.expert import make_expert
+from accerl_lerobot.envs import MetaWorld, MetaWorldConfig, gl, make_world
+from accerl_lerobot.envs.metaworld_tasks import all_tasks, description, expert_name, groups
+from accerl_lerobot.errors import InputError
+
+pytest.importorskip("metaworld")
+TASK = "handle-press-v3"
+IMAGE = "observation.images.corner2"
+
+
+def play(world: MetaWorld, seed: int = 0, chunk: int = 1) -> list:
+    world.reset(seed, TASK)
+    expert, results = make_expert(world.config, world, TASK), []
+    while not results or not results[-1].done:
+        action = np.clip(expert(), -1, 1).astype(np.float32)
+        results.append(world.step_chunk(np.repeat(action[None], chunk, 0)))
+    return results
+
+
+def test_success_terminates_with_one_reward_and_no_picture(monkeypatch: pytest.MonkeyPatch):
+    world, frames = MetaWorld(MetaWorldConfig(task=TASK)), []
+    frame = MetaWorld._frame
+    monkeypatch.setattr(MetaWorld, "_frame", lambda *args: frames.append(1) or frame(*args))
+    results = play(world, chunk=3)
+    assert results[-1].terminated and results[-1].success and not results[-1].truncated
+    assert results[-1].observation is None
+    assert sum(float(r.rewards.sum()) for r in results) == 1.0 and results[-1].rewards[-1] == 1.0
+    assert len(frames) == len(results), "one picture at the reset and one per chunk, none after the end"
+
+
+def test_success_can_be_passed_by():
+    world = MetaWorld(MetaWorldConfig(task=TASK, terminate_on_success=False, max_steps=60))
+    results = play(world)
+    assert len(results) == 60 and results[-1].truncated and results[-1].success
+    assert sum(float(r.rewards.sum()) for r in results) == 1.0
+
+
+def test_same_states_rewards_and_frames_as_lerobot(monkeypatch: pytest.MonkeyPatch):
+    gl.import_mujoco()
+    stock_module = pytest.importorskip("lerobot.envs.metaworld")
+    stock = stock_module.MetaworldEnv("push-v3", obs_type="pixels_agent_pos")
+    config = MetaWorldConfig(task="push-v3", image_size=480, lighting="default", reward="dense")
+    world = make_world(config)
+    theirs, ours = stock.reset(seed=11)[0], world.reset(11, "push-v3")
+    assert np.array_equal(theirs["agent_pos"].astype(np.float32), ours["observation.state"])
+    for action in np.random.default_rng(0).uniform(-1, 1, (3, 4)).astype(np.float32):
+        theirs, reward, *_ = stock.step(action)
+        result = world.step_chunk(action[None])
+        assert np.array_equal(theirs["agent_pos"].astype(np.float32), result.observation["observation.state"])
+        assert np.array_equal(theirs["pixels"], result.observation[IMAGE])
+        assert np.float32(reward) == result.rewards[0]
+    assert result.observation["task"] == stock.task_description
+    stock.close()
+    world.close()
+
+
+def test_another_process_sees_the_same_episode():
+    code = (
+        "import hashlib, numpy as np\n"
+        "from accerl_lerobot.envs import MetaWorldConfig, make_world\n"
+        "w = make_world(MetaWorldConfig(task='push-v3')); o = w.reset(9, 'push-v3')\n"
+        "r = w.step_chunk(np.full((5, 4), .3, np.float32)).observation\n"
+        "parts = [x[k].tobytes() for x in (o, r) for k in sorted(x) if k != 'task']\n"
+        "print(hashlib.sha1(b''.join(parts)).hexdigest())"
+    )
+    root = Path(__file__).parents[2]
+    output = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=True
+    )
+    world = make_world(MetaWorldConfig(task="push-v3"))
+    world.reset(1, "push-v3")
+    world.step_chunk(np.ones((7, 4), np.float32))
+    first = world.reset(9, "push-v3")
+    later = world.step_chunk(np.full((5, 4), 0.3, np.float32)).observation
+    parts = [x[k].tobytes() for x in (first, later) for k in sorted(x) if k != "task"]
+    assert output.stdout.strip() == hashlib.sha1(b"".join(parts)).hexdigest()
+
+
+def test_cameras_and_tasks_side_by_side():
+    world = make_world(MetaWorldConfig(task="reach-v3,drawer-open-v3", camera="corner2,topview"))
+    one, other = world.reset(0, "reach-v3"), world.reset(0, "drawer-open-v3")
+    assert set(world.spec.images) == {IMAGE, "observation.images.topview"}
+    assert one["task"] == description("reach-v3") != other["task"]
+    assert not np.array_equal(one[IMAGE], other[IMAGE])
+    assert np.array_equal(one[IMAGE], world.reset(0, "reach-v3")[IMAGE])
+    world.close()
+
+
+def test_a_diverged_simulator_ends_the_episode_and_says_so(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its log into the working directory
+    world = MetaWorld(MetaWorldConfig(task=TASK))
+    world.reset(0, TASK)
+    world._sims[TASK].data.qpos[:] = np.nan
+    result = world.step_chunk(np.zeros((5, 4), np.float32))
+    assert result.info["nonfinite"] == 1.0 and result.truncated and result.steps == 1
+    healthy = world.reset(0, TASK)
+    assert np.isfinite(healthy["observation.state"]).all()
+    assert not world.step_chunk(np.zeros((5, 4), np.float32)).info
+
+
+def test_tables_know_all_fifty_tasks():
+    assert len(all_tasks()) == 50 == len(groups()["all"])
+    assert sum(len(groups()[name]) for name in ("easy", "medium", "hard", "very_hard")) == 50
+    policies = pytest.importorskip("metaworld.policies")
+    assert all(hasattr(policies, expert_name(task)) and description(task) for task in all_tasks())
+
+
+def test_groups_and_lists_resolve_in_order():
+    assert len(MetaWorldConfig(task="easy").tasks) == 28
+    assert MetaWorldConfig(task="reach-v3, hard,reach-v3").tasks == ("reach-v3", *groups()["hard"])
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"task": "metaworld-push-v2"}, "push-v3"),
+        ({"task": ""}, "env.task=''"),
+        ({"camera": "front"}, "corner2"),
+        ({"camera": "corner,corner"}, "once"),
+        ({"image_size": 63}, "env.image_size=63: use 64 to 480"),
+        ({"max_steps": 501}, "1 to 500"),
+        ({"lighting": "dark"}, "cheap or default"),
+        ({"reward": "sparse"}, "success or dense"),
+    ],
+)
+def test_bad_values_name_field_and_remedy(values: dict, message: str):
+    with pytest.raises(InputError, match=message) as caught:
+        MetaWorldConfig(**values)
+    assert "\n" not in str(caught.value) and str(caught.value).startswith("env.")
+
+
+def test_a_missing_opengl_names_the_package(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(gl, "_LIBRARIES", {"egl": ("libNoEGL.so",), "osmesa": ("libNoMesa.so",)})
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(InputError, match="apt-get install -y libosmesa6"):
+        gl.choose_backend()
+
+
+def test_the_package_is_light_to_import():
+    code = (
+        "import sys, accerl_lerobot.envs, accerl_lerobot.demos.expert\n"
+        "heavy = {'torch', 'lerobot', 'mujoco', 'metaworld', 'gymnasium', 'ray'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2], check=True)

@@ -1,0 +1,123 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The simulated world: solvable, as slow as asked, and broken on request."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.envs import SimulatedConfig, SimulatedWorld
+from accerl_lerobot.errors import InputError
+
+
+def held(world: SimulatedWorld, count: int = 10) -> np.ndarray:
+    return np.repeat(world.solution[None], count, 0)
+
+
+@pytest.mark.parametrize("task", ["match", "mirror"])
+def test_holding_the_solution_succeeds_at_once(task: str):
+    world = SimulatedWorld(SimulatedConfig(task="match,mirror", hold=4))
+    state = world.reset(0, task)["observation.state"]
+    assert np.array_equal(world.solution, state[:2] if task == "match" else -state[:2])
+    result = world.step_chunk(held(world))
+    assert result.terminated and result.success and result.steps == 4 and result.observation is None
+    assert result.rewards.tolist() == [0, 0, 0, 1]
+
+
+def test_success_counts_once_when_it_does_not_end_the_episode():
+    world = SimulatedWorld(SimulatedConfig(terminate_on_success=False, max_steps=20))
+    world.reset(0, "match")
+    results = [world.step_chunk(held(world)) for _ in range(2)]
+    assert results[-1].truncated and results[-1].success
+    assert sum(r.rewards.sum() for r in results) == 1
+
+
+def test_doing_nothing_rarely_succeeds():
+    world = SimulatedWorld(SimulatedConfig())
+    wins = 0
+    for seed in range(50):
+        world.reset(seed, "match")
+        wins += world.step_chunk(np.zeros((40, 2), np.float32)).success
+    assert 0 < wins < 15, "room to learn, and something to learn from"
+
+
+def test_the_picture_shows_the_target_and_the_actions():
+    world = SimulatedWorld(SimulatedConfig(tolerance=0.01))
+    pictures = [world.reset(seed, "match")["observation.images.front"] for seed in (0, 1)]
+    assert not np.array_equal(*pictures)
+    moved = world.step_chunk(np.full((2, 2), 0.9, np.float32)).observation["observation.images.front"]
+    assert not np.array_equal(pictures[1], moved)
+
+
+def test_no_picture_is_drawn_inside_a_chunk(monkeypatch: pytest.MonkeyPatch):
+    drawn = []
+    render = SimulatedWorld.render
+    monkeypatch.setattr(SimulatedWorld, "render", lambda *args: drawn.append(1) or render(*args))
+    world = SimulatedWorld(SimulatedConfig())
+    world.reset(0, "match")
+    world.step_chunk(np.zeros((10, 2), np.float32))
+    world.step_chunk(held(world))
+    assert len(drawn) == 2
+
+
+def test_latency_is_slept_and_has_the_mean_asked_for():
+    world = SimulatedWorld(SimulatedConfig(step_ms=2.0, frame_ms=10.0, tolerance=1e-6, max_steps=100))
+    world.reset(0, "match")
+    start = time.perf_counter()
+    world.step_chunk(np.zeros((10, 2), np.float32))
+    assert 0.030 <= time.perf_counter() - start < 0.2
+    world = SimulatedWorld(SimulatedConfig(latency="lognormal", latency_cv=1.0))
+    world.reset(0, "match")
+    draws = [world._delay(3.0) for _ in range(20_000)]
+    assert np.mean(draws) == pytest.approx(0.003, rel=0.05)
+    assert np.std(draws) / np.mean(draws) == pytest.approx(1.0, rel=0.15)
+
+
+def test_it_crashes_on_request_and_counts_over_episodes():
+    world = SimulatedWorld(SimulatedConfig(crash_after=12, tolerance=1e-6))
+    for seed in (0, 1):
+        world.reset(seed, "match")
+        if seed == 0:
+            world.step_chunk(np.zeros((10, 2), np.float32))
+    with pytest.raises(RuntimeError, match="simulated crash after 12"):
+        world.step_chunk(np.zeros((10, 2), np.float32))
+
+
+def test_one_nan_ends_the_episode_and_the_next_is_healthy():
+    world = SimulatedWorld(SimulatedConfig(nan_after=3))
+    world.reset(0, "match")
+    result = world.step_chunk(held(world))
+    assert result.info == {"nonfinite": 1.0} and result.truncated and result.steps == 3
+    assert np.isnan(result.observation["observation.state"]).all()
+    assert np.isfinite(world.reset(1, "match")["observation.state"]).all()
+    assert world.step_chunk(held(world)).success
+
+
+@pytest.mark.parametrize(
+    ("values", "field"),
+    [
+        ({"task": "other"}, "env.task"),
+        ({"state_dim": 3}, "env.state_dim"),
+        ({"hold": 41}, "env.hold"),
+        ({"tolerance": 0.0}, "env.tolerance"),
+        ({"step_ms": -1.0}, "env.step_ms"),
+        ({"latency": "normal"}, "env.latency"),
+    ],
+)
+def test_bad_values_name_their_field(values: dict, field: str):
+    with pytest.raises(InputError, match=f"^{field}="):
+        SimulatedWorld(SimulatedConfig(**values))
