@@ -1,0 +1,151 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""When to answer: requests wait until a batch is full, or until the oldest of them has waited long enough.
+
+Time is passed in and never read, so the same code serves a real clock and a test. The clock of a batch
+starts with its *oldest* request: counting from the newest would let a steady trickle postpone the answer
+forever, and a clock that is set only once would serve every later request alone.
+
+What must hold: first in, first out; a request is neither split nor reordered nor forgotten; a request waits
+for at most `max_wait_s` plus the time the batches before it take.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sized
+from dataclasses import dataclass, field
+
+from accerl_lerobot.errors import InputError
+
+
+@dataclass(kw_only=True)
+class BatcherStats:
+    """What the batcher has done so far."""
+
+    batches: int = 0
+    requests: int = 0
+    observations: int = 0
+    batch_sizes: dict[int, int] = field(default_factory=dict)
+    """Observations in a batch → batches."""
+    wait_sum_s: float = 0.0
+    """Seconds from `Batcher.add` to `Batcher.take`, summed over requests."""
+    wait_max_s: float = 0.0
+    """The longest such wait, in seconds."""
+
+    def metrics(self) -> dict[str, float]:
+        """Means for the log; 0 before the first batch."""
+        return {
+            "batches": float(self.batches),
+            "batch_size_mean": self.observations / max(self.batches, 1),
+            "wait_mean_s": self.wait_sum_s / max(self.requests, 1),
+            "wait_max_s": self.wait_max_s,
+        }
+
+
+class Batcher[R: Sized]:
+    """Gathers requests into batches; ``len(request)`` is the number of observations it carries.
+
+    Example:
+        >>> batcher: Batcher[list[str]] = Batcher(max_batch=3, max_wait_s=0.01)
+        >>> batcher.add(["a", "b"], now=0.0)
+        >>> batcher.due(now=0.004), batcher.next_deadline()
+        (False, 0.01)
+        >>> batcher.add(["c", "d"], now=0.005)
+        >>> batcher.due(now=0.005)  # four observations wait and only three fit
+        True
+        >>> batcher.take(now=0.005), batcher.next_deadline()
+        ([['a', 'b']], 0.015)
+
+    Args:
+        max_batch: observations in a batch at most, at least 1. A single larger request is served alone.
+        max_wait_s: how long the oldest request may wait for others, in seconds, at least 0.
+
+    Raises:
+        InputError: either is out of range.
+    """
+
+    def __init__(self, max_batch: int, max_wait_s: float) -> None:
+        if max_batch < 1:
+            raise InputError("inference.max_batch", max_batch, "use at least 1 observation")
+        if not max_wait_s >= 0.0:
+            raise InputError("inference.max_wait_s", max_wait_s, "use 0 or more seconds")
+        self.max_batch = max_batch
+        self.max_wait_s = max_wait_s
+        self.stats = BatcherStats()
+        self._waiting: deque[tuple[R, float]] = deque()
+        self._observations = 0
+
+    def __len__(self) -> int:
+        """Requests that wait."""
+        return len(self._waiting)
+
+    @property
+    def observations(self) -> int:
+        """Observations that wait."""
+        return self._observations
+
+    def add(self, request: R, now: float) -> None:
+        """Queues a request.
+
+        Args:
+            request: with at least one observation.
+            now: seconds on a monotonic clock, the same for all calls.
+
+        Raises:
+            ValueError: the request is empty.
+        """
+        if len(request) == 0:
+            raise ValueError("a request without observations")
+        self._waiting.append((request, now))
+        self._observations += len(request)
+
+    def due(self, now: float) -> bool:
+        """Whether the next batch should be served: it cannot grow any more, or its oldest request has
+        waited."""
+        deadline = self.next_deadline()
+        return deadline is not None and now >= deadline
+
+    def next_deadline(self) -> float | None:
+        """When the next batch is due if nothing more arrives; a moment in the past if it is full, None if
+        empty."""
+        if not self._waiting:
+            return None
+        oldest = self._waiting[0][1]
+        return oldest if self._observations >= self.max_batch else oldest + self.max_wait_s
+
+    def take(self, now: float) -> list[R]:
+        """Removes the next batch, due or not: the oldest requests, as many as fit, at least one.
+
+        Args:
+            now: seconds, for the statistics.
+
+        Returns:
+            The requests in order of arrival; empty if none waits.
+        """
+        batch: list[R] = []
+        size = 0
+        while self._waiting and (not batch or size + len(self._waiting[0][0]) <= self.max_batch):
+            request, since = self._waiting.popleft()
+            batch.append(request)
+            size += len(request)
+            self.stats.wait_sum_s += now - since
+            self.stats.wait_max_s = max(self.stats.wait_max_s, now - since)
+        self._observations -= size
+        if batch:
+            self.stats.batches += 1
+            self.stats.requests += len(batch)
+            self.stats.observations += size
+            self.stats.batch_sizes[size] = self.stats.batch_sizes.get(size, 0) + 1
+        return batch

@@ -1,0 +1,172 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Dynamic batching, with a clock that the test holds."""
+
+import random
+
+import pytest
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.inference.batcher import Batcher
+
+WAIT = 0.01
+
+
+def make_batcher(max_batch: int = 4, max_wait_s: float = WAIT) -> Batcher[str]:
+    """A request is a string: its characters are the observations."""
+    return Batcher(max_batch=max_batch, max_wait_s=max_wait_s)
+
+
+def test_an_empty_batcher_is_never_due() -> None:
+    batcher = make_batcher()
+    assert not batcher.due(now=1e9) and batcher.next_deadline() is None
+    assert batcher.take(now=0.0) == [] and len(batcher) == 0
+    assert batcher.stats.batches == 0 and batcher.stats.metrics()["wait_mean_s"] == 0.0
+
+
+def test_a_full_batch_fires_at_once() -> None:
+    batcher = make_batcher()
+    for i in range(3):
+        batcher.add("a", now=5.0)
+        assert not batcher.due(now=5.0), i
+    batcher.add("a", now=5.0)
+    assert batcher.due(now=5.0)
+    assert batcher.take(now=5.0) == ["a"] * 4
+
+
+def test_observations_count_and_not_requests() -> None:
+    batcher = make_batcher()
+    batcher.add("abc", now=0.0)
+    assert not batcher.due(now=0.0) and (len(batcher), batcher.observations) == (1, 3)
+    batcher.add("d", now=0.0)
+    assert batcher.due(now=0.0) and (len(batcher), batcher.observations) == (2, 4)
+
+
+def test_a_batch_that_cannot_grow_is_full() -> None:
+    batcher = make_batcher()
+    batcher.add("abc", now=0.0)
+    batcher.add("de", now=0.0)
+    assert batcher.due(now=0.0)
+    assert batcher.take(now=0.0) == ["abc"]
+    assert not batcher.due(now=0.0)  # "de" may still find company
+
+
+def test_the_oldest_request_sets_the_clock() -> None:
+    batcher = make_batcher(max_batch=100)
+    for i in range(9):  # a trickle, each arrival younger than the wait
+        batcher.add("a", now=i * WAIT / 10)
+    assert batcher.next_deadline() == WAIT
+    assert not batcher.due(now=0.99 * WAIT)
+    assert batcher.due(now=WAIT)
+
+
+def test_the_clock_moves_on_with_the_remainder() -> None:
+    batcher = make_batcher()
+    batcher.add("aaa", now=0.0)
+    batcher.add("bbb", now=0.004)
+    assert batcher.take(now=0.005) == ["aaa"]
+    assert batcher.next_deadline() == 0.004 + WAIT
+    assert not batcher.due(now=WAIT) and batcher.due(now=0.004 + WAIT)
+
+
+def test_the_clock_starts_anew_after_an_empty_spell() -> None:
+    batcher = make_batcher()
+    batcher.add("a", now=0.0)
+    batcher.take(now=WAIT)
+    batcher.add("b", now=100.0)
+    assert not batcher.due(now=100.0) and batcher.next_deadline() == 100.0 + WAIT
+
+
+def test_the_deadline_is_exactly_when_it_is_due() -> None:
+    rng = random.Random(0)
+    for _ in range(500):
+        batcher = make_batcher(max_wait_s=rng.random())
+        batcher.add("a", now=rng.uniform(0, 1e6))
+        deadline = batcher.next_deadline()
+        assert deadline is not None and batcher.due(now=deadline)
+
+
+def test_a_full_batch_has_a_deadline_in_the_past() -> None:
+    batcher = make_batcher()
+    batcher.add("abcd", now=7.0)
+    assert batcher.next_deadline() == 7.0
+
+
+def test_a_request_larger_than_a_batch_is_served_alone() -> None:
+    batcher = make_batcher()
+    batcher.add("a", now=0.0)
+    batcher.add("bbbbbbb", now=0.0)
+    batcher.add("c", now=0.0)
+    assert [batcher.take(now=0.0) for _ in range(4)] == [["a"], ["bbbbbbb"], ["c"], []]
+
+
+def test_take_before_it_is_due_serves_what_is_there() -> None:
+    batcher = make_batcher()
+    batcher.add("a", now=0.0)
+    assert batcher.take(now=0.0) == ["a"] and len(batcher) == 0 and batcher.observations == 0
+
+
+def test_no_wait_means_due_at_once() -> None:
+    batcher = make_batcher(max_wait_s=0.0)
+    batcher.add("a", now=3.0)
+    assert batcher.due(now=3.0)
+
+
+def test_first_in_first_out_nothing_lost_nobody_starves() -> None:
+    """A random load, served whenever due by a server that takes its time; large requests are not
+    overtaken."""
+    rng = random.Random(1)
+    batcher: Batcher[list[int]] = Batcher(max_batch=8, max_wait_s=WAIT)
+    now, sent, served, busy_until = 0.0, 0, [], 0.0
+    arrived: dict[int, float] = {}
+    for _ in range(5000):
+        now += rng.expovariate(1.0) * WAIT / 4
+        if sent < 2000:
+            batcher.add([sent] * rng.choice([1, 1, 1, 2, 5, 8, 11]), now)
+            arrived[sent] = now
+            sent += 1
+        if now >= busy_until and batcher.due(now):
+            ahead = len(batcher)
+            batch = batcher.take(now)
+            assert sum(map(len, batch)) <= 8 or len(batch) == 1
+            assert 1 <= len(batch) <= ahead
+            served += [request[0] for request in batch]
+            busy_until = now + WAIT / 8
+    assert served == list(range(2000)) and len(batcher) == batcher.observations == 0
+
+
+def test_statistics() -> None:
+    batcher = make_batcher()
+    batcher.add("ab", now=0.0)
+    batcher.add("cd", now=1.0)
+    batcher.take(now=3.0)
+    batcher.add("e", now=3.0)
+    batcher.take(now=4.0)
+    batcher.take(now=9.0)  # nothing there: not a batch
+    stats = batcher.stats
+    assert stats.batch_sizes == {4: 1, 1: 1}
+    assert (stats.batches, stats.requests, stats.observations) == (2, 3, 5)
+    assert stats.wait_sum_s == 3.0 + 2.0 + 1.0 and stats.wait_max_s == 3.0
+    expected = {"batches": 2.0, "batch_size_mean": 2.5, "wait_mean_s": 2.0, "wait_max_s": 3.0}
+    assert stats.metrics() == expected
+
+
+def test_nonsense_is_refused() -> None:
+    with pytest.raises(InputError, match=r"inference\.max_batch=0"):
+        make_batcher(max_batch=0)
+    for wait in (-1.0, float("nan")):
+        with pytest.raises(InputError, match=r"inference\.max_wait_s"):
+            make_batcher(max_wait_s=wait)
+    with pytest.raises(ValueError, match="without observations"):
+        make_batcher().add("", now=0.0)
