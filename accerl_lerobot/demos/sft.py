@@ -25,7 +25,7 @@ import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -116,6 +116,7 @@ def run_sft(
     output_dir: Path,
     seed: int,
     device: str = "cpu",
+    texts: Sequence[str] = (),
     on_step: Callable[[int, float], None] | None = None,
 ) -> Path:
     """Trains and returns the ``pretrained_model`` folder.
@@ -124,6 +125,7 @@ def run_sft(
         repo_id: dataset id, on the Hub or a label for `root`.
         root: local dataset folder, or None to use the Hub cache.
         output_dir: must not exist; its parent gets ``sft.log``.
+        texts: the dataset's instructions, for a new backbone's tokeniser.
         on_step: called with (step, loss) as progress is reported.
 
     Raises:
@@ -134,7 +136,7 @@ def run_sft(
         raise InputError("output_dir", str(output_dir), "the folder exists; choose another or remove it")
     output_dir.parent.mkdir(parents=True, exist_ok=True)
     if config.init_path is None and config.backbone is not None:
-        write_backbone(output_dir.parent / "backbone", config.backbone)
+        write_backbone(output_dir.parent / "backbone", config.backbone, texts)
     command = sft_command(config, repo_id, root, output_dir, seed, device)
     logger.info("%s", shlex.join(command))
     environment = os.environ | {

@@ -20,6 +20,7 @@ LeRobot's `SmolVLAPolicy` on the same code path as ``lerobot/smolvla_base``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,12 +46,17 @@ class BackboneConfig:
     """Width of the image encoder."""
     vision_layers: int = 2
     vision_heads: int = 4
-    patch: int = 8
+    patch: int = 16
     """Side of an image patch in pixels."""
     image: int = 64
     """Side of the image the encoder sees; a multiple of 2·patch."""
 
+    vocabulary: int = 512
+    """Most tokens the tokeniser has; 264 are bytes and special tokens."""
+
     def __post_init__(self) -> None:
+        if self.vocabulary < 264:
+            raise InputError("sft.backbone.vocabulary", self.vocabulary, "use at least 264")
         if self.image % (2 * self.patch):
             raise InputError("sft.backbone.image", self.image, f"use a multiple of {2 * self.patch}, twice the patch")
         for heads, width in (("heads", self.hidden), ("vision_heads", self.vision_hidden)):
@@ -58,9 +64,19 @@ class BackboneConfig:
                 raise InputError(f"sft.backbone.{heads}", getattr(self, heads), f"use a divisor of the width {width}")
 
 
-def write_backbone(directory: Path, config: BackboneConfig) -> Path:
-    """Writes config, tokeniser and image processor; no weights. Returns `directory`."""
-    from tokenizers import Tokenizer, decoders, models, pre_tokenizers
+def write_backbone(directory: Path, config: BackboneConfig, texts: Sequence[str] = ()) -> Path:
+    """Writes config, tokeniser and image processor; no weights.
+
+    Args:
+        directory: created if need be.
+        config: the sizes.
+        texts: instructions the tokeniser merges bytes on, so that they become a few tokens instead of one per byte; any
+            other text still encodes, byte by byte.
+
+    Returns:
+        `directory`.
+    """
+    from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
     from transformers import (
         PreTrainedTokenizerFast,
         SmolVLMConfig,
@@ -69,12 +85,17 @@ def write_backbone(directory: Path, config: BackboneConfig) -> Path:
         SmolVLMVideoProcessor,
     )
 
-    vocabulary = {token: i for i, token in enumerate(SPECIAL_TOKENS)}
-    for byte in sorted(pre_tokenizers.ByteLevel.alphabet()):
-        vocabulary.setdefault(byte, len(vocabulary))
-    raw = Tokenizer(models.BPE(vocab=vocabulary, merges=[]))
+    raw = Tokenizer(models.BPE())
     raw.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
     raw.decoder = decoders.ByteLevel()
+    trainer = trainers.BpeTrainer(
+        vocab_size=config.vocabulary,
+        special_tokens=list(SPECIAL_TOKENS),
+        initial_alphabet=sorted(pre_tokenizers.ByteLevel.alphabet()),
+        show_progress=False,
+    )
+    raw.train_from_iterator(sorted(set(texts)), trainer)
+    vocabulary = raw.get_vocab()
     tokenizer = PreTrainedTokenizerFast(
         tokenizer_object=raw,
         pad_token="<|pad|>",

@@ -1,0 +1,83 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Settings of the trainer; free of torch, so that a run is parsed before it is loaded."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from accerl_lerobot.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainerConfig:
+    """How the policy is updated.
+
+    The *version* of weights is the number of updates behind them; lag is counted in it.
+    """
+
+    updates: int = 1000
+    """Optimiser steps of the run; the trainer is the run's clock."""
+    batch_decisions: int = 128
+    """Decisions of one update; whole segments are drawn until there are at least as many."""
+    micro_batch: int = 1024
+    """Decisions per backward pass; smaller saves memory, and costs one more forward pass for the values."""
+    lr: float = 1e-4
+    """Peak learning rate of the policy, [0, 1); 0 freezes it."""
+    value_lr: float = 1e-3
+    """Peak learning rate of the critic head, [0, 1)."""
+    warmup_updates: int = 20
+    """Updates over which both rates rise linearly from 0."""
+    schedule: str = "constant"
+    """constant, or cosine: falls to `final_lr_share` of the peak over `updates`."""
+    final_lr_share: float = 0.1
+    value_warmup_updates: int = 20
+    """First updates in which only the critic head learns, because advantages of an untrained one are noise."""
+    grad_clip: float = 1.0
+    """Largest gradient norm; > 0."""
+    weight_decay: float = 0.0
+    betas: tuple[float, float] = (0.9, 0.95)
+    publish_every: int = 1
+    """Updates between two publications of the weights."""
+    max_nonfinite: int = 5
+    """Updates with a non-finite loss or gradient are skipped and counted; this many in a row end the run."""
+    num_threads: int = 1
+    """CPU threads."""
+
+    def __post_init__(self) -> None:
+        for name in ("updates", "batch_decisions", "micro_batch", "publish_every", "max_nonfinite", "num_threads"):
+            if getattr(self, name) < 1:
+                raise InputError(f"trainer.{name}", getattr(self, name), "use at least 1")
+        for name in ("lr", "value_lr"):
+            if not 0 <= getattr(self, name) < 1:
+                raise InputError(f"trainer.{name}", getattr(self, name), "use a value in [0, 1), e.g. 1e-4")
+        for name in ("warmup_updates", "value_warmup_updates", "weight_decay"):
+            if getattr(self, name) < 0:
+                raise InputError(f"trainer.{name}", getattr(self, name), "use 0 or more")
+        if self.schedule not in ("constant", "cosine"):
+            raise InputError("trainer.schedule", self.schedule, "use constant or cosine")
+        if not self.grad_clip > 0:
+            raise InputError("trainer.grad_clip", self.grad_clip, "use a positive norm")
+        if not 0 <= self.final_lr_share <= 1:
+            raise InputError("trainer.final_lr_share", self.final_lr_share, "use a share in [0, 1]")
+
+    def lr_share(self, update: int) -> float:
+        """Factor on both learning rates at `update`, counted from 0."""
+        if update < self.warmup_updates:
+            return (update + 1) / self.warmup_updates
+        if self.schedule == "constant":
+            return 1.0
+        done = (update - self.warmup_updates) / max(1, self.updates - self.warmup_updates)
+        return self.final_lr_share + (1 - self.final_lr_share) * 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
