@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import collections
 import concurrent.futures
+import importlib.metadata
 import json
 import logging
 import math
@@ -29,6 +30,7 @@ import shutil
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -44,11 +46,12 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import demo_seed
 
 SIDECAR = Path("meta") / "accerl_demos.json"
-"""Inside the dataset: the two configs and what came of them."""
+"""Inside the dataset: the two configs, what came of them, and the versions that decide on the physics."""
 
 _logger = logging.getLogger(__name__)
 _MAX_EPISODES = 10_000
 _MAX_TRIES = 50
+_VERSIONS = ("lerobot", "metaworld", "mujoco", "numpy")
 _Results = Iterator[tuple[Episode, int]]
 
 
@@ -125,6 +128,7 @@ def record_demos(env_config: EnvConfig, config: DemosConfig) -> Path:
             "env": draccus.encode(env_config, EnvConfig),
             "demos": {k: v for k, v in draccus.encode(config).items() if k not in ("root", "processes")},
             **tally,
+            "versions": {name: importlib.metadata.version(name) for name in _VERSIONS if find_spec(name)},
         }
         (partial / SIDECAR).write_text(json.dumps(sidecar, indent=2) + "\n")
         partial.rename(root)
@@ -170,6 +174,8 @@ def _write(env_config: EnvConfig, config: DemosConfig, spec: WorldSpec, root: Pa
             tally["discarded"] += discarded
             progress.advance(bar)
         dataset.finalize()
+        # The pictures are inside the parquet files; LeRobot leaves the folders they were collected in.
+        shutil.rmtree(root / "images", ignore_errors=True)
     return tally
 
 

@@ -60,19 +60,20 @@ def test_success_can_be_passed_by():
     assert sum(float(r.rewards.sum()) for r in results) == 1.0
 
 
-def test_same_states_rewards_and_frames_as_lerobot(monkeypatch: pytest.MonkeyPatch):
+def test_same_states_rewards_and_frames_as_lerobot():
     gl.import_mujoco()
     stock_module = pytest.importorskip("lerobot.envs.metaworld")
     stock = stock_module.MetaworldEnv("push-v3", obs_type="pixels_agent_pos")
-    config = MetaWorldConfig(task="push-v3", image_size=480, lighting="default", reward="dense")
-    world = make_world(config)
-    theirs, ours = stock.reset(seed=11)[0], world.reset(11, "push-v3")
-    assert np.array_equal(theirs["agent_pos"].astype(np.float32), ours["observation.state"])
-    for action in np.random.default_rng(0).uniform(-1, 1, (3, 4)).astype(np.float32):
-        theirs, reward, *_ = stock.step(action)
+    actions = np.random.default_rng(0).uniform(-1, 1, (3, 4)).astype(np.float32)
+    # LeRobot's pictures first: once ours has an OpenGL context, theirs would be drawn into it.
+    theirs = [(stock.reset(seed=11)[0], 0.0), *(stock.step(action)[:2] for action in actions)]
+    world = make_world(MetaWorldConfig(task="push-v3", image_size=480, lighting="default", reward="dense"))
+    ours = world.reset(11, "push-v3")
+    assert np.array_equal(theirs[0][0]["agent_pos"].astype(np.float32), ours["observation.state"])
+    for action, (raw, reward) in zip(actions, theirs[1:], strict=True):
         result = world.step_chunk(action[None])
-        assert np.array_equal(theirs["agent_pos"].astype(np.float32), result.observation["observation.state"])
-        assert np.array_equal(theirs["pixels"], result.observation[IMAGE])
+        assert np.array_equal(raw["agent_pos"].astype(np.float32), result.observation["observation.state"])
+        assert np.array_equal(raw["pixels"], result.observation[IMAGE])
         assert np.float32(reward) == result.rewards[0]
     assert result.observation["task"] == stock.task_description
     stock.close()

@@ -1,0 +1,199 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""How fast our MetaWorld is next to LeRobot's: both step random actions, in turns, on the same machine.
+
+Three arms: ``ours`` (a picture per decision), ``ours_every_step`` (chunks of one, so a picture per step) and
+``stock`` (LeRobot's own wrapper: 480 pixels, default lights, a picture per step). Blocks go forth and back
+(A B C C B A), so that a machine that slows down slows every arm.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import multiprocessing
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from accerl_lerobot.envs.gl import import_mujoco
+from accerl_lerobot.envs.metaworld import ACTION_DIM, MetaWorld, MetaWorldConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.seeds import train_seed
+
+OURS, EVERY_STEP, STOCK = "ours", "ours_every_step", "stock"
+_ARMS = (OURS, EVERY_STEP, STOCK)
+Decide = Callable[[], int]
+"""Makes one decision's worth of steps; gives how many env steps that was."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchWorldConfig:
+    """What is measured, for how long."""
+
+    task: str = "drawer-open-v3"
+    """One MetaWorld task."""
+    chunk: int = 10
+    """Actions per decision, 1 to 500."""
+    image_size: int = 64
+    """Our pictures' height and width in pixels; LeRobot's wrapper always draws 480."""
+    seconds: float = 4.0
+    """Length of one block, above 0."""
+    rounds: int = 2
+    """Times each arm is measured twice, 1 or more."""
+
+    def __post_init__(self) -> None:
+        if len(self.env.tasks) != 1:
+            raise InputError("bench.task", self.task, "name one task")
+        if not 1 <= self.chunk <= 500:
+            raise InputError("bench.chunk", self.chunk, "use 1 to 500")
+        if not self.seconds > 0:
+            raise InputError("bench.seconds", self.seconds, "use a positive time")
+        if self.rounds < 1:
+            raise InputError("bench.rounds", self.rounds, "use at least 1")
+
+    @property
+    def env(self) -> MetaWorldConfig:
+        """Our world."""
+        return MetaWorldConfig(task=self.task, image_size=self.image_size)
+
+
+def bench_world(config: BenchWorldConfig) -> dict[str, Any]:
+    """Measures all three arms.
+
+    Returns:
+        ``arms[name]`` with ``env_steps_per_s`` and ``decisions_per_s``, each median, min, max and blocks;
+        ``ratio``, our env steps per second over LeRobot's, median of the blocks' pairs and their range;
+        ``config`` and ``host``.
+    """
+    blocks: dict[str, list[tuple[float, float]]] = {name: [] for name in _ARMS}
+    context = multiprocessing.get_context("spawn")
+    with contextlib.ExitStack() as stack:
+        # A process for each arm: two OpenGL contexts in one process get in each other's way.
+        pools = {
+            name: stack.enter_context(
+                ProcessPoolExecutor(1, context, initializer=_start, initargs=(name, config))
+            )
+            for name in _ARMS
+        }
+        for name in (*_ARMS, *config.rounds * (*_ARMS, *reversed(_ARMS))):
+            blocks[name].append(pools[name].submit(_measure, config.seconds).result())
+        host = pools[OURS].submit(_host).result()
+    blocks = {
+        name: values[1:] for name, values in blocks.items()
+    }  # the first round built and warmed everything
+    rates = {
+        name: {
+            "env_steps_per_s": _spread([steps for steps, _ in values]),
+            "decisions_per_s": _spread([decisions for _, decisions in values]),
+        }
+        for name, values in blocks.items()
+    }
+    pairs = [ours[0] / theirs[0] for ours, theirs in zip(blocks[OURS], blocks[STOCK], strict=True)]
+    return {"config": asdict(config), "arms": rates, "ratio": _spread(pairs), "host": host}
+
+
+def table(result: dict[str, Any]) -> Table:
+    """`result` for people."""
+    config, ratio = result["config"], result["ratio"]
+    shown = Table(
+        title=f"{config['task']}, chunk {config['chunk']}: {ratio['median']:.0f} times the env steps of "
+        f"LeRobot's world ({ratio['min']:.0f} to {ratio['max']:.0f})"
+    )
+    for heading in ("arm", "env steps/s", "range", "decisions/s", "range"):
+        shown.add_column(heading, justify="left" if heading == "arm" else "right")
+    for name, rates in result["arms"].items():
+        cells = [name]
+        for kind in ("env_steps_per_s", "decisions_per_s"):
+            rate = rates[kind]
+            cells += [f"{rate['median']:,.1f}", f"{rate['min']:,.1f} to {rate['max']:,.1f}"]
+        shown.add_row(*cells)
+    return shown
+
+
+_decide: Decide
+
+
+def _start(arm: str, config: BenchWorldConfig) -> None:
+    """Makes a process ready to measure one arm."""
+    global _decide
+    import_mujoco()
+    if arm == STOCK:
+        del os.environ["LP_NUM_THREADS"]  # ours draws with one thread, LeRobot's by default with all
+    chunk = config.chunk if arm == OURS else 1
+    actions = np.random.default_rng(0).uniform(-1, 1, (997, chunk, ACTION_DIM)).astype(np.float32)
+    _decide = _stock(config.task, actions) if arm == STOCK else _ours(config, actions)
+
+
+def _ours(config: BenchWorldConfig, actions: np.ndarray) -> Decide:
+    world = MetaWorld(config.env)
+    seeds = (train_seed(0, 0, episode) for episode in itertools.count())
+    chunks = itertools.cycle(actions)
+    world.reset(next(seeds), config.task)
+
+    def decide() -> int:
+        result = world.step_chunk(next(chunks))
+        if result.done:
+            world.reset(next(seeds), config.task)
+        return result.steps
+
+    return decide
+
+
+def _stock(task: str, actions: np.ndarray) -> Decide:
+    from lerobot.envs.metaworld import MetaworldEnv
+
+    env = MetaworldEnv(task, obs_type="pixels_agent_pos")
+    chunks = itertools.cycle(actions)
+    env.reset(seed=0)
+
+    def decide() -> int:
+        _, _, terminated, truncated, _ = env.step(next(chunks)[0])
+        if truncated and not terminated:  # it resets itself after a termination
+            env.reset()
+        return 1
+
+    return decide
+
+
+def _measure(seconds: float) -> tuple[float, float]:
+    """Env steps and decisions a second."""
+    steps = decisions = 0
+    start = now = time.perf_counter()
+    while now - start < seconds:
+        steps += _decide()
+        decisions += 1
+        now = time.perf_counter()
+    return steps / (now - start), decisions / (now - start)
+
+
+def _host() -> dict[str, Any]:
+    return {
+        "cores": os.cpu_count(),
+        "machine": platform.machine(),
+        "mujoco": import_mujoco().__version__,
+        "gl": os.environ.get("MUJOCO_GL", ""),
+    }
+
+
+def _spread(values: list[float]) -> dict[str, Any]:
+    return {"median": statistics.median(values), "min": min(values), "max": max(values), "blocks": values}

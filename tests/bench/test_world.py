@@ -1,0 +1,51 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The world benchmark runs and its numbers add up."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import pytest
+from rich.console import Console
+
+from accerl_lerobot.bench.world import BenchWorldConfig, bench_world, table
+from accerl_lerobot.errors import InputError
+
+
+def test_three_arms_in_turns():
+    pytest.importorskip("metaworld")
+    pytest.importorskip("lerobot")
+    result = bench_world(BenchWorldConfig(seconds=0.3, rounds=1, chunk=5))
+    assert json.loads(json.dumps(result)) == result
+    arms = result["arms"]
+    for rates in arms.values():
+        assert len(rates["env_steps_per_s"]["blocks"]) == 2
+        assert rates["env_steps_per_s"]["min"] <= rates["env_steps_per_s"]["median"]
+    ours = arms["ours"]
+    assert ours["env_steps_per_s"]["median"] == pytest.approx(5 * ours["decisions_per_s"]["median"], rel=0.1)
+    assert result["ratio"]["min"] > 10, "the whole point of our own world"
+    console = Console(width=120, record=True, file=io.StringIO())
+    console.print(table(result))
+    assert "stock" in console.export_text()
+
+
+@pytest.mark.parametrize(
+    ("values", "field"),
+    [({"task": "easy"}, "bench.task"), ({"chunk": 0}, "bench.chunk"), ({"seconds": 0.0}, "bench.seconds")],
+)
+def test_bad_values_name_their_field(values: dict, field: str):
+    with pytest.raises(InputError, match=f"^{field}="):
+        BenchWorldConfig(**values)
