@@ -51,7 +51,7 @@ def choose_backend() -> str | None:
     Raises:
         InputError: neither library is installed.
     """
-    if sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+    if not _headless():
         return None
     order = ("egl", "osmesa") if any(Path(node).exists() for node in _GPU_NODES) else ("osmesa", "egl")
     for backend in order:
@@ -69,7 +69,11 @@ def import_mujoco() -> ModuleType:
     imported = "mujoco" in sys.modules
     # One software-rendering thread per world: several worlds then share the cores without fighting.
     os.environ.setdefault("LP_NUM_THREADS", "1")
-    chosen = None if os.environ.get("MUJOCO_GL") else choose_backend()
+    given = os.environ.get("MUJOCO_GL", "").lower()
+    if given and given not in _LIBRARIES and _headless():
+        # GLFW without a display takes the whole process down, with no Python error to catch.
+        raise InputError("MUJOCO_GL", given, "there is no display: use egl or osmesa, or unset it")
+    chosen = None if given else choose_backend()
     if chosen is not None:
         os.environ["MUJOCO_GL"] = chosen
     try:
@@ -105,6 +109,10 @@ def _close_all() -> None:
     """Frees every context while the interpreter still can; otherwise OSMesa complains at exit."""
     for renderer in tuple(_open):
         renderer.close()
+
+
+def _headless() -> bool:
+    return sys.platform == "linux" and not any(os.environ.get(k) for k in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def _loads(library: str) -> bool:

@@ -53,8 +53,9 @@ class LeRobotEnvConfig(EnvConfig):
     """Fields of LeRobot's config of that environment, such as ``task`` or ``obs_type``."""
     task: str = ""
     """Instruction text, for environments that have none of their own."""
-    camera: str = ""
-    """A lone camera becomes ``observation.images.<camera>``; if empty, LeRobot's ``observation.image``."""
+    camera: str = "image"
+    """Name of a lone camera: ``observation.images.<camera>``; if empty, LeRobot's ``observation.image``,
+    which policies trained on LeRobot's PushT dataset expect."""
     max_steps: int = 300
     """Episode limit in env steps; reaching it truncates."""
     reward: str = "success"

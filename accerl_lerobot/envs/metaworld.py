@@ -51,7 +51,8 @@ class MetaWorldConfig(EnvConfig):
     """
 
     task: str = "drawer-open-v3"
-    """Task names separated by commas, or LeRobot's groups: easy, medium, hard, very_hard, all."""
+    """Task names separated by commas, or LeRobot's groups: easy, medium, hard, very_hard, all. A world keeps
+    each task it has played, at about 90 MB a task."""
     camera: str = "corner2"
     """Camera names separated by commas; each becomes ``observation.images.<name>``."""
     image_size: int = 64

@@ -155,10 +155,22 @@ def test_bad_values_name_field_and_remedy(values: dict, message: str):
     assert "\n" not in str(caught.value) and str(caught.value).startswith("env.")
 
 
-def test_a_missing_opengl_names_the_package(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(gl, "_LIBRARIES", {"egl": ("libNoEGL.so",), "osmesa": ("libNoMesa.so",)})
+@pytest.fixture
+def headless(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    monkeypatch.setattr(sys, "platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
+    return monkeypatch
+
+
+def test_a_backend_that_needs_a_display_is_refused_without_one(headless: pytest.MonkeyPatch):
+    headless.setenv("MUJOCO_GL", "glfw")
+    with pytest.raises(InputError, match="MUJOCO_GL='glfw': there is no display"):
+        make_world(MetaWorldConfig(task=TASK)).reset(0, TASK)
+
+
+def test_a_missing_opengl_names_the_package(headless: pytest.MonkeyPatch):
+    headless.setattr(gl, "_LIBRARIES", {"egl": ("libNoEGL.so",), "osmesa": ("libNoMesa.so",)})
     with pytest.raises(InputError, match="apt-get install -y libosmesa6"):
         gl.choose_backend()
 
