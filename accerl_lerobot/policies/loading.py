@@ -30,6 +30,7 @@ from typing import Any
 import torch
 from safetensors.torch import load_file, save_file
 
+from accerl_lerobot.checkpoint import BACKBONE
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.base import PolicyAdapter
 from accerl_lerobot.policies.flow import FlowSamplerConfig
@@ -40,9 +41,6 @@ logger = logging.getLogger(__name__)
 
 OURS = "accerl.json"
 VALUE_HEAD = "value_head.safetensors"
-BACKBONE = "backbone"
-"""Folder beside the weights with the vision-language backbone's config and tokeniser, when they are local files."""
-
 ADAPTERS = {"smolvla": "accerl_lerobot.policies.smolvla:SmolVLAAdapter"}
 """LeRobot policy type → adapter class. A further policy of a known family is one line."""
 
@@ -165,31 +163,6 @@ def save_pretrained(adapter: PolicyAdapter, directory: Path, config: PolicyConfi
     save_file(critic, directory / VALUE_HEAD)
     ours = {"sampler": asdict(config.sampler), "value_head": asdict(config.value_head), "rename_map": config.rename_map}
     (directory / OURS).write_text(json.dumps(ours, indent=2) + "\n")
-
-
-def relocate(directory: Path) -> None:
-    """Points a saved checkpoint's config and tokeniser at the backbone files that lie in its own folder.
-
-    LeRobot 0.6.1 stores a local backbone by absolute path; called after a checkpoint has reached its final place.
-    """
-    backbone = directory / BACKBONE
-    if not backbone.is_dir():
-        return
-    name = str(backbone.resolve())
-    for file, edit in (("config.json", _set_vlm), ("policy_preprocessor.json", _set_tokenizer)):
-        content = json.loads((directory / file).read_text())
-        edit(content, name)
-        (directory / file).write_text(json.dumps(content, indent=4) + "\n")
-
-
-def _set_vlm(content: dict[str, Any], name: str) -> None:
-    content["vlm_model_name"] = name
-
-
-def _set_tokenizer(content: dict[str, Any], name: str) -> None:
-    for step in content["steps"]:
-        if step.get("registry_name") == "tokenizer_processor":
-            step["config"]["tokenizer_name"] = name
 
 
 def _verify_weights(policy: Any, path: str, revision: str | None) -> None:

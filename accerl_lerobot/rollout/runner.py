@@ -21,11 +21,11 @@ the single-process mode answers at once.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from accerl_lerobot.envs.base import World
+from accerl_lerobot.envs.base import ChunkResult, World
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Observation, Request, Segment
 from accerl_lerobot.rollout.segments import SegmentBuilder
@@ -67,6 +67,8 @@ class EpisodePlan:
     """Position in the evaluation it belongs to."""
     group: str = "train"
     """Which evaluation it belongs to."""
+    film: bool = False
+    """Record frames for people. Steps the world one action at a time, which changes nothing else."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +82,8 @@ class EpisodeResult:
     decisions: int
     versions: tuple[int, int]
     """Oldest and newest weights that decided in it."""
+    frames: list[np.ndarray] = field(default_factory=list)
+    """uint8 (H, W, 3) each, when the plan asked for a film."""
 
 
 @dataclass
@@ -102,6 +106,7 @@ class _Slot:
     steps: int = 0
     decisions: int = 0
     versions: list[int] = field(default_factory=list)
+    frames: list[np.ndarray] = field(default_factory=list)
 
 
 class RolloutRunner:
@@ -114,6 +119,7 @@ class RolloutRunner:
         name: unique per incarnation of a worker; the prefix of its segments' keys.
         on_segment: receives finished segments of exploring episodes.
         on_episode: receives every finished episode.
+        film: (side in pixels, env steps per frame) of filmed episodes.
     """
 
     def __init__(
@@ -124,12 +130,14 @@ class RolloutRunner:
         name: str,
         on_segment: Callable[[Segment], None],
         on_episode: Callable[[EpisodeResult], None],
+        film: tuple[int, int] = (240, 2),
     ) -> None:
         self.config, self.name = config, name
         self.counters = Counters()
         self._slots = [_Slot(world) for world in worlds]
         self._next_plan, self._on_segment, self._on_episode = next_plan, on_segment, on_episode
         self._sequence = 0
+        self._film = film
 
     def __len__(self) -> int:
         return len(self._slots)
@@ -151,7 +159,7 @@ class RolloutRunner:
         state = self._slots[slot]
         plan, builder = state.plan, state.builder
         assert plan is not None and builder is not None
-        result = state.world.step_chunk(decision.chunk)
+        result = self._filmed(state, decision.chunk) if plan.film else state.world.step_chunk(decision.chunk)
         self.counters.env_steps += result.steps
         self.counters.decisions += 1
         if result.info.get("nonfinite") or not (np.isfinite(result.rewards).all() and _finite(result.observation)):
@@ -176,6 +184,19 @@ class RolloutRunner:
         """Closes the worlds."""
         for state in self._slots:
             state.world.close()
+
+    def _filmed(self, state: _Slot, actions: np.ndarray) -> ChunkResult:
+        """Executes a chunk one action at a time and keeps frames."""
+        side, every = self._film
+        rewards = []
+        for i in range(len(actions)):
+            result = state.world.step_chunk(actions[i : i + 1])
+            rewards.append(result.rewards)
+            if (state.steps + i) % every == 0 or result.done:
+                state.frames.append(state.world.render(side, side))
+            if result.done:
+                break
+        return replace(result, rewards=np.concatenate(rewards))
 
     def _request(self, state: _Slot) -> Request:
         plan, builder = state.plan, state.builder
@@ -209,6 +230,7 @@ class RolloutRunner:
                 steps=state.steps,
                 decisions=state.decisions,
                 versions=(min(versions), max(versions)),
+                frames=state.frames,
             )
         )
 

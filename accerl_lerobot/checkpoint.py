@@ -1,0 +1,84 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Checkpoints in LeRobot's layout, visible only when whole.
+
+``checkpoints/NNNNNN/pretrained_model`` holds what stock LeRobot loads; ``checkpoints/last`` points at the newest. A
+checkpoint is written under a temporary name and renamed, so that a reader never finds half of one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+PRETRAINED = "pretrained_model"
+BACKBONE = "backbone"
+"""Folder beside the weights with the vision-language backbone's config and tokeniser, when they are local files."""
+
+
+def save_checkpoint(checkpoints: Path, write: Callable[[Path], int], state: dict[str, Any]) -> Path:
+    """Writes one checkpoint and points ``last`` at it.
+
+    Args:
+        checkpoints: the run's ``checkpoints`` folder.
+        write: fills the folder it is given with ``pretrained_model`` files and returns their version, the number of
+            updates behind them.
+        state: plain JSON, stored as ``training_state/training_step.json``; ``step`` is added.
+
+    Returns:
+        ``checkpoints/NNNNNN``, which may have existed already.
+    """
+    checkpoints.mkdir(parents=True, exist_ok=True)
+    temporary = checkpoints / f".writing-{os.getpid()}"
+    shutil.rmtree(temporary, ignore_errors=True)
+    version = write(temporary / PRETRAINED)
+    final = checkpoints / f"{version:06d}"
+    relocate(temporary / PRETRAINED, final / PRETRAINED)
+    (temporary / "training_state").mkdir()
+    (temporary / "training_state" / "training_step.json").write_text(json.dumps({"step": version, **state}, indent=2) + "\n")
+    if final.exists():  # the same version is the same weights
+        shutil.rmtree(temporary)
+    else:
+        temporary.rename(final)
+    link = checkpoints / ".last-new"
+    link.unlink(missing_ok=True)
+    link.symlink_to(final.name)
+    link.replace(checkpoints / "last")
+    return final
+
+
+def relocate(directory: Path, home: Path) -> None:
+    """Points a checkpoint's config and tokeniser at the backbone files in its own folder.
+
+    LeRobot 0.6.1 stores a local backbone by absolute path.
+
+    Args:
+        directory: where the files are now.
+        home: where they will be.
+    """
+    if not (directory / BACKBONE).is_dir():
+        return
+    name = str((home / BACKBONE).absolute())
+    config = json.loads((directory / "config.json").read_text())
+    config["vlm_model_name"] = name
+    (directory / "config.json").write_text(json.dumps(config, indent=4) + "\n")
+    processor = json.loads((directory / "policy_preprocessor.json").read_text())
+    for step in processor["steps"]:
+        if step.get("registry_name") == "tokenizer_processor":
+            step["config"]["tokenizer_name"] = name
+    (directory / "policy_preprocessor.json").write_text(json.dumps(processor, indent=4) + "\n")

@@ -1,0 +1,72 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The verbs. Answers ``--help`` at once; everything heavy is imported by the verb that needs it."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import sys
+from collections.abc import Callable
+
+from accerl_lerobot import __version__
+from accerl_lerobot.errors import InputError
+
+VERBS = {
+    "train": ("verbs:train", "improve a policy by online RL (demonstrations and SFT first, if the recipe says so)"),
+    "demos": ("verbs:demos", "record scripted-expert demonstrations into a LeRobotDataset"),
+    "sft": ("verbs:sft", "fine-tune on a LeRobotDataset with LeRobot's own trainer"),
+    "eval": ("verbs:evaluate", "success of a checkpoint, with its confidence interval"),
+    "doctor": ("doctor:main", "resolve a recipe and check this machine"),
+    "bench": ("verbs:bench", "measure: accerl bench world"),
+}
+
+
+def usage() -> str:
+    """The text of ``accerl --help``."""
+    lines = [f"accerl {__version__}: online reinforcement learning of LeRobot policies", "", "usage: accerl VERB [--room.field=value …]", ""]
+    lines += [f"  {verb:8} {what}" for verb, (_, what) in VERBS.items()]
+    lines += ["", "  accerl train --config_path=recipes/quickstart.yaml --trainer.lr=1e-5", "  accerl VERB --help lists a verb's fields"]
+    return "\n".join(lines)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs a verb; returns the exit code."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        sys.stdout.write(usage() + "\n")
+        return 0
+    if arguments[0] == "--version":
+        sys.stdout.write(__version__ + "\n")
+        return 0
+    verb, rest = arguments[0], arguments[1:]
+    if verb not in VERBS:
+        sys.stderr.write(f"accerl: no verb {verb!r}; use one of {', '.join(VERBS)}\n")
+        return 2
+    logging.basicConfig(level=os.environ.get("ACCERL_LOG", "WARNING"), format="%(levelname)s %(name)s: %(message)s")
+    module, _, name = VERBS[verb][0].partition(":")
+    try:
+        function: Callable[[list[str]], int] = getattr(importlib.import_module(f"accerl_lerobot.{module}"), name)
+        return function(rest)
+    except InputError as error:
+        sys.stderr.write(f"accerl: {error}\n")
+        return 2
+    except KeyboardInterrupt:
+        sys.stderr.write("accerl: interrupted\n")
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

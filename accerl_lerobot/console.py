@@ -1,0 +1,73 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Progress for people: a bar per stage on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console as RichConsole
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+PLAIN_EVERY_S = 15.0
+"""Seconds between two lines of one stage when the output is not a terminal."""
+
+
+class Stage:
+    """One stage's bar."""
+
+    def __init__(self, console: RichConsole, name: str, total: int | None, progress: Progress, task: TaskID) -> None:
+        self._console, self._name, self._total, self._progress, self._task = console, name, total, progress, task
+        self._said = time.monotonic()
+
+    def update(self, done: int, status: str = "") -> None:
+        """Moves the bar."""
+        self._progress.update(self._task, completed=done, status=status)
+        now = time.monotonic()
+        if not self._console.is_terminal and now - self._said > PLAIN_EVERY_S:
+            self._said = now
+            self._console.print(f"  {self._name} {done}/{self._total or '?'} {status}", highlight=False)
+
+
+class Console:
+    """Where stages and results are announced.
+
+    Example:
+        >>> with console.stage("SFT", total=100) as stage:
+        ...     stage.update(25, "loss 0.9")
+    """
+
+    def __init__(self) -> None:
+        self.rich = RichConsole(stderr=True)
+        self._started = time.monotonic()
+
+    def say(self, text: str) -> None:
+        """One line, with the seconds since the start."""
+        self.rich.print(f"[{time.monotonic() - self._started:6.1f} s] {text}", highlight=False, markup=False)
+
+    @contextmanager
+    def stage(self, name: str, total: int | None = None) -> Iterator[Stage]:
+        """Announces a stage, shows its bar, and says how long it took."""
+        self.say(f"{name} …")
+        started = time.monotonic()
+        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}"), TimeElapsedColumn())
+        with Progress(
+            *columns, TextColumn("{task.fields[status]}"), console=self.rich, transient=True,
+            disable=not self.rich.is_terminal,
+        ) as progress:  # fmt: skip
+            task = progress.add_task(name, total=total, status="")
+            yield Stage(self.rich, name, total, progress, task)
+        self.say(f"{name}: {time.monotonic() - started:.1f} s")

@@ -1,0 +1,75 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What a run asks of an engine, whichever one it is: the asynchronous one (`launch`) or the one-process one (`local`)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
+
+
+@dataclass(kw_only=True)
+class Progress:
+    """What happened since the last poll."""
+
+    version: int
+    """Updates made so far."""
+    done: bool = False
+    """The trainer has made all its updates."""
+    updates: list[dict[str, float]] = field(default_factory=list)
+    """Metrics of each update."""
+    episodes: list[EpisodeResult] = field(default_factory=list)
+    """Finished episodes, exploring and planned ones."""
+    rollout: dict[str, float] = field(default_factory=dict)
+    """Counters over all rollout workers since the run began."""
+    replay: dict[str, float] = field(default_factory=dict)
+    inference: dict[str, float] = field(default_factory=dict)
+
+
+class Engine(ABC):
+    """Worlds, policy and trainer, ready to go.
+
+    Example:
+        >>> engine.plan(evaluation_plans(tasks, 100, "before"))   # runs at once, nothing else does
+        >>> engine.train()                                        # planned episodes still go first
+        >>> while not (progress := engine.poll()).done: ...
+        >>> engine.save(directory)
+    """
+
+    @abstractmethod
+    def plan(self, plans: list[EpisodePlan]) -> None:
+        """Queues episodes that are run before any exploring one; their results come through `poll`."""
+
+    @abstractmethod
+    def train(self) -> None:
+        """Starts exploring and learning; both end by themselves after the configured updates."""
+
+    @abstractmethod
+    def poll(self) -> Progress:
+        """Does or awaits a little work and reports it.
+
+        Raises:
+            RuntimeError: a worker failed for good; carries its own traceback.
+        """
+
+    @abstractmethod
+    def save(self, directory: Path) -> int:
+        """Writes the current policy as LeRobot files; returns its version."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Ends all workers. Safe to call twice."""

@@ -1,0 +1,160 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The inference process: one device answers many worlds.
+
+    consumes    requests from rollout workers; published weights
+    produces    decisions, each stamped with the version of the weights that made it
+    waits for   a full batch, or for the oldest request to have waited `max_wait_s`
+    weights     are swapped between batches: no batch ever sees two versions
+
+The event loop only queues and answers; forward passes run on a thread of their own, so requests are accepted meanwhile.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import Decision, Request
+from accerl_lerobot.inference.batcher import Batcher
+from accerl_lerobot.policies.loading import PolicyConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class InferenceConfig:
+    """How decisions are batched."""
+
+    max_batch: int = 16
+    """Observations per forward pass at most."""
+    max_wait_s: float = 0.002
+    """How long the oldest request waits for others, seconds."""
+    num_threads: int = 1
+    """CPU threads of the forward pass."""
+
+    def __post_init__(self) -> None:
+        for name in ("max_batch", "num_threads"):
+            if getattr(self, name) < 1:
+                raise InputError(f"inference.{name}", getattr(self, name), "use at least 1")
+        if not 0 <= self.max_wait_s < 10:
+            raise InputError("inference.max_wait_s", self.max_wait_s, "use seconds in [0, 10)")
+
+
+class _Waiting:
+    """Requests of one caller and where their answer goes."""
+
+    def __init__(self, requests: Sequence[Request], future: asyncio.Future[list[Decision]]) -> None:
+        self.requests, self.future = requests, future
+
+    def __len__(self) -> int:
+        return len(self.requests)
+
+
+class InferenceWorker:
+    """Becomes a Ray actor in `launch`.
+
+    Args:
+        policy: which checkpoint to load; every inference worker and the trainer load the same one.
+        config: batching.
+    """
+
+    def __init__(self, policy: PolicyConfig, config: InferenceConfig) -> None:
+        import torch
+
+        from accerl_lerobot.policies.loading import load_adapter
+
+        torch.set_num_threads(config.num_threads)
+        self._adapter = load_adapter(policy)
+        self._batcher: Batcher[_Waiting] = Batcher(config.max_batch, config.max_wait_s)
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="forward")
+        self._wake = asyncio.Event()
+        self._version = 0
+        self._published: tuple[int, dict[str, np.ndarray]] | None = None
+        self._busy_s = 0.0
+        self._since = time.monotonic()
+
+    async def ready(self) -> int:
+        """Answers once the policy is loaded; returns its version."""
+        return self._version
+
+    async def decide(self, requests: list[Request]) -> list[Decision]:
+        """Answers a caller's requests, in order, as part of some batch."""
+        waiting = _Waiting(requests, asyncio.get_running_loop().create_future())
+        self._batcher.add(waiting, time.monotonic())
+        self._wake.set()
+        return await waiting.future
+
+    async def receive_weights(self, version: int, tensors: dict[str, np.ndarray]) -> int:
+        """Takes a published set; it serves from the next batch on. Older sets than the newest are ignored."""
+        if version > max(self._version, self._published[0] if self._published else -1):
+            self._published = (version, tensors)
+            self._wake.set()
+        return version
+
+    async def serve(self) -> None:
+        """Serves until the process ends; an exception here ends the run."""
+        while True:
+            deadline = self._batcher.next_deadline()
+            now = time.monotonic()
+            if deadline is None or now < deadline:
+                timeout = None if deadline is None else deadline - now
+                try:
+                    await asyncio.wait_for(self._wake.wait(), timeout)
+                except TimeoutError:
+                    continue
+                finally:
+                    self._wake.clear()
+                if not self._batcher.due(time.monotonic()) and self._published is None:
+                    continue
+            await self._swap()
+            if self._batcher.due(time.monotonic()):
+                await self._serve_batch(self._batcher.take(time.monotonic()))
+
+    async def metrics(self) -> dict[str, float]:
+        """Batching statistics, the version served and the busy share since the last call."""
+        now = time.monotonic()
+        share, self._busy_s = self._busy_s / max(1e-9, now - self._since), 0.0
+        self._since = now
+        return {**self._batcher.stats.metrics(), "version": float(self._version), "busy_share": share}
+
+    async def _swap(self) -> None:
+        if self._published is None:
+            return
+        version, tensors = self._published
+        self._published = None
+        await asyncio.get_running_loop().run_in_executor(self._pool, self._adapter.load_trainable, tensors)
+        self._version = version
+
+    async def _serve_batch(self, batch: list[_Waiting]) -> None:
+        requests = [r for waiting in batch for r in waiting.requests]
+        started = time.monotonic()
+        try:
+            decisions = await asyncio.get_running_loop().run_in_executor(
+                self._pool, self._adapter.decide, requests, self._version
+            )
+        except Exception as error:
+            for waiting in batch:
+                waiting.future.set_exception(error)
+            raise
+        self._busy_s += time.monotonic() - started
+        start = 0
+        for waiting in batch:
+            if not waiting.future.cancelled():
+                waiting.future.set_result(decisions[start : start + len(waiting)])
+            start += len(waiting)

@@ -1,0 +1,137 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The whole picture in one process, without Ray: the same parts, called in turn, deterministic for a given seed.
+
+    every poll:   all worlds get a decision and step it → segments enter replay → one update, if the pace allows it
+
+For tests and debugging. Weights reach the acting policy at once, so the lag comes from replay alone.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from accerl_lerobot.config import RunConfig
+from accerl_lerobot.engine import Engine, Progress
+from accerl_lerobot.envs import make_world
+from accerl_lerobot.experience import Request
+from accerl_lerobot.replay import Replay
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutRunner
+from accerl_lerobot.seeds import train_seed
+
+
+class LocalEngine(Engine):
+    """Single-process engine.
+
+    Args:
+        config: the run; its ``policy.path`` must be set.
+        tasks: the training tasks.
+    """
+
+    def __init__(self, config: RunConfig, tasks: tuple[str, ...]) -> None:
+        import torch
+
+        from accerl_lerobot.policies.loading import load_adapter
+        from accerl_lerobot.trainer.update import Update
+
+        torch.manual_seed(config.seed)
+        torch.set_num_threads(config.trainer.num_threads)
+        self._config, self._tasks = config, tasks
+        self._adapter = load_adapter(config.policy)
+        self._update = Update(self._adapter, config.algorithm, config.trainer)
+        self._replay = Replay(config.replay)
+        self._rng = np.random.default_rng(config.seed)
+        self._planned: deque[EpisodePlan] = deque()
+        self._episodes: list[EpisodeResult] = []
+        self._training = False
+        self._number = 0
+        worlds = [make_world(config.env) for _ in range(config.rollout.worlds * config.rollout.workers)]
+        film = (config.evaluation.video_size, config.evaluation.video_every)
+        self._runner = RolloutRunner(
+            worlds, self._next_plan, config.rollout, "local", self._replay.insert, self._episodes.append, film
+        )
+        self._due: dict[int, Request] = {}
+
+    def plan(self, plans: list[EpisodePlan]) -> None:
+        self._planned.extend(plans)
+
+    def train(self) -> None:
+        self._training = True
+
+    def poll(self) -> Progress:
+        self._act()
+        updates = []
+        n = self._config.trainer.batch_decisions
+        if self._exploring and self._replay.may_sample(n):
+            segments = self._replay.sample(n, self._update.version, self._rng)
+            if segments:
+                updates.append(self._update.step(segments) | {"update": float(self._update.version)})
+        episodes = list(self._episodes)
+        self._episodes.clear()
+        return Progress(
+            version=self._update.version,
+            done=self._update.version >= self._config.trainer.updates,
+            updates=updates,
+            episodes=episodes,
+            rollout={k: float(v) for k, v in asdict(self._runner.counters).items()},
+            replay=self._replay.metrics(),
+            inference={"version": float(self._update.version)},
+        )
+
+    def save(self, directory: Path) -> int:
+        from accerl_lerobot.policies.loading import save_pretrained
+
+        save_pretrained(self._adapter, directory, self._config.policy)
+        return self._update.version
+
+    def close(self) -> None:
+        self._runner.close()
+
+    @property
+    def _exploring(self) -> bool:
+        return self._training and self._update.version < self._config.trainer.updates
+
+    def _act(self) -> None:
+        """One decision in every world that may go on."""
+        for slot in range(len(self._runner)):
+            request = self._due.get(slot)
+            if request is None or (request.explore and not self._exploring):
+                self._due.pop(slot, None)
+                fresh = self._runner.start(slot)
+                if fresh is not None:
+                    self._due[slot] = fresh
+        may_explore = self._replay.may_insert()
+        slots = [s for s, r in self._due.items() if may_explore or not r.explore]
+        if not slots:
+            return
+        decisions = self._adapter.decide([self._due[s] for s in slots], self._update.version)
+        for slot, decision in zip(slots, decisions, strict=True):
+            request = self._runner.advance(slot, decision)
+            if request is None:
+                del self._due[slot]
+            else:
+                self._due[slot] = request
+
+    def _next_plan(self) -> EpisodePlan | None:
+        if self._planned:
+            return self._planned.popleft()
+        if not self._exploring:
+            return None
+        number, self._number = self._number, self._number + 1
+        task = self._tasks[number % len(self._tasks)]
+        return EpisodePlan(task=task, seed=train_seed(self._config.seed, 0, number), explore=True)

@@ -1,0 +1,94 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Where a run's numbers go: JSON lines always, TensorBoard always, wandb when asked for.
+
+``metrics.jsonl`` has one object per line, each with ``kind`` (train, rollout, evaluation), ``wall_s`` and ``update``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class WandBConfig:
+    """Weights & Biases, off unless enabled."""
+
+    enable: bool = False
+    project: str = "accerl-lerobot"
+    entity: str | None = None
+
+
+class MetricsLog:
+    """Appends records; `close` flushes them.
+
+    Args:
+        directory: the run's folder.
+        wandb: whether to log there too.
+        config: the resolved run config, for wandb.
+    """
+
+    def __init__(self, directory: Path, wandb: WandBConfig, config: dict[str, Any]) -> None:
+        from tensorboard.compat.proto.event_pb2 import Event
+        from tensorboard.compat.proto.summary_pb2 import Summary
+        from tensorboard.summary.writer.event_file_writer import EventFileWriter
+
+        self._event, self._summary = Event, Summary
+        self._file = (directory / "metrics.jsonl").open("a", buffering=1)
+        self._board = EventFileWriter(str(directory / "tensorboard"))
+        self._started = time.monotonic()
+        self._wandb = None
+        if wandb.enable:
+            import wandb as client
+
+            self._wandb = client.init(
+                project=wandb.project, entity=wandb.entity, dir=str(directory), name=directory.name, config=config
+            )
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds since this log was opened."""
+        return time.monotonic() - self._started
+
+    def write(self, kind: str, update: int, values: dict[str, Any]) -> None:
+        """Records numbers; non-numeric values go to the JSON lines only. NaN and infinity are written as null."""
+        record = {"kind": kind, "wall_s": round(self.wall_s, 3), "update": update, **values}
+        self._file.write(json.dumps(_finite(record)) + "\n")
+        scalars = {k: float(v) for k, v in values.items() if isinstance(v, (int, float)) and math.isfinite(v)}
+        summary = self._summary(
+            value=[self._summary.Value(tag=f"{kind}/{k}", simple_value=v) for k, v in scalars.items()]
+        )
+        self._board.add_event(self._event(wall_time=time.time(), step=update, summary=summary))
+        if self._wandb is not None:
+            self._wandb.log({f"{kind}/{k}": v for k, v in scalars.items()} | {"update": update})
+
+    def close(self) -> None:
+        """Flushes and closes everything."""
+        self._file.close()
+        self._board.close()
+        if self._wandb is not None:
+            self._wandb.finish()
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    return [_finite(v) for v in value] if isinstance(value, (list, tuple)) else value

@@ -1,0 +1,89 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The replay process: the door between collecting and learning.
+
+    consumes    segments from rollout workers
+    produces    batches of segments for the trainer
+    waits for   the pace: `insert` until rollouts are not too far ahead, `sample` until there is enough that is new
+    unblocked   by the other side, or by `close`
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+
+import numpy as np
+
+from accerl_lerobot.experience import Segment
+from accerl_lerobot.replay.buffer import Replay
+from accerl_lerobot.replay.pacing import ReplayConfig
+
+
+class ReplayWorker:
+    """Becomes an asynchronous Ray actor in `launch`.
+
+    Args:
+        config: size and pace.
+        seed: of the draw among segments used equally often.
+    """
+
+    def __init__(self, config: ReplayConfig, seed: int) -> None:
+        self._replay = Replay(config)
+        self._rng = np.random.default_rng(seed)
+        self._changed = asyncio.Condition()
+        self._closed = False
+        self._insert_wait_s = self._sample_wait_s = 0.0
+        self._episodes: list[dict[str, float]] = []
+
+    async def insert(self, segments: list[Segment]) -> bool:
+        """Stores segments once the pace allows it; False when the run is over and they were not stored."""
+        started = time.monotonic()
+        async with self._changed:
+            await self._changed.wait_for(lambda: self._closed or self._replay.may_insert())
+            self._insert_wait_s += time.monotonic() - started
+            if self._closed:
+                return False
+            for segment in segments:
+                if self._replay.insert(segment) and segment.episode:
+                    self._episodes.append(segment.episode)
+            self._changed.notify_all()
+        return True
+
+    async def sample(self, num_decisions: int, trainer_version: int) -> list[Segment]:
+        """A batch once the pace allows it; empty when the run is over."""
+        started = time.monotonic()
+        async with self._changed:
+            while True:
+                await self._changed.wait_for(lambda: self._closed or self._replay.may_sample(num_decisions))
+                if self._closed:
+                    return []
+                segments = self._replay.sample(num_decisions, trainer_version, self._rng)
+                self._changed.notify_all()
+                if segments:
+                    self._sample_wait_s += time.monotonic() - started
+                    return segments
+
+    async def close(self) -> None:
+        """Ends all waiting; nothing is stored or drawn any more."""
+        async with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    async def metrics(self) -> dict[str, float]:
+        """Counters and seconds waited at either door; episodes since the last call as means."""
+        episodes, self._episodes = self._episodes, []
+        means = {f"episode_{k}": float(np.mean([e[k] for e in episodes])) for k in (episodes[0] if episodes else {})}
+        waits = {"insert_wait_s": self._insert_wait_s, "sample_wait_s": self._sample_wait_s}
+        return self._replay.metrics() | waits | means | {"episodes": float(len(episodes))}

@@ -1,0 +1,108 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The trainer process: the run's clock.
+
+    consumes    batches of segments from replay, the next one drawn while the current one is learned from
+    produces    weights, published every `publish_every` updates without waiting for anyone
+    waits for   a batch
+    ends        after `updates` updates, or when replay is closed
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import ray
+
+from accerl_lerobot.algorithms import AlgorithmConfig
+from accerl_lerobot.policies.loading import PolicyConfig
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.weights.ray_channel import RayPublisher
+
+
+class TrainerWorker:
+    """Becomes a threaded Ray actor in `launch`: `run` on one thread, everything else beside it.
+
+    Args:
+        policy: the checkpoint to start from.
+        algorithm: the objective.
+        config: the optimiser.
+        seed: of torch's global generator.
+    """
+
+    def __init__(self, policy: PolicyConfig, algorithm: AlgorithmConfig, config: TrainerConfig, seed: int) -> None:
+        import torch
+
+        from accerl_lerobot.policies.loading import load_adapter
+        from accerl_lerobot.trainer.update import Update
+
+        torch.set_num_threads(config.num_threads)
+        torch.manual_seed(seed)
+        self._policy, self._config = policy, config
+        self._update = Update(load_adapter(policy), algorithm, config)
+        self._lock = threading.Lock()
+        self._history: list[dict[str, float]] = []
+
+    def ready(self) -> int:
+        """Answers once the policy is loaded; returns its version."""
+        return self._update.version
+
+    def run(self, replay: Any, readers: list[Any]) -> int:
+        """Trains; returns the number of updates made."""
+        publisher = RayPublisher(readers)
+        n, config = self._config.batch_decisions, self._config
+        publisher.publish(0, self._export())  # the critic is not in the checkpoint: all must start from one
+        upcoming = replay.sample.remote(n, self._update.version)
+        while self._update.version < config.updates:
+            asked = time.monotonic()
+            segments = ray.get(upcoming)
+            if not segments:
+                break
+            waited = time.monotonic() - asked
+            upcoming = replay.sample.remote(n, self._update.version + 1)
+            started = time.monotonic()
+            with self._lock:
+                metrics = self._update.step(segments)
+            updated = time.monotonic()
+            if self._update.version % config.publish_every == 0:
+                publisher.publish(self._update.version, self._export())
+            metrics |= {
+                "update": float(self._update.version), "wait_s": waited, "update_s": updated - started,
+                "publish_s": time.monotonic() - updated,
+            }  # fmt: skip
+            self._history.append(metrics)
+        with self._lock:
+            if self._update.version % config.publish_every:
+                publisher.publish(self._update.version, self._export())
+        publisher.flush()
+        return self._update.version
+
+    def metrics(self) -> list[dict[str, float]]:
+        """One record per update since the last call."""
+        history, self._history = self._history, []
+        return history
+
+    def save(self, directory: str) -> int:
+        """Writes LeRobot's ``pretrained_model`` files between two updates; returns their version."""
+        from accerl_lerobot.policies.loading import save_pretrained
+
+        with self._lock:
+            save_pretrained(self._update.adapter, Path(directory), self._policy)
+            return self._update.version
+
+    def _export(self) -> dict[str, Any]:
+        return self._update.adapter.export_trainable()
