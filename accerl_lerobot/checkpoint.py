@@ -50,7 +50,9 @@ def save_checkpoint(checkpoints: Path, write: Callable[[Path], int], state: dict
     final = checkpoints / f"{version:06d}"
     relocate(temporary / PRETRAINED, final / PRETRAINED)
     (temporary / "training_state").mkdir()
-    (temporary / "training_state" / "training_step.json").write_text(json.dumps({"step": version, **state}, indent=2) + "\n")
+    (temporary / "training_state" / "training_step.json").write_text(
+        json.dumps({"step": version, **state}, indent=2) + "\n"
+    )
     if final.exists():  # the same version is the same weights
         shutil.rmtree(temporary)
     else:

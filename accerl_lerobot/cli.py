@@ -25,7 +25,10 @@ from accerl_lerobot import __version__
 from accerl_lerobot.errors import InputError
 
 VERBS = {
-    "train": ("verbs:train", "improve a policy by online RL (demonstrations and SFT first, if the recipe says so)"),
+    "train": (
+        "verbs:train",
+        "improve a policy by online RL (demonstrations and SFT first, if the recipe says so)",
+    ),
     "demos": ("verbs:demos", "record scripted-expert demonstrations into a LeRobotDataset"),
     "sft": ("verbs:sft", "fine-tune on a LeRobotDataset with LeRobot's own trainer"),
     "eval": ("verbs:evaluate", "success of a checkpoint, with its confidence interval"),
@@ -36,9 +39,18 @@ VERBS = {
 
 def usage() -> str:
     """The text of ``accerl --help``."""
-    lines = [f"accerl {__version__}: online reinforcement learning of LeRobot policies", "", "usage: accerl VERB [--room.field=value …]", ""]
+    lines = [
+        f"accerl {__version__}: online reinforcement learning of LeRobot policies",
+        "",
+        "usage: accerl VERB [--room.field=value …]",
+        "",
+    ]
     lines += [f"  {verb:8} {what}" for verb, (_, what) in VERBS.items()]
-    lines += ["", "  accerl train --config_path=recipes/quickstart.yaml --trainer.lr=1e-5", "  accerl VERB --help lists a verb's fields"]
+    lines += [
+        "",
+        "  accerl train --config_path=recipes/quickstart.yaml --trainer.lr=1e-5",
+        "  accerl VERB --help lists a verb's fields",
+    ]
     return "\n".join(lines)
 
 
@@ -55,10 +67,14 @@ def main(arguments: list[str] | None = None) -> int:
     if verb not in VERBS:
         sys.stderr.write(f"accerl: no verb {verb!r}; use one of {', '.join(VERBS)}\n")
         return 2
-    logging.basicConfig(level=os.environ.get("ACCERL_LOG", "WARNING"), format="%(levelname)s %(name)s: %(message)s")
+    logging.basicConfig(
+        level=os.environ.get("ACCERL_LOG", "WARNING"), format="%(levelname)s %(name)s: %(message)s"
+    )
     module, _, name = VERBS[verb][0].partition(":")
     try:
-        function: Callable[[list[str]], int] = getattr(importlib.import_module(f"accerl_lerobot.{module}"), name)
+        function: Callable[[list[str]], int] = getattr(
+            importlib.import_module(f"accerl_lerobot.{module}"), name
+        )
         return function(rest)
     except InputError as error:
         sys.stderr.write(f"accerl: {error}\n")

@@ -146,4 +146,6 @@ def _as_input_error(error: BaseException) -> InputError:
         if isinstance(cause, InputError):
             return cause
         cause = cause.__cause__ or cause.__context__
-    return InputError("config", str(error).splitlines()[0], "run accerl train --help for the fields of each room")
+    return InputError(
+        "config", str(error).splitlines()[0], "run accerl train --help for the fields of each room"
+    )

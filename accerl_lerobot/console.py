@@ -29,8 +29,16 @@ PLAIN_EVERY_S = 15.0
 class Stage:
     """One stage's bar."""
 
-    def __init__(self, console: RichConsole, name: str, total: int | None, progress: Progress, task: TaskID) -> None:
-        self._console, self._name, self._total, self._progress, self._task = console, name, total, progress, task
+    def __init__(
+        self, console: RichConsole, name: str, total: int | None, progress: Progress, task: TaskID
+    ) -> None:
+        self._console, self._name, self._total, self._progress, self._task = (
+            console,
+            name,
+            total,
+            progress,
+            task,
+        )
         self._said = time.monotonic()
 
     def update(self, done: int, status: str = "") -> None:
@@ -63,7 +71,12 @@ class Console:
         """Announces a stage, shows its bar, and says how long it took."""
         self.say(f"{name} …")
         started = time.monotonic()
-        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f}"), TimeElapsedColumn())
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.completed:.0f}"),
+            TimeElapsedColumn(),
+        )
         with Progress(
             *columns, TextColumn("{task.fields[status]}"), console=self.rich, transient=True,
             disable=not self.rich.is_terminal,

@@ -27,8 +27,6 @@ traceback. Workers get handles and never hold the conductor.
 from __future__ import annotations
 
 import logging
-import os
-import secrets
 import time
 from pathlib import Path
 from typing import Any
@@ -42,20 +40,10 @@ from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 logger = logging.getLogger(__name__)
 
 POLL_S = 0.5
-WORKER_ENVIRONMENT = {
-    "OMP_NUM_THREADS": "1",  # several CPU workers share the cores; spinning threads would cost more than they give
-    "OMP_WAIT_POLICY": "PASSIVE",
-    "TOKENIZERS_PARALLELISM": "false",
-}
 
 
 def start_ray() -> None:
-    """A private Ray on this machine: loopback, no dashboard, a token that only this run knows."""
-    for key, value in WORKER_ENVIRONMENT.items():
-        os.environ.setdefault(key, value)
-    os.environ["RAY_AUTH_MODE"] = "token"
-    os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    """A private Ray on this machine: loopback, no dashboard; `ray_environment` gave it its token."""
     ray.init(
         address="local",
         include_dashboard=False,
@@ -90,7 +78,11 @@ class RayEngine(Engine):
         self._trainer = ray.remote(TrainerWorker).options(num_cpus=0, num_gpus=share, max_concurrency=4).remote(
             config.policy, config.algorithm, config.trainer, config.seed
         )  # fmt: skip
-        self._replay = ray.remote(ReplayWorker).options(num_cpus=0, max_concurrency=1000).remote(config.replay, config.seed)
+        self._replay = (
+            ray.remote(ReplayWorker)
+            .options(num_cpus=0, max_concurrency=1000)
+            .remote(config.replay, config.seed)
+        )
         self._incarnations = [0] * config.rollout.workers
         self._outstanding: list[dict[tuple[str, int], EpisodePlan]] = [{} for _ in self._incarnations]
         self._counters: list[dict[str, float]] = [{} for _ in self._incarnations]
@@ -183,7 +175,9 @@ class RayEngine(Engine):
         ray.get(self._replay.close.remote())
 
     def _restart(self, index: int, error: Exception) -> None:
-        logger.warning("rollout worker %d died and is started again: %s", index, str(error).strip().splitlines()[-1])
+        logger.warning(
+            "rollout worker %d died and is started again: %s", index, str(error).strip().splitlines()[-1]
+        )
         ray.kill(self._rollouts[index])
         self._past["restarts"] += 1
         for key, value in self._counters[index].items():

@@ -58,7 +58,11 @@ class MetricsLog:
             import wandb as client
 
             self._wandb = client.init(
-                project=wandb.project, entity=wandb.entity, dir=str(directory), name=directory.name, config=config
+                project=wandb.project,
+                entity=wandb.entity,
+                dir=str(directory),
+                name=directory.name,
+                config=config,
             )
 
     @property

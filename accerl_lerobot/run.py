@@ -13,13 +13,13 @@
 # limitations under the License.
 """One run from start to summary: demonstrations → SFT → evaluation → asynchronous RL → evaluation.
 
-    outputs/<run>/
-      config.yaml            the resolved config; `accerl train --config_path=…/config.yaml` repeats the run
-      demos/                 a LeRobotDataset, if this run recorded one
-      sft/                   LeRobot's own training output, sft.log beside it
-      checkpoints/NNNNNN/    LeRobot's layout; `last` is the newest
-      metrics.jsonl          and tensorboard/
-      success_curve.png, before_after.mp4, summary.json
+outputs/<run>/
+  config.yaml            the resolved config; `accerl train --config_path=…/config.yaml` repeats the run
+  demos/                 a LeRobotDataset, if this run recorded one
+  sft/                   LeRobot's own training output, sft.log beside it
+  checkpoints/NNNNNN/    LeRobot's layout; `last` is the newest
+  metrics.jsonl          and tensorboard/
+  success_curve.png, before_after.mp4, summary.json
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from accerl_lerobot import ray_environment
 from accerl_lerobot.checkpoint import PRETRAINED, save_checkpoint
 from accerl_lerobot.config import RunConfig, encode
 from accerl_lerobot.console import Console
@@ -76,6 +77,7 @@ def make_engine(config: RunConfig, tasks: tuple[str, ...]) -> Engine:
         from accerl_lerobot.local import LocalEngine
 
         return LocalEngine(config, tasks)
+    ray_environment.prepare()
     from accerl_lerobot.launch import RayEngine
 
     return RayEngine(config, tasks)
@@ -159,9 +161,21 @@ class _Loop:
     """The run once its engine stands: evaluates, trains, and writes what came of it."""
 
     def __init__(
-        self, config: RunConfig, directory: Path, console: Console, engine: Engine, log: MetricsLog, tasks: tuple[str, ...]
+        self,
+        config: RunConfig,
+        directory: Path,
+        console: Console,
+        engine: Engine,
+        log: MetricsLog,
+        tasks: tuple[str, ...],
     ) -> None:
-        self.config, self.directory, self.console, self.engine, self.log = config, directory, console, engine, log
+        self.config, self.directory, self.console, self.engine, self.log = (
+            config,
+            directory,
+            console,
+            engine,
+            log,
+        )
         self.tasks = tasks
         self.evaluations: list[dict[str, Any]] = []
         self.curve: list[tuple[float, float]] = []
@@ -234,22 +248,34 @@ class _Loop:
         if explored:
             self.recent = (self.recent + [e.success for e in explored])[-RECENT:]
             share = float(np.mean(self.recent))
-            self.curve.append((self._steps(progress), share))
+            if (
+                len(self.recent) >= RECENT // 4
+            ):  # the first episodes to end are the short ones, which are successes
+                self.curve.append((self._steps(progress), share))
             values = progress.rollout | {f"replay_{k}": v for k, v in progress.replay.items()}
-            values |= {f"inference_{k}": v for k, v in progress.inference.items()} | {"success_exploring": share}
+            values |= {f"inference_{k}": v for k, v in progress.inference.items()} | {
+                "success_exploring": share
+            }
             self.log.write("rollout", progress.version, values)
         for episode in progress.episodes:
             if episode.plan.group in self.during:
                 self.during[episode.plan.group].append(episode)
                 if len(self.during[episode.plan.group]) == self.config.evaluation.episodes_during:
-                    self._report(episode.plan.group, self.during[episode.plan.group], self._steps(progress), progress.version)
+                    self._report(
+                        episode.plan.group,
+                        self.during[episode.plan.group],
+                        self._steps(progress),
+                        progress.version,
+                    )
 
     def _plan_during(self, number: int, steps: float) -> None:
         group = f"during-{number}"
         self.during[group] = []
         self.engine.plan(evaluation_plans(self.tasks, self.config.evaluation.episodes_during, group))
 
-    def _evaluate(self, group: str, episodes: int, steps: float) -> tuple[dict[str, Any], list[EpisodeResult]]:
+    def _evaluate(
+        self, group: str, episodes: int, steps: float
+    ) -> tuple[dict[str, Any], list[EpisodeResult]]:
         self.engine.plan(evaluation_plans(self.tasks, episodes, group, self.config.evaluation.videos))
         results = run_plans(self.engine, episodes, group, self.console)
         return self._report(group, results, steps, results[0].versions[1]), results
@@ -266,7 +292,9 @@ class _Loop:
         return summary
 
     def _save(self, version: int) -> None:
-        path = save_checkpoint(self.directory / "checkpoints", self.engine.save, {"algorithm": self.config.algorithm.type})
+        path = save_checkpoint(
+            self.directory / "checkpoints", self.engine.save, {"algorithm": self.config.algorithm.type}
+        )
         self.console.say(f"checkpoint {path / PRETRAINED}")
 
     def _since(self, progress: Progress, key: str) -> float:

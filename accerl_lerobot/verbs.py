@@ -110,7 +110,9 @@ def sft(arguments: list[str]) -> int:
     out = Path(config.output_dir)
     if out.exists():
         raise InputError("output_dir", str(out), "the folder exists; choose another or remove it")
-    meta = open_metadata(config.dataset) if config.env is None else check_dataset(config.dataset, config.env, {})
+    meta = (
+        open_metadata(config.dataset) if config.env is None else check_dataset(config.dataset, config.env, {})
+    )
     console = Console()
     with console.stage("SFT", total=config.sft.steps) as stage:
         path = run_sft(
@@ -151,7 +153,9 @@ def evaluate(arguments: list[str]) -> int:
         (out / "evaluation.json").write_text(json.dumps(summary, indent=2) + "\n")
         for result in results:
             if result.frames:
-                name = f"{result.plan.task}_{result.plan.seed}_{'success' if result.success else 'failure'}.mp4"
+                name = (
+                    f"{result.plan.task}_{result.plan.seed}_{'success' if result.success else 'failure'}.mp4"
+                )
                 write_video(out / name, [result.frames], fps=20)
     sys.stdout.write(json.dumps(summary) + "\n")
     return 0
@@ -168,6 +172,3 @@ def bench(arguments: list[str]) -> int:
     Console().rich.print(world.table(result))
     sys.stdout.write(json.dumps(result, indent=2) + "\n")
     return 0
-
-
-

@@ -35,12 +35,16 @@ def open_metadata(dataset: DatasetConfig) -> Any:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
     if dataset.root is not None and not (Path(dataset.root) / "meta" / "info.json").is_file():
-        raise InputError("dataset.root", dataset.root, "no meta/info.json there; give the folder of a LeRobotDataset v3")
+        raise InputError(
+            "dataset.root", dataset.root, "no meta/info.json there; give the folder of a LeRobotDataset v3"
+        )
     try:
         return LeRobotDatasetMetadata(dataset.repo_id, root=dataset.root, revision=dataset.revision)
     except (OSError, FileNotFoundError, ConnectionError, ValueError) as error:
         first = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError("dataset.repo_id", dataset.repo_id, f"not found locally nor on the Hub ({first})") from error
+        raise InputError(
+            "dataset.repo_id", dataset.repo_id, f"not found locally nor on the Hub ({first})"
+        ) from error
 
 
 def check_dataset(dataset: DatasetConfig, env: EnvConfig, rename_map: dict[str, str]) -> Any:

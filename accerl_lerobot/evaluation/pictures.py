@@ -22,7 +22,9 @@ from typing import Any
 import numpy as np
 
 
-def success_curve(path: Path, evaluations: Sequence[dict[str, Any]], training: Sequence[tuple[float, float]]) -> None:
+def success_curve(
+    path: Path, evaluations: Sequence[dict[str, Any]], training: Sequence[tuple[float, float]]
+) -> None:
     """Draws evaluation success with intervals over env steps, and the exploring policy's success behind it.
 
     Args:
@@ -45,7 +47,13 @@ def success_curve(path: Path, evaluations: Sequence[dict[str, Any]], training: S
     high = [e["ci95"][1] - e["success"] for e in evaluations]
     axes.errorbar(x, y, yerr=[low, high], marker="o", capsize=3, color="C0", label="evaluation, 95 % Wilson")
     for e in (evaluations[0], evaluations[-1]):
-        axes.annotate(f"n={e['n']}", (e["env_steps"], e["success"]), textcoords="offset points", xytext=(6, -12), fontsize=8)
+        axes.annotate(
+            f"n={e['n']}",
+            (e["env_steps"], e["success"]),
+            textcoords="offset points",
+            xytext=(6, -12),
+            fontsize=8,
+        )
     axes.set(xlabel="env steps of online experience", ylabel="success", ylim=(-0.02, 1.02))
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right")
@@ -66,7 +74,9 @@ def write_video(path: Path, rows: Sequence[Sequence[np.ndarray]], fps: int) -> N
 
     length = max(len(clip) for clip in rows)
     gap = np.full((rows[0][0].shape[0], 4, 3), 255, np.uint8)
-    with imageio.get_writer(path, fps=fps, macro_block_size=1, codec="libx264", pixelformat="yuv444p") as writer:
+    with imageio.get_writer(
+        path, fps=fps, macro_block_size=1, codec="libx264", pixelformat="yuv444p"
+    ) as writer:
         for i in range(length + fps // 2):
             tiles: list[np.ndarray] = []
             for clip in rows:

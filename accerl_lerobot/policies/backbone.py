@@ -58,10 +58,14 @@ class BackboneConfig:
         if self.vocabulary < 264:
             raise InputError("sft.backbone.vocabulary", self.vocabulary, "use at least 264")
         if self.image % (2 * self.patch):
-            raise InputError("sft.backbone.image", self.image, f"use a multiple of {2 * self.patch}, twice the patch")
+            raise InputError(
+                "sft.backbone.image", self.image, f"use a multiple of {2 * self.patch}, twice the patch"
+            )
         for heads, width in (("heads", self.hidden), ("vision_heads", self.vision_hidden)):
             if width % getattr(self, heads):
-                raise InputError(f"sft.backbone.{heads}", getattr(self, heads), f"use a divisor of the width {width}")
+                raise InputError(
+                    f"sft.backbone.{heads}", getattr(self, heads), f"use a divisor of the width {width}"
+                )
 
 
 def write_backbone(directory: Path, config: BackboneConfig, texts: Sequence[str] = ()) -> Path:

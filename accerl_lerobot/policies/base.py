@@ -59,7 +59,9 @@ class PolicyAdapter(nn.Module, ABC):
         """Acts on a batch, without gradient. Answers in the order of the requests."""
 
     @abstractmethod
-    def evaluate(self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]) -> Evaluation:
+    def evaluate(
+        self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
+    ) -> Evaluation:
         """Re-scores stored latents, differentiably.
 
         Args:
@@ -84,11 +86,15 @@ class PolicyAdapter(nn.Module, ABC):
         """
         parameters = self.trainable()
         if parameters.keys() != tensors.keys():
-            raise ValueError(f"published weights differ by name: {sorted(parameters.keys() ^ tensors.keys())[:4]}")
+            raise ValueError(
+                f"published weights differ by name: {sorted(parameters.keys() ^ tensors.keys())[:4]}"
+            )
         with torch.no_grad():
             for name, parameter in parameters.items():
                 if tuple(parameter.shape) != tensors[name].shape:
-                    raise ValueError(f"published {name} has shape {tensors[name].shape}, not {tuple(parameter.shape)}")
+                    raise ValueError(
+                        f"published {name} has shape {tensors[name].shape}, not {tuple(parameter.shape)}"
+                    )
                 parameter.copy_(torch.from_numpy(tensors[name]))
 
     def export_trainable(self) -> dict[str, np.ndarray]:
@@ -120,7 +126,13 @@ def check_fit(policy_config: Any, spec: WorldSpec, rename_map: dict[str, str]) -
         )  # fmt: skip
     state = policy_config.robot_state_feature
     if state is not None and tuple(state.shape) != (spec.state_dim,):
-        raise InputError("policy.path", tuple(state.shape), f"the world's observation.state has ({spec.state_dim},) entries")
+        raise InputError(
+            "policy.path",
+            tuple(state.shape),
+            f"the world's observation.state has ({spec.state_dim},) entries",
+        )
     action = tuple(policy_config.action_feature.shape)
     if action != (spec.action_dim,):
-        raise InputError("policy.path", action, f"the policy's action size differs from the world's ({spec.action_dim},)")
+        raise InputError(
+            "policy.path", action, f"the policy's action size differs from the world's ({spec.action_dim},)"
+        )

@@ -75,9 +75,13 @@ class FlowSamplerConfig:
         }
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:
-                raise InputError(f"policy.sampler.{name}", getattr(self, name), f"use one of {', '.join(allowed)}")
+                raise InputError(
+                    f"policy.sampler.{name}", getattr(self, name), f"use one of {', '.join(allowed)}"
+                )
         if not 0 < self.noise_level <= 2:
-            raise InputError("policy.sampler.noise_level", self.noise_level, "use a value in (0, 2]; 0.2 is usual")
+            raise InputError(
+                "policy.sampler.noise_level", self.noise_level, "use a value in (0, 2]; 0.2 is usual"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +111,9 @@ def step_time(k: Tensor | int, num_steps: int) -> Tensor | float:
     return 1.0 + k * (-1.0 / num_steps)
 
 
-def transition(x: Tensor, v: Tensor, t: Tensor, shape: FlowShape, config: FlowSamplerConfig) -> tuple[Tensor, Tensor]:
+def transition(
+    x: Tensor, v: Tensor, t: Tensor, shape: FlowShape, config: FlowSamplerConfig
+) -> tuple[Tensor, Tensor]:
     """Mean and std of one Gaussian denoising step.
 
     Args:
@@ -137,7 +143,13 @@ def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor, mask: Tensor) -> Ten
 
 
 def sample(
-    velocity: Velocity, x0: Tensor, eps: Tensor, index: Tensor, explore: Tensor, shape: FlowShape, config: FlowSamplerConfig
+    velocity: Velocity,
+    x0: Tensor,
+    eps: Tensor,
+    index: Tensor,
+    explore: Tensor,
+    shape: FlowShape,
+    config: FlowSamplerConfig,
 ) -> tuple[Tensor, dict[str, Tensor], Tensor]:
     """Denoises a batch, some samples exploring and the others by the stock ODE.
 
@@ -171,7 +183,9 @@ def sample(
     return x, _latent(path, index, config), logp
 
 
-def log_prob(velocity: Velocity, latent: dict[str, Tensor], shape: FlowShape, config: FlowSamplerConfig) -> Tensor:
+def log_prob(
+    velocity: Velocity, latent: dict[str, Tensor], shape: FlowShape, config: FlowSamplerConfig
+) -> Tensor:
     """Log-density of stored latents under the current velocity field, (B, K), differentiable."""
     path, n = latent["path"], shape.num_steps
     b = path.shape[0]

@@ -89,14 +89,20 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     from lerobot.configs.policies import PreTrainedConfig
 
     if config.path is None:
-        raise InputError("policy.path", None, "give a LeRobot checkpoint directory or Hub id, or an sft section")
+        raise InputError(
+            "policy.path", None, "give a LeRobot checkpoint directory or Hub id, or an sft section"
+        )
     local = Path(config.path).expanduser()
     if (local.exists() or config.path.startswith((".", "/", "~"))) and not (local / "config.json").is_file():
-        raise InputError("policy.path", config.path, "no config.json there; give the folder named pretrained_model")
+        raise InputError(
+            "policy.path", config.path, "no config.json there; give the folder named pretrained_model"
+        )
     try:
         lerobot_config = PreTrainedConfig.from_pretrained(config.path, revision=config.revision)
     except (OSError, FileNotFoundError) as error:
-        raise InputError("policy.path", config.path, f"not a directory here and not loadable from the Hub ({error})") from error
+        raise InputError(
+            "policy.path", config.path, f"not a directory here and not loadable from the Hub ({error})"
+        ) from error
     name = lerobot_config.type
     if name not in ADAPTERS:
         why = NO_DENSITY.get(name, f"no likelihood for it yet; use one of {', '.join(ADAPTERS)}")
@@ -127,14 +133,19 @@ def load_adapter(config: PolicyConfig) -> PolicyAdapter:
 
     lerobot_config = load_lerobot_config(config)
     path = str(config.path)
-    policy = get_policy_class(lerobot_config.type).from_pretrained(path, config=lerobot_config, revision=config.revision)
+    policy = get_policy_class(lerobot_config.type).from_pretrained(
+        path, config=lerobot_config, revision=config.revision
+    )
     _verify_weights(policy, path, config.revision)
     device = torch.device(lerobot_config.device)
     overrides: dict[str, Any] = {"device_processor": {"device": str(device)}}
     if (Path(path) / BACKBONE).is_dir():
         overrides["tokenizer_processor"] = {"tokenizer_name": lerobot_config.vlm_model_name}
     pre, post = make_pre_post_processors(
-        lerobot_config, pretrained_path=path, pretrained_revision=config.revision, preprocessor_overrides=overrides
+        lerobot_config,
+        pretrained_path=path,
+        pretrained_revision=config.revision,
+        preprocessor_overrides=overrides,
     )
     module, _, name = ADAPTERS[lerobot_config.type].partition(":")
     adapter_class = getattr(importlib.import_module(module), name)
@@ -161,7 +172,11 @@ def save_pretrained(adapter: PolicyAdapter, directory: Path, config: PolicyConfi
     post.save_pretrained(directory)
     critic = {k: v.detach().cpu().contiguous() for k, v in adapter.value_head.state_dict().items()}
     save_file(critic, directory / VALUE_HEAD)
-    ours = {"sampler": asdict(config.sampler), "value_head": asdict(config.value_head), "rename_map": config.rename_map}
+    ours = {
+        "sampler": asdict(config.sampler),
+        "value_head": asdict(config.value_head),
+        "rename_map": config.rename_map,
+    }
     (directory / OURS).write_text(json.dumps(ours, indent=2) + "\n")
 
 
@@ -173,12 +188,20 @@ def _verify_weights(policy: Any, path: str, revision: str | None) -> None:
 
         file = Path(hf_hub_download(path, "model.safetensors", revision=revision))
     stored, loaded = load_file(file), policy.state_dict()
-    tied = {k for k in loaded if k.endswith("lm_head.weight")}  # tied to the embedding, which safetensors keeps once
+    tied = {
+        k for k in loaded if k.endswith("lm_head.weight")
+    }  # tied to the embedding, which safetensors keeps once
     missing = sorted(k for k in loaded.keys() - stored.keys() - tied)
     unexpected = sorted(stored.keys() - loaded.keys())
     if missing or unexpected:
-        detail = f"{len(missing)} tensors missing ({missing[:2]}), {len(unexpected)} unexpected ({unexpected[:2]})"
-        raise InputError("policy.path", path, f"the weights did not load: {detail}; config.json and model.safetensors disagree")
+        detail = (
+            f"{len(missing)} tensors missing ({missing[:2]}), {len(unexpected)} unexpected ({unexpected[:2]})"
+        )
+        raise InputError(
+            "policy.path",
+            path,
+            f"the weights did not load: {detail}; config.json and model.safetensors disagree",
+        )
     for name, tensor in stored.items():
         mine = loaded[name]
         if mine.shape != tensor.shape or not torch.equal(mine.cpu(), tensor.to(mine.dtype)):
@@ -188,6 +211,10 @@ def _verify_weights(policy: Any, path: str, revision: str | None) -> None:
 def _load_value_head(adapter: PolicyAdapter, file: Path, config: PolicyConfig) -> None:
     ours = json.loads((file.parent / OURS).read_text())
     if ours["value_head"] != asdict(config.value_head):
-        logger.warning("critic not loaded: value_head is %s in the checkpoint, %s here", ours["value_head"], config.value_head)
+        logger.warning(
+            "critic not loaded: value_head is %s in the checkpoint, %s here",
+            ours["value_head"],
+            config.value_head,
+        )
         return
     adapter.value_head.load_state_dict(load_file(file))

@@ -39,7 +39,11 @@ class Processing:
     """
 
     def __init__(
-        self, preprocessor: Any, postprocessor: Any, device: torch.device, rename_map: dict[str, str] | None = None
+        self,
+        preprocessor: Any,
+        postprocessor: Any,
+        device: torch.device,
+        rename_map: dict[str, str] | None = None,
     ) -> None:
         self.preprocessor, self.postprocessor = preprocessor, postprocessor
         self.device = device

@@ -48,14 +48,24 @@ class SmolVLAAdapter(PolicyAdapter):
     """
 
     def __init__(
-        self, policy: Any, processing: Processing, sampler: flow.FlowSamplerConfig, value_head: ValueHeadConfig
+        self,
+        policy: Any,
+        processing: Processing,
+        sampler: flow.FlowSamplerConfig,
+        value_head: ValueHeadConfig,
     ) -> None:
         super().__init__()
         config = policy.config
         if config.rtc_config is not None and config.rtc_config.enabled:
-            raise InputError("policy.rtc_config.enabled", True, "real-time chunking changes the sampler's density; turn it off")
+            raise InputError(
+                "policy.rtc_config.enabled",
+                True,
+                "real-time chunking changes the sampler's density; turn it off",
+            )
         if config.adapt_to_pi_aloha:
-            raise InputError("policy.adapt_to_pi_aloha", True, "not supported in RL; train a policy without it")
+            raise InputError(
+                "policy.adapt_to_pi_aloha", True, "not supported in RL; train a policy without it"
+            )
         self.policy = policy
         self.processing = processing
         self.sampler = sampler
@@ -92,7 +102,9 @@ class SmolVLAAdapter(PolicyAdapter):
             for i in range(len(requests))
         ]
 
-    def evaluate(self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]) -> Evaluation:
+    def evaluate(
+        self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
+    ) -> Evaluation:
         velocity, value = self._prefix(observations, tasks)
         latent = {k: v.to(self.device) for k, v in latent.items()}
         return Evaluation(
@@ -116,14 +128,20 @@ class SmolVLAAdapter(PolicyAdapter):
             RuntimeError: above `SELF_CHECK_TOLERANCE`, as after an incompatible LeRobot upgrade.
         """
         b = len(tasks)
-        noise = torch.randn(b, self.shape.chunk_size, self.shape.padded_dim, generator=torch.Generator().manual_seed(0))
+        noise = torch.randn(
+            b, self.shape.chunk_size, self.shape.padded_dim, generator=torch.Generator().manual_seed(0)
+        )
         x0 = noise.to(self.device)
-        stock = self.policy.predict_action_chunk(self.processing.prepare(observations, tasks), noise=x0.clone())
+        stock = self.policy.predict_action_chunk(
+            self.processing.prepare(observations, tasks), noise=x0.clone()
+        )
         with torch.no_grad():
             velocity, _ = self._prefix(observations, tasks)
             eps = x0[:, None].expand(-1, self.shape.num_steps, -1, -1)
             still = torch.zeros(b, dtype=torch.bool, device=self.device)
-            ours, _, _ = flow.sample(velocity, x0, eps, torch.zeros_like(still, dtype=torch.long), still, self.shape, self.sampler)
+            ours, _, _ = flow.sample(
+                velocity, x0, eps, torch.zeros_like(still, dtype=torch.long), still, self.shape, self.sampler
+            )
         self.policy.reset()
         difference = float((ours[..., : self.shape.action_dim] - stock).abs().max())
         if not difference <= SELF_CHECK_TOLERANCE:
@@ -135,7 +153,9 @@ class SmolVLAAdapter(PolicyAdapter):
             )
         return difference
 
-    def _prefix(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> tuple[flow.Velocity, Tensor]:
+    def _prefix(
+        self, observations: dict[str, np.ndarray], tasks: Sequence[str]
+    ) -> tuple[flow.Velocity, Tensor]:
         """Encodes observations; returns the velocity field conditioned on them and V (B,)."""
         from lerobot.policies.common.vla_utils import make_att_2d_masks
         from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
@@ -155,7 +175,9 @@ class SmolVLAAdapter(PolicyAdapter):
         )
 
         def velocity(x: Tensor, t: Tensor) -> Tensor:
-            return model.denoise_step(prefix_pad_masks=pad, past_key_values=cache, x_t=x, timestep=t.to(torch.float32))
+            return model.denoise_step(
+                prefix_pad_masks=pad, past_key_values=cache, x_t=x, timestep=t.to(torch.float32)
+            )
 
         return velocity, self.value_head(features, pad)
 
@@ -169,4 +191,8 @@ class SmolVLAAdapter(PolicyAdapter):
             eps.append(rng.standard_normal((n, *size), dtype=np.float32))
             index.append(rng.integers(n))
         to = self.device
-        return torch.from_numpy(np.stack(x0)).to(to), torch.from_numpy(np.stack(eps)).to(to), torch.tensor(index, device=to)
+        return (
+            torch.from_numpy(np.stack(x0)).to(to),
+            torch.from_numpy(np.stack(eps)).to(to),
+            torch.tensor(index, device=to),
+        )

@@ -13,10 +13,10 @@
 # limitations under the License.
 """The replay process: the door between collecting and learning.
 
-    consumes    segments from rollout workers
-    produces    batches of segments for the trainer
-    waits for   the pace: `insert` until rollouts are not too far ahead, `sample` until there is enough that is new
-    unblocked   by the other side, or by `close`
+consumes    segments from rollout workers
+produces    batches of segments for the trainer
+waits for   the pace: `insert` until rollouts are not too far ahead, `sample` until there is enough that is new
+unblocked   by the other side, or by `close`
 """
 
 from __future__ import annotations
@@ -84,6 +84,9 @@ class ReplayWorker:
     async def metrics(self) -> dict[str, float]:
         """Counters and seconds waited at either door; episodes since the last call as means."""
         episodes, self._episodes = self._episodes, []
-        means = {f"episode_{k}": float(np.mean([e[k] for e in episodes])) for k in (episodes[0] if episodes else {})}
+        means = {
+            f"episode_{k}": float(np.mean([e[k] for e in episodes]))
+            for k in (episodes[0] if episodes else {})
+        }
         waits = {"insert_wait_s": self._insert_wait_s, "sample_wait_s": self._sample_wait_s}
         return self._replay.metrics() | waits | means | {"episodes": float(len(episodes))}

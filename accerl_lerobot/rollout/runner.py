@@ -162,7 +162,9 @@ class RolloutRunner:
         result = self._filmed(state, decision.chunk) if plan.film else state.world.step_chunk(decision.chunk)
         self.counters.env_steps += result.steps
         self.counters.decisions += 1
-        if result.info.get("nonfinite") or not (np.isfinite(result.rewards).all() and _finite(result.observation)):
+        if result.info.get("nonfinite") or not (
+            np.isfinite(result.rewards).all() and _finite(result.observation)
+        ):
             self.counters.dropped_nonfinite += len(builder.decisions) + 1
             if not plan.explore:  # an evaluation counts every episode it planned
                 self._finish(state, plan, success=False)
@@ -201,11 +203,19 @@ class RolloutRunner:
     def _request(self, state: _Slot) -> Request:
         plan, builder = state.plan, state.builder
         assert plan is not None and builder is not None
-        seed = plan.seed * 1_000_003 + state.decisions  # one stream per (episode, decision), however requests are batched
+        seed = (
+            plan.seed * 1_000_003 + state.decisions
+        )  # one stream per (episode, decision), however requests are batched
         return Request(observation=builder.latest, noise_seed=seed, explore=plan.explore)
 
     def _emit(
-        self, state: _Slot, plan: EpisodePlan, builder: SegmentBuilder, terminated: bool, truncated: bool, success: bool
+        self,
+        state: _Slot,
+        plan: EpisodePlan,
+        builder: SegmentBuilder,
+        terminated: bool,
+        truncated: bool,
+        success: bool,
     ) -> None:
         self._sequence += 1
         episode = {}
@@ -238,4 +248,8 @@ class RolloutRunner:
 def _finite(observation: Observation | None) -> bool:
     if observation is None:
         return True
-    return all(np.isfinite(v).all() for v in observation.values() if isinstance(v, np.ndarray) and v.dtype.kind == "f")
+    return all(
+        np.isfinite(v).all()
+        for v in observation.values()
+        if isinstance(v, np.ndarray) and v.dtype.kind == "f"
+    )

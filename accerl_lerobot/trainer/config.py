@@ -57,7 +57,14 @@ class TrainerConfig:
     """CPU threads."""
 
     def __post_init__(self) -> None:
-        for name in ("updates", "batch_decisions", "micro_batch", "publish_every", "max_nonfinite", "num_threads"):
+        for name in (
+            "updates",
+            "batch_decisions",
+            "micro_batch",
+            "publish_every",
+            "max_nonfinite",
+            "num_threads",
+        ):
             if getattr(self, name) < 1:
                 raise InputError(f"trainer.{name}", getattr(self, name), "use at least 1")
         for name in ("lr", "value_lr"):
@@ -80,4 +87,6 @@ class TrainerConfig:
         if self.schedule == "constant":
             return 1.0
         done = (update - self.warmup_updates) / max(1, self.updates - self.warmup_updates)
-        return self.final_lr_share + (1 - self.final_lr_share) * 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
+        return self.final_lr_share + (1 - self.final_lr_share) * 0.5 * (
+            1 + math.cos(math.pi * min(1.0, done))
+        )

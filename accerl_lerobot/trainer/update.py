@@ -147,7 +147,9 @@ class Update:
     def _backward(self, batch: Batch) -> dict[str, float]:
         """Accumulates gradients over micro-batches; returns metrics weighted by their decisions."""
         n = len(batch.reward)
-        chunks = [np.arange(i, min(i + self.config.micro_batch, n)) for i in range(0, n, self.config.micro_batch)]
+        chunks = [
+            np.arange(i, min(i + self.config.micro_batch, n)) for i in range(0, n, self.config.micro_batch)
+        ]
         bootstrap = self._values(batch.last_observations, batch.segment_tasks)
         # With one micro-batch its own forward pass supplies the values that GAE needs.
         whole = len(chunks) == 1
@@ -158,7 +160,9 @@ class Update:
             latent = {k: v[rows] for k, v in batch.latent.items()}
             evaluation = self.adapter.evaluate(*_rows(batch, rows), latent)
             if targets is None:
-                targets = self._targets(batch, evaluation.value.detach().cpu() if values is None else values, bootstrap)
+                targets = self._targets(
+                    batch, evaluation.value.detach().cpu() if values is None else values, bootstrap
+                )
             device = evaluation.value.device
             output = compute_loss(
                 LossInputs(
@@ -177,7 +181,9 @@ class Update:
                 if name == "ratio_max_dev":
                     total[name] = max(total.get(name, 0.0), float(value))
                 else:
-                    total[name] = total.get(name, 0.0) + (float(value) if name == "decisions" else share * float(value))
+                    total[name] = total.get(name, 0.0) + (
+                        float(value) if name == "decisions" else share * float(value)
+                    )
         assert targets is not None
         return total | {"return_mean": float(targets[1].mean()), "reward_mean": float(batch.reward.mean())}
 
@@ -186,7 +192,12 @@ class Update:
         mask = decision_mask(batch.lengths, int(batch.lengths.max()))
         padded = [torch.zeros(mask.shape).masked_scatter(mask, x.float()) for x in (batch.reward, values)]
         advantages, returns = gae(
-            *padded, bootstrap, batch.terminated, batch.lengths, gamma=self.algorithm.gamma, lam=self.algorithm.lam
+            *padded,
+            bootstrap,
+            batch.terminated,
+            batch.lengths,
+            gamma=self.algorithm.gamma,
+            lam=self.algorithm.lam,
         )
         advantages = normalise(advantages, moments(advantages, mask), mask)
         return advantages[mask], returns[mask]

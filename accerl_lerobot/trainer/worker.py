@@ -13,10 +13,10 @@
 # limitations under the License.
 """The trainer process: the run's clock.
 
-    consumes    batches of segments from replay, the next one drawn while the current one is learned from
-    produces    weights, published every `publish_every` updates without waiting for anyone
-    waits for   a batch
-    ends        after `updates` updates, or when replay is closed
+consumes    batches of segments from replay, the next one drawn while the current one is learned from
+produces    weights, published every `publish_every` updates without waiting for anyone
+waits for   a batch
+ends        after `updates` updates, or when replay is closed
 """
 
 from __future__ import annotations
@@ -44,7 +44,9 @@ class TrainerWorker:
         seed: of torch's global generator.
     """
 
-    def __init__(self, policy: PolicyConfig, algorithm: AlgorithmConfig, config: TrainerConfig, seed: int) -> None:
+    def __init__(
+        self, policy: PolicyConfig, algorithm: AlgorithmConfig, config: TrainerConfig, seed: int
+    ) -> None:
         import torch
 
         from accerl_lerobot.policies.loading import load_adapter
