@@ -13,8 +13,8 @@
 # limitations under the License.
 """Checkpoints in LeRobot's layout, visible only when whole.
 
-``checkpoints/NNNNNN/pretrained_model`` holds what stock LeRobot loads; ``checkpoints/last`` points at the newest. A
-checkpoint is written under a temporary name and renamed, so that a reader never finds half of one.
+``checkpoints/NNNNNN/pretrained_model`` holds what stock LeRobot loads; ``checkpoints/last`` points at the
+newest. A checkpoint is written under a temporary name and renamed, so that a reader never finds half of one.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from typing import Any
 
 PRETRAINED = "pretrained_model"
 BACKBONE = "backbone"
-"""Folder beside the weights with the vision-language backbone's config and tokeniser, when they are local files."""
+"""Folder beside the weights with the vision-language backbone's config and tokeniser, when they are local."""
 
 
 def save_checkpoint(checkpoints: Path, write: Callable[[Path], int], state: dict[str, Any]) -> Path:
@@ -36,27 +36,30 @@ def save_checkpoint(checkpoints: Path, write: Callable[[Path], int], state: dict
 
     Args:
         checkpoints: the run's ``checkpoints`` folder.
-        write: fills the folder it is given with ``pretrained_model`` files and returns their version, the number of
-            updates behind them.
+        write: creates and fills the ``pretrained_model`` folder it is given and returns the version of what
+            it wrote, the number of updates behind it.
         state: plain JSON, stored as ``training_state/training_step.json``; ``step`` is added.
 
     Returns:
-        ``checkpoints/NNNNNN``, which may have existed already.
+        ``checkpoints/NNNNNN``, left as it is if that version has been saved before.
+
+    Raises:
+        Exception: whatever `write` raises; older checkpoints and ``last`` are as before.
     """
     checkpoints.mkdir(parents=True, exist_ok=True)
     temporary = checkpoints / f".writing-{os.getpid()}"
     shutil.rmtree(temporary, ignore_errors=True)
-    version = write(temporary / PRETRAINED)
-    final = checkpoints / f"{version:06d}"
-    relocate(temporary / PRETRAINED, final / PRETRAINED)
-    (temporary / "training_state").mkdir()
-    (temporary / "training_state" / "training_step.json").write_text(
-        json.dumps({"step": version, **state}, indent=2) + "\n"
-    )
-    if final.exists():  # the same version is the same weights
-        shutil.rmtree(temporary)
-    else:
-        temporary.rename(final)
+    try:
+        version = write(temporary / PRETRAINED)
+        final = checkpoints / f"{version:06d}"
+        if not final.exists():  # the same version is the same weights
+            relocate(temporary / PRETRAINED, final / PRETRAINED)
+            (temporary / "training_state").mkdir()
+            step = json.dumps({"step": version, **state}, indent=2)
+            (temporary / "training_state" / "training_step.json").write_text(step + "\n")
+            temporary.rename(final)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
     link = checkpoints / ".last-new"
     link.unlink(missing_ok=True)
     link.symlink_to(final.name)

@@ -13,7 +13,7 @@
 # limitations under the License.
 """The nouns that cross a process border.
 
-Shape letters: T decisions of a segment, K actions per chunk, A action dims, L log-prob factors of one decision.
+Shape letters: T decisions of a segment, K actions per chunk, A action dims, L log-prob factors of a decision.
 NumPy only: a rollout worker that imports this file stays free of torch and LeRobot.
 """
 
@@ -26,8 +26,8 @@ import numpy as np
 Observation = dict[str, np.ndarray | str]
 """One observation under LeRobot's feature names.
 
-``observation.images.<camera>`` uint8 (H, W, 3), ``observation.state`` float32 (S,), ``task`` the instruction text.
-Values are raw: scaling and normalisation belong to the policy's own LeRobot processors.
+``observation.images.<camera>`` uint8 (H, W, 3), ``observation.state`` float32 (S,), ``task`` the instruction
+text. Values are raw: scaling and normalisation belong to the policy's own LeRobot processors.
 """
 
 TASK = "task"
@@ -51,8 +51,8 @@ class Decision:
     """One policy call, as the inference service answers it.
 
     Example:
-        A rollout worker submits an observation, gets a ``Decision``, hands ``chunk`` to ``World.step_chunk`` and keeps
-        the rest for the segment. ``version`` says which weights decided.
+        A rollout worker submits an observation, gets a ``Decision``, hands ``chunk`` to ``World.step_chunk``
+        and keeps the rest for the segment. ``version`` says which weights decided.
     """
 
     chunk: np.ndarray
@@ -60,7 +60,8 @@ class Decision:
     latent: dict[str, np.ndarray]
     """What the policy actually sampled; `log_prob` is the density of this, in normalised action space."""
     log_prob: np.ndarray
-    """float32 (L,), one entry per factor (for a flow policy one per executed action); the chunk's is their sum."""
+    """float32 (L,), one entry per factor (for a flow policy one per row of the chunk that has a density); the
+    chunk's is their sum."""
     value: float
     """V(observation) by the critic of the same version."""
     version: int
@@ -71,14 +72,16 @@ class Decision:
 class Segment:
     """T consecutive decisions of one episode, plus the observation after the last one.
 
-    Exactly one of three things ends a segment: the episode `terminated` (bootstrap 0), it was `truncated` by the time
-    limit (bootstrap with V of the last observation), or neither, when the segment is cut in mid-episode (same bootstrap).
+    Exactly one of three things ends a segment: the episode `terminated` (bootstrap 0), it was `truncated` by
+    the time limit (bootstrap with V of the last observation), or neither, when the segment is cut in
+    mid-episode (same bootstrap).
     """
 
     observations: dict[str, np.ndarray]
     """Each (T + 1, ...) under LeRobot's names, without the task; the last row is the bootstrap observation.
 
-    After a termination no observation is rendered and the last row repeats the one before; it is never bootstrapped from.
+    After a termination no observation is rendered and the last row repeats the one before; it is never
+    bootstrapped from.
     """
     task: str
     latent: dict[str, np.ndarray]

@@ -13,8 +13,9 @@
 # limitations under the License.
 """Stock ``lerobot-train`` with the dataset's items kept in memory; same arguments, same items, same result.
 
-LeRobot 0.6.1 decodes every image of an action chunk to read the chunk's actions: 3.8 ms an item for a chunk of ten 64-pixel
-frames, several times what a tiny policy needs to learn from it. Items are remembered after their first read.
+LeRobot 0.6.1 decodes every image of an action chunk to read the chunk's actions: 3.8 ms an item for a chunk
+of ten 64-pixel frames, several times what a tiny policy needs to learn from it. Items are remembered after
+their first read.
 
 Run: ``python -m accerl_lerobot.demos.cached_train <lerobot-train arguments>``
 """
@@ -49,6 +50,8 @@ class CachedDataset(Dataset[Any]):
         return dict(item)
 
     def __getattr__(self, name: str) -> Any:
+        if name == "_dataset":  # not there yet while a loader process unpickles this object
+            raise AttributeError(name)
         return getattr(self._dataset, name)
 
 
@@ -64,14 +67,15 @@ def item_bytes(meta: Any) -> int:
 
 
 def main() -> None:
+    """Runs ``lerobot-train`` on the command line's arguments."""
     from lerobot.scripts import lerobot_train
 
     stock = lerobot_train.make_train_eval_datasets
 
     def cached(cfg: Any) -> tuple[Any, Any]:
         train, evaluation = stock(cfg)
-        fits = len(train) * item_bytes(train.meta) <= MAX_BYTES
-        if fits and not cfg.dataset.image_transforms.enable and not cfg.dataset.streaming:
+        fixed = not cfg.dataset.image_transforms.enable and not cfg.dataset.streaming
+        if fixed and len(train) * item_bytes(train.meta) <= MAX_BYTES:
             train = CachedDataset(train)
         return train, evaluation
 

@@ -13,8 +13,8 @@
 # limitations under the License.
 """Warm start: hands a LeRobotDataset to LeRobot's own trainer and returns a LeRobot checkpoint.
 
-The trainer is stock ``lerobot-train`` in a process of its own; the exact command is logged, so that anyone can repeat it
-without us.
+The trainer is stock ``lerobot-train`` in a process of its own; the exact command is logged, so that anyone
+can repeat it without us.
 """
 
 from __future__ import annotations
@@ -23,13 +23,15 @@ import json
 import logging
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from accerl_lerobot.checkpoint import BACKBONE, relocate
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.backbone import BackboneConfig, write_backbone
 
@@ -51,7 +53,7 @@ class SFTConfig:
     """Peak learning rate; LeRobot's preset warms up and decays it over `steps`."""
     warmup_steps: int = 20
     cache: bool = True
-    """Keep the dataset's items in memory (see `cached_train`); ignored above 4 GiB and with image transforms."""
+    """Keep the dataset's items in memory, see `cached_train`; not above 4 GiB nor with image transforms."""
     num_workers: int = 0
     """Data-loading processes; 0 loads in the trainer, which is what `cache` wants."""
     num_threads: int = 2
@@ -70,14 +72,21 @@ class SFTConfig:
             raise InputError("sft.steps", self.steps, "use 0 (skip) or more")
         if not 0 < self.lr < 1:
             raise InputError("sft.lr", self.lr, "use a value in (0, 1)")
-        if self.batch_size < 1:
-            raise InputError("sft.batch_size", self.batch_size, "use at least 1")
+        for name, least in (("batch_size", 1), ("warmup_steps", 0), ("num_workers", 0), ("num_threads", 1)):
+            if getattr(self, name) < least:
+                raise InputError(f"sft.{name}", getattr(self, name), f"use at least {least}")
         if self.init_path is None and "type" not in self.policy:
             raise InputError("sft.policy", self.policy, "name LeRobot's policy type, e.g. {type: smolvla}")
 
 
 def sft_command(
-    config: SFTConfig, repo_id: str, root: str | None, output_dir: Path, seed: int, device: str
+    config: SFTConfig,
+    repo_id: str,
+    root: str | None,
+    output_dir: Path,
+    seed: int,
+    device: str,
+    revision: str | None = None,
 ) -> list[str]:
     """The ``lerobot-train`` command line of this warm start."""
     fields: dict[str, Any]
@@ -94,6 +103,7 @@ def sft_command(
     command = [sys.executable, "-m", module]
     command += [f"--policy.{key}={_as_argument(value)}" for key, value in fields.items()]
     command += [f"--dataset.repo_id={repo_id}"] + ([f"--dataset.root={root}"] if root else [])
+    command += [f"--dataset.revision={revision}"] if revision else []
     command += [
         f"--output_dir={output_dir}",
         f"--steps={config.steps}",
@@ -118,15 +128,20 @@ def run_sft(
     device: str = "cpu",
     texts: Sequence[str] = (),
     on_step: Callable[[int, float], None] | None = None,
+    revision: str | None = None,
 ) -> Path:
     """Trains and returns the ``pretrained_model`` folder.
 
     Args:
+        config: what to train, and for how long.
         repo_id: dataset id, on the Hub or a label for `root`.
         root: local dataset folder, or None to use the Hub cache.
         output_dir: must not exist; its parent gets ``sft.log``.
+        seed: of LeRobot's trainer.
+        device: cpu or cuda.
         texts: the dataset's instructions, for a new backbone's tokeniser.
-        on_step: called with (step, loss) as progress is reported.
+        on_step: called with (step, loss) as progress is reported, from 1000 on rounded to thousands.
+        revision: Hub revision of the dataset.
 
     Raises:
         InputError: `output_dir` exists.
@@ -137,7 +152,8 @@ def run_sft(
     output_dir.parent.mkdir(parents=True, exist_ok=True)
     if config.init_path is None and config.backbone is not None:
         write_backbone(output_dir.parent / "backbone", config.backbone, texts)
-    command = sft_command(config, repo_id, root, output_dir, seed, device)
+    config = _with_backbone_in_place(config, output_dir.parent / "init")
+    command = sft_command(config, repo_id, root, output_dir, seed, device, revision)
     logger.info("%s", shlex.join(command))
     environment = os.environ | {
         "OMP_NUM_THREADS": str(config.num_threads),
@@ -145,25 +161,44 @@ def run_sft(
         "TOKENIZERS_PARALLELISM": "false",
     }
     log = output_dir.parent / "sft.log"
-    with log.open("w") as file:
-        process = subprocess.Popen(
+    with (
+        log.open("w") as file,
+        subprocess.Popen(
             command,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
             env=environment,
             errors="replace",
-        )
-        assert process.stdout is not None
-        for line in process.stdout:
-            file.write(line)
-            if on_step is not None and (parsed := _parse_progress(line)):
-                on_step(*parsed)
-        code = process.wait()
+        ) as process,
+    ):
+        try:
+            assert process.stdout is not None
+            for line in process.stdout:
+                file.write(line)
+                if on_step is not None and (parsed := _parse_progress(line)):
+                    on_step(*parsed)
+        except BaseException:
+            process.terminate()  # nobody reads on: it must not train alone
+            raise
+    code = process.returncode
     if code != 0:
         tail = "".join(log.read_text().splitlines(keepends=True)[-15:])
         raise RuntimeError(f"lerobot-train ended with exit code {code}; the end of {log}:\n{tail}")
     return output_dir / "checkpoints" / "last" / "pretrained_model"
+
+
+def _with_backbone_in_place(config: SFTConfig, copy: Path) -> SFTConfig:
+    """Starts from a copy where the checkpoint's own backbone is no longer where its files say it is."""
+    start = Path(config.init_path or "").expanduser()
+    if config.init_path is None or not (start / BACKBONE).is_dir():
+        return config
+    stored = json.loads((start / "config.json").read_text()).get("vlm_model_name")
+    if stored is not None and Path(stored).is_dir():
+        return config
+    shutil.copytree(start, copy)
+    relocate(copy, copy)
+    return replace(config, init_path=str(copy))
 
 
 def _as_argument(value: Any) -> str:
@@ -177,7 +212,8 @@ def _parse_progress(line: str) -> tuple[int, float] | None:
         return None
     try:
         step = fields["step"]
-        number = float(step[:-1]) * 1000 if step.endswith("K") else float(step)
+        scale = {"K": 1_000, "M": 1_000_000}.get(step[-1:], 1)
+        number = float(step if scale == 1 else step[:-1]) * scale
         return int(number), float(fields["loss"])
     except ValueError:
         return None

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Opens a LeRobotDataset's metadata and refuses what a world's policy could not be trained on, before any long work."""
+"""Opens a LeRobotDataset's metadata and refuses, before any long work, what does not fit a world."""
 
 from __future__ import annotations
 
@@ -33,14 +33,22 @@ def open_metadata(dataset: DatasetConfig) -> Any:
     from pathlib import Path
 
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from lerobot.datasets.utils import CompatibilityError
 
+    if dataset.repo_id is None:
+        raise InputError(
+            "dataset.repo_id", None, "name a LeRobotDataset; with dataset.root any label will do"
+        )
     if dataset.root is not None and not (Path(dataset.root) / "meta" / "info.json").is_file():
         raise InputError(
             "dataset.root", dataset.root, "no meta/info.json there; give the folder of a LeRobotDataset v3"
         )
     try:
         return LeRobotDatasetMetadata(dataset.repo_id, root=dataset.root, revision=dataset.revision)
-    except (OSError, FileNotFoundError, ConnectionError, ValueError) as error:
+    except CompatibilityError as error:
+        remedy = "its format is another LeRobot version's; convert it as LeRobot's message says"
+        raise InputError("dataset.repo_id", dataset.repo_id, remedy) from error
+    except (OSError, ValueError) as error:
         first = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(
             "dataset.repo_id", dataset.repo_id, f"not found locally nor on the Hub ({first})"
@@ -66,7 +74,7 @@ def check_dataset(dataset: DatasetConfig, env: EnvConfig, rename_map: dict[str, 
     wanted = {"observation.state": (spec.state_dim,), "action": (spec.action_dim,)}
     for key, shape in wanted.items():
         if shapes.get(key) != shape:
-            remedy = f"{key} has shape {shapes.get(key)} in the dataset and {shape} in the world; they must be equal"
+            remedy = f"{key} has shape {shapes.get(key)} here and {shape} in the world; they must be equal"
             raise InputError("dataset.repo_id", dataset.repo_id, remedy)
     return meta
 

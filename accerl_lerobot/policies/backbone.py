@@ -13,9 +13,9 @@
 # limitations under the License.
 """A vision-language backbone of any size, with random weights, written offline.
 
-SmolVLA reads its backbone's architecture and tokeniser from a model directory. For policies small enough to train on a
-laptop this writes such a directory: SmolVLM's own classes, shrunk, with a byte-level tokeniser, so that the policy is
-LeRobot's `SmolVLAPolicy` on the same code path as ``lerobot/smolvla_base``.
+SmolVLA reads its backbone's architecture and tokeniser from a model directory. For policies small enough to
+train on a laptop this writes such a directory: SmolVLM's own classes, shrunk, with a byte-level tokeniser, so
+that the policy is LeRobot's `SmolVLAPolicy` on the same code path as ``lerobot/smolvla_base``.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ def write_backbone(directory: Path, config: BackboneConfig, texts: Sequence[str]
     Args:
         directory: created if need be.
         config: the sizes.
-        texts: instructions the tokeniser merges bytes on, so that they become a few tokens instead of one per byte; any
-            other text still encodes, byte by byte.
+        texts: instructions the tokeniser merges bytes on, so that they become a few tokens instead of one per
+            byte; any other text still encodes, byte by byte.
 
     Returns:
         `directory`.

@@ -13,8 +13,8 @@
 # limitations under the License.
 """What the engine needs of a policy: π(chunk | observation) with a density, and V(observation).
 
-An adapter wraps one LeRobot policy with its processors. `decide` acts, `evaluate` re-scores what was stored; both run
-the same code on the same weights, so the ratio at equal weights is 1.
+An adapter wraps one LeRobot policy with its processors. `decide` acts, `evaluate` re-scores what was stored;
+both run the same code on the same weights, so the ratio at equal weights is 1.
 """
 
 from __future__ import annotations
@@ -30,9 +30,13 @@ from torch import Tensor, nn
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Decision, Request
+from accerl_lerobot.policies.processing import Processing
+from accerl_lerobot.policies.value_head import ValueHead
 
 if TYPE_CHECKING:
     from accerl_lerobot.envs.base import WorldSpec
+
+OBS_STATE = "observation.state"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +56,9 @@ class PolicyAdapter(nn.Module, ABC):
 
     policy: Any
     """The LeRobot policy; holds the weights that are exported."""
+    processing: Processing
+    """The policy's LeRobot processors."""
+    value_head: ValueHead
     device: torch.device
 
     @abstractmethod
@@ -78,24 +85,33 @@ class PolicyAdapter(nn.Module, ABC):
     def trainable(self) -> dict[str, nn.Parameter]:
         """The parameters the trainer updates and publishes, critic included, by name."""
 
+    @abstractmethod
+    def self_check(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> float:
+        """Largest difference between this adapter's sampler without exploration and LeRobot's own.
+
+        Raises:
+            RuntimeError: they are different samplers, as after an incompatible LeRobot upgrade.
+        """
+
     def load_trainable(self, tensors: dict[str, np.ndarray]) -> None:
-        """Copies published weights in place.
+        """Copies published weights in place: all of them, or none when they do not fit.
 
         Raises:
             ValueError: names or shapes differ from `trainable`.
         """
         parameters = self.trainable()
         if parameters.keys() != tensors.keys():
-            raise ValueError(
-                f"published weights differ by name: {sorted(parameters.keys() ^ tensors.keys())[:4]}"
-            )
+            names = sorted(parameters.keys() ^ tensors.keys())[:4]
+            raise ValueError(f"published weights differ by name: {names}")
+        for name, parameter in parameters.items():
+            if tuple(parameter.shape) != tensors[name].shape:
+                raise ValueError(
+                    f"published {name} has shape {tensors[name].shape}, not {tuple(parameter.shape)}"
+                )
         with torch.no_grad():
             for name, parameter in parameters.items():
-                if tuple(parameter.shape) != tensors[name].shape:
-                    raise ValueError(
-                        f"published {name} has shape {tensors[name].shape}, not {tuple(parameter.shape)}"
-                    )
-                parameter.copy_(torch.from_numpy(tensors[name]))
+                # A copy first: arrays out of Ray's store are read-only, which torch cannot express.
+                parameter.copy_(torch.tensor(tensors[name]))
 
     def export_trainable(self) -> dict[str, np.ndarray]:
         """A copy of `trainable` as NumPy arrays, safe to hand to another thread."""
@@ -113,26 +129,34 @@ def check_fit(policy_config: Any, spec: WorldSpec, rename_map: dict[str, str]) -
     """Refuses a policy that cannot act in a world, before anything is started.
 
     Raises:
-        InputError: a camera is missing, or state or action sizes differ.
+        InputError: a camera is missing, `rename_map` names a feature the world does not have, or state or
+            action sizes differ.
     """
-    offered = {rename_map.get(k, k): k for k in spec.images}
-    wanted = [k for k in policy_config.image_features if ".empty_camera_" not in k]
-    missing = [k for k in wanted if k not in offered]
+    unknown = sorted(rename_map.keys() - spec.images.keys() - {OBS_STATE})
+    if unknown:
+        names = ", ".join([*spec.images, OBS_STATE])
+        raise InputError("policy.rename_map", unknown[0], f"the world has no such feature; it offers {names}")
+    offered = [rename_map.get(key, key) for key in spec.images]
+    missing = [k for k in policy_config.image_features if ".empty_camera_" not in k and k not in offered]
     if missing:
         raise InputError(
-            "policy.path", missing[0],
-            f"the policy wants this camera but the world offers {', '.join(offered) or 'none'}; "
-            "choose env.camera accordingly or map names with --policy.rename_map",
-        )  # fmt: skip
+            "policy.path",
+            missing[0],
+            f"the policy wants this camera but the world offers {', '.join(offered) or 'none'}; choose "
+            "env.camera accordingly or map the world's name to the policy's with policy.rename_map",
+        )
+    remedy = "choose a policy trained in this world, or the world it was trained in"
     state = policy_config.robot_state_feature
     if state is not None and tuple(state.shape) != (spec.state_dim,):
         raise InputError(
             "policy.path",
             tuple(state.shape),
-            f"the world's observation.state has ({spec.state_dim},) entries",
+            f"the policy's observation.state has this shape, the world's ({spec.state_dim},); {remedy}",
         )
     action = tuple(policy_config.action_feature.shape)
     if action != (spec.action_dim,):
         raise InputError(
-            "policy.path", action, f"the policy's action size differs from the world's ({spec.action_dim},)"
+            "policy.path",
+            action,
+            f"the policy's action has this shape, the world's ({spec.action_dim},); {remedy}",
         )

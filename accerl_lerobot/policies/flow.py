@@ -11,28 +11,32 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""The flow family's likelihood: a denoising path whose density is known, from a velocity field that has none.
+"""The flow family's likelihood: a denoising path whose density is known, from a velocity without one.
 
-A flow policy integrates x from t = 1 (noise) to t = 0 (action) in N Euler steps of δ = 1/N: x ← x − δ·v(x, t). That map
-has no usable density, so exploration makes some steps Gaussian and the log-prob is that of the path. Which steps:
+A flow policy integrates x from t = 1 (noise) to t = 0 (action) in N Euler steps of δ = 1/N:
+x ← x − δ·v(x, t). That map has no usable density, so exploration makes some steps Gaussian and the log-prob
+is that of the path. Which steps:
 
-``last``  Every step but the last is the stock ODE; the last one adds N(0, s²). Given the initial noise x₀, whose
-          density does not depend on the weights, the executed action is exactly N(G_θ(x₀), s²). Padded action dims and
-          rows that are not executed are never fed back after the last step, so leaving them out marginalises them
-          exactly. Re-scoring replays the ODE from x₀: N velocity passes.
-``all``   Every step is Gaussian; the path density is the sum over steps (Flow-GRPO, arXiv 2505.05470; πRL, arXiv
-          2510.25889). Exact as well; N velocity passes. Padded dims feed back into real ones, so they belong to the
-          density: see `FlowSamplerConfig.padded`.
-``one``   One randomly drawn step is Gaussian, the rest ODE, and re-scoring takes its start point as given: one
-          velocity pass (the "mixed ODE-SDE" of MixGRPO, arXiv 2507.21802, and of πRL). The steps around the drawn one
-          move with the weights and are left out of the ratio, so importance weights are exact for the drawn transition
-          only. Cheap for large models; the ratio is still 1 at equal weights.
+``last``  Every step but the last is the stock ODE; the last one adds N(0, s²). Given the initial noise x₀,
+          whose density does not depend on the weights, the executed action is exactly N(G_θ(x₀), s²). Padded
+          action dims and rows that are not executed are never fed back after the last step, so leaving them
+          out marginalises them exactly. Re-scoring replays the ODE from x₀: N velocity passes.
+``all``   Every step is Gaussian; the path density is the sum over steps (Flow-GRPO, arXiv 2505.05470; πRL,
+          arXiv 2510.25889). Exact as well; N velocity passes. Padded dims feed back into real ones, so they
+          belong to the density: see `FlowSamplerConfig.padded`.
+``one``   One randomly drawn step is Gaussian, the rest ODE, and re-scoring takes its start point as given:
+          one velocity pass (the "mixed ODE-SDE" of MixGRPO, arXiv 2507.21802, and of πRL). The steps around
+          the drawn one move with the weights too but are left out of the ratio, so weighting with it gives
+          the policy in which *only* the drawn transition is new: E_μ[ρ f(a)] is that policy's E[f(a)], not
+          π's. Cheap for large models; the ratio is still 1 at equal weights.
 
-Two noise laws, `FlowSamplerConfig.noise`: ``euler`` keeps the ODE's mean and adds a constant std, so that the executed
-mean is the stock action; ``flow_sde`` scales the noise with t and corrects the drift so that the marginals of the ODE are
-preserved. Everything here is a pure function of tensors; the velocity comes as a callable.
+Two noise laws, `FlowSamplerConfig.noise`: ``euler`` keeps the ODE's mean and adds a constant std, so that the
+executed mean is the stock action; ``flow_sde`` scales the noise with t and corrects the drift so that the
+marginals of the ODE are preserved. Everything here is a pure function of tensors; the velocity is a callable.
 
-Shapes: B batch, K actions per chunk, D = max_action_dim (real dims first, then padding), A real dims, N steps.
+Shapes: B batch, K actions per chunk, D = max_action_dim (real dims first, then padding), A real dims,
+N steps, L log-prob factors: one per executed row under ``last``; one per row otherwise, since all rows feed
+back.
 """
 
 from __future__ import annotations
@@ -54,18 +58,19 @@ LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 
 @dataclass(frozen=True, kw_only=True)
 class FlowSamplerConfig:
-    """How a flow policy explores; saved with every checkpoint, since a stored latent means nothing without it."""
+    """How a flow policy explores; saved with checkpoints, since a stored latent means nothing without it."""
 
     stochastic: str = "last"
     """Which denoising steps are Gaussian: last, all or one."""
     noise: str = "euler"
     """euler (stock mean, constant std) or flow_sde (marginal-preserving, std grows with t)."""
     noise_level: float = 0.2
-    """euler: total injected std in normalised action units, (0, 2]. flow_sde: the factor a of σ_t = a·√(t/(1−t))."""
+    """(0, 2]. euler: total injected std in normalised action units. flow_sde: the factor a of
+    σ_t = a·√(t/(1−t))."""
     padded: str = "joint"
-    """Padded action dims under ``all`` and ``one``: joint (noise in them, counted in the density; the stock sampler as
-    noise → 0) or analytic (overwritten by t·ε_pad after every step: exact given ε_pad and free of untrained
-    velocities' variance, but not the stock sampler). Without effect under ``last``."""
+    """Padded action dims under ``all`` and ``one``: joint (noise in them, counted in the density; the stock
+    sampler as noise → 0) or analytic (overwritten by t·ε_pad after every step: exact given ε_pad and free of
+    untrained velocities' variance, but not the stock sampler). Without effect under ``last``."""
 
     def __post_init__(self) -> None:
         choices = {
@@ -106,8 +111,13 @@ class FlowShape:
         return mask
 
 
-def step_time(k: Tensor | int, num_steps: int) -> Tensor | float:
-    """t at the start of denoising step k ∈ [0, N), as LeRobot's Euler loop counts it."""
+def factors(shape: FlowShape, config: FlowSamplerConfig) -> int:
+    """L. Rows without a density are left out: as constant factors they would dilute means over factors."""
+    return shape.executed if config.stochastic == "last" else shape.chunk_size
+
+
+def step_time(k: int, num_steps: int) -> float:
+    """t at the start of denoising step k ∈ [0, N], as LeRobot's Euler loop counts it, in double precision."""
     return 1.0 + k * (-1.0 / num_steps)
 
 
@@ -160,7 +170,7 @@ def sample(
         explore: (B,) bool; False samples take the stock path, equal to LeRobot's sampler.
 
     Returns:
-        x_N (B, K, D); the latent that `log_prob` re-scores; its log-prob (B, K), zero where not exploring.
+        x_N (B, K, D); the latent that `log_prob` re-scores; its log-prob (B, L), zero where not exploring.
     """
     n = shape.num_steps
     mask = shape.action_mask().to(x0.device)
@@ -180,19 +190,21 @@ def sample(
         logp = logp + torch.where(noisy[:, None], counted, 0.0)
         x = step
         path.append(x)
-    return x, _latent(path, index, config), logp
+    return x, _latent(path, index, config), logp[:, : factors(shape, config)]
 
 
 def log_prob(
     velocity: Velocity, latent: dict[str, Tensor], shape: FlowShape, config: FlowSamplerConfig
 ) -> Tensor:
-    """Log-density of stored latents under the current velocity field, (B, K), differentiable."""
+    """Log-density of stored latents under the current velocity field, (B, L), differentiable."""
     path, n = latent["path"], shape.num_steps
     b = path.shape[0]
     mask = shape.action_mask().to(path.device)
     if config.stochastic == "one":
         index = latent["index"]
-        t = step_time(index.to(path.dtype), n)
+        # Gathered, not computed from `index`: single-precision arithmetic would differ from `step_time` in
+        # the last bit, which a sinusoidal time embedding of period 4e-3 turns into a log-prob error of 1e-4.
+        t = path.new_tensor([step_time(k, n) for k in range(n)])[index]
         mean, std = transition(path[:, 0], velocity(path[:, 0], t), t, shape, config)
         # The last step's density covers executed entries only; earlier ones feed back, so all of them count.
         rows = torch.stack([_counted(k, mask, shape, config) for k in range(n)])[index]
@@ -203,7 +215,7 @@ def log_prob(
             x = x + (-1.0 / n) * velocity(x, x.new_full((b,), step_time(k, n)))
         t = x.new_full((b,), step_time(n - 1, n))
         mean, std = transition(x, velocity(x, t), t, shape, config)
-        return gaussian_log_prob(path[:, 1], mean, std, mask)
+        return gaussian_log_prob(path[:, 1], mean, std, mask)[:, : factors(shape, config)]
     total = path.new_zeros(b, shape.chunk_size)
     for k in range(n):
         t = path.new_full((b,), step_time(k, n))
@@ -213,7 +225,7 @@ def log_prob(
 
 
 def entropy(latent: dict[str, Tensor], shape: FlowShape, config: FlowSamplerConfig) -> Tensor:
-    """Differential entropy (B,) of the Gaussian steps that were drawn; the stds do not depend on the weights."""
+    """Differential entropy (B,) of the Gaussian steps that were drawn; the weights do not change it."""
     path, n = latent["path"], shape.num_steps
     b = path.shape[0]
     mask = shape.action_mask().to(path.device)

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""LeRobot's own processors around a batch of raw observations: they hold the tokeniser and the normalisation."""
+"""LeRobot's own processors around raw observations: they hold the tokeniser and the normalisation."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ IMAGES = "observation.images."
 class Processing:
     """A policy's pre- and post-processor, fed with what worlds observe.
 
-    Only observations and tasks pass through: a LeRobot preprocessor silently drops keys it does not know, so log-probs,
-    rewards and versions travel beside it.
+    Only observations and tasks pass through: a LeRobot preprocessor silently drops keys it does not know, so
+    log-probs, rewards and versions travel beside it.
 
     Args:
         preprocessor: LeRobot's `PolicyProcessorPipeline` for inputs.

@@ -13,8 +13,8 @@
 # limitations under the License.
 """SmolVLA as a stochastic policy: prefix once, then denoising steps against its key-value cache.
 
-Touches LeRobot internals (`embed_prefix`, `vlm_with_expert.forward`, `denoise_step`), so `self_check` compares the
-hand-driven sampler with the installed LeRobot's own at start-up.
+Touches LeRobot internals (`embed_prefix`, `vlm_with_expert.forward`, `denoise_step`), so `self_check`
+compares the hand-driven sampler with the installed LeRobot's own whenever a policy is loaded.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from accerl_lerobot.policies.processing import Processing
 from accerl_lerobot.policies.value_head import ValueHead, ValueHeadConfig
 
 SELF_CHECK_TOLERANCE = 1e-5
-"""Largest difference, in normalised action units, accepted between our ODE and LeRobot's; fp32 noise is 1e-6."""
+"""Largest difference, in normalised action units, between our ODE and LeRobot's; fp32 noise is 1e-6."""
 
 
 class SmolVLAAdapter(PolicyAdapter):
@@ -66,6 +66,12 @@ class SmolVLAAdapter(PolicyAdapter):
             raise InputError(
                 "policy.adapt_to_pi_aloha", True, "not supported in RL; train a policy without it"
             )
+        if config.compile_model:
+            raise InputError(
+                "policy.compile_model",
+                True,
+                "a compiled sampler rounds unlike the re-scoring pass; set it to false in config.json",
+            )
         self.policy = policy
         self.processing = processing
         self.sampler = sampler
@@ -82,6 +88,7 @@ class SmolVLAAdapter(PolicyAdapter):
         self.policy.eval()
 
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
+        """See the base class; each decision's noise is its own request's, whatever batch it lands in."""
         arrays, tasks = stack_observations(requests)
         x0, eps, index = self._noise(requests)
         explore = torch.tensor([r.explore for r in requests], device=self.device)
@@ -105,6 +112,7 @@ class SmolVLAAdapter(PolicyAdapter):
     def evaluate(
         self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
     ) -> Evaluation:
+        """See the base class."""
         velocity, value = self._prefix(observations, tasks)
         latent = {k: v.to(self.device) for k, v in latent.items()}
         return Evaluation(
@@ -115,9 +123,11 @@ class SmolVLAAdapter(PolicyAdapter):
 
     @torch.no_grad()
     def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
+        """See the base class."""
         return self._prefix(observations, tasks)[1]
 
     def trainable(self) -> dict[str, nn.Parameter]:
+        """See the base class; what LeRobot's config freezes stays frozen."""
         named = {f"policy.{k}": p for k, p in self.policy.named_parameters() if p.requires_grad}
         return named | {f"value_head.{k}": p for k, p in self.value_head.named_parameters()}
 
@@ -125,32 +135,24 @@ class SmolVLAAdapter(PolicyAdapter):
         """Largest difference between our σ = 0 sampler and LeRobot's `predict_action_chunk` on equal noise.
 
         Raises:
-            RuntimeError: above `SELF_CHECK_TOLERANCE`, as after an incompatible LeRobot upgrade.
+            RuntimeError: above `SELF_CHECK_TOLERANCE`, or LeRobot's internals have changed.
         """
-        b = len(tasks)
-        noise = torch.randn(
-            b, self.shape.chunk_size, self.shape.padded_dim, generator=torch.Generator().manual_seed(0)
-        )
-        x0 = noise.to(self.device)
-        stock = self.policy.predict_action_chunk(
-            self.processing.prepare(observations, tasks), noise=x0.clone()
-        )
-        with torch.no_grad():
-            velocity, _ = self._prefix(observations, tasks)
-            eps = x0[:, None].expand(-1, self.shape.num_steps, -1, -1)
-            still = torch.zeros(b, dtype=torch.bool, device=self.device)
-            ours, _, _ = flow.sample(
-                velocity, x0, eps, torch.zeros_like(still, dtype=torch.long), still, self.shape, self.sampler
-            )
+        size = (len(tasks), self.shape.chunk_size, self.shape.padded_dim)
+        x0 = torch.randn(size, generator=torch.Generator().manual_seed(0)).to(self.device)
+        still = torch.zeros(len(tasks), dtype=torch.bool, device=self.device)
+        eps, index = x0[:, None].expand(-1, self.shape.num_steps, -1, -1), still.long()
+        try:
+            batch = self.processing.prepare(observations, tasks)
+            stock = self.policy.predict_action_chunk(batch, noise=x0.clone())
+            with torch.no_grad():
+                velocity, _ = self._prefix(observations, tasks)
+                ours, _, _ = flow.sample(velocity, x0, eps, index, still, self.shape, self.sampler)
+        except (AttributeError, ImportError, KeyError, TypeError) as error:
+            raise _incompatible(f"cannot drive it ({type(error).__name__}: {error})") from error
         self.policy.reset()
         difference = float((ours[..., : self.shape.action_dim] - stock).abs().max())
         if not difference <= SELF_CHECK_TOLERANCE:
-            import lerobot
-
-            raise RuntimeError(
-                f"our SmolVLA sampler differs from LeRobot {lerobot.__version__}'s by {difference:.2e}: log-probs would be "
-                "those of another policy; install the LeRobot version pinned in pyproject.toml"
-            )
+            raise _incompatible(f"differs from its sampler by {difference:.2e}")
         return difference
 
     def _prefix(
@@ -196,3 +198,12 @@ class SmolVLAAdapter(PolicyAdapter):
             torch.from_numpy(np.stack(eps)).to(to),
             torch.tensor(index, device=to),
         )
+
+
+def _incompatible(what: str) -> RuntimeError:
+    import lerobot
+
+    return RuntimeError(
+        f"our SmolVLA adapter does not fit LeRobot {lerobot.__version__}: it {what}, so log-probs would be "
+        "those of another policy; install the LeRobot version that this package pins"
+    )
