@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import logging
 import os
@@ -42,16 +43,30 @@ def usage() -> str:
     lines = [
         f"accerl {__version__}: online reinforcement learning of LeRobot policies",
         "",
-        "usage: accerl VERB [--room.field=value …]",
+        "usage: accerl VERB [recipe.yaml] [--room.field=value …]",
         "",
     ]
     lines += [f"  {verb:8} {what}" for verb, (_, what) in VERBS.items()]
     lines += [
         "",
+        "examples:",
+        "  accerl doctor recipes/quickstart.yaml",
         "  accerl train --config_path=recipes/quickstart.yaml --trainer.lr=1e-5",
-        "  accerl VERB --help lists a verb's fields",
+        "  accerl eval --config_path=RUN/config.yaml --policy.path=RUN/checkpoints/last/pretrained_model",
+        "",
+        "accerl VERB --help lists the verb's fields. ACCERL_LOG=INFO says more.",
     ]
     return "\n".join(lines)
+
+
+def show_help(verb: str) -> int:
+    """``accerl VERB --help``."""
+    from accerl_lerobot.field_help import help_text
+    from accerl_lerobot.verbs import CONFIGS
+
+    name = "bench world" if verb == "bench" else verb
+    sys.stdout.write(help_text(name, CONFIGS[verb], VERBS[verb][1]) + "\n")
+    return 0
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -65,19 +80,24 @@ def main(arguments: list[str] | None = None) -> int:
         return 0
     verb, rest = arguments[0], arguments[1:]
     if verb not in VERBS:
-        sys.stderr.write(f"accerl: no verb {verb!r}; use one of {', '.join(VERBS)}\n")
+        near = difflib.get_close_matches(verb, VERBS, n=1)
+        hint = f"did you mean {near[0]}? Otherwise " if near else ""
+        sys.stderr.write(f"accerl: no verb {verb!r}; {hint}use one of {', '.join(VERBS)}\n")
         return 2
     logging.basicConfig(
         level=os.environ.get("ACCERL_LOG", "WARNING"), format="%(levelname)s %(name)s: %(message)s"
     )
     module, _, name = VERBS[verb][0].partition(":")
     try:
+        if "-h" in rest or "--help" in rest:
+            return show_help(verb)
         function: Callable[[list[str]], int] = getattr(
             importlib.import_module(f"accerl_lerobot.{module}"), name
         )
         return function(rest)
     except InputError as error:
-        sys.stderr.write(f"accerl: {error}\n")
+        # Ray raises a subclass whose text is a whole traceback; the error itself is inside.
+        sys.stderr.write(f"accerl: {getattr(error, 'cause', error)}\n")
         return 2
     except KeyboardInterrupt:
         sys.stderr.write("accerl: interrupted\n")

@@ -13,16 +13,14 @@
 # limitations under the License.
 """A run is one dataclass per room, composed, checked and saved beside the results.
 
-YAML through ``--config_path``, any field through ``--room.field=value``, as in LeRobot. Nothing is filled in later.
+YAML through ``--config_path``, any field through ``--room.field=value``, as in LeRobot. Nothing is filled in
+later. Each room's config stands beside the class it configures; what concerns two rooms is checked here.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
-
-import draccus
 
 from accerl_lerobot.algorithms import AlgorithmConfig, GIPOConfig
 from accerl_lerobot.demos.record import DemosConfig
@@ -32,10 +30,13 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.metrics import WandBConfig
+from accerl_lerobot.parsing import decode, encode, parse
 from accerl_lerobot.policies.loading import PolicyConfig
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
+
+__all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "check_chunk", "decode", "encode", "parse"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,13 +50,19 @@ class DatasetConfig:
     revision: str | None = None
     """Hub revision."""
 
+    def __post_init__(self) -> None:
+        if self.root is not None and self.repo_id is None:
+            raise InputError(
+                "dataset.repo_id", None, "name the dataset in dataset.root; any owner/name will do"
+            )
+
 
 @dataclass(frozen=True, kw_only=True)
 class LaunchConfig:
     """Where the workers run."""
 
     engine: str = "ray"
-    """ray: asynchronous workers. local: the same parts in one process, deterministic, for tests and debugging."""
+    """ray: asynchronous workers. local: the same parts in one process, deterministic, for tests."""
     stall_s: float = 300.0
     """A run in which nothing at all moved for so many seconds ends with an error; > 0."""
 
@@ -70,8 +77,8 @@ class LaunchConfig:
 class RunConfig:
     """Everything one run needs.
 
-    The start is one of: ``policy.path`` (a LeRobot checkpoint); ``sft`` on ``dataset``; ``sft`` on demonstrations that the
-    run records itself with ``demos``.
+    The start is one of: ``policy.path`` (a LeRobot checkpoint); ``sft`` on ``dataset``; ``sft`` on
+    demonstrations that the run records itself with ``demos``.
     """
 
     seed: int = 0
@@ -79,6 +86,7 @@ class RunConfig:
     output_dir: str | None = None
     """Folder of the run; must not exist. None: ``outputs/<date>/<time>_<job_name>``."""
     job_name: str = "run"
+    """Last part of the folder's name."""
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     demos: DemosConfig = field(default_factory=DemosConfig)
@@ -100,52 +108,34 @@ class RunConfig:
             raise InputError("seed", self.seed, "use 0 to 99")
         if self.save_every_updates < 0:
             raise InputError("save_every_updates", self.save_every_updates, "use 0 (only at the end) or more")
+        if self.demos.seed:
+            raise InputError(
+                "demos.seed", self.demos.seed, "a run's demonstrations take its own seed; use --seed"
+            )
         if self.policy.path is not None and self.sft.steps:
-            remedy = "give either a checkpoint to improve or an SFT that makes one; sft.init_path fine-tunes a checkpoint"
+            remedy = "add --sft.steps=0 to improve this checkpoint, or fine-tune it first with sft.init_path"
             raise InputError("policy.path", self.policy.path, remedy)
+        if self.sft.steps and self.sft.init_path is None:
+            check_chunk(self.sft.policy)
         if self.trainer.updates:
             self.replay.check(
                 batch_decisions=self.trainer.batch_decisions, segment_decisions=self.rollout.segment_length
             )
 
 
-def parse(config_class: type[Any], arguments: list[str]) -> Any:
-    """Parses ``--config_path=…`` and overrides into a config.
+def check_chunk(policy: dict[str, Any]) -> None:
+    """Refuses sizes in ``sft.policy`` that no LeRobot policy can have.
+
+    Args:
+        policy: fields of a LeRobot policy config; LeRobot itself checks the others, see `preflight`.
 
     Raises:
-        InputError: an unknown key, a value of the wrong type, or one out of range; names the field.
+        InputError: a size is not a whole number above 0, or more is executed than predicted.
     """
-    try:
-        path = None
-        rest = []
-        for argument in arguments:
-            key, _, value = argument.partition("=")
-            if key == "--config_path":
-                path = Path(value)
-                if not path.is_file():
-                    raise InputError("config_path", value, "no such file; see recipes/")
-            else:
-                rest.append(argument)
-        return draccus.parse(config_class, config_path=path, args=rest)
-    except InputError:
-        raise
-    except draccus.utils.DraccusException as error:
-        raise _as_input_error(error) from error
-
-
-def encode(config: Any) -> dict[str, Any]:
-    """Plain JSON types, for files and loggers."""
-    encoded: dict[str, Any] = draccus.encode(config)
-    return encoded
-
-
-def _as_input_error(error: BaseException) -> InputError:
-    """The InputError inside draccus's wrapping, or draccus's own message as one."""
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, InputError):
-            return cause
-        cause = cause.__cause__ or cause.__context__
-    return InputError(
-        "config", str(error).splitlines()[0], "run accerl train --help for the fields of each room"
-    )
+    for name in ("chunk_size", "n_action_steps", "num_steps", "max_state_dim", "max_action_dim"):
+        size = policy.get(name, 1)
+        if not isinstance(size, int) or isinstance(size, bool) or size < 1:
+            raise InputError(f"sft.policy.{name}", size, "use a whole number from 1 up")
+    chunk, executed = policy.get("chunk_size"), policy.get("n_action_steps")
+    if chunk is not None and executed is not None and executed > chunk:
+        raise InputError("sft.policy.n_action_steps", executed, f"use 1 to sft.policy.chunk_size, {chunk}")

@@ -32,17 +32,17 @@ class Stage:
     def __init__(
         self, console: RichConsole, name: str, total: int | None, progress: Progress, task: TaskID
     ) -> None:
-        self._console, self._name, self._total, self._progress, self._task = (
-            console,
-            name,
-            total,
-            progress,
-            task,
-        )
+        self._console, self._name, self._total = console, name, total
+        self._progress, self._task = progress, task
         self._said = time.monotonic()
 
     def update(self, done: int, status: str = "") -> None:
-        """Moves the bar."""
+        """Moves the bar.
+
+        Args:
+            done: how far it is.
+            status: shown beside it.
+        """
         self._progress.update(self._task, completed=done, status=status)
         now = time.monotonic()
         if not self._console.is_terminal and now - self._said > PLAIN_EVERY_S:

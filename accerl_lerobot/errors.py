@@ -15,6 +15,9 @@
 
 from __future__ import annotations
 
+LONGEST = 200
+"""Characters of a value that are shown; a whole room may have been given where a number belongs."""
+
 
 class InputError(ValueError):
     """Bad input, refused before any long work.
@@ -35,4 +38,7 @@ class InputError(ValueError):
         super().__init__(field, value, remedy)
 
     def __str__(self) -> str:
-        return f"{self.field}={self.value!r}: {self.remedy}"
+        value = repr(self.value)
+        if len(value) > LONGEST:
+            value = f"{value[: LONGEST - 1]}…"
+        return " ".join(f"{self.field}={value}: {self.remedy}".split())

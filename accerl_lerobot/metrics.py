@@ -13,7 +13,8 @@
 # limitations under the License.
 """Where a run's numbers go: JSON lines always, TensorBoard always, wandb when asked for.
 
-``metrics.jsonl`` has one object per line, each with ``kind`` (train, rollout, evaluation), ``wall_s`` and ``update``.
+``metrics.jsonl`` has one object per line, each with ``kind`` (train, rollout, evaluation), ``wall_s`` and
+``update``. ``docs/metrics.md`` explains every number.
 """
 
 from __future__ import annotations
@@ -25,14 +26,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 
 @dataclass(frozen=True, kw_only=True)
 class WandBConfig:
     """Weights & Biases, off unless enabled."""
 
     enable: bool = False
+    """Whether to log there too; the machine must be logged in."""
     project: str = "accerl-lerobot"
+    """Project of the run."""
     entity: str | None = None
+    """User or team; null is the default one."""
 
 
 class MetricsLog:
@@ -71,10 +77,18 @@ class MetricsLog:
         return time.monotonic() - self._started
 
     def write(self, kind: str, update: int, values: dict[str, Any]) -> None:
-        """Records numbers; non-numeric values go to the JSON lines only. NaN and infinity are written as null."""
-        record = {"kind": kind, "wall_s": round(self.wall_s, 3), "update": update, **values}
-        self._file.write(json.dumps(_finite(record)) + "\n")
-        scalars = {k: float(v) for k, v in values.items() if isinstance(v, (int, float)) and math.isfinite(v)}
+        """Records numbers.
+
+        Args:
+            kind: train, rollout or evaluation.
+            update: version of the weights.
+            values: numbers; anything else goes to the JSON lines only. NaN and infinity become null there,
+                which JSON does not know, and are left out elsewhere.
+        """
+        plain = _plain(values)
+        record = {"kind": kind, "wall_s": round(self.wall_s, 3), "update": update, **plain}
+        self._file.write(json.dumps(record) + "\n")
+        scalars = {k: float(v) for k, v in plain.items() if isinstance(v, (int, float))}
         summary = self._summary(
             value=[self._summary.Value(tag=f"{kind}/{k}", simple_value=v) for k, v in scalars.items()]
         )
@@ -90,9 +104,12 @@ class MetricsLog:
             self._wandb.finish()
 
 
-def _finite(value: Any) -> Any:
+def _plain(value: Any) -> Any:
+    """JSON types: NumPy numbers become Python's, numbers that are not finite become None."""
+    if isinstance(value, np.generic):
+        value = value.item()
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
-    return [_finite(v) for v in value] if isinstance(value, (list, tuple)) else value
+        return {k: _plain(v) for k, v in value.items()}
+    return [_plain(v) for v in value] if isinstance(value, (list, tuple)) else value

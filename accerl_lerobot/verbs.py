@@ -11,17 +11,24 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What each verb of ``accerl`` does, once its arguments are parsed."""
+"""What each verb of ``accerl`` does, once its arguments are parsed.
+
+Results go to the standard output, everything else to the standard error: LeRobot prints while it loads, and
+what a verb hands on should stay readable for programs.
+"""
 
 from __future__ import annotations
 
 import json
+import shutil
 import sys
+from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.config import DatasetConfig, LaunchConfig, RunConfig, parse
+from accerl_lerobot.bench.world import BenchWorldConfig
+from accerl_lerobot.config import DatasetConfig, LaunchConfig, RunConfig, check_chunk, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
@@ -30,12 +37,12 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.loading import PolicyConfig
-from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 
 
 @dataclass(frozen=True, kw_only=True)
 class DemosRun:
-    """``accerl demos``."""
+    """``accerl demos``: scripted experts, recorded."""
 
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     demos: DemosConfig = field(default_factory=DemosConfig)
@@ -43,23 +50,32 @@ class DemosRun:
 
 @dataclass(frozen=True, kw_only=True)
 class SFTRun:
-    """``accerl sft``."""
+    """``accerl sft``: LeRobot's own trainer on a LeRobotDataset."""
 
     seed: int = 0
-    output_dir: str = "outputs/sft"
-    """Folder to create."""
+    """0 to 99."""
+    output_dir: str | None = None
+    """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
+    job_name: str = "sft"
+    """Last part of the folder's name."""
     device: str = "auto"
+    """cpu, cuda, or auto."""
     env: EnvConfig | None = None
     """When given, the dataset is checked against it first."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     sft: SFTConfig = field(default_factory=SFTConfig)
 
+    def __post_init__(self) -> None:
+        if self.sft.init_path is None:
+            check_chunk(self.sft.policy)
+
 
 @dataclass(frozen=True, kw_only=True)
 class EvalRun:
-    """``accerl eval``."""
+    """``accerl eval``: a checkpoint on seeds that no run trains on."""
 
     seed: int = 0
+    """0 to 99; the evaluated episodes do not depend on it."""
     output_dir: str | None = None
     """Folder for ``evaluation.json`` and videos; None prints only."""
     env: EnvConfig = field(default_factory=MetaWorldConfig)
@@ -72,16 +88,23 @@ class EvalRun:
 
 def train(arguments: list[str]) -> int:
     """``accerl train``."""
-    from accerl_lerobot import run
-
     config: RunConfig = parse(RunConfig, arguments)
+    from accerl_lerobot import run
+    from accerl_lerobot.preflight import check_start
+
+    check_start(config)
     console = Console()
     directory = run.make_output_dir(config)
     console.say(f"run {directory}")
-    summary = run.train(config, directory, console)
+    try:
+        with redirect_stdout(sys.stderr):
+            summary = run.train(config, directory, console)
+    except InputError:
+        _discard_unused(directory)
+        raise
     console.say(
-        f"success {summary['success_before']:.1%} → {summary['success_after']:.1%} in {summary['wall_s']:.0f} s; "
-        f"see {directory / 'success_curve.png'}"
+        f"success {summary['success_before']:.1%} → {summary['success_after']:.1%} "
+        f"in {summary['wall_s']:.0f} s; see {directory / 'success_curve.png'}"
     )
     sys.stdout.write(json.dumps(summary, indent=2) + "\n")
     return 0
@@ -89,74 +112,80 @@ def train(arguments: list[str]) -> int:
 
 def demos(arguments: list[str]) -> int:
     """``accerl demos``."""
+    config: DemosRun = parse(DemosRun, arguments, recipe_class=RunConfig)
     from accerl_lerobot.demos.record import record_demos
 
-    config: DemosRun = parse(DemosRun, arguments)
-    sys.stdout.write(f"{record_demos(config.env, config.demos)}\n")
+    with redirect_stdout(sys.stderr):
+        path = record_demos(config.env, config.demos)
+    sys.stdout.write(f"{path}\n")
     return 0
 
 
 def sft(arguments: list[str]) -> int:
     """``accerl sft``."""
-    from accerl_lerobot.demos.sft import run_sft
-    from accerl_lerobot.demos.windows import check_dataset, open_metadata, task_texts
-    from accerl_lerobot.policies.loading import resolve_device
-
-    config: SFTRun = parse(SFTRun, arguments)
+    config: SFTRun = parse(SFTRun, arguments, recipe_class=RunConfig)
     if config.dataset.repo_id is None:
         raise InputError("dataset.repo_id", None, "name a LeRobotDataset, on the Hub or with dataset.root")
     if config.sft.steps == 0:
         raise InputError("sft.steps", 0, "use at least 1")
-    out = Path(config.output_dir)
-    if out.exists():
-        raise InputError("output_dir", str(out), "the folder exists; choose another or remove it")
-    meta = (
-        open_metadata(config.dataset) if config.env is None else check_dataset(config.dataset, config.env, {})
-    )
+    from accerl_lerobot import run
+    from accerl_lerobot.demos.sft import run_sft
+    from accerl_lerobot.demos.windows import check_dataset, open_metadata, task_texts
+    from accerl_lerobot.policies.loading import resolve_device
+    from accerl_lerobot.preflight import check_sft_policy
+
+    if config.sft.init_path is None:
+        check_sft_policy(config.sft)
+    if config.env is None:
+        meta = open_metadata(config.dataset)
+    else:
+        meta = check_dataset(config.dataset, config.env, {})
+    device = str(resolve_device(config.device))
+    directory = run.make_output_dir(RunConfig(output_dir=config.output_dir, job_name=config.job_name))
     console = Console()
-    with console.stage("SFT", total=config.sft.steps) as stage:
+    with redirect_stdout(sys.stderr), console.stage("SFT", total=config.sft.steps) as stage:
         path = run_sft(
-            config.sft, config.dataset.repo_id, config.dataset.root, out / "sft", config.seed,
-            str(resolve_device(config.device)), task_texts(meta), on_step=lambda s, loss: stage.update(s, f"loss {loss:.3f}"),
-        )  # fmt: skip
+            config.sft,
+            config.dataset.repo_id,
+            config.dataset.root,
+            directory / "sft",
+            config.seed,
+            device,
+            task_texts(meta),
+            on_step=lambda step, loss: stage.update(step, f"loss {loss:.3f}"),
+            revision=config.dataset.revision,
+        )
     sys.stdout.write(f"{path}\n")
     return 0
 
 
 def evaluate(arguments: list[str]) -> int:
     """``accerl eval``."""
-    from accerl_lerobot import run
-    from accerl_lerobot.evaluation.config import evaluation_plans
-    from accerl_lerobot.evaluation.pictures import write_video
-    from accerl_lerobot.evaluation.summary import summarise, table
-
-    config: EvalRun = parse(EvalRun, arguments)
-    rooms = ("seed", "env", "policy", "rollout", "inference", "evaluation", "launch")
-    whole = RunConfig(**{name: getattr(config, name) for name in rooms})
-    out = Path(config.output_dir) if config.output_dir else None
+    config: EvalRun = parse(EvalRun, arguments, recipe_class=RunConfig)
+    out = Path(config.output_dir).expanduser() if config.output_dir else None
     if out is not None and out.exists():
         raise InputError("output_dir", str(out), "the folder exists; choose another or remove it")
-    run.check_policy(whole)
-    tasks = run.check_world(whole)
+    from accerl_lerobot import run
+    from accerl_lerobot.evaluation.config import evaluation_plans
+    from accerl_lerobot.evaluation.summary import summarise, table
+
+    rooms = ("seed", "env", "policy", "rollout", "inference", "evaluation", "launch")
+    whole = RunConfig(**{name: getattr(config, name) for name in rooms})
+    film = config.evaluation.videos if out else 0
     console = Console()
-    engine = run.make_engine(whole, tasks)
-    try:
-        film = config.evaluation.videos if out else 0
-        engine.plan(evaluation_plans(tasks, config.evaluation.episodes, "eval", film))
-        results = run.run_plans(engine, config.evaluation.episodes, "eval", console)
-    finally:
-        engine.close()
+    with redirect_stdout(sys.stderr):
+        run.check_policy(whole)
+        tasks = run.check_world(whole)
+        engine = run.make_engine(whole, tasks)
+        try:
+            engine.plan(evaluation_plans(tasks, config.evaluation.episodes, "eval", film))
+            results = run.run_plans(engine, config.evaluation.episodes, "eval", console)
+        finally:
+            engine.close()
     summary: dict[str, Any] = summarise(results) | {"policy": config.policy.path}
-    console.rich.print(table(summary, f"{config.policy.path}"))
+    console.rich.print(table(summary, str(config.policy.path)))
     if out is not None:
-        out.mkdir(parents=True)
-        (out / "evaluation.json").write_text(json.dumps(summary, indent=2) + "\n")
-        for result in results:
-            if result.frames:
-                name = (
-                    f"{result.plan.task}_{result.plan.seed}_{'success' if result.success else 'failure'}.mp4"
-                )
-                write_video(out / name, [result.frames], fps=20)
+        _write_evaluation(out, summary, results)
     sys.stdout.write(json.dumps(summary) + "\n")
     return 0
 
@@ -167,8 +196,37 @@ def bench(arguments: list[str]) -> int:
 
     if not arguments or arguments[0] != "world":
         raise InputError("bench", arguments[0] if arguments else "", "use: accerl bench world")
-    config: world.BenchWorldConfig = parse(world.BenchWorldConfig, arguments[1:])
+    config: BenchWorldConfig = parse(BenchWorldConfig, arguments[1:])
     result = world.bench_world(config)
     Console().rich.print(world.table(result))
     sys.stdout.write(json.dumps(result, indent=2) + "\n")
     return 0
+
+
+CONFIGS: dict[str, type[Any]] = {
+    "train": RunConfig,
+    "demos": DemosRun,
+    "sft": SFTRun,
+    "eval": EvalRun,
+    "doctor": RunConfig,
+    "bench": BenchWorldConfig,
+}
+"""Verb → what its command line is parsed into."""
+
+
+def _write_evaluation(out: Path, summary: dict[str, Any], results: list[EpisodeResult]) -> None:
+    from accerl_lerobot.evaluation.pictures import write_video
+
+    out.mkdir(parents=True)
+    (out / "evaluation.json").write_text(json.dumps(summary, indent=2) + "\n")
+    for result in results:
+        if result.frames:
+            outcome = "success" if result.success else "failure"
+            name = f"{result.plan.task.replace('/', '-')}_{result.plan.seed}_{outcome}.mp4"
+            write_video(out / name, [result.frames], fps=20)
+
+
+def _discard_unused(directory: Path) -> None:
+    """Removes the folder of a run that was refused before it did anything, so that its name is free again."""
+    if {path.name for path in directory.iterdir()} <= {"config.yaml"}:
+        shutil.rmtree(directory)

@@ -28,7 +28,7 @@ class EvaluationConfig:
     """Success rates before, during and after training; always with LeRobot's own sampler."""
 
     episodes: int = 100
-    """Episodes before and after training, over all tasks; the same seeds both times, none of them trained on."""
+    """Episodes before and after training, over all tasks; the same seeds both times, never trained on."""
     every_updates: int = 0
     """Evaluate while training, every so many updates; 0 does not."""
     episodes_during: int = 20

@@ -21,6 +21,9 @@ from typing import Any
 
 import numpy as np
 
+GAP = 4
+"""Columns of white between two clips."""
+
 
 def success_curve(
     path: Path, evaluations: Sequence[dict[str, Any]], training: Sequence[tuple[float, float]]
@@ -41,19 +44,16 @@ def success_curve(
     if training:
         steps, share = zip(*training, strict=True)
         axes.plot(steps, share, color="0.7", lw=1.5, label="while exploring")
+    evaluations = sorted(evaluations, key=lambda e: e["env_steps"])
     x = [e["env_steps"] for e in evaluations]
     y = [e["success"] for e in evaluations]
-    low = [e["success"] - e["ci95"][0] for e in evaluations]
-    high = [e["ci95"][1] - e["success"] for e in evaluations]
+    # Rounding may leave the rate a hair outside its interval, and matplotlib refuses negative lengths.
+    low = [max(0.0, e["success"] - e["ci95"][0]) for e in evaluations]
+    high = [max(0.0, e["ci95"][1] - e["success"]) for e in evaluations]
     axes.errorbar(x, y, yerr=[low, high], marker="o", capsize=3, color="C0", label="evaluation, 95 % Wilson")
     for e in (evaluations[0], evaluations[-1]):
-        axes.annotate(
-            f"n={e['n']}",
-            (e["env_steps"], e["success"]),
-            textcoords="offset points",
-            xytext=(6, -12),
-            fontsize=8,
-        )
+        place = (e["env_steps"], e["success"])
+        axes.annotate(f"n={e['n']}", place, textcoords="offset points", xytext=(6, -12), fontsize=8)
     axes.set(xlabel="env steps of online experience", ylabel="success", ylim=(-0.02, 1.02))
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right")
@@ -62,23 +62,31 @@ def success_curve(
     plt.close(figure)
 
 
-def write_video(path: Path, rows: Sequence[Sequence[np.ndarray]], fps: int) -> None:
-    """Writes clips beside each other; a clip that ends early holds its last frame.
+def write_video(path: Path, clips: Sequence[Sequence[np.ndarray]], fps: int) -> None:
+    """Writes clips side by side; one that ends early holds its last frame.
 
     Args:
         path: .mp4 to write.
-        rows: one list of frames per clip, each uint8 (H, W, 3), all of one size.
+        clips: frames of each, uint8 (H, W, 3), all of one size.
         fps: frames per second.
+
+    Raises:
+        ValueError: no clip, or one without frames.
     """
     import imageio.v2 as imageio
 
-    length = max(len(clip) for clip in rows)
-    gap = np.full((rows[0][0].shape[0], 4, 3), 255, np.uint8)
-    with imageio.get_writer(
-        path, fps=fps, macro_block_size=1, codec="libx264", pixelformat="yuv444p"
-    ) as writer:
+    if not clips or not all(clips):
+        raise ValueError("every clip needs a frame")
+    length = max(len(clip) for clip in clips)
+    gap = np.full((clips[0][0].shape[0], GAP, 3), 255, np.uint8)
+    # The pixel format every player knows, at the price of even sides: an odd last row or column is left out.
+    writer: Any = imageio.get_writer(
+        path, fps=fps, macro_block_size=1, codec="libx264", pixelformat="yuv420p"
+    )
+    with writer:
         for i in range(length + fps // 2):
             tiles: list[np.ndarray] = []
-            for clip in rows:
+            for clip in clips:
                 tiles += [clip[min(i, len(clip) - 1)], gap]
-            writer.append_data(np.concatenate(tiles[:-1], axis=1))
+            row = np.concatenate(tiles[:-1], axis=1)
+            writer.append_data(row[: row.shape[0] // 2 * 2, : row.shape[1] // 2 * 2])

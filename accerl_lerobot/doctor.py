@@ -1,0 +1,358 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""``accerl doctor``: will this recipe run on this machine? Every answer that is no comes with its remedy.
+
+Nothing here is guessed: a frame is really drawn, in a process of its own, because a broken OpenGL can take a
+process down; packages are compared with the pins this version was tested with.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib.metadata
+import importlib.util
+import math
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from accerl_lerobot.errors import InputError
+
+if TYPE_CHECKING:
+    from accerl_lerobot.config import RunConfig
+
+OK, WARN, FAIL = "ok", "warn", "FAIL"
+DISTRIBUTION = "accerl-lerobot"
+
+GIB = 2**30
+POLICY_PROCESS_GIB, ROLLOUT_PROCESS_GIB, TASK_GIB = 1.0, 0.4, 0.09
+"""Resident memory, measured with a policy of 0.4 M parameters: a process with torch and LeRobot, a rollout
+process with an OpenGL context, and each MetaWorld task that a world has played."""
+DISK_GIB = 2.0
+"""What a run may need for demonstrations, checkpoints and videos."""
+RENDER_TIMEOUT_S = 120
+
+DRAW = """
+import time
+from accerl_lerobot.envs.gl import import_mujoco, new_renderer
+mujoco = import_mujoco()
+model = mujoco.MjModel.from_xml_string(
+    "<mujoco><worldbody><light pos='0 0 3'/><geom size='.3' rgba='1 0 0 1'/></worldbody></mujoco>"
+)
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+renderer = new_renderer(model, 64, 64)
+renderer.update_scene(data)
+renderer.render()
+started = time.perf_counter()
+renderer.update_scene(data)
+frame = renderer.render()
+print("drawn", frame.std() > 1, round(1000 * (time.perf_counter() - started), 1))
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """One answer."""
+
+    name: str
+    status: str
+    """ok, warn or FAIL; only the last makes the exit code 1."""
+    text: str
+    """What was found and, unless it is fine, what to do."""
+
+
+def main(arguments: list[str]) -> int:
+    """``accerl doctor``; 0 if everything needed is there, otherwise 1."""
+    config, checks = _resolve(arguments) if arguments else (None, [])
+    if config is not None:
+        from accerl_lerobot.config import encode
+
+        sys.stdout.write(yaml.safe_dump(encode(config), sort_keys=False, allow_unicode=True) + "\n")
+    checks += list(machine(config))
+    if config is not None:
+        checks += list(pace(config))
+    for check in checks:
+        sys.stdout.write(f"{check.status:5} {check.name:10} {check.text}\n")
+    failed = sum(check.status == FAIL for check in checks)
+    sys.stdout.write(f"\n{'all good' if not failed else f'{failed} of {len(checks)} checks failed'}\n")
+    return 1 if failed else 0
+
+
+def machine(config: RunConfig | None) -> Iterator[Check]:
+    """What any run needs, and what `config` asks for beyond that."""
+    yield python_version()
+    yield packages()
+    yield hugging_face_datasets()
+    yield ray_imports()
+    yield cuda(config)
+    yield rendering(needed=config is None or config.env.type == "metaworld")
+    yield from resources(config)
+
+
+def python_version() -> Check:
+    """The interpreter."""
+    fine = sys.version_info >= (3, 12)
+    return Check(
+        name="python",
+        status=OK if fine else FAIL,
+        text=f"{platform.python_version()} in {sys.prefix}" + ("" if fine else "; use 3.12 or newer"),
+    )
+
+
+def pins(requirements: list[str]) -> dict[str, tuple[str, bool]]:
+    """Package → (pinned version, whether it belongs to an extra) from requirement strings.
+
+    Example:
+        >>> pins(["lerobot[dataset]==0.6.1", 'mujoco==3.3.2; extra == "metaworld"'])
+        {'lerobot': ('0.6.1', False), 'mujoco': ('3.3.2', True)}
+    """
+    found: dict[str, tuple[str, bool]] = {}
+    for requirement in requirements:
+        match = re.match(r"([A-Za-z0-9._-]+)\s*(?:\[[^]]*\])?\s*\(?==\s*([^;\s)]+)", requirement)
+        if match and match[1] not in found:
+            found[match[1]] = (match[2], "extra ==" in requirement)
+    return found
+
+
+def packages() -> Check:
+    """Installed versions against the pins."""
+    try:
+        pinned = pins(importlib.metadata.requires(DISTRIBUTION) or [])
+    except importlib.metadata.PackageNotFoundError:
+        return Check(name="packages", status=FAIL, text=f"{DISTRIBUTION} is not installed: run make setup")
+    differing: list[str] = []
+    absent: list[str] = []
+    extras: list[str] = []
+    for name, (version, extra) in pinned.items():
+        try:
+            installed = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            (extras if extra else absent).append(name)
+            continue
+        if installed.partition("+")[0] != version:
+            differing.append(f"{name} {installed} instead of {version}")
+    if absent:
+        text = f"not installed: {', '.join(absent)}; run make setup"
+        return Check(name="packages", status=FAIL, text=text)
+    if differing:
+        text = f"{', '.join(differing)}: not the tested versions; run make setup"
+        return Check(name="packages", status=WARN, text=text)
+    text = f"{len(pinned) - len(extras)} at the tested versions, lerobot {pinned['lerobot'][0]} among them"
+    if extras:
+        text += f"; without the extras' {', '.join(extras)}"
+    return Check(name="packages", status=OK, text=text)
+
+
+def hugging_face_datasets() -> Check:
+    """A folder named ``datasets`` stands in for a package that is absent, and one with a file shadows it."""
+    spec = importlib.util.find_spec("datasets")
+    origin = None if spec is None else spec.origin
+    try:
+        version = importlib.metadata.version("datasets")
+    except importlib.metadata.PackageNotFoundError:
+        version = None
+    if version is None or origin is None:
+        text = "Hugging Face datasets is not installed, or a folder hides it; run make setup"
+        return Check(name="datasets", status=FAIL, text=text)
+    home = Path(str(importlib.metadata.distribution("datasets").locate_file("datasets"))).resolve()
+    if Path(origin).resolve().parent != home:
+        text = f"{origin} shadows Hugging Face datasets: remove or rename it"
+        return Check(name="datasets", status=FAIL, text=text)
+    return Check(name="datasets", status=OK, text=f"Hugging Face datasets {version}")
+
+
+def ray_imports() -> Check:
+    """Ray, with the environment a run would give it."""
+    from accerl_lerobot import ray_environment
+
+    ray_environment.prepare()
+    try:
+        import ray
+    except Exception as error:
+        return Check(name="ray", status=FAIL, text=f"cannot be imported ({_line(error)}); run make setup")
+    return Check(name="ray", status=OK, text=ray.__version__)
+
+
+def cuda(config: RunConfig | None) -> Check:
+    """Whether torch sees a GPU, and whether the recipe insists on one."""
+    wish = config.policy.device if config is not None else "auto"
+    try:
+        import torch
+    except Exception as error:
+        return Check(name="torch", status=FAIL, text=f"cannot be imported ({_line(error)}); run make setup")
+    if torch.cuda.is_available():
+        number, name = torch.cuda.device_count(), torch.cuda.get_device_name(0)
+        return Check(name="torch", status=OK, text=f"{torch.__version__}, {number} × {name}")
+    text = f"{torch.__version__}, no CUDA device"
+    if wish.startswith("cuda"):
+        text += f": policy.device={wish!r} cannot be had; use auto or cpu"
+        return Check(name="torch", status=FAIL, text=text)
+    return Check(name="torch", status=OK, text=f"{text}; policies run on the CPU")
+
+
+def rendering(*, needed: bool, script: str = DRAW) -> Check:
+    """Draws a frame in a process of its own.
+
+    Args:
+        needed: whether the recipe's world draws with MuJoCo; otherwise a failure is only a warning.
+        script: what draws it.
+    """
+    bad = FAIL if needed else WARN
+    if importlib.util.find_spec("mujoco") is None:
+        text = "MuJoCo is not installed; install the extra: accerl-lerobot[metaworld]"
+        return Check(name="rendering", status=bad, text=text)
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", script],
+            capture_output=True,
+            text=True,
+            timeout=RENDER_TIMEOUT_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        text = f"no frame within {RENDER_TIMEOUT_S} s; set MUJOCO_GL to osmesa or egl"
+        return Check(name="rendering", status=bad, text=text)
+    words = done.stdout.split()
+    if done.returncode == 0 and words[:2] == ["drawn", "True"]:
+        text = f"MuJoCo draws 64 × 64 pixels in {words[2]} ms ({_backend()})"
+        return Check(name="rendering", status=OK, text=text)
+    if done.returncode == 0:
+        text = "MuJoCo draws an empty picture; set MUJOCO_GL to osmesa or egl"
+        return Check(name="rendering", status=bad, text=text)
+    last = (done.stderr.strip().splitlines() or [f"ended with code {done.returncode}"])[-1]
+    return Check(name="rendering", status=bad, text=last.removeprefix("accerl_lerobot.errors.InputError: "))
+
+
+def resources(config: RunConfig | None) -> Iterator[Check]:
+    """Cores, memory and disk, against what the recipe will take."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    text, status = f"{cores} cores", OK
+    if config is not None:
+        threads = max(config.trainer.num_threads, config.inference.num_threads)
+        text += f" for {config.rollout.workers} rollout, 1 inference, 1 trainer"
+        if config.rollout.workers > cores:
+            status, text = WARN, f"{text}: they will wait for each other; lower rollout.workers"
+        elif threads > cores:
+            status, text = WARN, f"{text}: lower trainer.num_threads and inference.num_threads to {cores}"
+    yield Check(name="cpu", status=status, text=text)
+    free = _memory_gib()
+    if free is not None:
+        text, status = f"{free:.1f} GiB free", OK
+        if config is not None:
+            need = memory_estimate_gib(config)
+            text += f", about {need:.1f} GiB needed"
+            if need > free:
+                status, text = WARN, f"{text}: lower rollout.workers, rollout.worlds or replay.capacity"
+        yield Check(name="memory", status=status, text=text)
+    disk = shutil.disk_usage(Path.cwd()).free / GIB
+    short = disk < DISK_GIB
+    text = f"{disk:.0f} GiB free here" + (f"; a run may need {DISK_GIB:.0f}" if short else "")
+    yield Check(name="disk", status=WARN if short else OK, text=text)
+
+
+def memory_estimate_gib(config: RunConfig) -> float:
+    """Rough: processes with their libraries, simulators, and replay."""
+    tasks = len(getattr(config.env, "tasks", ("one",)))
+    worlds = config.rollout.workers * config.rollout.worlds
+    simulators = worlds * tasks * TASK_GIB if config.env.type == "metaworld" else 0.0
+    # The driver, inference and the trainer each load torch.
+    processes = 3 * POLICY_PROCESS_GIB + config.rollout.workers * ROLLOUT_PROCESS_GIB
+    return processes + simulators + config.replay.capacity * observation_bytes(config) / GIB
+
+
+def observation_bytes(config: RunConfig) -> int:
+    """Bytes of one decision's images; what else a decision holds is small beside them."""
+    env: Any = config.env
+    side = getattr(
+        env, "image_size", 96
+    )  # LeRobot's own environments differ; PushT's pictures have 96 pixels
+    return 3 * side * side * len(getattr(env, "cameras", ("one",)))
+
+
+def pace(config: RunConfig) -> Iterator[Check]:
+    """How far apart collecting and learning may run under this recipe, and how much it collects."""
+    from accerl_lerobot.replay import lag_bound
+
+    rollout, replay, trainer = config.rollout, config.replay, config.trainer
+    in_flight = rollout.workers * rollout.worlds * rollout.segment_length
+    ahead = 1 if config.launch.engine == "ray" else 0  # of publications under way, and of batches drawn early
+    arguments = {"batch_decisions": trainer.batch_decisions, "in_flight": in_flight}
+    arguments |= {"publish_every": trainer.publish_every, "pickup": ahead, "prefetch": ahead}
+    bound = lag_bound(replay, **arguments)
+    of_pace = lag_bound(dataclasses.replace(replay, max_lag=sys.maxsize), **arguments)
+    text = f"at most {bound} updates with {in_flight} decisions under way"
+    if of_pace > bound:
+        text += (
+            f"; the pace alone allows {of_pace}, so segments may be thrown away as too old: "
+            "lower replay.capacity, replay.ahead or replay.samples_per_insert, or raise replay.max_lag"
+        )
+    yield Check(name="lag", status=WARN if of_pace > bound else OK, text=text)
+    collected = math.ceil(trainer.updates * trainer.batch_decisions / replay.samples_per_insert)
+    text = f"{trainer.updates:,} updates of {trainer.batch_decisions} on about {collected:,} decisions"
+    executed = config.policy.n_action_steps or (config.sft.steps and config.sft.policy.get("n_action_steps"))
+    if executed:
+        text += f", at most {collected * int(executed):,} env steps"
+    yield Check(name="work", status=OK, text=text)
+
+
+def _resolve(arguments: list[str]) -> tuple[RunConfig | None, list[Check]]:
+    from accerl_lerobot.config import RunConfig, parse
+    from accerl_lerobot.preflight import check_start
+
+    try:
+        config: RunConfig = parse(RunConfig, arguments)
+        check_start(config)
+        if config.output_dir is not None and Path(config.output_dir).expanduser().exists():
+            raise InputError(
+                "output_dir", config.output_dir, "the folder exists; choose another or remove it"
+            )
+    except InputError as error:
+        return None, [Check(name="recipe", status=FAIL, text=str(error))]
+    return config, [Check(name="recipe", status=OK, text="resolves")]
+
+
+def _memory_gib() -> float | None:
+    """Memory that can be had, within the container's limit; None where that is unknown."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    entries = {line.split(":")[0]: int(line.split()[1]) * 1024 for line in lines}
+    free = float(entries.get("MemAvailable", 0))
+    group = Path("/sys/fs/cgroup")
+    with contextlib.suppress(OSError, ValueError):  # no such file, or no limit
+        limit, used = (int((group / f"memory.{name}").read_text()) for name in ("max", "current"))
+        free = min(free, limit - used)
+    return free / GIB
+
+
+def _backend() -> str:
+    from accerl_lerobot.envs.gl import choose_backend
+
+    return os.environ.get("MUJOCO_GL") or choose_backend() or "the display"
+
+
+def _line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

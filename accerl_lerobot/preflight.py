@@ -1,0 +1,98 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What can be refused before any long work although it takes LeRobot to know it.
+
+`config` checks what plain numbers can say; this asks LeRobot, which costs its import.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from typing import TYPE_CHECKING, Any
+
+import draccus
+
+from accerl_lerobot.errors import InputError
+
+if TYPE_CHECKING:
+    from accerl_lerobot.config import RunConfig
+    from accerl_lerobot.demos.sft import SFTConfig
+
+
+def check_start(config: RunConfig) -> None:
+    """Refuses a run that could not begin: no policy, no dataset, or an SFT whose outcome could not be improved.
+
+    Raises:
+        InputError: see above; also what `check_sft_policy` raises.
+    """
+    if config.policy.path is None and not config.sft.steps:
+        remedy = "give a LeRobot checkpoint, or sft.steps > 0 to make one; recipes/quickstart.yaml does"
+        raise InputError("policy.path", None, remedy)
+    if config.policy.path is not None:
+        from accerl_lerobot.policies.loading import load_lerobot_config
+
+        load_lerobot_config(config.policy)
+        return
+    if config.dataset.repo_id is not None:
+        from accerl_lerobot.demos.windows import open_metadata
+
+        open_metadata(config.dataset)
+    if config.sft.init_path is None:
+        from accerl_lerobot.policies.loading import ADAPTERS
+
+        check_sft_policy(config.sft)
+        kind = config.sft.policy["type"]
+        if kind not in ADAPTERS:
+            remedy = (
+                f"RL needs a likelihood, and this type has none here yet; use one of {', '.join(ADAPTERS)}"
+            )
+            raise InputError("sft.policy.type", kind, remedy)
+
+
+def check_sft_policy(config: SFTConfig) -> None:
+    """Lets LeRobot build the policy config that the SFT would ask for.
+
+    Raises:
+        InputError: LeRobot has no such policy, no such field, or refuses a value.
+    """
+    import lerobot.policies  # noqa: F401  fills the registry of policy types
+    from lerobot.configs.policies import PreTrainedConfig
+
+    fields: dict[str, Any] = {k: v for k, v in config.policy.items() if k != "type"}
+    kind, choices = config.policy["type"], PreTrainedConfig.get_known_choices()
+    if kind not in choices:
+        raise InputError("sft.policy.type", kind, f"LeRobot has {', '.join(sorted(choices))}")
+    names = [field.name for field in dataclasses.fields(choices[kind])]
+    for key, value in fields.items():
+        if key not in names:
+            near = " or ".join(difflib.get_close_matches(key, names, n=3))
+            remedy = f"LeRobot's {kind} has no such field{f'; did you mean {near}?' if near else ''}"
+            raise InputError(f"sft.policy.{key}", value, remedy)
+    try:
+        draccus.decode(choices[kind], {"device": "cpu"} | fields)  # without a device LeRobot looks for one
+    except draccus.utils.DraccusException as error:
+        raise _as_input_error(error, fields) from error
+
+
+def _as_input_error(error: BaseException, fields: dict[str, Any]) -> InputError:
+    chain = [error]
+    while (cause := chain[-1].__cause__ or chain[-1].__context__) is not None:
+        chain.append(cause)
+    located = next((e for e in chain if getattr(e, "key_path", ())), None)
+    text = " ".join(str(chain[-1]).split())
+    if located is None:
+        return InputError("sft.policy", fields, f"LeRobot says: {text}")
+    key = located.key_path[0]  # type: ignore[attr-defined]
+    return InputError(f"sft.policy.{key}", fields.get(key), f"LeRobot says: {text}")

@@ -1,0 +1,245 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The doctor: right about this machine, and right about machines that lack something."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import yaml
+
+from accerl_lerobot import cli, doctor
+from accerl_lerobot.config import RunConfig, decode
+from accerl_lerobot.doctor import FAIL, OK, WARN, Check
+
+QUICKSTART = Path(__file__).parents[1] / "recipes" / "quickstart.yaml"
+
+
+@pytest.fixture
+def healthy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine on which all is well, whatever this one is like."""
+    monkeypatch.setattr(doctor, "machine", lambda config: [Check(name="python", status=OK, text="3.12")])
+
+
+def checks(config: RunConfig) -> dict[str, Check]:
+    return {c.name: c for c in (*doctor.resources(config), *doctor.pace(config))}
+
+
+def test_this_machine(capsys: pytest.CaptureFixture[str]) -> None:
+    """The tests need a machine on which everything works, so the doctor must find none of it missing."""
+    assert cli.main(["doctor"]) == 0
+    out = capsys.readouterr().out
+    assert "FAIL" not in out and "MuJoCo draws 64 × 64 pixels" in out
+    for name in ("python", "packages", "datasets", "ray", "torch", "rendering", "cpu", "memory", "disk"):
+        assert f" {name} " in out
+    assert "recipe" not in out and out.endswith("all good\n")
+
+
+@pytest.mark.usefixtures("healthy")
+class TestRecipe:
+    """`accerl doctor recipe.yaml`."""
+
+    @pytest.mark.parametrize("form", ["{}", "--config_path={}", "--config_path {}"])
+    def test_prints_what_it_resolves_to(self, form: str, capsys: pytest.CaptureFixture[str]) -> None:
+        assert cli.main(["doctor", *form.format(QUICKSTART).split(), "--trainer.lr=1e-5"]) == 0
+        resolved, _, found = capsys.readouterr().out.partition("\n\n")
+        config = decode(RunConfig, yaml.safe_load(resolved))
+        assert config.trainer.lr == 1e-5 and config.job_name == "quickstart"
+        assert "ok    recipe     resolves" in found
+        assert "lag        at most" in found and "work " in found and "env steps" in found
+
+    def test_a_mistake_fails_with_its_line(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert cli.main(["doctor", str(QUICKSTART), "--env.type=x"]) == 1
+        out = capsys.readouterr().out
+        assert out.startswith("FAIL  recipe     env.type='x': use one of lerobot, metaworld, simulated\n")
+        assert "ok    python" in out and "1 of 2 checks failed" in out
+
+    def test_what_only_lerobot_knows_is_found_too(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert cli.main(["doctor", str(QUICKSTART), "--sft.policy.colour=red"]) == 1
+        assert "sft.policy.colour='red': LeRobot's smolvla has no such field" in capsys.readouterr().out
+
+    def test_an_output_folder_that_exists(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert cli.main(["doctor", str(QUICKSTART), f"--output_dir={tmp_path}"]) == 1
+        assert "the folder exists" in capsys.readouterr().out
+
+    def test_no_file(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert cli.main(["doctor", "nowhere.yaml"]) == 1
+        assert "config_path='nowhere.yaml': no such file" in capsys.readouterr().out
+
+
+class TestRendering:
+    """A frame is drawn in another process, whose every way of failing is an answer."""
+
+    def draw(self, script: str, needed: bool = True) -> Check:
+        return doctor.rendering(needed=needed, script=script)
+
+    def test_a_process_that_dies(self) -> None:
+        check = self.draw("import os; os.abort()")
+        assert check.status == FAIL and "ended with code -6" in check.text
+
+    def test_an_error_keeps_its_remedy(self) -> None:
+        check = self.draw(
+            "from accerl_lerobot.errors import *; raise InputError('MUJOCO_GL', '', 'install it')"
+        )
+        assert check.text == "MUJOCO_GL='': install it"
+
+    def test_an_empty_picture(self) -> None:
+        assert "empty picture" in self.draw("print('drawn', False, 3.0)").text
+
+    def test_a_world_that_does_not_draw_is_only_warned_about(self) -> None:
+        assert self.draw("raise SystemExit(1)", needed=False).status == WARN
+
+    def test_no_library(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+            monkeypatch.delenv(name, raising=False)
+        monkeypatch.setenv("MUJOCO_GL", "glfw")
+        check = doctor.rendering(needed=True)
+        assert check.status == FAIL and "there is no display: use egl or osmesa" in check.text
+
+    def test_takes_too_long(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(doctor, "RENDER_TIMEOUT_S", 0.2)
+        assert "no frame within" in self.draw("import time; time.sleep(30)").text
+
+    def test_without_mujoco(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+        assert "install the extra" in doctor.rendering(needed=True).text
+
+
+class TestPackages:
+    """Pins against what is installed."""
+
+    def test_reads_requirements(self) -> None:
+        requirements = ["lerobot[dataset,smolvla]==0.6.1", 'mujoco==3.3.2; extra == "metaworld"', "numpy>=2"]
+        assert doctor.pins(requirements) == {"lerobot": ("0.6.1", False), "mujoco": ("3.3.2", True)}
+
+    def versions(self, monkeypatch: pytest.MonkeyPatch, installed: dict[str, str]) -> Check:
+        def version(name: str) -> str:
+            if name not in installed:
+                raise importlib.metadata.PackageNotFoundError(name)
+            return installed[name]
+
+        pinned = ["lerobot==0.6.1", "torch==2.11.0", 'mujoco==3.3.2; extra == "metaworld"']
+        monkeypatch.setattr(importlib.metadata, "requires", lambda name: pinned)
+        monkeypatch.setattr(importlib.metadata, "version", version)
+        return doctor.packages()
+
+    def test_all_as_tested(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        check = self.versions(monkeypatch, {"lerobot": "0.6.1", "torch": "2.11.0+cpu", "mujoco": "3.3.2"})
+        assert check.status == OK and check.text.startswith("3 at the tested versions")
+
+    def test_an_extra_may_be_absent(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        check = self.versions(monkeypatch, {"lerobot": "0.6.1", "torch": "2.11.0"})
+        assert check.status == OK and check.text.endswith("without the extras' mujoco")
+
+    def test_another_version(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        check = self.versions(monkeypatch, {"lerobot": "0.6.2", "torch": "2.11.0"})
+        assert check.status == WARN and "lerobot 0.6.2 instead of 0.6.1" in check.text
+
+    def test_something_absent(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        check = self.versions(monkeypatch, {"lerobot": "0.6.1"})
+        assert check.status == FAIL and "not installed: torch" in check.text
+
+
+class TestHuggingFaceDatasets:
+    """The folder `datasets/` of this repository must not be taken for the package."""
+
+    def test_here(self) -> None:
+        assert doctor.hugging_face_datasets().status == OK
+
+    def test_a_folder_without_a_file(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name: SimpleNamespace(origin=None))
+        check = doctor.hugging_face_datasets()
+        assert check.status == FAIL and "a folder hides it" in check.text
+
+    def test_a_package_in_front_of_it(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        (tmp_path / "datasets").mkdir()
+        (tmp_path / "datasets" / "__init__.py").touch()
+        monkeypatch.syspath_prepend(str(tmp_path))
+        monkeypatch.delitem(sys.modules, "datasets", raising=False)
+        check = doctor.hugging_face_datasets()
+        assert check.status == FAIL and "shadows" in check.text
+
+
+class TestResources:
+    """Cores, memory, disk and pace against a recipe."""
+
+    def recipe(self, **rooms: dict[str, Any]) -> RunConfig:
+        config: RunConfig = decode(RunConfig, rooms)
+        return config
+
+    @pytest.fixture(autouse=True)
+    def four_cores(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(4)), raising=False)
+        monkeypatch.setattr(doctor, "_memory_gib", lambda: 16.0)
+
+    def test_fits(self) -> None:
+        found = checks(self.recipe(rollout={"workers": 4}))
+        assert [found[name].status for name in ("cpu", "memory")] == [OK, OK]
+
+    def test_more_workers_than_cores(self) -> None:
+        cpu = checks(self.recipe(rollout={"workers": 5}))["cpu"]
+        assert cpu.status == WARN and "lower rollout.workers" in cpu.text
+
+    def test_more_threads_than_cores(self) -> None:
+        cpu = checks(self.recipe(trainer={"num_threads": 8}))["cpu"]
+        assert cpu.status == WARN and "trainer.num_threads" in cpu.text
+
+    def test_too_little_memory(self) -> None:
+        big = {"image_size": 480}
+        memory = checks(self.recipe(env=big, replay={"capacity": 100_000}))["memory"]
+        assert memory.status == WARN and "GiB needed: lower" in memory.text
+
+    def test_too_little_disk(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: SimpleNamespace(free=2**28))
+        assert checks(self.recipe())["disk"].status == WARN
+
+    def test_lag_is_that_of_the_formula(self) -> None:
+        """⌊⌈r⌉ (max(ahead, min) + 2·in_flight + capacity) / batch⌋ − 1; with Ray one pickup, one prefetch."""
+        replay = {"capacity": 1024, "ahead": 256, "min_decisions": 128, "samples_per_insert": 2.0}
+        rollout = {"workers": 2, "worlds": 4, "segment_length": 8}
+        trainer = {"batch_decisions": 128}
+        lag = checks(self.recipe(replay=replay, rollout=rollout, trainer=trainer))["lag"]
+        by_hand = 2 * (256 + 2 * 64 + 1024) // 128 - 1
+        assert lag.status == OK
+        assert lag.text == f"at most {by_hand + 2} updates with 64 decisions under way"
+        local = self.recipe(replay=replay, rollout=rollout, trainer=trainer, launch={"engine": "local"})
+        assert checks(local)["lag"].text.startswith(f"at most {by_hand} updates")
+
+    def test_a_pace_that_would_waste_is_warned_about(self) -> None:
+        lag = checks(self.recipe(replay={"max_lag": 3}))["lag"]
+        assert lag.status == WARN and lag.text.startswith("at most 4 updates") and "thrown away" in lag.text
+
+    def test_work(self) -> None:
+        config = self.recipe(
+            replay={"samples_per_insert": 4.0},
+            trainer={"updates": 100, "batch_decisions": 64},
+            policy={"n_action_steps": 5},
+        )
+        text = "100 updates of 64 on about 1,600 decisions, at most 8,000 env steps"
+        assert checks(config)["work"].text == text
+
+    def test_a_gpu_that_is_not_there(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        import torch
+
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+        check = doctor.cuda(self.recipe(policy={"device": "cuda"}))
+        assert check.status == FAIL and "use auto or cpu" in check.text
+        assert doctor.cuda(None).status == OK
