@@ -37,11 +37,12 @@ class BackboneConfig:
     """Sizes of a random SmolVLM. The defaults give a SmolVLA of about 0.4 M parameters."""
 
     hidden: int = 96
-    """Width of the language model; a multiple of `heads`."""
+    """Width of the language model; a multiple of 2·`heads`."""
     layers: int = 2
     """Language-model layers; the action expert has as many."""
     heads: int = 4
     kv_heads: int = 2
+    """Key and value heads; a divisor of `heads`."""
     vision_hidden: int = 64
     """Width of the image encoder."""
     vision_layers: int = 2
@@ -55,17 +56,31 @@ class BackboneConfig:
     """Most tokens the tokeniser has; 264 are bytes and special tokens."""
 
     def __post_init__(self) -> None:
+        for name in (
+            "hidden",
+            "layers",
+            "heads",
+            "kv_heads",
+            "vision_hidden",
+            "vision_layers",
+            "vision_heads",
+        ):
+            if getattr(self, name) < 1:
+                raise InputError(f"sft.backbone.{name}", getattr(self, name), "use at least 1")
         if self.vocabulary < 264:
             raise InputError("sft.backbone.vocabulary", self.vocabulary, "use at least 264")
-        if self.image % (2 * self.patch):
-            raise InputError(
-                "sft.backbone.image", self.image, f"use a multiple of {2 * self.patch}, twice the patch"
-            )
-        for heads, width in (("heads", self.hidden), ("vision_heads", self.vision_hidden)):
-            if width % getattr(self, heads):
-                raise InputError(
-                    f"sft.backbone.{heads}", getattr(self, heads), f"use a divisor of the width {width}"
-                )
+        if self.patch < 1 or self.image < 1 or self.image % (2 * self.patch):
+            remedy = f"use a multiple of {2 * self.patch}, twice the patch"
+            raise InputError("sft.backbone.image", self.image, remedy)
+        if self.hidden % (2 * self.heads):  # rotary embeddings halve a head
+            remedy = f"use a multiple of {2 * self.heads}, twice the heads"
+            raise InputError("sft.backbone.hidden", self.hidden, remedy)
+        if self.heads % self.kv_heads:
+            remedy = f"use a divisor of the {self.heads} heads"
+            raise InputError("sft.backbone.kv_heads", self.kv_heads, remedy)
+        if self.vision_hidden % self.vision_heads:
+            remedy = f"use a divisor of the width {self.vision_hidden}"
+            raise InputError("sft.backbone.vision_heads", self.vision_heads, remedy)
 
 
 def write_backbone(directory: Path, config: BackboneConfig, texts: Sequence[str] = ()) -> Path:

@@ -119,7 +119,7 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     except InputError:
         raise
     except (OSError, ValueError, AttributeError, draccus.utils.DraccusException) as error:
-        remedy = f"its config.json is not one of this LeRobot's policies ({_first_line(error)})"
+        remedy = f"its config.json is not one of this LeRobot's policies ({_brief(error)})"
         raise InputError("policy.path", config.path, remedy) from error
     lerobot_config.device = str(resolve_device(config.device))
     if config.num_steps is not None:
@@ -154,9 +154,7 @@ def load_adapter(config: PolicyConfig) -> PolicyAdapter:
     try:
         policy = get_policy_class(lerobot_config.type).from_pretrained(folder, config=lerobot_config)
     except Exception as error:
-        raise InputError(
-            "policy.path", config.path, f"the weights did not load ({_first_line(error)})"
-        ) from error
+        raise InputError("policy.path", config.path, f"the weights did not load ({_brief(error)})") from error
     _verify_weights(policy, folder, config)
     device = torch.device(lerobot_config.device)
     overrides: dict[str, Any] = {"device_processor": {"device": str(device)}}
@@ -168,7 +166,7 @@ def load_adapter(config: PolicyConfig) -> PolicyAdapter:
         )
     except Exception as error:
         raise InputError(
-            "policy.path", config.path, f"its LeRobot processors did not load ({_first_line(error)})"
+            "policy.path", config.path, f"its LeRobot processors did not load ({_brief(error)})"
         ) from error
     module, _, name = ADAPTERS[lerobot_config.type].partition(":")
     adapter_class = getattr(importlib.import_module(module), name)
@@ -240,7 +238,7 @@ def _checkpoint_folder(config: PolicyConfig) -> Path:
                 snapshot_download(config.path, revision=config.revision, allow_patterns=list(FILES))
             )
         except (OSError, ValueError) as error:
-            remedy = f"not a directory here and not loadable from the Hub ({_first_line(error)})"
+            remedy = f"not a directory here and not loadable from the Hub ({_brief(error)})"
             raise InputError("policy.path", config.path, remedy) from error
     if not (folder / CONFIG).is_file():
         raise InputError(
@@ -291,6 +289,7 @@ def _load_ours(adapter: PolicyAdapter, folder: Path, config: PolicyConfig) -> No
         adapter.value_head.load_state_dict(load_file(folder / VALUE_HEAD))
 
 
-def _first_line(error: BaseException) -> str:
-    text = str(error).strip()
-    return text.splitlines()[0] if text else type(error).__name__
+def _brief(error: BaseException) -> str:
+    """The error's words on one line, not more than a line's worth."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= 160 else text[:159] + "…"

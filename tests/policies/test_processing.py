@@ -1,0 +1,66 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Around the network: LeRobot's own scaling, tokens and names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from accerl_lerobot.policies.base import PolicyAdapter, stack_observations
+from tests.policies.tiny import TEXTS, adapter_at, requests
+
+
+def prepared(adapter: PolicyAdapter, count: int = 3) -> tuple[dict, dict]:
+    observations, tasks = stack_observations(requests(count))
+    return observations, adapter.processing.prepare(observations, tasks)
+
+
+def test_images_are_scaled_and_states_normalised(tiny_checkpoint: Path):
+    raw, batch = prepared(adapter_at(tiny_checkpoint))
+    image = batch["observation.images.front"]
+    assert image.shape == (3, 3, 32, 32) and image.dtype == torch.float32
+    assert np.array_equal(
+        image[1, 2, 5, 7].numpy(), np.float32(raw["observation.images.front"][1, 5, 7, 2]) / 255
+    )
+    assert np.allclose(batch["observation.state"], raw["observation.state"] / 0.5, rtol=1e-6)
+
+
+def test_instructions_get_lerobot_s_newline_and_padding(tiny_checkpoint: Path):
+    adapter = adapter_at(tiny_checkpoint)
+    _, batch = prepared(adapter)
+    tokenizer = adapter.policy.model.vlm_with_expert.processor.tokenizer
+    tokens, mask = batch["observation.language.tokens"], batch["observation.language.attention_mask"]
+    assert len({int(row.sum()) for row in mask}) == 3, "the batch is padded"
+    for text, row, real in zip(TEXTS, tokens, mask, strict=True):
+        assert tokenizer.decode(row[real]) == text + "\n"
+
+
+def test_actions_come_back_in_the_world_s_units(tiny_checkpoint: Path):
+    adapter = adapter_at(tiny_checkpoint)
+    chunk = torch.randn(2, 4, 2, generator=torch.Generator().manual_seed(0))
+    assert torch.allclose(adapter.processing.unnormalise(chunk), 0.5 * chunk)
+
+
+def test_the_caller_s_arrays_are_left_alone(tiny_checkpoint: Path):
+    adapter, asked = adapter_at(tiny_checkpoint), requests(2)
+    observations, tasks = stack_observations(asked)
+    copies = {k: v.copy() for k, v in observations.items()}
+    adapter.decide(asked, 0)
+    adapter.values(observations, tasks)
+    assert all(np.array_equal(observations[k], v) for k, v in copies.items())
+    again = stack_observations(asked)[0]
+    assert all(np.array_equal(again[k], v) for k, v in copies.items())

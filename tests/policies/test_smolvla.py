@@ -1,0 +1,389 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""SmolVLA, in numbers: what acts and what re-scores are one policy; not exploring, it is LeRobot's own."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from accerl_lerobot.experience import Request, Segment
+from accerl_lerobot.policies import flow
+from accerl_lerobot.policies.base import PolicyAdapter, stack_observations
+from accerl_lerobot.policies.flow import FlowSamplerConfig
+from accerl_lerobot.policies.loading import PolicyConfig, save_pretrained
+from accerl_lerobot.policies.value_head import ValueHeadConfig
+from accerl_lerobot.rollout.segments import SegmentBuilder
+from tests.conftest import write_smolvla
+from tests.policies import oracle
+from tests.policies.tiny import adapter_at, log_ratio, perturb, requests, stored
+
+TOLERANCE = 1e-5
+"""The contract: |ρ − 1| of a whole chunk at equal weights, in fp32."""
+SAMPLERS = [
+    FlowSamplerConfig(
+        stochastic=stochastic, noise=noise, noise_level=0.5 if noise == "flow_sde" else 0.2, padded=padded
+    )
+    for stochastic, noise, padded in itertools.product(
+        ("last", "all", "one"), ("euler", "flow_sde"), ("joint", "analytic")
+    )
+    if (stochastic, padded) != ("last", "analytic")  # the same sampler as joint
+]
+
+
+def name(config: FlowSamplerConfig) -> str:
+    return f"{config.stochastic}-{config.noise}-{config.padded}"
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Padded dims, and rows that are not executed: what the traps are about."""
+    directory = tmp_path_factory.mktemp("smolvla") / "pretrained_model"
+    return write_smolvla(directory, chunk=5, executed=3, padded_dim=4, action_dim=2, num_steps=3)
+
+
+@pytest.fixture(scope="module")
+def loaded(path: Path) -> PolicyAdapter:
+    return adapter_at(path)
+
+
+@pytest.fixture
+def adapter(loaded: PolicyAdapter) -> PolicyAdapter:
+    """One of its own for each test."""
+    return copy.deepcopy(loaded)
+
+
+def exploring(adapter: PolicyAdapter, config: FlowSamplerConfig) -> PolicyAdapter:
+    adapter.sampler = config
+    return adapter
+
+
+def as_segment(asked: list[Request], adapter: PolicyAdapter, length: int) -> Segment:
+    """Plays requests as one episode, in which each decision is made alone."""
+    builder = SegmentBuilder(asked[0].observation, length)
+    for i in range(length):
+        builder.add(adapter.decide([asked[i]], 3)[0], 0.0, 3, asked[i + 1].observation)
+    return pickle.loads(pickle.dumps(builder.cut("test")))
+
+
+@pytest.mark.parametrize("config", SAMPLERS, ids=name)
+def test_equal_weights_give_ratio_one_across_batch_sizes(adapter: PolicyAdapter, config: FlowSamplerConfig):
+    adapter, asked = exploring(adapter, config), requests(64)
+    together = adapter.decide(asked, 0)
+    alone = [adapter.decide([request], 0)[0] for request in asked[:16]]
+    for scored, decisions in (
+        (asked, together),  # the same batch
+        (asked, alone + together[16:]),  # decided alone, re-scored among 64 of which most are longer
+        (asked[7:10], together[7:10]),  # the other way round
+    ):
+        assert log_ratio(adapter, scored, decisions).exp().sub(1).abs().max() <= TOLERANCE
+
+
+@pytest.mark.parametrize("config", SAMPLERS, ids=name)
+def test_other_weights_give_the_oracle_s_ratio(adapter: PolicyAdapter, config: FlowSamplerConfig):
+    adapter, asked = exploring(adapter, config), requests(4)
+    decisions = adapter.decide(asked, 0)
+    latent, old = stored(decisions)
+    perturb(adapter, 0.3)
+    observations, tasks = stack_observations(asked)
+    fields = [
+        adapter._prefix({k: v[i : i + 1] for k, v in observations.items()}, [tasks[i]])[0] for i in range(4)
+    ]
+
+    def slow(x: np.ndarray, t: float, sample: int) -> np.ndarray:
+        with torch.no_grad():
+            v = fields[sample](torch.from_numpy(x).float()[None], torch.tensor([t], dtype=torch.float32))
+        return v[0].numpy().astype(np.float64)
+
+    shape = adapter.shape
+    index = np.asarray(latent["index"]) if "index" in latent else np.zeros(4, int)
+    path_ = np.full((4, shape.num_steps + 1, shape.chunk_size, shape.padded_dim), np.nan)
+    if config.stochastic == "all":
+        path_[:] = latent["path"]
+    for b in range(4):
+        if config.stochastic == "last":
+            path_[b, 0], path_[b, -1] = latent["path"][b]
+        if config.stochastic == "one":
+            path_[b, index[b]], path_[b, index[b] + 1] = latent["path"][b]
+    expected = oracle.log_prob(slow, path_, index, shape, config)[:, : old.shape[1]]
+    change = log_ratio(adapter, asked, decisions).numpy()
+    assert np.allclose(change, (expected - old.numpy()).sum(1), atol=2e-4)
+    assert np.abs(change).max() > 0.05, "the weights must have moved the policy"
+
+
+def test_a_decision_does_not_depend_on_its_batch(adapter: PolicyAdapter):
+    asked = requests(24)
+    alone = [adapter.decide([request], 7)[0] for request in asked]
+    together = adapter.decide(asked, 7)
+    reversed_ = adapter.decide(asked[::-1], 7)[::-1]
+    for one, other, third in zip(alone, together, reversed_, strict=True):
+        for a in (other, third):
+            assert np.abs(one.chunk - a.chunk).max() <= TOLERANCE
+            assert np.abs(one.latent["path"] - a.latent["path"]).max() <= TOLERANCE
+            assert abs(one.value - a.value) <= TOLERANCE
+        assert one.chunk.shape == (3, 2) and one.chunk.dtype == np.float32 and one.version == 7
+        assert one.log_prob.shape == (3,) and one.log_prob.dtype == np.float32
+
+
+def test_the_same_batch_gives_the_same_decisions_to_the_bit(adapter: PolicyAdapter):
+    asked = requests(5)
+    one, other = adapter.decide(asked, 0), adapter.decide(asked, 0)
+    assert pickle.dumps(one) == pickle.dumps(other)
+    torch.manual_seed(1)
+    assert pickle.dumps(adapter.decide(asked, 0)) == pickle.dumps(one), "no global generator is read"
+
+
+def test_seed_observation_and_instruction_all_matter(adapter: PolicyAdapter):
+    first = requests(1)[0]
+    observation = first.observation
+    others = [
+        Request(observation=observation, noise_seed=99),
+        *(
+            Request(observation=observation | {key: value}, noise_seed=first.noise_seed)
+            for key, value in {
+                "observation.state": np.ones(4, np.float32),
+                "observation.images.front": np.zeros((32, 32, 3), np.uint8),
+                "task": "Stay",
+            }.items()
+        ),
+    ]
+    chunk = adapter.decide([first], 0)[0].chunk
+    for other in others:
+        assert np.abs(adapter.decide([other], 0)[0].chunk - chunk).max() > 1e-3
+
+
+@pytest.mark.parametrize("config", SAMPLERS, ids=name)
+def test_ratio_one_after_save_and_load_and_a_segment_s_journey(
+    adapter: PolicyAdapter, path: Path, tmp_path: Path, config: FlowSamplerConfig
+):
+    adapter, asked = exploring(adapter, config), requests(9)
+    perturb(adapter, 0.1)
+    segment = as_segment(asked, adapter, 8)
+    save_pretrained(adapter, tmp_path / "saved", PolicyConfig(path=str(path), device="cpu", sampler=config))
+    again = adapter_at(tmp_path / "saved", config)
+    with torch.no_grad():
+        evaluation = again.evaluate(
+            {k: v[:-1] for k, v in segment.observations.items()},
+            [str(r.observation["task"]) for r in asked[:8]],
+            {k: torch.from_numpy(v) for k, v in segment.latent.items()},
+        )
+    ratio = (evaluation.log_prob - torch.from_numpy(segment.log_prob)).sum(1).exp()
+    assert (ratio - 1).abs().max() <= TOLERANCE
+    assert np.abs(evaluation.value.numpy() - segment.value).max() <= TOLERANCE
+    assert np.abs(segment.value).max() > 0, "the critic was saved and loaded, not made anew"
+
+
+@pytest.mark.parametrize("config", SAMPLERS, ids=name)
+def test_not_exploring_is_lerobot_s_own_sampler(adapter: PolicyAdapter, config: FlowSamplerConfig):
+    adapter, asked = exploring(adapter, config), requests(6, explore=False)
+    observations, tasks = stack_observations(asked)
+    assert adapter.self_check(observations, tasks) == 0.0
+    noise, _, _ = adapter._noise(asked)
+    batch = adapter.processing.prepare(observations, tasks)
+    stock = adapter.processing.unnormalise(adapter.policy.predict_action_chunk(batch, noise=noise))
+    adapter.policy.reset()
+    chunks = np.stack([d.chunk for d in adapter.decide(asked, 0)])
+    assert np.array_equal(chunks, stock[:, :3].numpy())
+    noisy = np.stack([d.chunk for d in adapter.decide(requests(6), 0)])
+    assert np.abs(noisy - chunks).max() > 1e-2
+
+
+def test_the_executed_noise_has_the_configured_size(adapter: PolicyAdapter):
+    # Under ``last`` and euler the executed action is the stock one plus N(0, 0.2²) in normalised units;
+    # the checkpoint's action std is 0.5.
+    adapter.sampler = FlowSamplerConfig(stochastic="last", noise="euler", noise_level=0.2)
+    noisy = np.stack([d.chunk for d in adapter.decide(requests(200), 0)])
+    stock = np.stack([d.chunk for d in adapter.decide(requests(200, explore=False), 0)])
+    added = (noisy - stock) / 0.5
+    assert abs(added.mean()) < 0.02 and added.std() == pytest.approx(0.2, rel=0.06)
+
+
+def test_a_changed_velocity_is_refused(adapter: PolicyAdapter, monkeypatch: pytest.MonkeyPatch):
+    observations, tasks = stack_observations(requests(2))
+    prefix = adapter._prefix
+
+    def tampered(observations, tasks):  # noqa: ANN001, ANN202
+        velocity, value = prefix(observations, tasks)
+        return (lambda x, t: 1.001 * velocity(x, t)), value
+
+    monkeypatch.setattr(adapter, "_prefix", tampered)
+    with pytest.raises(
+        RuntimeError, match=r"does not fit LeRobot 0\.6\.1: it differs from its sampler by \d"
+    ):
+        adapter.self_check(observations, tasks)
+
+
+def test_an_incompatible_lerobot_fails_at_load(path: Path, monkeypatch: pytest.MonkeyPatch):
+    from lerobot.policies.smolvla import modeling_smolvla
+
+    def midpoint(denoise, noise, num_steps, **options):  # noqa: ANN001, ANN003, ANN202
+        x, dt = noise, -1.0 / num_steps
+        for step in range(num_steps):
+            x = x + dt * denoise(x, torch.full((len(x),), 1.0 + (step + 0.5) * dt))
+        return x
+
+    with monkeypatch.context() as patch:
+        patch.setattr(modeling_smolvla, "euler_integrate", midpoint)
+        with pytest.raises(RuntimeError, match="differs from its sampler"):
+            adapter_at(path)
+    monkeypatch.delattr(modeling_smolvla.VLAFlowMatching, "embed_prefix")
+    with pytest.raises(RuntimeError, match=r"cannot drive it \(AttributeError: .*embed_prefix"):
+        adapter_at(path)
+
+
+def test_weights_that_compute_nan_are_refused(adapter: PolicyAdapter):
+    with torch.no_grad():
+        adapter.policy.model.action_out_proj.bias.fill_(float("nan"))
+    with pytest.raises(RuntimeError, match="differs from its sampler by nan"):
+        adapter.self_check(*stack_observations(requests(2)))
+
+
+def test_values_are_those_of_evaluate_and_carry_no_gradient(adapter: PolicyAdapter):
+    perturb(adapter, 0.1)
+    asked = requests(6)
+    observations, tasks = stack_observations(asked)
+    latent, _ = stored(adapter.decide(asked, 0))
+    values = adapter.values(observations, tasks)
+    evaluation = adapter.evaluate(observations, tasks, latent)
+    assert not values.requires_grad and evaluation.value.requires_grad and evaluation.log_prob.requires_grad
+    assert torch.equal(values, evaluation.value.detach()) and values.shape == evaluation.entropy.shape == (6,)
+    assert values.std() > 0
+
+
+@pytest.mark.parametrize("stochastic", ["last", "all", "one"])
+def test_gradients_reach_every_trainable_parameter(adapter: PolicyAdapter, stochastic: str):
+    adapter, asked = exploring(adapter, FlowSamplerConfig(stochastic=stochastic)), requests(8)
+    perturb(adapter, 0.1)  # the critic starts at zero, where only its output layer has a gradient
+    latent, _ = stored(adapter.decide(asked, 0))
+    evaluation = adapter.evaluate(*stack_observations(asked), latent)
+    (evaluation.log_prob.sum() + evaluation.value.sum()).backward()
+    parameters = adapter.trainable()
+    silent = [k for k, p in parameters.items() if p.grad is None or not p.grad.abs().max() > 0]
+    assert silent == []
+    assert any("vision_model" in k for k in parameters) and any("lm_expert" in k for k in parameters)
+
+
+@pytest.mark.parametrize("detach", [True, False])
+def test_the_value_loss_reaches_the_backbone_only_when_asked(path: Path, detach: bool):
+    adapter = adapter_at(path, value_head=ValueHeadConfig(detach=detach))
+    perturb(adapter, 0.1)
+    asked = requests(4)
+    latent, _ = stored(adapter.decide(asked, 0))
+    adapter.evaluate(*stack_observations(asked), latent).value.square().sum().backward()
+    reached = {k for k, p in adapter.trainable().items() if p.grad is not None and p.grad.abs().max() > 0}
+    critic = {k for k in adapter.trainable() if k.startswith("value_head.")}
+    assert critic <= reached
+    assert (reached == critic) if detach else any("vision_model" in k for k in reached)
+
+
+@pytest.mark.parametrize("config", [c for c in SAMPLERS if c.padded == "joint"], ids=name)
+def test_log_prob_s_gradient_against_finite_differences(adapter: PolicyAdapter, config: FlowSamplerConfig):
+    # fp32: along the gradient itself, where the change is large against rounding.
+    adapter, asked = exploring(adapter, config), requests(8)
+    decisions = adapter.decide(asked, 0)
+    latent, _ = stored(decisions)
+    perturb(adapter, 0.2)
+    adapter.evaluate(*stack_observations(asked), latent).log_prob.sum().backward()
+    named = {k: p for k, p in adapter.trainable().items() if not k.startswith("value_head.")}
+    for part in ("vision_model", "text_model", "lm_expert", "action_out_proj"):
+        gradients = {k: p.grad.clone() for k, p in named.items() if part in k}
+        norm = float(torch.cat([g.flatten() for g in gradients.values()]).norm())
+        home, scores, step = {k: named[k].detach().clone() for k in gradients}, [], 0.05 / norm
+        for sign in (1, -1):
+            with torch.no_grad():
+                for key, gradient in gradients.items():
+                    named[key].copy_(home[key] + sign * step * gradient / norm)
+            scores.append(float(log_ratio(adapter, asked, decisions).sum()))
+        with torch.no_grad():
+            for key, value in home.items():
+                named[key].copy_(value)
+        assert (scores[0] - scores[1]) / (2 * step) == pytest.approx(norm, rel=0.02), part
+
+
+def test_published_weights_go_round_and_make_the_same_policy(loaded: PolicyAdapter):
+    trainer, reader, asked = copy.deepcopy(loaded), copy.deepcopy(loaded), requests(5)
+    perturb(trainer, 0.1)
+    exported = trainer.export_trainable()
+    assert all(a.dtype == np.float32 for a in exported.values())
+    assert any(k.startswith("value_head.") for k in exported)
+    before = pickle.dumps(reader.decide(asked, 0))
+    for array in exported.values():
+        array.setflags(write=False)  # as out of Ray's object store
+    reader.load_trainable(exported)
+    assert pickle.dumps(reader.decide(asked, 0)) == pickle.dumps(trainer.decide(asked, 0)) != before
+    perturb(trainer, 0.1)
+    assert np.array_equal(exported["value_head.out.bias"], reader.export_trainable()["value_head.out.bias"])
+
+
+def test_weights_that_do_not_fit_change_nothing(adapter: PolicyAdapter):
+    good = adapter.export_trainable()
+    moved = {k: v + 1 for k, v in good.items()}
+    first = next(iter(moved))
+    with pytest.raises(ValueError, match=f"published weights differ by name: .*{first}"):
+        adapter.load_trainable({k: v for k, v in moved.items() if k != first})
+    last = list(moved)[-1]
+    with pytest.raises(ValueError, match=rf"published {last} has shape \(7,\), not"):
+        adapter.load_trainable(moved | {last: np.zeros(7, np.float32)})
+    assert all(np.array_equal(a, good[k]) for k, a in adapter.export_trainable().items())
+
+
+def test_training_touches_neither_normalisation_nor_what_lerobot_froze(
+    adapter: PolicyAdapter, path: Path, tmp_path: Path
+):
+    asked = requests(4)
+    state = {k: v.clone() for k, v in adapter.policy.state_dict().items()}
+    trainable = adapter.trainable()
+    latent, _ = stored(adapter.decide(asked, 0))
+    optimizer = torch.optim.AdamW(trainable.values(), lr=1e-2)
+    evaluation = adapter.evaluate(*stack_observations(asked), latent)
+    (evaluation.log_prob.sum() + evaluation.value.sum()).backward()
+    optimizer.step()
+    save_pretrained(adapter, tmp_path / "trained", PolicyConfig(path=str(path), device="cpu"))
+    files = sorted(f.name for f in path.glob("policy_*processor*.safetensors"))
+    assert len(files) == 2
+    for file in files:
+        assert (tmp_path / "trained" / file).read_bytes() == (path / file).read_bytes()
+    moved = {k for k, v in adapter.policy.state_dict().items() if not torch.equal(v, state[k])}
+    assert moved == {k.removeprefix("policy.") for k in trainable if k.startswith("policy.")}
+    frozen = {k for k, p in adapter.policy.named_parameters() if not p.requires_grad}
+    assert frozen and not frozen & moved
+
+
+@pytest.mark.parametrize("config", [c for c in SAMPLERS if c.stochastic == "last"], ids=name)
+def test_only_executed_entries_are_scored(adapter: PolicyAdapter, config: FlowSamplerConfig):
+    adapter, asked = exploring(adapter, config), requests(4)
+    decisions = adapter.decide(asked, 0)
+    for decision in decisions:
+        decision.latent["path"][1, 3:] += 1.0
+        decision.latent["path"][1, :, 2:] += 1.0
+    assert log_ratio(adapter, asked, decisions).abs().max() <= TOLERANCE
+    for decision in decisions:
+        decision.latent["path"][1, 2, 1] += 0.1
+    assert log_ratio(adapter, asked, decisions).abs().min() > 1e-3
+
+
+@pytest.mark.parametrize(("stochastic", "points"), [("last", 2), ("all", 4), ("one", 2)])
+def test_the_latent_is_as_small_as_re_scoring_allows(adapter: PolicyAdapter, stochastic: str, points: int):
+    decision = exploring(adapter, FlowSamplerConfig(stochastic=stochastic)).decide(requests(1), 0)[0]
+    assert decision.latent["path"].shape == (points, 5, 4)
+
+
+def test_the_shape_is_the_policy_s(adapter: PolicyAdapter):
+    assert adapter.shape == flow.FlowShape(num_steps=3, chunk_size=5, executed=3, padded_dim=4, action_dim=2)

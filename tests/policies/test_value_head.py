@@ -1,0 +1,85 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The critic: pools real tokens only, starts at zero, can keep its gradient to itself."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.value_head import ValueHead, ValueHeadConfig
+
+
+def head(**options: object) -> ValueHead:
+    """With weights of ordinary size, as after some training."""
+    torch.manual_seed(0)
+    module = ValueHead(6, ValueHeadConfig(**options))
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter.normal_()
+    return module
+
+
+def inputs() -> tuple[torch.Tensor, torch.Tensor]:
+    features = torch.randn(2, 4, 6, generator=torch.Generator().manual_seed(1))
+    return features, torch.tensor([[True, True, True, False], [True, True, False, False]])
+
+
+def test_a_new_critic_says_zero():
+    assert torch.equal(ValueHead(6, ValueHeadConfig())(*inputs()), torch.zeros(2))
+
+
+@pytest.mark.parametrize("pooling", ["attention", "mean"])
+def test_padding_is_not_read(pooling: str):
+    critic, (features, mask) = head(pooling=pooling), inputs()
+    value = critic(features, mask)
+    assert value.shape == (2,) and value.std() > 0
+    other = torch.where(mask[..., None], features, 100.0)
+    assert torch.equal(critic(other, mask), value)
+    alone = critic(features[1:, :2], mask[1:, :2])
+    assert torch.allclose(alone, value[1:], atol=1e-6)
+
+
+def test_mean_pooling_by_hand_and_attention_that_differs():
+    (features, mask), mean, attention = inputs(), head(pooling="mean"), head(pooling="attention")
+    pooled = torch.stack([features[0, :3].mean(0), features[1, :2].mean(0)])
+    expected = mean.out(torch.relu(mean.hidden(mean.norm(pooled))))[:, 0]
+    assert torch.allclose(mean(features, mask), expected, atol=1e-6)
+    assert attention.query is not None
+    scores = features[1, :2] @ attention.query / 6**0.5
+    pooled = (torch.softmax(scores, 0)[:, None] * features[1, :2]).sum(0)
+    expected = attention.out(torch.relu(attention.hidden(attention.norm(pooled))))[0]
+    assert torch.allclose(attention(features, mask)[1], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("detach", [True, False])
+def test_detach(detach: bool):
+    features, mask = inputs()
+    features.requires_grad_()
+    critic = head(detach=detach)
+    critic(features, mask).sum().backward()
+    assert all(p.grad is not None and p.grad.abs().max() > 0 for p in critic.parameters())
+    assert (features.grad is None) == detach
+
+
+def test_half_precision_features_are_read_in_full():
+    features, mask = inputs()
+    assert head()(features.bfloat16(), mask).dtype == torch.float32
+
+
+@pytest.mark.parametrize(("name", "value"), [("pooling", "max"), ("hidden", 0)])
+def test_bad_options_name_their_field(name: str, value: object):
+    with pytest.raises(InputError, match=f"^policy.value_head.{name}={value!r}: use"):
+        ValueHeadConfig(**{name: value})

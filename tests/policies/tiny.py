@@ -1,0 +1,77 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Observations for the tiny SmolVLA of `write_smolvla`, and stored decisions as the trainer sees them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from accerl_lerobot.experience import TASK, Decision, Request
+from accerl_lerobot.policies.base import PolicyAdapter, stack_observations
+from accerl_lerobot.policies.flow import FlowSamplerConfig
+from accerl_lerobot.policies.loading import PolicyConfig, load_adapter
+
+TEXTS = ("Match the target", "Go", "Mirror the target slowly, then stay")
+"""Of different lengths, so that a batch pads some of them."""
+
+
+def requests(count: int, *, explore: bool = True, seed: int = 0) -> list[Request]:
+    rng = np.random.default_rng(seed)
+    return [
+        Request(
+            observation={
+                "observation.images.front": rng.integers(0, 256, (32, 32, 3), dtype=np.uint8),
+                "observation.state": rng.standard_normal(4, dtype=np.float32),
+                TASK: TEXTS[i % len(TEXTS)],
+            },
+            noise_seed=1000 * seed + i,
+            explore=explore,
+        )
+        for i in range(count)
+    ]
+
+
+def adapter_at(path: Path, sampler: FlowSamplerConfig | None = None, **options: Any) -> PolicyAdapter:
+    sampler = sampler or FlowSamplerConfig()
+    return load_adapter(PolicyConfig(path=str(path), device="cpu", sampler=sampler, **options))
+
+
+def stored(decisions: Sequence[Decision]) -> tuple[dict[str, Tensor], Tensor]:
+    """(latents, log-probs (B, L)) of decisions, as a batch."""
+    latent = {k: torch.from_numpy(np.stack([d.latent[k] for d in decisions])) for k in decisions[0].latent}
+    return latent, torch.from_numpy(np.stack([d.log_prob for d in decisions]))
+
+
+def log_ratio(adapter: PolicyAdapter, asked: Sequence[Request], decisions: Sequence[Decision]) -> Tensor:
+    """log ρ (B,) of whole chunks, re-scored in one batch without gradient."""
+    latent, old = stored(decisions)
+    with torch.no_grad():
+        new = adapter.evaluate(*stack_observations(asked), latent).log_prob
+    assert new.shape == old.shape
+    return (new - old).sum(1)
+
+
+def perturb(adapter: PolicyAdapter, scale: float, seed: int = 0) -> None:
+    """Moves every trainable weight at random, relative to its size."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in adapter.trainable().values():
+            size = parameter.abs().mean() + 1e-3
+            parameter += scale * size * torch.randn(parameter.shape, generator=generator)
