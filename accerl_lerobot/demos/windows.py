@@ -32,7 +32,7 @@ def open_metadata(dataset: DatasetConfig) -> Any:
     """
     from pathlib import Path
 
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from lerobot.datasets.dataset_metadata import CODEBASE_VERSION, LeRobotDatasetMetadata
     from lerobot.datasets.utils import CompatibilityError
 
     if dataset.repo_id is None:
@@ -45,8 +45,11 @@ def open_metadata(dataset: DatasetConfig) -> Any:
         )
     try:
         return LeRobotDatasetMetadata(dataset.repo_id, root=dataset.root, revision=dataset.revision)
-    except CompatibilityError as error:
-        remedy = "its format is another LeRobot version's; convert it as LeRobot's message says"
+    except (CompatibilityError, NotImplementedError) as error:
+        tool = f"python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={dataset.repo_id}"
+        remedy = (
+            f"its format is not {CODEBASE_VERSION}, which this LeRobot reads; from v2.1 convert with: {tool}"
+        )
         raise InputError("dataset.repo_id", dataset.repo_id, remedy) from error
     except (OSError, ValueError) as error:
         first = (str(error).splitlines() or [type(error).__name__])[0]

@@ -1,0 +1,299 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Warm start: LeRobot's own trainer in a process of its own, and its items from memory."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import shutil
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from accerl_lerobot.demos import cached_train, sft
+from accerl_lerobot.demos.sft import SFTConfig, run_sft, sft_command
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.backbone import BackboneConfig
+from tests.policies.tiny import adapter_at
+
+ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
+CAMERA = "observation.images.corner2"
+TINY = SFTConfig(
+    steps=2,
+    batch_size=4,
+    warmup_steps=1,
+    num_threads=1,
+    policy={
+        "type": "smolvla",
+        "num_vlm_layers": 2,
+        "num_expert_layers": 2,
+        "chunk_size": 4,
+        "n_action_steps": 4,
+        "max_state_dim": 4,
+        "max_action_dim": 4,
+        "resize_imgs_with_padding": [32, 32],
+        "num_steps": 2,
+        "expert_width_multiplier": 1.0,
+        "train_expert_only": False,
+        "freeze_vision_encoder": False,
+    },
+    backbone=BackboneConfig(
+        hidden=32, heads=2, kv_heads=1, vision_hidden=16, vision_layers=1, vision_heads=2, patch=8, image=32
+    ),
+)
+
+
+def stock_dataset() -> Any:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    return LeRobotDataset(
+        "accerl/metaworld_tiny",
+        root=ROOT,
+        delta_timestamps={"action": [i / 80 for i in range(4)]},
+        video_backend="pyav",
+        return_uint8=True,
+    )
+
+
+def equal(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    return one.keys() == other.keys() and all(
+        torch.equal(one[k], other[k]) if isinstance(one[k], torch.Tensor) else one[k] == other[k] for k in one
+    )
+
+
+class Counting:
+    """A dataset that counts how often it is read."""
+
+    num_frames = 3
+
+    def __init__(self) -> None:
+        self.reads: list[int] = []
+
+    def __len__(self) -> int:
+        return 3
+
+    def __getitem__(self, index: int) -> dict[str, int]:
+        self.reads.append(index)
+        return {"index": index}
+
+
+def test_cached_items_are_the_stock_ones_at_every_reading():
+    dataset = stock_dataset()
+    cached = cached_train.CachedDataset(dataset)
+    assert len(cached) == len(dataset) == 365
+    for index in (0, 7, 88, 364):  # 364: a chunk that reaches beyond its episode
+        for _ in range(2):
+            assert equal(cached[index], dataset[index])
+    assert cached[364]["action_is_pad"].tolist() == [False, True, True, True]
+    assert cached.meta is dataset.meta and cached.num_frames == 365
+
+
+def test_items_are_read_once_and_cannot_be_spoilt():
+    dataset = Counting()
+    cached = cached_train.CachedDataset(dataset)
+    cached[1].clear()
+    cached[1]["task"] = "mine"
+    assert cached[1] == {"index": 1} and cached[2] == {"index": 2} and dataset.reads == [1, 2]
+    assert cached.num_frames == 3
+    with pytest.raises(AttributeError, match="no_such"):
+        _ = cached.no_such
+    again = pickle.loads(pickle.dumps(cached))  # as into a loader process that is spawned
+    assert again[1] == {"index": 1} and again.num_frames == 3
+
+
+def test_image_memory_by_hand():
+    meta = SimpleNamespace(
+        camera_keys=["a", "b"], features={"a": {"shape": (8, 4, 3)}, "b": {"shape": (2, 2, 3)}}
+    )
+    assert cached_train.item_bytes(meta) == 4 * (8 * 4 * 3 + 2 * 2 * 3)
+
+
+@pytest.mark.parametrize(
+    ("transforms", "streaming", "limit", "expected"),
+    [
+        (False, False, 1000, True),
+        (True, False, 1000, False),
+        (False, True, 1000, False),
+        (False, False, 100, False),
+    ],
+)
+def test_what_cannot_be_cached_is_read_the_stock_way(
+    monkeypatch: pytest.MonkeyPatch, transforms: bool, streaming: bool, limit: int, expected: bool
+):
+    from lerobot.scripts import lerobot_train
+
+    dataset = Counting()
+    dataset.meta = SimpleNamespace(camera_keys=["a"], features={"a": {"shape": (4, 4, 3)}})
+    got = []
+    monkeypatch.setattr(lerobot_train, "make_train_eval_datasets", lambda cfg: (dataset, "evaluation"))
+    options = SimpleNamespace(image_transforms=SimpleNamespace(enable=transforms), streaming=streaming)
+    monkeypatch.setattr(
+        lerobot_train,
+        "main",
+        lambda: got.extend(lerobot_train.make_train_eval_datasets(SimpleNamespace(dataset=options))),
+    )
+    monkeypatch.setattr(cached_train, "MAX_BYTES", limit)
+    cached_train.main()
+    assert isinstance(got[0], cached_train.CachedDataset) == expected and got[1] == "evaluation"
+
+
+def test_two_steps_of_lerobot_s_trainer_give_a_checkpoint(tmp_path: Path):
+    path = run_sft(
+        TINY, "accerl/metaworld_tiny", str(ROOT), tmp_path / "sft", seed=0, texts=["Open a drawer"]
+    )
+    assert path == tmp_path / "sft" / "checkpoints" / "last" / "pretrained_model"
+    assert "End of training" in (tmp_path / "sft.log").read_text()
+    adapter = adapter_at(path)
+    assert (adapter.shape.executed, adapter.shape.action_dim, adapter.shape.padded_dim) == (4, 4, 4)
+    assert list(adapter.policy.config.image_features) == [CAMERA]
+    item = stock_dataset()[100]
+    observation = {
+        "observation.state": item["observation.state"].numpy()[None],
+        CAMERA: item[CAMERA].permute(1, 2, 0).numpy()[None],
+    }
+    batch = adapter.processing.prepare(observation, [item["task"]])
+    stats = stock_dataset().meta.stats["observation.state"]
+    expected = (observation["observation.state"] - stats["mean"]) / (stats["std"] + 1e-8)
+    assert np.allclose(batch["observation.state"], expected, atol=1e-4), "the dataset's normalisation"
+
+
+def command_that(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
+    monkeypatch.setattr(sft, "sft_command", lambda *arguments: [sys.executable, "-u", "-c", program])
+
+
+def test_a_failing_trainer_raises_with_the_end_of_its_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    command_that(monkeypatch, "for i in range(40): print('line', i)\nraise SystemExit('out of disk')")
+    with pytest.raises(RuntimeError) as caught:
+        run_sft(TINY, "a/b", None, tmp_path / "sft", seed=0)
+    message = str(caught.value)
+    assert "exit code 1" in message and str(tmp_path / "sft.log") in message
+    assert "line 39\n" in message and "line 20\n" not in message and "out of disk" in message
+    assert (tmp_path / "sft.log").read_text().startswith("line 0\n")
+
+
+def test_progress_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    lines = [
+        "INFO 2026-01-01 12:00:00 train.py:1 step:25 smpl:2K ep:4 epch:0.41 loss:1.250 grdn:2.0 lr:1.0e-03",
+        "a line: with colons",
+        "step:2K loss:0.5",
+        "step:1M loss:nan",
+        "step:? loss:0.5",
+    ]
+    command_that(monkeypatch, f"print({chr(10).join(lines)!r})")
+    seen: list[tuple[int, float]] = []
+    run_sft(TINY, "a/b", None, tmp_path / "sft", seed=0, on_step=lambda step, loss: seen.append((step, loss)))
+    assert seen[:2] == [(25, 1.25), (2000, 0.5)]
+    assert seen[2][0] == 1_000_000 and np.isnan(seen[2][1]) and len(seen) == 3
+
+
+def test_an_interrupted_caller_takes_the_trainer_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    command_that(
+        monkeypatch, "import os, time\nprint(f'step:{os.getpid()} loss:1', flush=True)\ntime.sleep(60)"
+    )
+    seen: list[int] = []
+
+    def interrupt(step: int, loss: float) -> None:
+        seen.append(step)
+        raise KeyboardInterrupt
+
+    started = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        run_sft(TINY, "a/b", None, tmp_path / "sft", seed=0, on_step=interrupt)
+    assert time.monotonic() - started < 30
+    with pytest.raises(ProcessLookupError):
+        os.kill(seen[0], 0)
+
+
+def test_an_existing_folder_is_never_touched(tmp_path: Path):
+    with pytest.raises(InputError, match="^output_dir=.*the folder exists"):
+        run_sft(TINY, "a/b", None, tmp_path, seed=0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_command_line(tmp_path: Path):
+    command = sft_command(TINY, "a/b", "/data", tmp_path / "sft", 3, "cpu", "v1")
+    assert command[:3] == [sys.executable, "-m", "accerl_lerobot.demos.cached_train"]
+    for argument in (
+        "--policy.type=smolvla",
+        "--policy.resize_imgs_with_padding=[32, 32]",
+        "--policy.train_expert_only=false",
+        f"--policy.vlm_model_name={tmp_path / 'backbone'}",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        "--policy.optimizer_lr=0.001",
+        "--policy.scheduler_decay_steps=2",
+        "--dataset.repo_id=a/b",
+        "--dataset.root=/data",
+        "--dataset.revision=v1",
+        "--steps=2",
+        "--seed=3",
+    ):
+        assert argument in command
+    start = SFTConfig(steps=2, init_path="org/policy", cache=False, extra_args=["--log_freq=1"])
+    command = sft_command(start, "a/b", None, tmp_path / "sft", 0, "cuda")
+    assert command[2] == "lerobot.scripts.lerobot_train" and "--policy.path=org/policy" in command
+    assert command[-1] == "--log_freq=1"
+    assert not [a for a in command if a.startswith(("--policy.type", "--dataset.root", "--dataset.revision"))]
+
+
+def test_a_moved_checkpoint_is_started_from_a_copy(
+    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    from accerl_lerobot.checkpoint import relocate
+    from accerl_lerobot.policies.loading import PolicyConfig, save_pretrained
+
+    start = tmp_path / "start"
+    save_pretrained(adapter_at(tiny_checkpoint), start, PolicyConfig(path=str(tiny_checkpoint)))
+    seen: list[str | None] = []
+
+    def command(config: SFTConfig, *rest: object) -> list[str]:
+        seen.append(config.init_path)
+        return [sys.executable, "-c", ""]
+
+    monkeypatch.setattr(sft, "sft_command", command)
+    run_sft(SFTConfig(steps=1, init_path=str(start)), "a/b", None, tmp_path / "one" / "sft", seed=0)
+    shutil.move(start, tmp_path / "moved")
+    before = (tmp_path / "moved" / "config.json").read_text()
+    run_sft(
+        SFTConfig(steps=1, init_path=str(tmp_path / "moved")), "a/b", None, tmp_path / "two" / "sft", seed=0
+    )
+    assert seen == [str(start), str(tmp_path / "two" / "init")]
+    assert (tmp_path / "moved" / "config.json").read_text() == before
+    copied = (tmp_path / "two" / "init" / "config.json").read_text()
+    relocate(tmp_path / "two" / "init", tmp_path / "two" / "init")
+    assert (tmp_path / "two" / "init" / "config.json").read_text() == copied
+
+
+@pytest.mark.parametrize(
+    ("values", "field"),
+    [
+        ({"steps": -1}, "sft.steps"),
+        ({"lr": 1.0}, "sft.lr"),
+        ({"batch_size": 0}, "sft.batch_size"),
+        ({"warmup_steps": -1}, "sft.warmup_steps"),
+        ({"num_workers": -1}, "sft.num_workers"),
+        ({"num_threads": 0}, "sft.num_threads"),
+        ({"policy": {"chunk_size": 4}}, "sft.policy"),
+    ],
+)
+def test_bad_values_name_their_field(values: dict, field: str):
+    with pytest.raises(InputError, match=f"^{field}="):
+        SFTConfig(**values)
