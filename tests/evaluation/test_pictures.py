@@ -1,0 +1,97 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The curve and the video that people look at."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+
+from accerl_lerobot.evaluation.pictures import GAP, success_curve, write_video
+
+
+def evaluation(env_steps: float, successes: int, n: int) -> dict[str, Any]:
+    from accerl_lerobot.evaluation.stats import wilson_interval
+
+    interval = wilson_interval(successes, n)
+    return {"env_steps": env_steps, "success": successes / n, "n": n, "ci95": [interval.low, interval.high]}
+
+
+def clip(frames: int, colour: tuple[int, int, int], side: int = 32) -> list[np.ndarray]:
+    return [np.full((side, side, 3), colour, np.uint8) for _ in range(frames)]
+
+
+def read(path: Path) -> np.ndarray:
+    return np.stack([np.asarray(frame) for frame in imageio.get_reader(path)])
+
+
+class TestSuccessCurve:
+    """PNG."""
+
+    def test_draws(self, tmp_path: Path) -> None:
+        path = tmp_path / "curve.png"
+        success_curve(path, [evaluation(0, 30, 100), evaluation(5000, 95, 100)], [(100, 0.3), (4000, 0.9)])
+        image = np.asarray(imageio.imread(path))
+        assert image.shape[:2] == (480, 840)
+        assert len(np.unique(image[..., :3].reshape(-1, 3), axis=0)) > 20
+
+    @pytest.mark.parametrize("successes", [0, 1, 20])
+    def test_rates_at_the_ends(self, tmp_path: Path, successes: int) -> None:
+        """matplotlib refuses an error bar of negative length, be it by rounding."""
+        success_curve(tmp_path / "curve.png", [evaluation(0, successes, 20)], [])
+
+    def test_evaluations_may_come_out_of_order(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """One that was planned while training may be reported after a later one."""
+        from matplotlib.axes import Axes
+
+        seen: list[list[float]] = []
+        draw = Axes.errorbar
+
+        def errorbar(self: Axes, x: Any, y: Any, **rest: Any) -> Any:
+            seen.append(list(x))
+            return draw(self, x, y, **rest)
+
+        monkeypatch.setattr(Axes, "errorbar", errorbar)
+        success_curve(tmp_path / "curve.png", [evaluation(s, 5, 10) for s in (0, 900, 400)], [])
+        assert seen == [[0, 400, 900]]
+
+
+class TestVideo:
+    """MP4 in the pixel format that all players know."""
+
+    def test_clips_stand_side_by_side_and_hold_their_last_frame(self, tmp_path: Path) -> None:
+        path = tmp_path / "film.mp4"
+        write_video(path, [clip(3, (200, 0, 0)), clip(6, (0, 0, 200))], fps=10)
+        film = read(path)
+        assert film.shape == (6 + 5, 32, 32 + GAP + 32, 3)
+        left, right = film[:, 8:24, 8:24].mean((1, 2)), film[:, 8:24, -24:-8].mean((1, 2))
+        assert (abs(left - (200, 0, 0)) < 25).all() and (abs(right - (0, 0, 200)) < 25).all()
+        assert (film[:, :, 33 : 32 + GAP - 1] > 150).all()
+
+    def test_odd_sides(self, tmp_path: Path) -> None:
+        write_video(tmp_path / "film.mp4", [clip(2, (9, 9, 9), side=33)], fps=4)
+        assert read(tmp_path / "film.mp4").shape[1:3] == (32, 32)
+
+    def test_pixel_format(self, tmp_path: Path) -> None:
+        write_video(tmp_path / "film.mp4", [clip(2, (9, 9, 9))], fps=4)
+        assert imageio.get_reader(tmp_path / "film.mp4").get_meta_data()["pix_fmt"].startswith("yuv420p")
+
+    @pytest.mark.parametrize("clips", [[], [[]]])
+    def test_nothing_to_write(self, tmp_path: Path, clips: list[list[np.ndarray]]) -> None:
+        with pytest.raises(ValueError, match="every clip needs a frame"):
+            write_video(tmp_path / "film.mp4", clips, fps=4)

@@ -1,0 +1,226 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What must hold of the repository itself, whoever adds a file to it."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from accerl_lerobot.cli import VERBS
+from accerl_lerobot.config import RunConfig, parse
+from accerl_lerobot.doctor import pins
+from accerl_lerobot.preflight import check_sft_policy
+from accerl_lerobot.verbs import CONFIGS
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "accerl_lerobot"
+
+HEADER = (
+    "# Copyright 2026 The accerl-lerobot authors.\n#\n"
+    '# Licensed under the Apache License, Version 2.0 (the "License");\n'
+)
+LONGEST_FILE = 400
+SHELLS = {"launch.py", "doctor.py", "ray_channel.py", "worker.py"}
+"""Files that may import Ray; all others are testable without it."""
+
+LIGHT = [
+    "accerl_lerobot.algorithms",
+    "accerl_lerobot.cli",
+    "accerl_lerobot.demos.record",
+    "accerl_lerobot.envs",
+    "accerl_lerobot.experience",
+    "accerl_lerobot.inference.batcher",
+    "accerl_lerobot.replay.worker",
+    "accerl_lerobot.rollout.worker",
+    "accerl_lerobot.trainer.config",
+    "accerl_lerobot.weights.ray_channel",
+]
+"""Modules of processes that hold no policy: torch and LeRobot would cost each 400 MB and four seconds."""
+
+
+def tracked() -> list[Path]:
+    """Files under version control, and new ones that are about to be."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    try:
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    except (FileNotFoundError, subprocess.CalledProcessError):
+        pytest.skip("not a git checkout")
+    return [ROOT / line for line in done.stdout.splitlines() if (ROOT / line).is_file()]
+
+
+def sources() -> list[Path]:
+    return sorted(PACKAGE.rglob("*.py"))
+
+
+def imports(path: Path, *, top_level: bool = False) -> Iterator[str]:
+    """Names of imported modules; those at the top of the file only, if so asked."""
+    tree = ast.parse(path.read_text())
+    for node in tree.body if top_level else ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def test_every_python_file_has_the_licence_header() -> None:
+    bare = [p.name for p in tracked() if p.suffix == ".py" and not p.read_text().startswith(HEADER)]
+    assert bare == []
+
+
+def test_no_file_is_too_long() -> None:
+    long = {
+        str(p.relative_to(ROOT)): n
+        for p in sources()
+        if (n := len(p.read_text().splitlines())) > LONGEST_FILE
+    }
+    assert long == {}
+
+
+def test_every_module_says_what_it_is() -> None:
+    silent = [str(p.relative_to(ROOT)) for p in sources() if not ast.get_docstring(ast.parse(p.read_text()))]
+    assert silent == []
+
+
+def test_nothing_shadows_hugging_face_datasets_or_the_standard_library() -> None:
+    for path in tracked():
+        assert path.name != "datasets.py"
+        assert not (path.parent.name == "datasets" and path.suffix == ".py")
+    names = {p.stem for p in sources()} | {p.name for p in PACKAGE.iterdir() if p.is_dir()}
+    assert names & set(sys.stdlib_module_names) <= {"__init__", "__main__"}
+
+
+def test_folders_below_tests_are_packages() -> None:
+    """Test files of equal name in two rooms would clash otherwise."""
+    for folder in {p.parent for p in (ROOT / "tests").rglob("test_*.py")}:
+        assert (folder / "__init__.py").is_file(), folder
+
+
+def test_the_top_level_is_the_agreed_one() -> None:
+    folders = {"accerl_lerobot", "recipes", "datasets", "tests", "docs", ".ci"}
+    files = {"pyproject.toml", "README.md", "LICENSE", "Makefile", ".gitignore", ".python-version"}
+    assert {p.relative_to(ROOT).parts[0] for p in tracked()} <= folders | files
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "recipes").glob("*")), ids=lambda p: p.name)
+def test_recipes_resolve(path: Path) -> None:
+    config = parse(RunConfig, [f"--config_path={path}"])
+    assert config.job_name == path.stem
+    if config.sft.steps and config.sft.init_path is None:
+        check_sft_policy(config.sft)
+    lines = path.read_text().splitlines()
+    assert lines[0].startswith("# ")
+    assert any(f"accerl train --config_path=recipes/{path.name}" in line for line in lines if line[:1] == "#")
+
+
+def test_nothing_is_unpickled() -> None:
+    """Whatever is loaded from a file or the Hub may come from anybody."""
+    for path in sources():
+        assert not {"pickle", "cloudpickle", "dill", "joblib"} & set(imports(path)), path
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+                assert (node.value.id, node.attr) not in {("torch", "load"), ("torch", "save")}, path
+                assert (node.value.id, node.attr) != ("yaml", "unsafe_load"), path
+
+
+def test_only_shells_import_ray() -> None:
+    users = {p.name for p in sources() for name in imports(p) if name.split(".")[0] == "ray"}
+    assert users <= SHELLS
+    for path in sources():
+        assert "torch.distributed" not in set(imports(path)) or path.name == "worker.py", path
+
+
+def test_collecting_and_storing_stay_free_of_torch_and_lerobot() -> None:
+    code = (
+        "import importlib, sys\n"
+        "for name in sys.argv[1:]:\n"
+        "    importlib.import_module(name)\n"
+        "    heavy = {'torch', 'lerobot', 'transformers', 'mujoco', 'matplotlib'} & set(sys.modules)\n"
+        "    assert not heavy, f'{name} imports {heavy}'\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *LIGHT], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_what_the_package_imports_is_pinned() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    pinned = {*pins(project["dependencies"])}
+    pinned |= {name for extra in project["optional-dependencies"].values() for name in pins(extra)}
+    distribution = {"PIL": "pillow", "yaml": "pyyaml", "huggingface_hub": "huggingface-hub"}
+    used = {name.split(".")[0] for path in sources() for name in imports(path)} - {"accerl_lerobot"}
+    used = {distribution.get(name, name) for name in used - set(sys.stdlib_module_names)}
+    assert used <= pinned
+
+
+def test_requirements_are_exact() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for requirement in [*project["dependencies"], *sum(project["optional-dependencies"].values(), [])]:
+        assert re.fullmatch(r"[a-z0-9-]+(\[[a-z,]+\])?==[0-9.]+", requirement), requirement
+
+
+def test_no_paths_of_a_machine() -> None:
+    """A path into somebody's home or an internal host works nowhere else."""
+    pattern = re.compile(
+        "|".join(("/ro" + "ot/", "/ho" + "me/", "/wo" + "rk/", r"/us" + r"r/local/", r"/op" + "t/"))
+    )
+    found = []
+    for path in tracked():
+        if path.suffix in (".png", ".mp4", ".parquet") or path == Path(__file__):
+            continue
+        for number, line in enumerate(path.read_text().splitlines(), 1):
+            if pattern.search(line):
+                found.append(f"{path.relative_to(ROOT)}:{number}: {line.strip()}")
+    assert found == []
+
+
+def test_links_in_the_documents_lead_somewhere() -> None:
+    broken = []
+    for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "datasets").rglob("*.md")]:
+        for target in re.findall(r"\]\(([^)#]+)[^)]*\)", path.read_text()):
+            if not target.startswith("http") and not (path.parent / target).exists():
+                broken.append(f"{path.relative_to(ROOT)}: {target}")
+    assert broken == []
+
+
+def commands() -> list[tuple[str, str]]:
+    """Every `accerl …` line of the documents' code blocks, continuation lines joined."""
+    found = []
+    for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "datasets").rglob("*.md")]:
+        for block in re.findall(r"```(?:bash|sh)\n(.*?)```", path.read_text(), flags=re.DOTALL):
+            for line in block.replace("\\\n", " ").splitlines():
+                line = line.split("  #")[0].strip()
+                if line.startswith("accerl "):
+                    found.append((str(path.relative_to(ROOT)), line))
+    return found
+
+
+@pytest.mark.parametrize(("path", "line"), commands())
+def test_commands_in_the_documents_parse(path: str, line: str) -> None:
+    """Verb, fields, types and values; places that the reader fills in are written in capitals."""
+    _, verb, *arguments = shlex.split(line)
+    assert verb in VERBS, path
+    if verb == "bench":
+        arguments = arguments[1:]
+    # A run's own config is one that train resolved, so its place is taken by no recipe at all.
+    here = [a.replace("recipes/", f"{ROOT}/recipes/") for a in arguments if "RUN/config.yaml" not in a]
+    parse(CONFIGS[verb], here, recipe_class=RunConfig)
