@@ -46,9 +46,9 @@ OK, WARN, FAIL = "ok", "warn", "FAIL"
 DISTRIBUTION = "accerl-lerobot"
 
 GIB = 2**30
-POLICY_PROCESS_GIB, ROLLOUT_PROCESS_GIB, TASK_GIB = 1.0, 0.4, 0.09
-"""Resident memory, measured with a policy of 0.4 M parameters: a process with torch and LeRobot, a rollout
-process with an OpenGL context, and each MetaWorld task that a world has played."""
+POLICY_PROCESS_GIB, ROLLOUT_PROCESS_GIB, SIMULATOR_GIB, RAY_GIB = 1.2, 0.4, 0.17, 0.7
+"""Resident memory in the quickstart, with a policy of 0.6 M parameters: a process with torch and LeRobot, a
+rollout process without its worlds, each task of each MetaWorld (renderers included), Ray's own processes."""
 DISK_GIB = 2.0
 """What a run may need for demonstrations, checkpoints and videos."""
 RENDER_TIMEOUT_S = 120
@@ -276,10 +276,13 @@ def memory_estimate_gib(config: RunConfig) -> float:
     """Rough: processes with their libraries, simulators, and replay."""
     tasks = len(getattr(config.env, "tasks", ("one",)))
     worlds = config.rollout.workers * config.rollout.worlds
-    simulators = worlds * tasks * TASK_GIB if config.env.type == "metaworld" else 0.0
+    simulators = worlds * tasks * SIMULATOR_GIB if config.env.type == "metaworld" else 0.0
+    pictures = config.replay.capacity * observation_bytes(config) / GIB
+    if config.launch.engine == "local":
+        return POLICY_PROCESS_GIB + simulators + pictures
     # The driver, inference and the trainer each load torch.
-    processes = 3 * POLICY_PROCESS_GIB + config.rollout.workers * ROLLOUT_PROCESS_GIB
-    return processes + simulators + config.replay.capacity * observation_bytes(config) / GIB
+    workers = 3 * POLICY_PROCESS_GIB + config.rollout.workers * ROLLOUT_PROCESS_GIB
+    return RAY_GIB + workers + simulators + pictures
 
 
 def observation_bytes(config: RunConfig) -> int:

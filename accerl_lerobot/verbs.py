@@ -183,7 +183,8 @@ def evaluate(arguments: list[str]) -> int:
         finally:
             engine.close()
     summary: dict[str, Any] = summarise(results) | {"policy": config.policy.path}
-    console.rich.print(table(summary, str(config.policy.path)))
+    console.say(f"{config.policy.path}, LeRobot's sampler")
+    console.rich.print(table(summary, "evaluation"))
     if out is not None:
         _write_evaluation(out, summary, results)
     sys.stdout.write(json.dumps(summary) + "\n")

@@ -15,7 +15,9 @@
 
 from __future__ import annotations
 
+import ast
 import json
+import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,8 +27,13 @@ import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
+from accerl_lerobot.config import RunConfig, parse
 from accerl_lerobot.console import Console
+from accerl_lerobot.inference.batcher import BatcherStats
+from accerl_lerobot.local import LocalEngine
 from accerl_lerobot.metrics import MetricsLog, WandBConfig
+
+ROOT = Path(__file__).parents[1]
 
 
 def lines(directory: Path) -> list[dict[str, Any]]:
@@ -109,6 +116,54 @@ def test_wandb_only_when_enabled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     started, logged, finished = calls
     assert started["project"] == "p" and started["config"] == {"seed": 1}
     assert logged == {"train/loss": 1.0, "update": 4} and finished == "finish"
+
+
+def explained(section: str) -> set[str]:
+    """Names in the first column of a table of docs/metrics.md."""
+    text = (ROOT / "docs" / "metrics.md").read_text()
+    body = text.split(f"## `{section}`")[1].split("\n## ")[0]
+    cells = [line.split("|")[1] for line in body.splitlines() if line.startswith("| `")]
+    return {name for cell in cells for name in re.findall(r"`([a-z_0-9]+)`", cell)}
+
+
+def test_every_logged_number_is_explained(tiny_checkpoint: Path) -> None:
+    """And nothing is explained that is not logged."""
+    arguments = [
+        "--env.type=simulated",
+        f"--policy.path={tiny_checkpoint}",
+        "--launch.engine=local",
+        "--replay.min_decisions=32",
+        "--trainer.batch_decisions=16",
+        "--rollout.worlds=4",
+    ]
+    config = parse(RunConfig, arguments)
+    engine = LocalEngine(config, ("match",))
+    try:
+        engine.train()
+        while not (progress := engine.poll()).updates:
+            pass
+    finally:
+        engine.close()
+    with_ray = {"wait_s", "update_s", "publish_s"}
+    assert explained("train") == (progress.updates[0].keys() - {"update"}) | with_ray
+    rollout = progress.rollout.keys() | {f"replay_{k}" for k in progress.replay}
+    rollout |= {f"inference_{k}" for k in (*BatcherStats().metrics(), "version", "busy_share")}
+    ends = ("s", "_return", "_steps", "_decisions", "_success")
+    rollout |= {"restarts", "success_exploring", "replay_insert_wait_s", "replay_sample_wait_s"}
+    assert explained("rollout") == rollout | {f"replay_episode{end}" for end in ends}
+
+
+def test_the_summary_is_explained() -> None:
+    source = (ROOT / "accerl_lerobot" / "run.py").read_text()
+    assignments = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.Assign)]
+    (value,) = [
+        n.value for n in assignments if ast.unparse(n.targets[0]) == "summary" and "wall_s" in ast.unparse(n)
+    ]
+    assert isinstance(value, ast.Dict)
+    logged = {ast.literal_eval(key) for key in value.keys if key is not None}
+    whens = {f"{name}_{when}" for name in ("success", "n", "ci95", "tasks") for when in ("before", "after")}
+    text = (ROOT / "docs" / "metrics.md").read_text().split("## `summary.json`")[1]
+    assert whens <= logged and logged - whens == set(re.findall(r"`([a-z_0-9]+)`", text)) - whens
 
 
 def test_console_without_a_terminal_prints_lines(
