@@ -281,6 +281,8 @@ def test_the_backbone_s_own_weights_are_not_copied(tiny_checkpoint: Path, tmp_pa
     save_pretrained(adapter, tmp_path / "saved", config)
     assert (tmp_path / "saved" / BACKBONE / "tokenizer.json").is_file()
     assert not (tmp_path / "saved" / BACKBONE / "model.safetensors").exists()
+    config_file = json.loads((tmp_path / "saved" / "config.json").read_text())
+    assert config_file["vlm_model_name"] == str(tmp_path / "saved" / BACKBONE)
 
 
 def test_a_checkpoint_on_the_hub_is_loaded_whole(
