@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 def check_start(config: RunConfig) -> None:
-    """Refuses a run that could not begin: no policy, no dataset, or an SFT whose outcome could not be improved.
+    """Refuses a run that could not begin: no policy, no dataset, or an SFT whose outcome RL could not use.
 
     Raises:
         InputError: see above; also what `check_sft_policy` raises.
