@@ -72,15 +72,16 @@ class BackboneConfig:
         if self.patch < 1 or self.image < 1 or self.image % (2 * self.patch):
             remedy = f"use a multiple of {2 * self.patch}, twice the patch"
             raise InputError("sft.backbone.image", self.image, remedy)
+        for heads, width in (("heads", self.hidden), ("vision_heads", self.vision_hidden)):
+            if width % getattr(self, heads):
+                remedy = f"use a divisor of the width {width}"
+                raise InputError(f"sft.backbone.{heads}", getattr(self, heads), remedy)
         if self.hidden % (2 * self.heads):  # rotary embeddings halve a head
             remedy = f"use a multiple of {2 * self.heads}, twice the heads"
             raise InputError("sft.backbone.hidden", self.hidden, remedy)
         if self.heads % self.kv_heads:
             remedy = f"use a divisor of the {self.heads} heads"
             raise InputError("sft.backbone.kv_heads", self.kv_heads, remedy)
-        if self.vision_hidden % self.vision_heads:
-            remedy = f"use a divisor of the width {self.vision_hidden}"
-            raise InputError("sft.backbone.vision_heads", self.vision_heads, remedy)
 
 
 def write_backbone(directory: Path, config: BackboneConfig, texts: Sequence[str] = ()) -> Path:

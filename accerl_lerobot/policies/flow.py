@@ -30,9 +30,10 @@ is that of the path. Which steps:
           the policy in which *only* the drawn transition is new: E_μ[ρ f(a)] is that policy's E[f(a)], not
           π's. Cheap for large models; the ratio is still 1 at equal weights.
 
-Two noise laws, `FlowSamplerConfig.noise`: ``euler`` keeps the ODE's mean and adds a constant std, so that the
-executed mean is the stock action; ``flow_sde`` scales the noise with t and corrects the drift so that the
-marginals of the ODE are preserved. Everything here is a pure function of tensors; the velocity is a callable.
+Two noise laws, `FlowSamplerConfig.noise`: ``euler`` keeps the ODE's mean and adds a constant std, so that
+under ``last`` the executed mean is the stock action; it does not preserve the ODE's marginals. ``flow_sde``
+scales the noise with t and corrects the drift, so that under ``all`` it does preserve them, up to the step
+size. Everything here is a pure function of tensors; the velocity is a callable.
 
 Shapes: B batch, K actions per chunk, D = max_action_dim (real dims first, then padding), A real dims,
 N steps, L log-prob factors: one per executed row under ``last``; one per row otherwise, since all rows feed

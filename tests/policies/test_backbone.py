@@ -76,7 +76,7 @@ def test_the_vision_tower_has_the_sizes_asked_for(tmp_path: Path):
     [
         ({"vocabulary": 263}, "sft.backbone.vocabulary=263: use at least 264"),
         ({"image": 48}, "sft.backbone.image=48: use a multiple of 32"),
-        ({"heads": 5}, "sft.backbone.hidden=96: use a multiple of 10"),
+        ({"heads": 5}, "sft.backbone.heads=5: use a divisor of the width 96"),
         ({"vision_heads": 3}, "sft.backbone.vision_heads=3: use a divisor of the width 64"),
         ({"kv_heads": 3}, "sft.backbone.kv_heads=3: use a divisor of the 4 heads"),
         ({"hidden": 12}, "sft.backbone.hidden=12: use a multiple of 8"),
