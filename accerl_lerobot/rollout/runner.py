@@ -43,6 +43,14 @@ class RolloutConfig:
     """Largest number of decisions in a segment."""
     decision_cost: float = 0.01
     """Subtracted from the reward of every decision, so that faster is better; ≥ 0."""
+    time_limit: str = "truncate"
+    """What running out of time means to the learner. truncate: nothing; V of the last observation stands for what
+    would have followed. fail: the task was to be done in time, so the return ends there.
+
+    Where success is counted within a limit, `fail` is the measured choice: a policy that gets stuck bootstraps
+    from its own optimistic value and failures go unpunished. On door-open, success at update 100 fell from 0.82
+    to 0.50 (n = 20) with truncate.
+    """
     max_restarts: int = 3
     """How often a rollout worker that died is started again before the run ends with its error."""
 
@@ -50,6 +58,8 @@ class RolloutConfig:
         for name in ("workers", "worlds", "segment_length"):
             if getattr(self, name) < 1:
                 raise InputError(f"rollout.{name}", getattr(self, name), "use at least 1")
+        if self.time_limit not in ("truncate", "fail"):
+            raise InputError("rollout.time_limit", self.time_limit, "use truncate or fail")
         for name in ("decision_cost", "max_restarts"):
             if getattr(self, name) < 0:
                 raise InputError(f"rollout.{name}", getattr(self, name), "use 0 or more")
@@ -176,7 +186,9 @@ class RolloutRunner:
         state.versions.append(decision.version)
         builder.add(decision, reward, result.steps, result.observation)
         if result.done or builder.full:
-            self._emit(state, plan, builder, result.terminated, result.truncated, result.success)
+            failed = result.truncated and self.config.time_limit == "fail"
+            ended = (result.terminated or failed, result.truncated and not failed)
+            self._emit(state, plan, builder, *ended, result.success)
         if result.done:
             self._finish(state, plan, result.success)
             return self.start(slot)
