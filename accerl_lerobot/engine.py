@@ -11,11 +11,12 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What a run asks of an engine, whichever one it is: the asynchronous one (`launch`) or the one-process one (`local`)."""
+"""What a run asks of an engine: the asynchronous one (`launch`) or the one-process one (`local`)."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -52,7 +53,11 @@ class Engine(ABC):
 
     @abstractmethod
     def plan(self, plans: list[EpisodePlan]) -> None:
-        """Queues episodes that are run before any exploring one; their results come through `poll`."""
+        """Queues episodes that are run before any exploring one; each has one result, which `poll` reports.
+
+        Raises:
+            ValueError: an episode of the same group and index has been planned and not been reported yet.
+        """
 
     @abstractmethod
     def train(self) -> None:
@@ -72,4 +77,21 @@ class Engine(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Ends all workers. Safe to call twice."""
+        """Ends all workers; does not raise, so that it cannot hide why it is called. Safe to call twice."""
+
+
+def episode_key(plan: EpisodePlan) -> tuple[str, int]:
+    """What names a planned episode."""
+    return plan.group, plan.index
+
+
+def check_new(plans: Sequence[EpisodePlan], outstanding: Container[tuple[str, int]]) -> None:
+    """For engines: refuses what `Engine.plan` refuses.
+
+    Raises:
+        ValueError: see there.
+    """
+    keys = [episode_key(p) for p in plans]
+    again = [key for i, key in enumerate(keys) if key in outstanding or key in keys[:i]]
+    if again:
+        raise ValueError(f"episode {again[0][1]} of {again[0][0]!r} is planned twice")

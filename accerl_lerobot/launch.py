@@ -13,37 +13,47 @@
 # limitations under the License.
 """Places the workers, connects them and watches them.
 
-    rollout ×W ──requests──► inference ──decisions──► rollout        micro-asynchrony: a rollout steps other worlds meanwhile
+    rollout ×W ──requests──► inference ──decisions──► rollout   micro-asynchrony: others step meanwhile
         │                        ▲
         └──segments──► replay    │ weights, published without waiting
                           │      │
-                          └──► trainer                               macro-asynchrony: no barrier, a bounded, measured lag
+                          └──► trainer                          macro-asynchrony: no barrier, a measured lag
 
-The trainer is the clock: when it has made its updates the run is over. Any other worker that ends is an event: a rollout
-worker is started again (its worlds hold nothing that is not in replay), a few times; any other ends the run with its own
-traceback. Workers get handles and never hold the conductor.
+The trainer is the clock: when it has made its updates the run is over. Another worker that ends is an event:
+a rollout worker is started again (its worlds hold nothing that is not in replay), a few times; any other ends
+the run with its own traceback. The same goes for one that hangs: nothing here waits for an answer without a
+limit. Workers get handles and never hold the conductor.
 """
 
 from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import ray
+from ray.exceptions import RayActorError, RayError, RayTaskError
 
 from accerl_lerobot.config import RunConfig
-from accerl_lerobot.engine import Engine, Progress
+from accerl_lerobot.engine import Engine, Progress, check_new, episode_key
+from accerl_lerobot.inference.worker import ServiceStoppedError
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
+from accerl_lerobot.watched import Watched
 
 logger = logging.getLogger(__name__)
 
 POLL_S = 0.5
+START_S = 600.0
+"""How long a worker may take to start; `LaunchConfig.stall_s` counts from its first answer."""
+BLAME_S = 10.0
+"""How long to wait for the failure that another failure is the consequence of."""
 
 
 def start_ray() -> None:
-    """A private Ray on this machine: loopback, no dashboard; `ray_environment` gave it its token."""
+    """A private Ray on this machine, without a dashboard; `ray_environment` says what keeps it private."""
     ray.init(
         address="local",
         include_dashboard=False,
@@ -53,165 +63,288 @@ def start_ray() -> None:
     )
 
 
+@dataclass(kw_only=True)
+class _Seat:
+    """A rollout worker's place, which outlives the processes that take it in turn."""
+
+    index: int
+    worker: Watched
+    incarnation: int = 0
+    outstanding: dict[tuple[str, int], EpisodePlan] = field(default_factory=dict)
+    """Planned episodes without a result; whoever sits here next runs them."""
+    unsent: list[EpisodePlan] = field(default_factory=list)
+    counters: dict[str, float] = field(default_factory=dict)
+    in_world_s: float = 0.0
+
+
 class RayEngine(Engine):
     """The asynchronous engine.
 
     Args:
         config: the run; its ``policy.path`` must be set.
         tasks: the training tasks.
+
+    Raises:
+        RuntimeError: a worker did not start; carries its own traceback.
     """
 
     def __init__(self, config: RunConfig, tasks: tuple[str, ...]) -> None:
-        from accerl_lerobot.inference.worker import InferenceWorker
-        from accerl_lerobot.replay.worker import ReplayWorker
-        from accerl_lerobot.trainer.worker import TrainerWorker
-
         self._config, self._tasks = config, tasks
-        self._started_ray = not ray.is_initialized()
-        if self._started_ray:
-            start_ray()
-        gpus = ray.available_resources().get("GPU", 0)
-        share = 0 if config.policy.device == "cpu" or not gpus else (1 if gpus > 1 else 0.5)
-        self._inference = ray.remote(InferenceWorker).options(num_cpus=0, num_gpus=share, max_concurrency=1000).remote(
-            config.policy, config.inference
-        )  # fmt: skip
-        self._trainer = ray.remote(TrainerWorker).options(num_cpus=0, num_gpus=share, max_concurrency=4).remote(
-            config.policy, config.algorithm, config.trainer, config.seed
-        )  # fmt: skip
-        self._replay = (
-            ray.remote(ReplayWorker)
-            .options(num_cpus=0, max_concurrency=1000)
-            .remote(config.replay, config.seed)
-        )
-        self._incarnations = [0] * config.rollout.workers
-        self._outstanding: list[dict[tuple[str, int], EpisodePlan]] = [{} for _ in self._incarnations]
-        self._counters: list[dict[str, float]] = [{} for _ in self._incarnations]
+        self._services: list[Watched] = []
+        self._seats: list[_Seat] = []
         self._past: dict[str, float] = {"restarts": 0.0}
-        self._rollouts = [self._new_rollout(i) for i in range(config.rollout.workers)]
-        ray.get([w.ready.remote() for w in (self._inference, self._trainer, *self._rollouts)])
-        self._running: dict[Any, tuple[str, int]] = {self._inference.serve.remote(): ("inference", 0)}
-        for i in range(len(self._rollouts)):
-            self._run_rollout(i)
-        self._training = self._done = False
+        self._updates: list[dict[str, float]] = []
+        self._replay_metrics: dict[str, float] = {}
+        self._inference_metrics: dict[str, float] = {}
+        self._training = self._done = self._closed = False
         self._version = 0
-        self._last_change, self._last_state = time.monotonic(), ()
+        self._last_change = time.monotonic()
+        self._last_state: tuple[object, ...] = ()
+        self._started_ray = not ray.is_initialized()
+        try:
+            if self._started_ray:
+                start_ray()
+            self._start()
+        except BaseException:
+            self.close()
+            raise
 
     def plan(self, plans: list[EpisodePlan]) -> None:
-        n = len(self._rollouts)
-        for i, worker in enumerate(self._rollouts):
-            mine = plans[i::n]
-            self._outstanding[i] |= {(p.group, p.index): p for p in mine}
-            worker.plan.remote(mine)
+        check_new(plans, {key for seat in self._seats for key in seat.outstanding})
+        for seat in self._seats:
+            mine = plans[seat.index :: len(self._seats)]
+            seat.outstanding |= {episode_key(p): p for p in mine}
+            seat.unsent += mine
 
     def train(self) -> None:
         self._training = True
-        self._running[self._trainer.run.remote(self._replay, [self._inference])] = ("trainer", 0)
-        for worker in self._rollouts:
-            worker.train.remote(True)
+        self._trainer.work = self._trainer.actor.run.remote(self._replay.actor, [self._inference.actor])
 
     def poll(self) -> Progress:
-        ended, _ = ray.wait(list(self._running), num_returns=1, timeout=POLL_S)
-        for reference in ended:
-            self._ended(reference)
-        episodes = [e for i in range(len(self._rollouts)) for e in self._drain(i)]
-        updates = ray.get(self._trainer.metrics.remote())
+        self._ask()
+        self._await_end()
+        episodes = self._listen()
+        self._check_hung()
+        totals = dict(self._past)
+        for seat in self._seats:
+            for key, value in seat.counters.items():
+                totals[key] = totals.get(key, 0.0) + value
+        updates, self._updates = self._updates, []
         if updates:
             self._version = int(updates[-1]["update"])
-        totals = dict(self._past)
-        for counters in self._counters:
-            for key, value in counters.items():
-                totals[key] = totals.get(key, 0.0) + value
         progress = Progress(
             version=self._version,
             done=self._done,
             updates=updates,
             episodes=episodes,
             rollout=totals,
-            replay=ray.get(self._replay.metrics.remote()),
-            inference=ray.get(self._inference.metrics.remote()),
+            replay=self._replay_metrics,
+            inference=self._inference_metrics,
         )
-        self._watch(progress)
+        self._check_moving(progress)
         return progress
 
     def save(self, directory: Path) -> int:
-        return int(ray.get(self._trainer.save.remote(str(directory.absolute()))))
+        return int(self._trainer.call("save", str(directory.absolute()), timeout=self._limit))
 
     def close(self) -> None:
-        if self._started_ray and ray.is_initialized():
-            ray.shutdown()
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            for worker in self._everyone():
+                ray.kill(worker.actor)
+            if self._started_ray and ray.is_initialized():
+                ray.shutdown()
+        except Exception:
+            logger.exception("could not end all workers")
 
-    def rollout_pids(self) -> list[int]:
-        """Process ids of the rollout workers, for fault tests."""
-        return [int(ray.get(w.pid.remote())) for w in self._rollouts]
+    def pids(self) -> dict[str, int]:
+        """Process ids by worker: ``inference``, ``replay``, ``trainer``, ``rollout 0`` …; for fault tests."""
+        return {w.name: int(w.call("ready", timeout=self._limit)) for w in self._everyone()}
 
-    def _new_rollout(self, index: int) -> Any:
+    @property
+    def _limit(self) -> float:
+        return self._config.launch.stall_s
+
+    def _everyone(self) -> Iterator[Watched]:
+        """Those that others depend on first."""
+        yield from self._services
+        yield from (seat.worker for seat in self._seats)
+
+    def _start(self) -> None:
+        from accerl_lerobot.inference.worker import InferenceWorker
+        from accerl_lerobot.replay.worker import ReplayWorker
+        from accerl_lerobot.trainer.worker import TrainerWorker
+
+        c = self._config
+        gpus = ray.available_resources().get("GPU", 0)
+        share = 0 if c.policy.device == "cpu" or not gpus else (1 if gpus > 1 else 0.5)
+        inference = ray.remote(InferenceWorker).options(num_cpus=0, num_gpus=share, max_concurrency=1000)
+        self._inference = self._service("inference", inference.remote(c.policy, c.inference))
+        replay = ray.remote(ReplayWorker).options(num_cpus=0, num_gpus=0, max_concurrency=1000)
+        self._replay = self._service("replay", replay.remote(c.replay, c.seed))
+        trainer = ray.remote(TrainerWorker).options(num_cpus=0, num_gpus=share, max_concurrency=4)
+        self._trainer = self._service("trainer", trainer.remote(c.policy, c.algorithm, c.trainer, c.seed))
+        for index in range(c.rollout.workers):
+            self._seats.append(_Seat(index=index, worker=self._new_rollout(index, 0)))
+        ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
+        for worker, reference in ready:
+            worker.result(reference, "ready", max(START_S, self._limit))
+        self._inference.work = self._inference.actor.serve.remote()
+        self._replay.work = self._replay.actor.run.remote()
+        for seat in self._seats:
+            self._set_to_work(seat)
+
+    def _service(self, name: str, actor: Any) -> Watched:
+        self._services.append(Watched(name, actor))
+        return self._services[-1]
+
+    def _new_rollout(self, index: int, incarnation: int) -> Watched:
         from accerl_lerobot.rollout.worker import RolloutWorker
 
         c = self._config
         film = (c.evaluation.video_size, c.evaluation.video_every)
-        return ray.remote(RolloutWorker).options(num_cpus=0, num_gpus=0, max_concurrency=3).remote(
-            c.env, c.rollout, self._tasks, c.seed, index, self._incarnations[index], film
-        )  # fmt: skip
+        actor = ray.remote(RolloutWorker).options(num_cpus=0, num_gpus=0, max_concurrency=4)
+        return Watched(
+            f"rollout {index}",
+            actor.remote(c.env, c.rollout, self._tasks, c.seed, index, incarnation, film),
+        )
 
-    def _run_rollout(self, index: int) -> None:
-        reference = self._rollouts[index].run.remote(self._inference, self._replay)
-        self._running[reference] = ("rollout", index)
+    def _set_to_work(self, seat: _Seat) -> None:
+        seat.worker.work = seat.worker.actor.run.remote(self._inference.actor, self._replay.actor)
 
-    def _ended(self, reference: Any) -> None:
-        """Decides what the end of a worker's long-running call means."""
-        role, index = self._running.pop(reference)
+    def _ask(self) -> None:
+        for worker in self._services:
+            worker.ask("metrics")
+        for seat in self._seats:
+            if seat.worker.ask("report", self._training and not self._done, seat.unsent):
+                seat.unsent = []
+
+    def _await_end(self) -> None:
+        """Waits a little, and deals with every worker whose long call has ended."""
+        works = {worker.work: worker for worker in self._everyone() if worker.work is not None}
+        if not ray.wait(list(works), num_returns=1, timeout=POLL_S)[0]:
+            return
+        ended = set(ray.wait(list(works), num_returns=len(works), timeout=0)[0])
+        for reference, worker in works.items():
+            if reference in ended:
+                self._ended(worker)
+
+    def _ended(self, worker: Watched) -> None:
+        """Decides what the end of a worker's long call means."""
+        reference, worker.work = worker.work, None
         try:
             result = ray.get(reference)
-        except ray.exceptions.RayError as error:
-            if role == "rollout" and self._past["restarts"] < self._config.rollout.max_restarts:
-                self._restart(index, error)
-                return
-            raise RuntimeError(f"{role} worker {index} failed for good:\n{error}") from error
-        if role != "trainer":
-            raise RuntimeError(f"{role} worker {index} ended without being asked to")
-        self._done, self._version = True, int(result)
-        for worker in self._rollouts:
-            worker.train.remote(False)
-        ray.get(self._replay.close.remote())
+        except RayError as error:
+            if isinstance(error, RayTaskError) and isinstance(error.cause, RayError | ServiceStoppedError):
+                self._blame()
+            for seat in self._seats:
+                if seat.worker is worker:
+                    return self._restart(seat, error)
+            raise RuntimeError(f"{worker.name} worker failed for good:\n{error}") from error
+        if worker is self._trainer:
+            self._finish(int(result))
+        elif not (worker is self._replay and self._done):
+            raise RuntimeError(f"{worker.name} worker ended without being asked to")
 
-    def _restart(self, index: int, error: Exception) -> None:
-        logger.warning(
-            "rollout worker %d died and is started again: %s", index, str(error).strip().splitlines()[-1]
-        )
-        ray.kill(self._rollouts[index])
-        self._past["restarts"] += 1
-        for key, value in self._counters[index].items():
-            self._past[key] = self._past.get(key, 0.0) + value
-        self._counters[index] = {}
-        self._incarnations[index] += 1
-        self._rollouts[index] = self._new_rollout(index)
-        self._run_rollout(index)
-        self._rollouts[index].plan.remote(list(self._outstanding[index].values()))
-        if self._training and not self._done:
-            self._rollouts[index].train.remote(True)
+    def _blame(self) -> None:
+        """A worker failed because of another one: ends the run with that one's failure, if it is found."""
+        works = {w.work: w for w in self._services if w is not self._trainer and w.work is not None}
+        if works:
+            for reference in ray.wait(list(works), num_returns=1, timeout=BLAME_S)[0]:
+                self._ended(works[reference])
 
-    def _drain(self, index: int) -> list[EpisodeResult]:
+    def _finish(self, version: int) -> None:
+        """The trainer has made its updates; its records and those of replay are completed."""
+        self._done, self._version = True, version
+        self._updates += self._trainer.answer(timeout=self._limit) or []
+        self._updates += self._trainer.call("metrics", timeout=self._limit)
+        self._replay.call("close", timeout=self._limit)
+        self._replay.answer(timeout=self._limit)
+        self._replay_metrics = self._replay.call("metrics", timeout=self._limit)
+
+    def _listen(self) -> list[EpisodeResult]:
+        """Picks up the answers that have come; returns the episodes among them."""
+        self._updates += self._hear(self._trainer) or []
+        self._replay_metrics = self._hear(self._replay) or self._replay_metrics
+        self._inference_metrics = self._hear(self._inference) or self._inference_metrics
+        episodes: list[EpisodeResult] = []
+        for seat in self._seats:
+            try:
+                report = seat.worker.answer()
+            except RayActorError:
+                continue  # its `run` has ended as well, and the next poll deals with that
+            except RayError as error:
+                raise RuntimeError(f"{seat.worker.name} worker failed to report:\n{error}") from error
+            if report is not None:
+                seat.counters, seat.in_world_s = report.counters, report.in_world_s
+                for episode in report.episodes:
+                    planned = seat.outstanding.pop(episode_key(episode.plan), None)
+                    if episode.plan.explore or planned is not None:
+                        episodes.append(episode)
+        return episodes
+
+    def _hear(self, worker: Watched) -> Any:
         try:
-            episodes, self._counters[index] = ray.get(self._rollouts[index].drain.remote())
-        except ray.exceptions.RayError:
-            return []  # its `run` has ended as well, and the next poll deals with that
-        for episode in episodes:
-            self._outstanding[index].pop((episode.plan.group, episode.plan.index), None)
-        return list(episodes)
+            return worker.answer()
+        except RayError as error:
+            raise RuntimeError(f"{worker.name} worker failed for good:\n{error}") from error
 
-    def _watch(self, progress: Progress) -> None:
-        """Ends a run in which nothing moves any more.
+    def _restart(self, seat: _Seat, error: Exception) -> None:
+        """Puts a new process into a rollout worker's seat.
+
+        Raises:
+            RuntimeError: it has been done `RolloutConfig.max_restarts` times; carries the worker's traceback.
+        """
+        name = seat.worker.name
+        if seat.incarnation >= self._config.rollout.max_restarts:
+            times = f" after {seat.incarnation} restarts" if seat.incarnation else ""
+            raise RuntimeError(f"{name} worker failed for good{times}:\n{error}") from error
+        reason = str(error).strip().splitlines()[-1][:200]
+        logger.warning("%s worker is started again: %s", name, reason)
+        ray.kill(seat.worker.actor)
+        self._past["restarts"] += 1
+        for key, value in seat.counters.items():
+            self._past[key] = self._past.get(key, 0.0) + value
+        seat.counters, seat.in_world_s = {}, 0.0
+        seat.incarnation += 1
+        seat.worker = self._new_rollout(seat.index, seat.incarnation)
+        seat.unsent = list(seat.outstanding.values())
+        self._set_to_work(seat)
+
+    def _check_hung(self) -> None:
+        """Starts a rollout worker again that does not answer or whose world does not return.
+
+        Raises:
+            RuntimeError: another worker does not answer.
+        """
+        for worker in self._services:
+            if worker.silent_s() > self._limit:
+                raise RuntimeError(f"{worker.name} worker has not answered for {worker.silent_s():.0f} s")
+        for seat in self._seats:
+            silent = seat.worker.silent_s()
+            if silent > (self._limit if seat.worker.answered else max(START_S, self._limit)):
+                self._restart(seat, RuntimeError(f"no answer for {silent:.0f} s"))
+            elif seat.in_world_s > self._limit:
+                self._restart(seat, RuntimeError(f"its world has not returned for {seat.in_world_s:.0f} s"))
+
+    def _check_moving(self, progress: Progress) -> None:
+        """Ends a run in which everybody answers and nothing moves.
 
         Raises:
             RuntimeError: neither decisions nor updates for `LaunchConfig.stall_s`.
         """
-        state = (progress.version, progress.rollout.get("decisions"), progress.rollout.get("restarts"))
+        state = (progress.version, progress.rollout.get("decisions"), progress.rollout["restarts"])
         now = time.monotonic()
-        waiting = any(self._outstanding) or (self._training and not self._done)
+        waiting = any(seat.outstanding for seat in self._seats) or (self._training and not self._done)
+        # Where one worker is to blame, `_check_hung` comes to it a moment later.
+        silent = max(worker.silent_s() for worker in self._everyone())
+        suspect = max(silent, *(seat.in_world_s for seat in self._seats)) > self._limit / 2
         if state != self._last_state or not waiting:
             self._last_state, self._last_change = state, now
-        elif now - self._last_change > self._config.launch.stall_s:
+        elif now - self._last_change > self._limit and not suspect:
             raise RuntimeError(
-                f"nothing moved for {self._config.launch.stall_s:.0f} s: {progress.rollout}, {progress.replay}, "
+                f"nothing moved for {self._limit:.0f} s: {progress.rollout}, {progress.replay}, "
                 f"{progress.inference}; raise launch.stall_s if a single step takes that long"
             )

@@ -11,9 +11,10 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""The whole picture in one process, without Ray: the same parts, called in turn, deterministic for a given seed.
+"""The whole picture in one process, without Ray: the same parts, called in turn, deterministic for a seed.
 
-    every poll:   all worlds get a decision and step it → segments enter replay → one update, if the pace allows it
+    every poll:   all worlds get a decision and step it → segments enter replay
+                  → one update, if the pace allows it
 
 For tests and debugging. Weights reach the acting policy at once, so the lag comes from replay alone.
 """
@@ -27,7 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from accerl_lerobot.config import RunConfig
-from accerl_lerobot.engine import Engine, Progress
+from accerl_lerobot.engine import Engine, Progress, check_new, episode_key
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.experience import Request
 from accerl_lerobot.replay import Replay
@@ -57,6 +58,7 @@ class LocalEngine(Engine):
         self._replay = Replay(config.replay)
         self._rng = np.random.default_rng(config.seed)
         self._planned: deque[EpisodePlan] = deque()
+        self._outstanding: set[tuple[str, int]] = set()
         self._episodes: list[EpisodeResult] = []
         self._training = False
         self._number = 0
@@ -68,6 +70,8 @@ class LocalEngine(Engine):
         self._due: dict[int, Request] = {}
 
     def plan(self, plans: list[EpisodePlan]) -> None:
+        check_new(plans, self._outstanding)
+        self._outstanding |= {episode_key(p) for p in plans}
         self._planned.extend(plans)
 
     def train(self) -> None:
@@ -83,6 +87,7 @@ class LocalEngine(Engine):
                 updates.append(self._update.step(segments) | {"update": float(self._update.version)})
         episodes = list(self._episodes)
         self._episodes.clear()
+        self._outstanding -= {episode_key(e.plan) for e in episodes}
         return Progress(
             version=self._update.version,
             done=self._update.version >= self._config.trainer.updates,

@@ -13,8 +13,8 @@
 # limitations under the License.
 """Environment variables that Ray and its workers read, set before Ray is imported: it reads them once.
 
-Every run gets a Ray of its own: token authentication with a token that only this process and its children know, so nobody
-else on the machine can talk to its ports.
+Every run gets a Ray of its own, which nobody else can talk to: it listens on the loopback interface only, and
+asks for a token that only this process and its children know.
 """
 
 from __future__ import annotations
@@ -24,18 +24,29 @@ import secrets
 import sys
 
 WORKERS = {
-    "OMP_NUM_THREADS": "1",  # several CPU workers share the cores; spinning threads would cost more than they give
+    # Several CPU workers share the cores: spinning threads would cost more than they give.
+    "OMP_NUM_THREADS": "1",
     "OMP_WAIT_POLICY": "PASSIVE",
     "TOKENIZERS_PARALLELISM": "false",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
 }
 
 
+PRIVATE = {
+    # Ray 2.60 moves a node at 127.0.0.1 to the machine's address and then listens on every interface, unless
+    # it is told that there is no cluster to be part of. The name is historical: it is read on all systems.
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+}
+
+
 def prepare() -> None:
-    """Sets them; does nothing about the token when Ray has been imported already or a token is configured."""
+    """Sets what is not set yet; the token only if none is configured and Ray has not been imported."""
     for key, value in WORKERS.items():
         os.environ.setdefault(key, value)
-    configured = any(os.environ.get(k) for k in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"))
-    if "ray" not in sys.modules and not configured:
+    if "ray" in sys.modules:
+        return
+    for key, value in PRIVATE.items():
+        os.environ.setdefault(key, value)
+    if not any(os.environ.get(k) for k in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")):
         os.environ["RAY_AUTH_MODE"] = "token"
         os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)

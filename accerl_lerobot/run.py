@@ -24,10 +24,13 @@ outputs/<run>/
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import json
 import logging
+import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -84,10 +87,11 @@ def make_engine(config: RunConfig, tasks: tuple[str, ...]) -> Engine:
 
 
 def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfig:
-    """Records demonstrations and runs SFT where the config asks for them; returns it with ``policy.path`` set."""
+    """Records demonstrations and runs SFT where the config asks for it; sets ``policy.path``."""
     from accerl_lerobot.demos.record import record_demos
     from accerl_lerobot.demos.sft import run_sft
     from accerl_lerobot.demos.windows import check_dataset, task_texts
+    from accerl_lerobot.policies.loading import resolve_device
 
     if config.policy.path is not None:
         return config
@@ -104,9 +108,15 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
     with console.stage("SFT", total=config.sft.steps) as stage:
         assert dataset.repo_id is not None
         path = run_sft(
-            config.sft, dataset.repo_id, dataset.root, directory / "sft", config.seed, _device(config), task_texts(meta),
+            config.sft,
+            dataset.repo_id,
+            dataset.root,
+            directory / "sft",
+            config.seed,
+            str(resolve_device(config.policy.device)),
+            task_texts(meta),
             on_step=lambda step, loss: stage.update(step, f"loss {loss:.3f}"),
-        )  # fmt: skip
+        )
     # From here on the run is one that improves a checkpoint.
     return replace(config, policy=replace(config.policy, path=str(path)), sft=replace(config.sft, steps=0))
 
@@ -125,14 +135,11 @@ def train(config: RunConfig, directory: Path, console: Console) -> dict[str, Any
     config = warm_start(config, directory, console)
     warm_s = time.monotonic() - started
     check_policy(config)
-    with console.stage("starting workers"):
-        engine = make_engine(config, tasks)
-    log = MetricsLog(directory, config.wandb, encode(config))
-    try:
+    with contextlib.ExitStack() as stack:  # ends the workers and flushes the log, whatever fails
+        log = stack.enter_context(contextlib.closing(MetricsLog(directory, config.wandb, encode(config))))
+        with console.stage("starting workers"):
+            engine = stack.enter_context(contextlib.closing(make_engine(config, tasks)))
         return _Loop(config, directory, console, engine, log, tasks).run(started, warm_s)
-    finally:
-        engine.close()
-        log.close()
 
 
 def check_policy(config: RunConfig) -> None:
@@ -147,12 +154,20 @@ def check_policy(config: RunConfig) -> None:
         world.close()
 
 
-def run_plans(engine: Engine, count: int, group: str, console: Console) -> list[EpisodeResult]:
-    """Waits for `count` planned episodes of `group`."""
+def run_plans(
+    engine: Engine,
+    count: int,
+    group: str,
+    console: Console,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+) -> list[EpisodeResult]:
+    """Waits for `count` planned episodes of `group`; `on_progress` sees what else happens meanwhile."""
     results: list[EpisodeResult] = []
     with console.stage(f"evaluation ({group})", total=count) as stage:
         while len(results) < count:
-            results += [e for e in engine.poll().episodes if e.plan.group == group]
+            progress = engine.poll()
+            results += [e for e in progress.episodes if e.plan.group == group]
+            on_progress(progress)
             stage.update(len(results), f"{np.mean([r.success for r in results]):.0%}" if results else "")
     return sorted(results, key=lambda r: r.plan.index)
 
@@ -169,14 +184,8 @@ class _Loop:
         log: MetricsLog,
         tasks: tuple[str, ...],
     ) -> None:
-        self.config, self.directory, self.console, self.engine, self.log = (
-            config,
-            directory,
-            console,
-            engine,
-            log,
-        )
-        self.tasks = tasks
+        self.config, self.directory, self.console = config, directory, console
+        self.engine, self.log, self.tasks = engine, log, tasks
         self.evaluations: list[dict[str, Any]] = []
         self.curve: list[tuple[float, float]] = []
         self.recent: list[bool] = []
@@ -185,6 +194,8 @@ class _Loop:
         self.mismatch_max = 0.0
         self.during: dict[str, list[EpisodeResult]] = {}
         self.base: dict[str, float] = {}
+        self.steps = math.inf
+        """Env steps of the training, once it has ended."""
 
     def run(self, started: float, warm_s: float) -> dict[str, Any]:
         evaluation = self.config.evaluation
@@ -193,30 +204,54 @@ class _Loop:
         rl_started = time.monotonic()
         last = self._train()
         rl_s = time.monotonic() - rl_started
+        self.steps = self._steps(last)
         self._save(last.version)
-        steps = self._steps(last)
-        after = self._evaluate("after", evaluation.episodes, steps)
+        after = self._evaluate("after", evaluation.episodes, self.steps)
         clips = [r.frames for r in (*before[1], *after[1]) if r.frames]
         if clips:
             write_video(self.directory / "before_after.mp4", clips, fps=20)
         success_curve(self.directory / "success_curve.png", self.evaluations, self.curve)
+        times = (time.monotonic() - started, warm_s, rl_s)
+        summary = self._summary(before[0], after[0], last, times)
+        (self.directory / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+        return summary
+
+    def _summary(
+        self,
+        before: dict[str, Any],
+        after: dict[str, Any],
+        last: Progress,
+        times: tuple[float, float, float],
+    ) -> dict[str, Any]:
         summary = {
-            "success_before": before[0]["success"], "success_after": after[0]["success"],
-            "n_before": before[0]["n"], "n_after": after[0]["n"],
-            "ci95_before": before[0]["ci95"], "ci95_after": after[0]["ci95"],
-            "tasks_before": before[0]["tasks"], "tasks_after": after[0]["tasks"],
-            "env_steps": int(steps), "decisions": int(self._since(last, "decisions")),
-            "episodes": int(self._since(last, "episodes")), "updates": last.version,
+            "success_before": before["success"],
+            "success_after": after["success"],
+            "n": after["n"],
+            "ci95": {"before": before["ci95"], "after": after["ci95"]},
+            "n_before": before["n"],
+            "n_after": after["n"],
+            "ci95_before": before["ci95"],
+            "ci95_after": after["ci95"],
+            "tasks_before": before["tasks"],
+            "tasks_after": after["tasks"],
+            "env_steps": int(self.steps),
+            "decisions": int(self._since(last, "decisions")),
+            "episodes": int(self._since(last, "episodes")),
+            "updates": last.version,
             "trained_decisions": int(last.replay.get("trained_decisions", 0)),
             "unique_decisions": int(last.replay.get("unique_decisions", 0)),
             "dropped_nonfinite": int(self._since(last, "dropped_nonfinite")),
             "restarts": int(last.rollout.get("restarts", 0)),
-            "lag_mean": float(np.mean(self.lags)) if self.lags else 0.0, "lag_max": self.lag_max,
+            "lag_mean": float(np.mean(self.lags)) if self.lags else 0.0,
+            "lag_max": self.lag_max,
             "ratio_max_dev": self.mismatch_max,
-            "wall_s": time.monotonic() - started, "warm_start_s": warm_s, "rl_s": rl_s,
-            "algorithm": self.config.algorithm.type, "tasks": list(self.tasks), "seed": self.config.seed,
-        }  # fmt: skip
-        (self.directory / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+            "wall_s": times[0],
+            "warm_start_s": times[1],
+            "rl_s": times[2],
+            "algorithm": self.config.algorithm.type,
+            "tasks": list(self.tasks),
+            "seed": self.config.seed,
+        }
         return summary
 
     def _train(self) -> Progress:
@@ -233,7 +268,7 @@ class _Loop:
                 every = config.evaluation.every_updates
                 if every and progress.version // every > evaluated:
                     evaluated = progress.version // every
-                    self._plan_during(evaluated, self._steps(progress))
+                    self._plan_during(evaluated)
                 if config.save_every_updates and progress.version // config.save_every_updates > saved:
                     saved = progress.version // config.save_every_updates
                     self._save(progress.version)
@@ -248,27 +283,21 @@ class _Loop:
         if explored:
             self.recent = (self.recent + [e.success for e in explored])[-RECENT:]
             share = float(np.mean(self.recent))
-            if (
-                len(self.recent) >= RECENT // 4
-            ):  # the first episodes to end are the short ones, which are successes
+            # The first episodes to end are the short ones, which are successes.
+            if len(self.recent) >= RECENT // 4:
                 self.curve.append((self._steps(progress), share))
-            values = progress.rollout | {f"replay_{k}": v for k, v in progress.replay.items()}
-            values |= {f"inference_{k}": v for k, v in progress.inference.items()} | {
-                "success_exploring": share
-            }
+            values = progress.rollout | {"success_exploring": share}
+            values |= {f"replay_{k}": v for k, v in progress.replay.items()}
+            values |= {f"inference_{k}": v for k, v in progress.inference.items()}
             self.log.write("rollout", progress.version, values)
         for episode in progress.episodes:
-            if episode.plan.group in self.during:
-                self.during[episode.plan.group].append(episode)
-                if len(self.during[episode.plan.group]) == self.config.evaluation.episodes_during:
-                    self._report(
-                        episode.plan.group,
-                        self.during[episode.plan.group],
-                        self._steps(progress),
-                        progress.version,
-                    )
+            results = self.during.get(episode.plan.group)
+            if results is not None:
+                results.append(episode)
+                if len(results) == self.config.evaluation.episodes_during:
+                    self._report(episode.plan.group, results, self._steps(progress), progress.version)
 
-    def _plan_during(self, number: int, steps: float) -> None:
+    def _plan_during(self, number: int) -> None:
         group = f"during-{number}"
         self.during[group] = []
         self.engine.plan(evaluation_plans(self.tasks, self.config.evaluation.episodes_during, group))
@@ -277,7 +306,8 @@ class _Loop:
         self, group: str, episodes: int, steps: float
     ) -> tuple[dict[str, Any], list[EpisodeResult]]:
         self.engine.plan(evaluation_plans(self.tasks, episodes, group, self.config.evaluation.videos))
-        results = run_plans(self.engine, episodes, group, self.console)
+        # An evaluation planned while training may end only now.
+        results = run_plans(self.engine, episodes, group, self.console, self._record)
         return self._report(group, results, steps, results[0].versions[1]), results
 
     def _report(self, group: str, results: list[EpisodeResult], steps: float, version: int) -> dict[str, Any]:
@@ -302,7 +332,7 @@ class _Loop:
         return progress.rollout.get(key, 0.0) - self.base.get(key, 0.0)
 
     def _steps(self, progress: Progress) -> float:
-        return self._since(progress, "env_steps")
+        return min(self.steps, self._since(progress, "env_steps"))
 
     def _status(self, progress: Progress) -> str:
         success = f"{np.mean(self.recent):.0%}" if self.recent else "…"
@@ -318,9 +348,3 @@ def check_world(config: RunConfig) -> tuple[str, ...]:
         return world.spec.tasks
     finally:
         world.close()
-
-
-def _device(config: RunConfig) -> str:
-    from accerl_lerobot.policies.loading import resolve_device
-
-    return str(resolve_device(config.policy.device))

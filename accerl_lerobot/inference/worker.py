@@ -18,12 +18,17 @@
     waits for   a full batch, or for the oldest request to have waited `max_wait_s`
     weights     are swapped between batches: no batch ever sees two versions
 
-The event loop only queues and answers; forward passes run on a thread of their own, so requests are accepted meanwhile.
+    ends        with the process; an exception fails every caller that waits or comes later, and ends the run
+
+The event loop only queues and answers; forward passes run on a thread of their own, so requests are
+accepted meanwhile.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -56,6 +61,10 @@ class InferenceConfig:
             raise InputError("inference.max_wait_s", self.max_wait_s, "use seconds in [0, 10)")
 
 
+class ServiceStoppedError(RuntimeError):
+    """The caller did nothing wrong: the service behind it had failed, and says why where it failed."""
+
+
 class _Waiting:
     """Requests of one caller and where their answer goes."""
 
@@ -67,7 +76,7 @@ class _Waiting:
 
 
 class InferenceWorker:
-    """Becomes a Ray actor in `launch`.
+    """Becomes an asynchronous Ray actor in `launch`.
 
     Args:
         policy: which checkpoint to load; every inference worker and the trainer load the same one.
@@ -85,46 +94,50 @@ class InferenceWorker:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="forward")
         self._wake = asyncio.Event()
         self._version = 0
+        self._received = -1
         self._published: tuple[int, dict[str, np.ndarray]] | None = None
+        self._failure: BaseException | None = None
         self._busy_s = 0.0
         self._since = time.monotonic()
 
     async def ready(self) -> int:
-        """Answers once the policy is loaded; returns its version."""
-        return self._version
+        """Answers once the policy is loaded; returns this process's id."""
+        return os.getpid()
 
     async def decide(self, requests: list[Request]) -> list[Decision]:
-        """Answers a caller's requests, in order, as part of some batch."""
+        """Answers a caller's requests, in order, as part of some batch.
+
+        Raises:
+            ServiceStoppedError: `serve` has failed, before or after this call began.
+        """
+        if self._failure is not None:
+            raise _stopped(self._failure)
         waiting = _Waiting(requests, asyncio.get_running_loop().create_future())
         self._batcher.add(waiting, time.monotonic())
         self._wake.set()
         return await waiting.future
 
     async def receive_weights(self, version: int, tensors: dict[str, np.ndarray]) -> int:
-        """Takes a published set; it serves from the next batch on. Older sets than the newest are ignored."""
-        if version > max(self._version, self._published[0] if self._published else -1):
+        """Takes a published set; it serves from the next batch on. What is not newer is ignored."""
+        if version > self._received:
+            self._received = version
             self._published = (version, tensors)
             self._wake.set()
         return version
 
     async def serve(self) -> None:
         """Serves until the process ends; an exception here ends the run."""
-        while True:
-            deadline = self._batcher.next_deadline()
-            now = time.monotonic()
-            if deadline is None or now < deadline:
-                timeout = None if deadline is None else deadline - now
-                try:
-                    await asyncio.wait_for(self._wake.wait(), timeout)
-                except TimeoutError:
-                    continue
-                finally:
-                    self._wake.clear()
-                if not self._batcher.due(time.monotonic()) and self._published is None:
-                    continue
-            await self._swap()
-            if self._batcher.due(time.monotonic()):
-                await self._serve_batch(self._batcher.take(time.monotonic()))
+        try:
+            while True:
+                await self._wait()
+                await self._swap()
+                if self._batcher.due(time.monotonic()):
+                    await self._serve_batch(self._batcher.take(time.monotonic()))
+        except BaseException as error:
+            self._failure = error
+            while batch := self._batcher.take(time.monotonic()):
+                _fail(batch, error)
+            raise
 
     async def metrics(self) -> dict[str, float]:
         """Batching statistics, the version served and the busy share since the last call."""
@@ -132,6 +145,20 @@ class InferenceWorker:
         share, self._busy_s = self._busy_s / max(1e-9, now - self._since), 0.0
         self._since = now
         return {**self._batcher.stats.metrics(), "version": float(self._version), "busy_share": share}
+
+    async def _wait(self) -> None:
+        """Returns when a batch is due or weights have arrived.
+
+        The event only says that something may have changed. It is cleared before the state is looked at, and
+        nothing runs in between, so a request that arrives at any moment is either seen or sets it again.
+        """
+        while True:
+            self._wake.clear()
+            deadline, now = self._batcher.next_deadline(), time.monotonic()
+            if self._published is not None or (deadline is not None and now >= deadline):
+                return
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), None if deadline is None else deadline - now)
 
     async def _swap(self) -> None:
         if self._published is None:
@@ -148,13 +175,22 @@ class InferenceWorker:
             decisions = await asyncio.get_running_loop().run_in_executor(
                 self._pool, self._adapter.decide, requests, self._version
             )
-        except Exception as error:
-            for waiting in batch:
-                waiting.future.set_exception(error)
+        except BaseException as error:
+            _fail(batch, error)
             raise
         self._busy_s += time.monotonic() - started
         start = 0
         for waiting in batch:
-            if not waiting.future.cancelled():
+            if not waiting.future.done():  # the caller may have been cancelled meanwhile
                 waiting.future.set_result(decisions[start : start + len(waiting)])
             start += len(waiting)
+
+
+def _stopped(error: BaseException) -> ServiceStoppedError:
+    return ServiceStoppedError(f"the inference service has stopped: {error!r}")
+
+
+def _fail(batch: list[_Waiting], error: BaseException) -> None:
+    for waiting in batch:
+        if not waiting.future.done():
+            waiting.future.set_exception(_stopped(error))

@@ -15,13 +15,14 @@
 
 consumes    segments from rollout workers
 produces    batches of segments for the trainer
-waits for   the pace: `insert` until rollouts are not too far ahead, `sample` until there is enough that is new
+waits for   the pace: `insert` until rollouts are not too far ahead, `sample` for enough that is new
 unblocked   by the other side, or by `close`
 """
 
 from __future__ import annotations
 
 import asyncio
+import os
 import time
 
 import numpy as np
@@ -46,6 +47,15 @@ class ReplayWorker:
         self._closed = False
         self._insert_wait_s = self._sample_wait_s = 0.0
         self._episodes: list[dict[str, float]] = []
+
+    async def ready(self) -> int:
+        """Answers once this process is up; returns its id."""
+        return os.getpid()
+
+    async def run(self) -> None:
+        """Lasts until `close`; that it ends earlier is how the conductor learns of this process's death."""
+        async with self._changed:
+            await self._changed.wait_for(lambda: self._closed)
 
     async def insert(self, segments: list[Segment]) -> bool:
         """Stores segments once the pace allows it; False when the run is over and they were not stored."""

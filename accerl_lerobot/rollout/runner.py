@@ -13,9 +13,9 @@
 # limitations under the License.
 """Several worlds, each somewhere between a decision and the next: the rollout worker without its process.
 
-A slot is one world. `start` resets it and `advance` executes a decision in it; both return the request for the next
-decision, and whoever drives the runner decides when that is answered: the Ray worker goes on with other slots meanwhile,
-the single-process mode answers at once.
+A slot is one world. `start` resets it and `advance` executes a decision in it; both return the request for
+the next decision, and whoever drives the runner decides when that is answered: the Ray worker goes on with
+other slots meanwhile, the single-process mode answers at once.
 """
 
 from __future__ import annotations
@@ -44,15 +44,18 @@ class RolloutConfig:
     decision_cost: float = 0.01
     """Subtracted from the reward of every decision, so that faster is better; ≥ 0."""
     time_limit: str = "truncate"
-    """What running out of time means to the learner. truncate: nothing; V of the last observation stands for what
-    would have followed. fail: the task was to be done in time, so the return ends there.
+    """What running out of time means to the learner. truncate: nothing; V of the last observation stands for
+    what would have followed. fail: the task was to be done in time, so the return ends there.
 
-    Where success is counted within a limit, `fail` is the measured choice: a policy that gets stuck bootstraps
-    from its own optimistic value and failures go unpunished. On door-open, success at update 100 fell from 0.82
-    to 0.50 (n = 20) with truncate.
+    Where success is counted within a limit, `fail` is the measured choice: a policy that gets stuck
+    bootstraps from its own optimistic value and failures go unpunished. On door-open, success at update 100
+    fell from 0.82 to 0.50 (n = 20) with truncate.
     """
     max_restarts: int = 3
-    """How often a rollout worker that died is started again before the run ends with its error."""
+    """How often each worker is started again after it died or hung; once more ends the run with its error.
+
+    Not reset by progress: a world that keeps crashing is to be mended.
+    """
 
     def __post_init__(self) -> None:
         for name in ("workers", "worlds", "segment_length"):
@@ -138,8 +141,8 @@ class RolloutRunner:
         next_plan: Callable[[], EpisodePlan | None],
         config: RolloutConfig,
         name: str,
-        on_segment: Callable[[Segment], None],
-        on_episode: Callable[[EpisodeResult], None],
+        on_segment: Callable[[Segment], object],
+        on_episode: Callable[[EpisodeResult], object],
         film: tuple[int, int] = (240, 2),
     ) -> None:
         self.config, self.name = config, name
@@ -172,9 +175,8 @@ class RolloutRunner:
         result = self._filmed(state, decision.chunk) if plan.film else state.world.step_chunk(decision.chunk)
         self.counters.env_steps += result.steps
         self.counters.decisions += 1
-        if result.info.get("nonfinite") or not (
-            np.isfinite(result.rewards).all() and _finite(result.observation)
-        ):
+        sound = np.isfinite(result.rewards).all() and _finite(result.observation)
+        if result.info.get("nonfinite") or not sound:
             self.counters.dropped_nonfinite += len(builder.decisions) + 1
             if not plan.explore:  # an evaluation counts every episode it planned
                 self._finish(state, plan, success=False)
@@ -215,9 +217,8 @@ class RolloutRunner:
     def _request(self, state: _Slot) -> Request:
         plan, builder = state.plan, state.builder
         assert plan is not None and builder is not None
-        seed = (
-            plan.seed * 1_000_003 + state.decisions
-        )  # one stream per (episode, decision), however requests are batched
+        # One stream per (episode, decision), whichever slot runs it and however requests are batched.
+        seed = plan.seed * 1_000_003 + state.decisions
         return Request(observation=builder.latest, noise_seed=seed, explore=plan.explore)
 
     def _emit(
@@ -233,9 +234,11 @@ class RolloutRunner:
         episode = {}
         if terminated or truncated:
             episode = {
-                "return": state.episode_return, "steps": state.steps, "decisions": state.decisions,
+                "return": state.episode_return,
+                "steps": state.steps,
+                "decisions": state.decisions,
                 "success": float(success),
-            }  # fmt: skip
+            }
         key = f"{self.name}.{self._sequence}"
         segment = builder.cut(key, terminated, truncated, success, episode)
         if plan.explore:
@@ -260,8 +263,5 @@ class RolloutRunner:
 def _finite(observation: Observation | None) -> bool:
     if observation is None:
         return True
-    return all(
-        np.isfinite(v).all()
-        for v in observation.values()
-        if isinstance(v, np.ndarray) and v.dtype.kind == "f"
-    )
+    arrays = [v for v in observation.values() if isinstance(v, np.ndarray) and v.dtype.kind == "f"]
+    return all(np.isfinite(v).all() for v in arrays)

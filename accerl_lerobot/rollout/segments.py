@@ -51,7 +51,7 @@ class SegmentBuilder:
         return len(self.decisions) >= self.length
 
     def add(self, decision: Decision, reward: float, steps: int, following: Observation | None) -> None:
-        """Records one executed decision; `following` None (after a termination) repeats the observation before."""
+        """Records one executed decision; `following` None (after a termination) repeats the observation."""
         self.decisions.append(decision)
         self.rewards.append(reward)
         self.steps.append(steps)

@@ -14,9 +14,10 @@
 """The rollout process: steps its worlds while other observations wait for a decision.
 
     consumes    decisions from inference
-    produces    segments for replay, results of evaluation episodes for the driver
+    produces    segments for replay, results of episodes for the driver
     waits for   a decision, only when every world has an observation under way
     pauses      exploring worlds while replay keeps segments at the door; evaluation goes on
+    ends        never unasked: a world that raises ends the process's `run`, and `launch` starts another
 
 Imports neither torch nor LeRobot (unless its world does).
 """
@@ -27,28 +28,45 @@ import os
 import threading
 import time
 from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import ray
 
 from accerl_lerobot.envs import EnvConfig, make_world
-from accerl_lerobot.experience import Request, Segment
+from accerl_lerobot.experience import Decision, Request, Segment
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig, RolloutRunner
 from accerl_lerobot.seeds import train_seed
 
 GROUPS = 2
-"""Worlds are asked for in this many groups per worker: one is stepped while the other's decisions are made."""
+"""A worker's worlds are asked for in so many groups: one is stepped while the other's decisions are made."""
 AT_THE_DOOR = 2
 """Insert calls that may be waiting before exploring worlds pause."""
+EPISODES_PER_INCARNATION = 1000
+"""By how much a restarted worker skips ahead in its training seeds, so as not to repeat its episodes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """What a rollout worker answers when it is asked how it is."""
+
+    episodes: list[EpisodeResult]
+    """Finished since the last report."""
+    counters: dict[str, float]
+    """Since this process began."""
+    in_world_s: float
+    """How long the world has been at what it does now, in seconds; 0 while none is stepped."""
 
 
 class RolloutWorker:
-    """Becomes a threaded Ray actor in `launch`: `run` on one thread, plans and drains on another.
+    """Becomes a threaded Ray actor in `launch`: `run` on one thread, `report` on another.
 
     Args:
         env: the world's config; one instance per slot.
         config: sizes.
-        tasks: the training tasks; slot i begins with task i modulo their number.
+        tasks: the training tasks, explored in turn.
         seed: the run's.
         index: of this worker.
         incarnation: how often it has been restarted; part of the segments' keys, and of the seeds.
@@ -66,52 +84,50 @@ class RolloutWorker:
         film: tuple[int, int],
     ) -> None:
         self._tasks, self._seed, self._index = tasks, seed, index
-        self._episode = incarnation * 1000
+        self._episode = incarnation * EPISODES_PER_INCARNATION
+        # Shared by the two threads: appending to and popping from a deque is atomic.
         self._planned: deque[EpisodePlan] = deque()
-        self._results: list[EpisodeResult] = []
-        self._outbox: list[Segment] = []
+        self._results: deque[EpisodeResult] = deque()
         self._training = threading.Event()
-        self._stopped = threading.Event()
+        self._entered: float | None = None
+        self._outbox: list[Segment] = []
         worlds = [make_world(env) for _ in range(config.worlds)]
         name = f"rollout{index}.{incarnation}"
         self._runner = RolloutRunner(
             worlds, self._next_plan, config, name, self._outbox.append, self._results.append, film
         )
 
-    def ready(self) -> bool:
-        """Answers once the worlds exist."""
-        return True
-
-    def pid(self) -> int:
-        """This process."""
+    def ready(self) -> int:
+        """Answers once the worlds exist; returns this process's id."""
         return os.getpid()
 
-    def plan(self, plans: list[EpisodePlan]) -> None:
-        """Queues evaluation episodes; they are taken before any training episode."""
+    def report(self, training: bool, plans: list[EpisodePlan]) -> Report:
+        """Takes orders and reports. One call at a time, so that orders cannot overtake each other.
+
+        Args:
+            training: whether training episodes are run between planned ones, from now on.
+            plans: evaluation episodes to queue; they are taken before any training episode.
+        """
         self._planned.extend(plans)
-
-    def train(self, on: bool) -> None:
-        """Whether training episodes are run between planned ones."""
-        (self._training.set if on else self._training.clear)()
-
-    def drain(self) -> tuple[list[EpisodeResult], dict[str, float]]:
-        """Episodes finished since the last call, and the counters so far."""
-        results = [self._results.pop(0) for _ in range(len(self._results))]
-        return results, {k: float(v) for k, v in vars(self._runner.counters).items()}
-
-    def stop(self) -> None:
-        """Makes `run` return."""
-        self._stopped.set()
+        (self._training.set if training else self._training.clear)()
+        episodes = [self._results.popleft() for _ in range(len(self._results))]
+        entered = self._entered
+        return Report(
+            episodes=episodes,
+            counters={k: float(v) for k, v in vars(self._runner.counters).items()},
+            in_world_s=0.0 if entered is None else time.monotonic() - entered,
+        )
 
     def run(self, inference: Any, replay: Any) -> None:
-        """Steps worlds until stopped."""
+        """Steps worlds until the process ends."""
         idle = list(range(len(self._runner)))
         due: dict[int, Request] = {}
         under_way: dict[Any, list[int]] = {}
         door: list[Any] = []
         size = max(1, len(self._runner) // GROUPS)
-        while not self._stopped.is_set():
-            door = self._still_waiting(door)
+        while True:
+            door = _still_waiting(door)
+            self._give_up(due, idle)
             idle = [slot for slot in idle if not self._begin(slot, due)]
             sendable = [slot for slot in due if len(door) < AT_THE_DOOR or not due[slot].explore]
             for start in range(0, len(sendable), size):
@@ -124,31 +140,40 @@ class RolloutWorker:
             for reference in done:
                 slots = under_way.pop(reference)
                 for slot, decision in zip(slots, ray.get(reference), strict=True):
-                    request = self._runner.advance(slot, decision)
-                    if request is not None and request.explore and not self._training.is_set():
-                        request = self._runner.start(slot)  # training ended: the episode is abandoned
-                    if request is None:
-                        idle.append(slot)
-                    else:
-                        due[slot] = request
+                    self._advance(slot, decision, due, idle)
                 if self._outbox:
                     door.append(replay.insert.remote(list(self._outbox)))
                     self._outbox.clear()
-        self._runner.close()
 
     def _begin(self, slot: int, due: dict[int, Request]) -> bool:
-        request = self._runner.start(slot)
+        with self._in_world():
+            request = self._runner.start(slot)
         if request is not None:
             due[slot] = request
         return request is not None
 
-    def _still_waiting(self, door: list[Any]) -> list[Any]:
-        if not door:
-            return door
-        done, waiting = ray.wait(door, num_returns=len(door), timeout=0)
-        for reference in done:
-            ray.get(reference)  # an insert that failed ends this worker
-        return waiting
+    def _advance(self, slot: int, decision: Decision, due: dict[int, Request], idle: list[int]) -> None:
+        with self._in_world():
+            request = self._runner.advance(slot, decision)
+        if request is None:
+            idle.append(slot)
+        else:
+            due[slot] = request
+
+    def _give_up(self, due: dict[int, Request], idle: list[int]) -> None:
+        """Abandons training episodes once training has ended, so that planned ones need not wait for them."""
+        if self._training.is_set():
+            return
+        for slot in [slot for slot, request in due.items() if request.explore]:
+            del due[slot]
+            idle.append(slot)
+
+    @contextmanager
+    def _in_world(self) -> Iterator[None]:
+        """Lets `report` tell a world that hangs from a worker that waits."""
+        self._entered = time.monotonic()
+        yield
+        self._entered = None
 
     def _next_plan(self) -> EpisodePlan | None:
         if self._planned:
@@ -158,3 +183,13 @@ class RolloutWorker:
         number, self._episode = self._episode, self._episode + 1
         task = self._tasks[(number + self._index) % len(self._tasks)]
         return EpisodePlan(task=task, seed=train_seed(self._seed, self._index, number), explore=True)
+
+
+def _still_waiting(door: list[Any]) -> list[Any]:
+    """The insert calls that have not returned."""
+    if not door:
+        return door
+    done, waiting = ray.wait(door, num_returns=len(door), timeout=0)
+    for reference in done:
+        ray.get(reference)  # an insert that failed ends this worker
+    return list(waiting)

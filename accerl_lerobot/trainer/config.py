@@ -44,7 +44,7 @@ class TrainerConfig:
     """constant, or cosine: falls to `final_lr_share` of the peak over `updates`."""
     final_lr_share: float = 0.1
     value_warmup_updates: int = 20
-    """First updates in which only the critic head learns, because advantages of an untrained one are noise."""
+    """First updates, in which only the critic head learns: advantages of an untrained one are noise."""
     grad_clip: float = 1.0
     """Largest gradient norm; > 0."""
     weight_decay: float = 0.0
@@ -52,19 +52,13 @@ class TrainerConfig:
     publish_every: int = 1
     """Updates between two publications of the weights."""
     max_nonfinite: int = 5
-    """Updates with a non-finite loss or gradient are skipped and counted; this many in a row end the run."""
+    """Updates with a non-finite loss or gradient are skipped and counted; so many in a row are an error."""
     num_threads: int = 1
     """CPU threads."""
 
     def __post_init__(self) -> None:
-        for name in (
-            "updates",
-            "batch_decisions",
-            "micro_batch",
-            "publish_every",
-            "max_nonfinite",
-            "num_threads",
-        ):
+        sizes = ("updates", "batch_decisions", "micro_batch", "publish_every", "max_nonfinite", "num_threads")
+        for name in sizes:
             if getattr(self, name) < 1:
                 raise InputError(f"trainer.{name}", getattr(self, name), "use at least 1")
         for name in ("lr", "value_lr"):
@@ -86,7 +80,6 @@ class TrainerConfig:
             return (update + 1) / self.warmup_updates
         if self.schedule == "constant":
             return 1.0
-        done = (update - self.warmup_updates) / max(1, self.updates - self.warmup_updates)
-        return self.final_lr_share + (1 - self.final_lr_share) * 0.5 * (
-            1 + math.cos(math.pi * min(1.0, done))
-        )
+        done = min(1.0, (update - self.warmup_updates) / max(1, self.updates - self.warmup_updates))
+        fall = 0.5 * (1 + math.cos(math.pi * done))
+        return self.final_lr_share + (1 - self.final_lr_share) * fall

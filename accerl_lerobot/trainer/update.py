@@ -13,10 +13,11 @@
 # limitations under the License.
 """One update: segments in, better weights and numbers about them out.
 
-    values of the current critic (bootstraps too) → GAE → advantages normalised over the batch → loss → clipped step
+    values of the current critic (bootstraps too) → GAE → advantages normalised over the batch → loss → step
 
-Values stored with the samples are stale by their lag, so they are recomputed; the stored log-probs are not, since they
-are what the ratio divides by. Knows no process: the Ray worker and the single-process mode both call `Update.step`.
+Values stored with the samples are stale by their lag, so they are recomputed; the stored log-probs are not,
+since they are what the ratio divides by. Knows no process: the Ray worker and the single-process mode both
+call `Update.step`.
 
 Shapes: S segments, T decisions of the longest one, N decisions in all.
 """
@@ -103,8 +104,8 @@ class Update:
         self._policy_parameters = [p for k, p in named.items() if not k.startswith("value_head.")]
         self._parameters = self._policy_parameters + critic
         groups = [
-            {"params": self._policy_parameters, "lr": config.lr, "peak": config.lr},
-            {"params": critic, "lr": config.value_lr, "peak": config.value_lr},
+            {"params": self._policy_parameters, "lr": config.lr},
+            {"params": critic, "lr": config.value_lr},
         ]
         self.optimizer = torch.optim.AdamW(groups, betas=config.betas, weight_decay=config.weight_decay)
 
@@ -117,52 +118,56 @@ class Update:
         batch = collate(segments)
         share = self.config.lr_share(self.version)
         critic_only = self.version < self.config.value_warmup_updates
-        for index, group in enumerate(self.optimizer.param_groups):
-            group["lr"] = 0.0 if critic_only and index == 0 else group["peak"] * share
+        policy_group, critic_group = self.optimizer.param_groups
+        policy_group["lr"] = 0.0 if critic_only else self.config.lr * share
+        critic_group["lr"] = self.config.value_lr * share
         self.optimizer.zero_grad(set_to_none=True)
         metrics = self._backward(batch)
+        if (
+            critic_only
+        ):  # before the norm is taken: noise in the policy's gradient must not scale the critic's
+            for parameter in self._policy_parameters:
+                parameter.grad = None
         norm = torch.nn.utils.clip_grad_norm_(self._parameters, self.config.grad_clip)
-        finite = bool(torch.isfinite(norm)) and np.isfinite(metrics["loss"])
-        if finite:
-            if critic_only:
-                for parameter in self._policy_parameters:
-                    parameter.grad = None
+        if bool(torch.isfinite(norm)) and np.isfinite(metrics["loss"]):
             self.optimizer.step()
             self._skipped_in_a_row = 0
         else:
-            self.skipped += 1
-            self._skipped_in_a_row += 1
-            if self._skipped_in_a_row >= self.config.max_nonfinite:
-                raise NonFiniteError(
-                    f"{self._skipped_in_a_row} updates in a row had a non-finite loss or gradient; lower trainer.lr"
-                )
+            self._skip()
         lag = lag_metrics(torch.from_numpy(batch.version), self.version)
         self.version += 1
-        return (
-            metrics
-            | {k: float(v) for k, v in lag.items()}
-            | {"grad_norm": float(norm), "lr": self.config.lr * share, "skipped": float(self.skipped)}
-        )
+        metrics |= {name: float(value) for name, value in lag.items()}
+        return metrics | {
+            "grad_norm": float(norm),
+            "lr": float(policy_group["lr"]),
+            "value_lr": float(critic_group["lr"]),
+            "skipped": float(self.skipped),
+        }
+
+    def _skip(self) -> None:
+        self.skipped += 1
+        self._skipped_in_a_row += 1
+        if self._skipped_in_a_row >= self.config.max_nonfinite:
+            raise NonFiniteError(
+                f"{self._skipped_in_a_row} updates in a row had a non-finite loss or gradient; "
+                "lower trainer.lr"
+            )
 
     def _backward(self, batch: Batch) -> dict[str, float]:
         """Accumulates gradients over micro-batches; returns metrics weighted by their decisions."""
         n = len(batch.reward)
-        chunks = [
-            np.arange(i, min(i + self.config.micro_batch, n)) for i in range(0, n, self.config.micro_batch)
-        ]
+        chunks = np.split(np.arange(n), range(self.config.micro_batch, n, self.config.micro_batch))
         bootstrap = self._values(batch.last_observations, batch.segment_tasks)
-        # With one micro-batch its own forward pass supplies the values that GAE needs.
-        whole = len(chunks) == 1
-        values = None if whole else torch.cat([self._values(*_rows(batch, rows)) for rows in chunks])
-        total: dict[str, float] = {}
         targets: tuple[Tensor, Tensor] | None = None
+        if len(chunks) > 1:  # a single micro-batch supplies the values that GAE needs by its own forward pass
+            targets = self._targets(batch, self._values(batch.observations, batch.tasks), bootstrap)
+        total: dict[str, float] = {}
         for rows in chunks:
             latent = {k: v[rows] for k, v in batch.latent.items()}
-            evaluation = self.adapter.evaluate(*_rows(batch, rows), latent)
+            observations, tasks = _rows(batch.observations, batch.tasks, rows)
+            evaluation = self.adapter.evaluate(observations, tasks, latent)
             if targets is None:
-                targets = self._targets(
-                    batch, evaluation.value.detach().cpu() if values is None else values, bootstrap
-                )
+                targets = self._targets(batch, evaluation.value.detach().cpu(), bootstrap)
             device = evaluation.value.device
             output = compute_loss(
                 LossInputs(
@@ -177,22 +182,18 @@ class Update:
             )
             share = len(rows) / n
             (output.loss * share).backward()
-            for name, value in output.metrics.items():
-                if name == "ratio_max_dev":
-                    total[name] = max(total.get(name, 0.0), float(value))
-                else:
-                    total[name] = total.get(name, 0.0) + (
-                        float(value) if name == "decisions" else share * float(value)
-                    )
+            _merge(total, {k: float(v) for k, v in output.metrics.items()}, share)
         assert targets is not None
         return total | {"return_mean": float(targets[1].mean()), "reward_mean": float(batch.reward.mean())}
 
     def _targets(self, batch: Batch, values: Tensor, bootstrap: Tensor) -> tuple[Tensor, Tensor]:
         """Normalised advantages and returns, each (N,)."""
         mask = decision_mask(batch.lengths, int(batch.lengths.max()))
-        padded = [torch.zeros(mask.shape).masked_scatter(mask, x.float()) for x in (batch.reward, values)]
+        padded = torch.zeros(mask.shape)
+        reward, value = (padded.masked_scatter(mask, x.float()) for x in (batch.reward, values))
         advantages, returns = gae(
-            *padded,
+            reward,
+            value,
             bootstrap,
             batch.terminated,
             batch.lengths,
@@ -203,8 +204,22 @@ class Update:
         return advantages[mask], returns[mask]
 
     def _values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
-        return self.adapter.values(observations, tasks).cpu()
+        """V of each row, (rows,), without gradient, at most `micro_batch` rows at a time."""
+        size, n = self.config.micro_batch, len(tasks)
+        rows = np.split(np.arange(n), range(size, n, size))
+        return torch.cat([self.adapter.values(*_rows(observations, tasks, r)).cpu().float() for r in rows])
 
 
-def _rows(batch: Batch, rows: np.ndarray) -> tuple[dict[str, np.ndarray], list[str]]:
-    return {k: v[rows] for k, v in batch.observations.items()}, [batch.tasks[i] for i in rows]
+def _rows(
+    observations: dict[str, np.ndarray], tasks: Sequence[str], rows: np.ndarray
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    return {k: v[rows] for k, v in observations.items()}, [tasks[i] for i in rows]
+
+
+def _merge(total: dict[str, float], metrics: dict[str, float], share: float) -> None:
+    """Adds a micro-batch's metrics: a maximum, a count, and means weighted by its share of the decisions."""
+    for name, value in metrics.items():
+        if name == "ratio_max_dev":
+            total[name] = max(total.get(name, value), value)
+        else:
+            total[name] = total.get(name, 0.0) + (value if name == "decisions" else share * value)

@@ -21,8 +21,10 @@ ends        after `updates` updates, or when replay is closed
 
 from __future__ import annotations
 
+import os
 import threading
 import time
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -57,17 +59,17 @@ class TrainerWorker:
         self._policy, self._config = policy, config
         self._update = Update(load_adapter(policy), algorithm, config)
         self._lock = threading.Lock()
-        self._history: list[dict[str, float]] = []
+        self._history: deque[dict[str, float]] = deque()  # filled on one thread, emptied on another
 
     def ready(self) -> int:
-        """Answers once the policy is loaded; returns its version."""
-        return self._update.version
+        """Answers once the policy is loaded; returns this process's id."""
+        return os.getpid()
 
     def run(self, replay: Any, readers: list[Any]) -> int:
         """Trains; returns the number of updates made."""
         publisher = RayPublisher(readers)
         n, config = self._config.batch_decisions, self._config
-        publisher.publish(0, self._export())  # the critic is not in the checkpoint: all must start from one
+        publisher.publish(0, self._export())  # a checkpoint need not hold a critic: all start from this one
         upcoming = replay.sample.remote(n, self._update.version)
         while self._update.version < config.updates:
             asked = time.monotonic()
@@ -75,28 +77,28 @@ class TrainerWorker:
             if not segments:
                 break
             waited = time.monotonic() - asked
-            upcoming = replay.sample.remote(n, self._update.version + 1)
+            if self._update.version + 1 < config.updates:
+                upcoming = replay.sample.remote(n, self._update.version + 1)
             started = time.monotonic()
             with self._lock:
                 metrics = self._update.step(segments)
             updated = time.monotonic()
-            if self._update.version % config.publish_every == 0:
+            last = self._update.version == config.updates
+            if self._update.version % config.publish_every == 0 or last:
                 publisher.publish(self._update.version, self._export())
             metrics |= {
-                "update": float(self._update.version), "wait_s": waited, "update_s": updated - started,
+                "update": float(self._update.version),
+                "wait_s": waited,
+                "update_s": updated - started,
                 "publish_s": time.monotonic() - updated,
-            }  # fmt: skip
+            }
             self._history.append(metrics)
-        with self._lock:
-            if self._update.version % config.publish_every:
-                publisher.publish(self._update.version, self._export())
         publisher.flush()
         return self._update.version
 
     def metrics(self) -> list[dict[str, float]]:
         """One record per update since the last call."""
-        history, self._history = self._history, []
-        return history
+        return [self._history.popleft() for _ in range(len(self._history))]
 
     def save(self, directory: str) -> int:
         """Writes LeRobot's ``pretrained_model`` files between two updates; returns their version."""

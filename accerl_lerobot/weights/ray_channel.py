@@ -13,8 +13,8 @@
 # limitations under the License.
 """Weights from the trainer to inference workers through Ray's object store.
 
-One copy is put into the store, each reader gets a reference, and at most one set per reader is under way: a reader that
-is slow skips versions instead of queueing them. The publisher never waits for a reader.
+One copy is put into the store, each reader gets a reference, and at most one set per reader is under way: a
+reader that is slow skips versions instead of queueing them. The publisher never waits for a reader.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ class RayPublisher:
     def __init__(self, readers: Sequence[Any]) -> None:
         self._readers = list(readers)
         self._under_way: list[Any] = [None] * len(self._readers)
+        self._sent: list[int | None] = [None] * len(self._readers)
         self._version: int | None = None
         self._newest: Any = None
 
@@ -54,18 +55,25 @@ class RayPublisher:
                 self._send(index)
 
     def flush(self) -> None:
-        """Waits until every reader has the newest set; called once after the last update."""
-        if self._version is None:
-            return
+        """Waits until every reader has the newest set; called once, after the last update.
+
+        Raises:
+            ray.exceptions.RayError: a reader has died.
+        """
         for index in range(len(self._readers)):
             self._arrived(index, timeout=None)
             self._send(index)
-            ray.get(self._under_way[index])
+        for index in range(len(self._readers)):
+            self._arrived(index, timeout=None)
 
     def _send(self, index: int) -> None:
-        self._under_way[index] = self._readers[index].receive_weights.remote(self._version, self._newest)
+        if self._sent[index] != self._version:
+            reader = self._readers[index]
+            self._under_way[index] = reader.receive_weights.remote(self._version, self._newest)
+            self._sent[index] = self._version
 
     def _arrived(self, index: int, timeout: float | None) -> bool:
+        """Whether what was sent to a reader has been received; waits up to `timeout` seconds for it."""
         reference = self._under_way[index]
         if reference is None:
             return True

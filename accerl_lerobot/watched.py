@@ -1,0 +1,92 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""An actor as the conductor sees it."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import ray
+from ray.exceptions import GetTimeoutError, RayError
+
+
+class Watched:
+    """One long call that must not end unasked, and one question at a time.
+
+    Questions are asked without waiting and answers picked up later. So a worker that hangs cannot hang the
+    conductor, its silence has a length, and orders arrive in order, which Ray does not promise for an actor
+    with threads.
+
+    Example:
+        >>> worker = Watched("trainer", actor)
+        >>> worker.work = actor.run.remote()    # `ray.wait` on it: its end is an event
+        >>> worker.ask("metrics")               # again and again: does nothing until the answer is picked up
+        >>> worker.answer(), worker.silent_s()
+        (None, 0.4)
+
+    Args:
+        name: for messages.
+        actor: its Ray handle.
+    """
+
+    def __init__(self, name: str, actor: Any) -> None:
+        self.name, self.actor = name, actor
+        self.work: Any = None
+        self.answered = False
+        self._question: Any = None
+        self._asked = 0.0
+
+    def ask(self, method: str, *arguments: Any) -> bool:
+        """Asks unless an answer is still owed; returns whether it did."""
+        if self._question is not None:
+            return False
+        self._question, self._asked = getattr(self.actor, method).remote(*arguments), time.monotonic()
+        return True
+
+    def answer(self, timeout: float = 0.0) -> Any:
+        """The answer to the last question, once; None if there is none yet.
+
+        Raises:
+            RayError: the call failed, or the process has died.
+        """
+        if self._question is None or not ray.wait([self._question], timeout=timeout)[0]:
+            return None
+        question, self._question = self._question, None
+        answer = ray.get(question)
+        self.answered = True
+        return answer
+
+    def silent_s(self) -> float:
+        """For how long an answer has been owed, in seconds."""
+        return 0.0 if self._question is None else time.monotonic() - self._asked
+
+    def call(self, method: str, *arguments: Any, timeout: float) -> Any:
+        """Waits for one answer.
+
+        Raises:
+            RuntimeError: it failed, with its traceback, or did not come in time.
+        """
+        return self.result(getattr(self.actor, method).remote(*arguments), method, timeout)
+
+    def result(self, reference: Any, method: str, timeout: float) -> Any:
+        """As `call`, for a call that has been made."""
+        try:
+            return ray.get(reference, timeout=timeout)
+        except GetTimeoutError as error:
+            raise RuntimeError(
+                f"{self.name} worker did not answer {method} within {timeout:.0f} s"
+            ) from error
+        except RayError as error:
+            raise RuntimeError(f"{self.name} worker failed in {method}:\n{error}") from error
