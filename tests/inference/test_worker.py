@@ -1,0 +1,310 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The inference service on an event loop of the test's own, with an adapter that only counts."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.experience import TASK, Decision, Request
+from accerl_lerobot.inference.worker import InferenceConfig, InferenceWorker, ServiceStoppedError
+from accerl_lerobot.policies import loading
+from accerl_lerobot.policies.loading import PolicyConfig
+
+NAMES = ("a", "b", "c")
+
+
+class CountingAdapter:
+    """Weights are three numbers that belong together; reading and writing them takes a while."""
+
+    def __init__(self, delay: float = 0.0) -> None:
+        self.delay = delay
+        self.weights = dict.fromkeys(NAMES, 0.0)
+        self.batches: list[list[int]] = []
+        self.loaded: list[int] = []
+        self.broken: Exception | None = None
+        self.gate: threading.Event | None = None
+        self.inside = 0
+        self.entered = threading.Event()
+
+    def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
+        self._enter()
+        if self.gate is not None:
+            assert self.gate.wait(10)
+        if self.broken is not None:
+            raise self.broken
+        self.batches.append([r.noise_seed for r in requests])
+        answers = []
+        for request in requests:
+            read = []
+            for name in NAMES:
+                read.append(self.weights[name])
+                time.sleep(self.delay)
+            answers.append(
+                Decision(
+                    chunk=np.array([read]),
+                    latent={},
+                    log_prob=np.zeros(1, np.float32),
+                    value=float(request.noise_seed),
+                    version=version,
+                )
+            )
+        self._leave()
+        return answers
+
+    def load_trainable(self, tensors: dict[str, np.ndarray]) -> None:
+        self._enter()
+        if self.broken is not None:
+            raise self.broken
+        for name in NAMES:
+            self.weights[name] = float(tensors[name])
+            time.sleep(self.delay)
+        self.loaded.append(int(tensors["a"]))
+        self._leave()
+
+    def _enter(self) -> None:
+        self.inside += 1
+        assert self.inside == 1, "weights were touched while a batch was decided"
+        self.entered.set()
+
+    def _leave(self) -> None:
+        self.inside -= 1
+
+
+def requests(*seeds: int) -> list[Request]:
+    return [Request(observation={TASK: "push"}, noise_seed=seed) for seed in seeds]
+
+
+def weights(version: int) -> dict[str, np.ndarray]:
+    return {name: np.array(float(version)) for name in NAMES}
+
+
+Scene = Callable[[InferenceWorker, CountingAdapter], Awaitable[Any]]
+
+
+@pytest.fixture
+def play(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    """Runs a scene beside a serving worker; a scene that takes 30 s hangs."""
+
+    def run(scene: Scene, adapter: CountingAdapter | None = None, **config: Any) -> Any:
+        adapter = adapter or CountingAdapter()
+        monkeypatch.setattr(loading, "load_adapter", lambda policy: adapter)
+
+        async def main() -> Any:
+            worker = InferenceWorker(PolicyConfig(path="nowhere", device="cpu"), InferenceConfig(**config))
+            serving = asyncio.create_task(worker.serve())
+            try:
+                return await asyncio.wait_for(scene(worker, adapter), 30)
+            finally:
+                serving.cancel()
+                await asyncio.gather(serving, return_exceptions=True)
+
+        return asyncio.run(main())
+
+    return run
+
+
+def test_a_full_batch_is_served_without_waiting(play):
+    async def scene(worker, adapter):
+        worker._batcher.max_wait_s = 1e9  # only fullness can be why this is answered
+        await asyncio.gather(*(worker.decide(requests(i)) for i in range(4)))
+        assert adapter.batches == [[0, 1, 2, 3]]
+
+    play(scene, max_batch=4)
+
+
+def test_a_lonely_request_is_served_when_it_has_waited(play):
+    async def scene(worker, adapter):
+        await worker.decide(requests(5))
+        assert adapter.batches == [[5]]
+        metrics = await worker.metrics()
+        assert metrics["wait_max_s"] >= 0.05 and metrics["batches"] == 1
+
+    play(scene, max_batch=4, max_wait_s=0.05)
+
+
+def test_a_trickle_of_requests_does_not_postpone_the_oldest(play):
+    async def scene(worker, adapter):
+        first = asyncio.create_task(worker.decide(requests(0)))
+        later = []
+        for i in range(1, 200):
+            await asyncio.sleep(0.01)
+            later.append(asyncio.create_task(worker.decide(requests(i))))
+            if first.done():
+                break
+        await asyncio.gather(first, *later)
+        # Were the clock to begin with the newest request, all of them would have been one batch.
+        assert adapter.batches[0][0] == 0 and len(adapter.batches[0]) < 200 - 1 and len(later) < 199
+
+    play(scene, max_batch=1000, max_wait_s=0.1)
+
+
+def test_answers_go_to_those_who_asked_in_their_order(play):
+    async def scene(worker, adapter):
+        seeds = [[1, 2, 3], [4], [5, 6], [7, 8], [9]]
+        answers = await asyncio.gather(*(worker.decide(requests(*some)) for some in seeds))
+        assert [[int(d.value) for d in some] for some in answers] == seeds
+
+    play(scene, max_batch=4, max_wait_s=0.01)
+
+
+def test_requests_that_arrive_during_a_forward_pass_are_not_forgotten(play):
+    adapter = CountingAdapter()
+    adapter.gate = threading.Event()
+
+    async def scene(worker, adapter):
+        first = asyncio.create_task(worker.decide(requests(0)))
+        while not adapter.entered.is_set():
+            await asyncio.sleep(0.001)
+        others = [asyncio.create_task(worker.decide(requests(i))) for i in (1, 2, 3)]
+        await asyncio.sleep(0.02)
+        assert not first.done()
+        adapter.gate.set()
+        await asyncio.gather(first, *others)
+        assert sorted(sum(adapter.batches, [])) == [0, 1, 2, 3]
+
+    play(scene, adapter, max_batch=1, max_wait_s=0.0)
+
+
+def test_no_batch_sees_two_versions(play):
+    """Weights arrive in the middle of every batch; every answer is of one version, the one it states."""
+    last = 60
+
+    async def scene(worker, adapter):
+        async def publish() -> None:
+            for version in range(1, last + 1):
+                while len(adapter.batches) < version:
+                    await asyncio.sleep(0.0002)
+                await worker.receive_weights(version, weights(version))
+
+        async def ask(first: int) -> list[Decision]:
+            answers = []
+            while worker._version < last:
+                answers += await worker.decide(requests(first, first + 1))
+            return answers
+
+        _, *answers = await asyncio.gather(publish(), *(ask(10 * i) for i in range(4)))
+        return [decision for some in answers for decision in some], adapter.loaded
+
+    answers, loaded = play(scene, CountingAdapter(delay=0.0002), max_batch=4, max_wait_s=0.001)
+    for decision in answers:
+        assert set(decision.chunk.ravel()) == {decision.version}
+    versions = {decision.version for decision in answers}
+    assert len(versions) > last / 2 and max(versions) <= last
+    assert loaded == sorted(set(loaded)) and loaded[-1] == last
+
+
+def test_weights_that_arrive_while_nobody_asks_are_loaded(play):
+    async def scene(worker, adapter):
+        await asyncio.sleep(0.01)
+        await worker.receive_weights(3, weights(3))
+        while adapter.loaded != [3]:
+            await asyncio.sleep(0.001)
+        (decision,) = await worker.decide(requests(0))
+        assert decision.version == 3 and set(decision.chunk.ravel()) == {3.0}
+        assert (await worker.metrics())["version"] == 3
+
+    play(scene, max_batch=4, max_wait_s=0.0)
+
+
+def test_the_first_weights_are_version_zero_and_are_loaded(play):
+    async def scene(worker, adapter):
+        adapter.weights = dict.fromkeys(NAMES, -1.0)  # another critic than the trainer's
+        await worker.receive_weights(0, weights(0))
+        (decision,) = await worker.decide(requests(0))
+        assert decision.version == 0 and set(decision.chunk.ravel()) == {0.0}
+
+    play(scene, max_batch=1, max_wait_s=0.0)
+
+
+def test_a_batch_served_after_weights_were_received_uses_them(play):
+    async def scene(worker, adapter):
+        for version in range(1, 30):
+            await worker.receive_weights(version, weights(version))
+            (decision,) = await worker.decide(requests(0))
+            assert decision.version == version
+
+    play(scene, max_batch=1, max_wait_s=0.0)
+
+
+def test_older_weights_are_ignored_even_while_newer_ones_are_loaded(play):
+    async def scene(worker, adapter):
+        await worker.receive_weights(4, weights(4))
+        while not adapter.entered.is_set():
+            await asyncio.sleep(0.0005)
+        await worker.receive_weights(3, weights(3))  # version 4 is being written just now
+        await worker.receive_weights(4, weights(4))
+        (decision,) = await worker.decide(requests(0))
+        assert decision.version == 4 and adapter.loaded == [4]
+
+    play(scene, CountingAdapter(delay=0.01), max_batch=1, max_wait_s=0.0)
+
+
+@pytest.mark.parametrize("weights_too", [False, True], ids=["forward pass", "loading weights"])
+def test_a_failure_reaches_everyone_who_waits_and_everyone_after(play, weights_too: bool):
+    adapter = CountingAdapter()
+
+    async def scene(worker, adapter):
+        # A batch holds one request, so that of those who wait only one is in the batch that fails.
+        adapter.broken = ValueError("no such weights")
+        if weights_too:
+            await worker.receive_weights(1, weights(1))
+        calls = [worker.decide(requests(i)) for i in range(5)]
+        answers = await asyncio.gather(*calls, return_exceptions=True)
+        assert all(isinstance(a, ServiceStoppedError) for a in answers), answers
+        assert "no such weights" in str(answers[-1])
+        with pytest.raises(ServiceStoppedError, match="no such weights"):
+            await worker.decide(requests(9))
+
+    play(scene, adapter, max_batch=1, max_wait_s=0.0)
+
+
+def test_serve_ends_with_the_failure_itself(monkeypatch: pytest.MonkeyPatch):
+    adapter = CountingAdapter()
+    adapter.broken = ValueError("no such weights")
+    monkeypatch.setattr(loading, "load_adapter", lambda policy: adapter)
+
+    async def main() -> None:
+        worker = InferenceWorker(PolicyConfig(path="nowhere"), InferenceConfig(max_batch=1))
+        asking = asyncio.create_task(worker.decide(requests(0)))
+        with pytest.raises(ValueError, match="no such weights"):
+            await asyncio.wait_for(worker.serve(), 10)
+        await asyncio.gather(asking, return_exceptions=True)
+
+    asyncio.run(main())
+
+
+def test_a_caller_who_gave_up_does_not_disturb_the_others(play):
+    adapter = CountingAdapter()
+    adapter.gate = threading.Event()
+
+    async def scene(worker, adapter):
+        quitter = asyncio.create_task(worker.decide(requests(0)))
+        patient = asyncio.create_task(worker.decide(requests(1)))
+        while not adapter.entered.is_set():
+            await asyncio.sleep(0.001)
+        quitter.cancel()
+        await asyncio.gather(quitter, return_exceptions=True)
+        adapter.gate.set()
+        assert (await patient)[0].value == 1.0
+        assert (await worker.decide(requests(2)))[0].value == 2.0
+
+    play(scene, adapter, max_batch=2, max_wait_s=1.0)

@@ -1,0 +1,127 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A Ray that several test modules share, and workers that start in no time because they hold no policy."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.experience import Decision, Request
+
+
+@pytest.fixture(scope="session")
+def light_ray() -> Iterator[None]:
+    """Ray for the rest of the test session; engines that find it leave it running."""
+    import ray
+
+    from accerl_lerobot.launch import start_ray
+
+    if not ray.is_initialized():
+        start_ray()
+    yield
+    ray.shutdown()
+
+
+NO_WEIGHTS = "a path without weights"
+
+
+class LightInference:
+    """Answers at once with noise drawn from each request's seed; breaks on request."""
+
+    def __init__(self, *_: Any) -> None:
+        self._broken: asyncio.Future[None] = asyncio.get_event_loop().create_future()
+        self._version = 0
+
+    async def ready(self) -> int:
+        return os.getpid()
+
+    async def serve(self) -> None:
+        await self._broken
+
+    async def fail(self) -> None:
+        self._broken.set_exception(ArithmeticError("the forward pass fell over"))
+
+    async def decide(self, requests: list[Request]) -> list[Decision]:
+        from accerl_lerobot.inference.worker import ServiceStoppedError
+
+        if self._broken.done():
+            raise ServiceStoppedError("the inference service has stopped")
+        return [_decision(request, self._version) for request in requests]
+
+    async def receive_weights(self, version: int, tensors: dict[str, np.ndarray]) -> int:
+        self._version = version
+        return version
+
+    async def metrics(self) -> dict[str, float]:
+        return {"version": float(self._version)}
+
+
+def _decision(request: Request, version: int) -> Decision:
+    chunk = np.random.default_rng(request.noise_seed).uniform(-1, 1, (4, 2)).astype(np.float32)
+    return Decision(
+        chunk=chunk, latent={"x": chunk}, log_prob=np.zeros(4, np.float32), value=0.0, version=version
+    )
+
+
+class LightTrainer:
+    """Takes batches and learns nothing from them; breaks or idles on request."""
+
+    def __init__(self, policy: Any, algorithm: Any, config: Any, seed: int) -> None:
+        if policy.path == NO_WEIGHTS:
+            raise FileNotFoundError("no weights there")
+        self._config = config
+        self._records: list[dict[str, float]] = []
+        self._lock = threading.Lock()
+        self._failure: str | None = None
+        self._idle = False
+
+    def ready(self) -> int:
+        return os.getpid()
+
+    def fail(self) -> None:
+        self._failure = "the optimiser fell over"
+
+    def idle(self) -> None:
+        self._idle = True
+
+    def run(self, replay: Any, readers: list[Any]) -> int:
+        import ray
+
+        for version in range(self._config.updates):
+            while self._idle:
+                time.sleep(0.05)
+            ray.get(replay.sample.remote(self._config.batch_decisions, version))
+            time.sleep(0.02)
+            if self._failure is not None:
+                raise ArithmeticError(self._failure)
+            ray.get([reader.receive_weights.remote(version + 1, {}) for reader in readers])
+            with self._lock:
+                self._records.append({"update": version + 1.0})
+        return self._config.updates
+
+    def metrics(self) -> list[dict[str, float]]:
+        with self._lock:
+            records, self._records = self._records, []
+        return records
+
+    def save(self, directory: str) -> int:
+        raise OSError("no space left on the device")

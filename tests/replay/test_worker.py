@@ -1,0 +1,151 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The door between collecting and learning: who waits, and who lets whom through."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.replay.worker import ReplayWorker
+from tests.replay.segments import make_segment
+
+CONFIG = ReplayConfig(capacity=64, min_decisions=8, ahead=8, samples_per_insert=1.0)
+BATCH = 8
+
+
+def play(scene: Callable[[ReplayWorker], Awaitable[Any]], config: ReplayConfig = CONFIG) -> Any:
+    """A scene that takes 20 s hangs."""
+
+    async def main() -> Any:
+        return await asyncio.wait_for(scene(ReplayWorker(config, seed=0)), 20)
+
+    return asyncio.run(main())
+
+
+async def waits(task: asyncio.Task[Any]) -> bool:
+    """Whether a call is still under way after everything that can run has run."""
+    for _ in range(20):
+        await asyncio.sleep(0)
+    return not task.done()
+
+
+def start(call: Awaitable[Any]) -> asyncio.Task[Any]:
+    return asyncio.ensure_future(call)
+
+
+def test_insert_waits_when_rollouts_are_ahead_and_goes_on_when_the_trainer_has_sampled():
+    async def scene(worker: ReplayWorker) -> None:
+        assert await worker.insert([make_segment("a", 8)])
+        late = start(worker.insert([make_segment("b", 8)]))
+        assert await waits(late)
+        assert len(await worker.sample(BATCH, 0)) == 1
+        assert await late is True
+        metrics = await worker.metrics()
+        assert metrics["inserted_decisions"] == 16 and metrics["insert_wait_s"] > 0
+
+    play(scene)
+
+
+def test_only_as_many_are_let_in_as_the_pace_allows():
+    async def scene(worker: ReplayWorker) -> None:
+        await worker.insert([make_segment("first", 8)])
+        late = [start(worker.insert([make_segment(f"late{i}", 8)])) for i in range(3)]
+        assert all([await waits(task) for task in late])
+        await worker.sample(BATCH, 0)
+        assert [await waits(task) for task in late] == [False, True, True]
+        await worker.sample(BATCH, 0)
+        assert [await waits(task) for task in late] == [False, False, True]
+        await worker.close()
+        assert [await task for task in late] == [True, True, False]
+
+    play(scene)
+
+
+def test_sample_waits_for_the_warm_start_and_goes_on_when_there_is_enough():
+    async def scene(worker: ReplayWorker) -> None:
+        early = start(worker.sample(BATCH, 0))
+        assert await waits(early)
+        await worker.insert([make_segment("a", 4)])
+        assert await waits(early)
+        await worker.insert([make_segment("b", 4)])
+        assert sorted(s.key for s in await early) == ["a", "b"]
+
+    play(scene)
+
+
+def test_sample_waits_for_what_is_new():
+    async def scene(worker: ReplayWorker) -> None:
+        await worker.insert([make_segment("a", 8)])
+        await worker.sample(BATCH, 0)
+        again = start(worker.sample(BATCH, 1))
+        assert await waits(again), "what has been trained on as often as the pace allows is not drawn again"
+        await worker.insert([make_segment("b", 8)])
+        assert [s.key for s in await again] == ["b"]
+
+    play(scene)
+
+
+def test_sample_that_finds_everything_too_old_lets_rollouts_in_and_waits_on():
+    async def scene(worker: ReplayWorker) -> None:
+        await worker.insert([make_segment("old", 8, version=0)])
+        late = start(worker.insert([make_segment("new", 8, version=9)]))
+        assert await waits(late)
+        segments = await worker.sample(BATCH, trainer_version=9)
+        assert [s.key for s in segments] == ["new"] and await late
+        assert (await worker.metrics())["retired_segments"] == 1
+
+    play(scene, ReplayConfig(capacity=64, min_decisions=8, ahead=8, max_lag=3))
+
+
+def test_close_releases_everyone_and_stores_nothing_more():
+    async def scene(worker: ReplayWorker) -> None:
+        running = start(worker.run())
+        await worker.insert([make_segment("a", 8)])
+        assert len(await worker.sample(BATCH, 0)) == 1
+        await worker.insert([make_segment("b", 8)])
+        inserting = start(worker.insert([make_segment("c", 8)]))
+        sampling = [start(worker.sample(1000, 1)) for _ in range(2)]
+        assert all([await waits(task) for task in (running, inserting, *sampling)])
+        await worker.close()
+        assert await inserting is False and [await task for task in sampling] == [[], []]
+        assert await running is None
+        assert await worker.insert([make_segment("d", 8)]) is False and await worker.sample(BATCH, 1) == []
+        assert (await worker.metrics())["inserted_segments"] == 2
+
+    play(scene)
+
+
+def test_a_segment_sent_twice_is_stored_once():
+    async def scene(worker: ReplayWorker) -> None:
+        assert await worker.insert([make_segment("a", 4), make_segment("a", 4)])
+        metrics = await worker.metrics()
+        assert metrics["inserted_segments"] == 1 and metrics["duplicates"] == 1
+
+    play(scene)
+
+
+def test_episodes_are_averaged_since_the_last_question():
+    async def scene(worker: ReplayWorker) -> None:
+        totals = [{"return": 1.0, "success": 1.0}, {"return": 0.0, "success": 0.0}]
+        segments = [make_segment(f"{i}", 2, episode=total) for i, total in enumerate(totals)]
+        await worker.insert([*segments, make_segment("middle", 2)])
+        metrics = await worker.metrics()
+        assert (metrics["episodes"], metrics["episode_return"], metrics["episode_success"]) == (2, 0.5, 0.5)
+        metrics = await worker.metrics()
+        assert metrics["episodes"] == 0 and "episode_return" not in metrics
+
+    play(scene)

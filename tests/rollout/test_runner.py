@@ -1,0 +1,215 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Worlds between decisions: what becomes a segment, what becomes a result."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.envs import SimulatedConfig, make_world
+from accerl_lerobot.experience import Decision, Request
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
+from tests.rollout.worlds import CHUNK, Recorder, ScriptedWorld, evaluate, explore
+
+CONFIG = RolloutConfig(worlds=1, segment_length=3, decision_cost=0.0)
+
+
+def steps_seen(segment) -> list[float]:
+    return segment.observations["observation.state"][:, 1].tolist()
+
+
+def test_an_episode_is_cut_into_segments_without_a_gap():
+    recorder = Recorder([ScriptedWorld(steps=14, end="limit")], [explore()], CONFIG)
+    recorder.play()
+    assert [len(s) for s in recorder.segments] == [3, 3, 1]
+    assert [steps_seen(s) for s in recorder.segments] == [[0, 2, 4, 6], [6, 8, 10, 12], [12, 14]]
+    # A decision's latent names the step it was made at: it must stand beside that observation.
+    for segment in recorder.segments:
+        assert segment.latent["x"][:, 0].tolist() == steps_seen(segment)[:-1]
+
+
+@pytest.mark.parametrize(
+    ("end", "terminated", "truncated", "success"),
+    [("success", True, False, True), ("failure", True, False, False), ("limit", False, True, False)],
+)
+def test_the_last_segment_says_how_the_episode_ended(end, terminated, truncated, success):
+    recorder = Recorder([ScriptedWorld(steps=8, end=end)], [explore()], CONFIG)
+    recorder.play()
+    cut, last = recorder.segments
+    assert (cut.terminated, cut.truncated, cut.success) == (False, False, False)
+    assert (last.terminated, last.truncated, last.success) == (terminated, truncated, success)
+    # A time limit is bootstrapped from what was seen then, a termination from nothing: its row is a repeat.
+    assert steps_seen(last) == ([6, 6] if terminated else [6, 8])
+
+
+def test_a_time_limit_may_count_as_a_failure():
+    """The return ends there, so the learner sees a termination; the episode itself is reported as before."""
+    config = replace(CONFIG, time_limit="fail")
+    recorder = Recorder([ScriptedWorld(steps=8, end="limit")], [explore()], config)
+    recorder.play()
+    cut, last = recorder.segments
+    assert (cut.terminated, cut.truncated) == (False, False)
+    assert (last.terminated, last.truncated, last.success) == (True, False, False)
+    assert last.episode["decisions"] == 4 and not recorder.results[0].success
+
+
+def test_an_episode_that_ends_within_a_chunk_counts_the_steps_that_were_made():
+    recorder = Recorder([ScriptedWorld(steps=2 * CHUNK + 1)], [explore()], CONFIG)
+    recorder.play()
+    (segment,) = recorder.segments
+    assert segment.steps.tolist() == [2, 2, 1] and segment.reward.tolist() == [2, 2, 1]
+    assert recorder.runner.counters.env_steps == 5 and recorder.runner.counters.decisions == 3
+
+
+def test_every_decision_costs():
+    config = replace(CONFIG, decision_cost=0.25)
+    recorder = Recorder([ScriptedWorld(steps=8)], [explore()], config)
+    recorder.play()
+    assert np.concatenate([s.reward for s in recorder.segments]).tolist() == [1.75] * 4
+    assert recorder.results[0].episode_return == pytest.approx(4 * 1.75)
+
+
+def test_episode_totals_come_with_the_last_segment_only():
+    recorder = Recorder([ScriptedWorld(steps=9)], [explore()], CONFIG)
+    recorder.play(version=7)
+    assert [bool(s.episode) for s in recorder.segments] == [False, True]
+    assert recorder.segments[-1].episode == {"return": 9.0, "steps": 9, "decisions": 5, "success": 1.0}
+    (result,) = recorder.results
+    assert (result.success, result.episode_return, result.steps, result.decisions) == (True, 9.0, 9, 5)
+    assert result.versions == (7, 7) and recorder.runner.counters.episodes == 1
+
+
+def test_totals_do_not_leak_into_the_next_episode():
+    recorder = Recorder([ScriptedWorld(steps=4)], [explore(1), explore(2)], CONFIG)
+    recorder.play()
+    assert [r.steps for r in recorder.results] == [4, 4]
+    assert [s.episode["return"] for s in recorder.segments] == [4.0, 4.0]
+
+
+def test_results_name_the_oldest_and_the_newest_weights():
+    recorder = Recorder([ScriptedWorld(steps=6)], [explore()], CONFIG)
+    request = recorder.runner.start(0)
+    for version in (4, 3, 5):
+        assert request is not None
+        chunk = np.zeros((CHUNK, 1), np.float32)
+        empty = np.zeros(1, np.float32)
+        decision = Decision(chunk=chunk, latent={"x": empty}, log_prob=empty, value=0.0, version=version)
+        request = recorder.runner.advance(0, decision)
+    assert recorder.results[0].versions == (3, 5)
+    assert recorder.segments[0].version.tolist() == [4, 3, 5]
+
+
+def test_keys_are_unique_over_slots_episodes_and_incarnations():
+    segments = []
+    for name in ("r0.0", "r0.1", "r1.0"):
+        plans = [explore(seed) for seed in range(6)]
+        recorder = Recorder([ScriptedWorld(steps=10) for _ in range(2)], plans, CONFIG, name)
+        recorder.play()
+        segments += recorder.segments
+    keys = [s.key for s in segments]
+    assert len(keys) == 3 * 6 * 2 and len(set(keys)) == len(keys)
+
+
+def test_a_nan_is_counted_and_the_next_episode_goes_on():
+    worlds = [ScriptedWorld(steps=20, nan_at=9)]
+    recorder = Recorder(worlds, [explore(1)], CONFIG)
+    recorder.play()
+    # Decisions 1 to 3 had become a segment; the 4th and 5th had not when the 5th met the NaN.
+    assert [len(s) for s in recorder.segments] == [3]
+    assert recorder.runner.counters.dropped_nonfinite == 2
+    assert recorder.results == [] and recorder.runner.counters.episodes == 0
+    worlds[0].nan_at = 0
+    recorder.plans = [explore(2)]
+    recorder.play()
+    assert len(recorder.results) == 1 and recorder.results[0].plan.seed == 2
+    seeds = {s.observations["observation.state"][0, 0] for s in recorder.segments[1:]}
+    assert seeds == {2.0}, "nothing of the dropped episode may follow"
+
+
+def test_an_evaluation_that_meets_a_nan_still_has_a_result():
+    recorder = Recorder([ScriptedWorld(steps=20, nan_at=5)], [evaluate(1, 0), evaluate(2, 1)], CONFIG)
+    recorder.play()
+    assert [(r.plan.index, r.success) for r in recorder.results] == [(0, False), (1, False)]
+    assert recorder.segments == []
+
+
+def test_a_first_observation_that_is_not_finite_is_an_error():
+    class Broken(ScriptedWorld):
+        def reset(self, seed, task):
+            observation = super().reset(seed, task)
+            observation["observation.state"] = np.array([np.inf, 0], np.float32)
+            return observation
+
+    with pytest.raises(RuntimeError, match="push with seed 3"):
+        Recorder([Broken()], [explore(3)], CONFIG).runner.start(0)
+
+
+def test_evaluation_asks_for_the_stock_sampler_and_makes_no_segment():
+    recorder = Recorder([ScriptedWorld()], [evaluate(1), explore(2)], CONFIG)
+    requests = recorder.play()[0]
+    assert [r.explore for r in requests] == [False] * 3 + [True] * 3
+    assert len(recorder.segments) == 1 and len(recorder.results) == 2
+
+
+def seeds_by_episode(slots: int, plans: list[EpisodePlan]) -> dict[int, list[int]]:
+    recorder = Recorder([ScriptedWorld(steps=6) for _ in range(slots)], plans, CONFIG)
+    found: dict[int, list[int]] = {}
+    for requests in recorder.play():
+        for request in requests:
+            episode = int(np.asarray(request.observation["observation.state"])[0])
+            found.setdefault(episode, []).append(request.noise_seed)
+    return found
+
+
+def test_noise_depends_on_episode_and_decision_and_on_nothing_else():
+    plans = [explore(seed) for seed in (1_000_000_000, 1_000_000_001, 2_000_000_007, 5)]
+    alone, together = seeds_by_episode(1, plans), seeds_by_episode(3, plans[::-1])
+    assert alone == together
+    every = [seed for seeds in alone.values() for seed in seeds]
+    assert len(every) == 4 * 3 and len(set(every)) == len(every)
+
+
+def simulated_episode(film: bool, seed: int, tolerance: float) -> EpisodeResult:
+    """One evaluation episode with actions drawn from the requests' own seeds."""
+    world = make_world(SimulatedConfig(max_steps=20, tolerance=tolerance))
+    plan = EpisodePlan(task="match", seed=seed, explore=False, film=film)
+    recorder = Recorder([world], [plan], CONFIG)
+    request: Request | None = recorder.runner.start(0)
+    while request is not None:
+        target = np.asarray(request.observation["observation.state"])[:2]
+        chunk = target + np.random.default_rng(request.noise_seed).normal(0, 1.0, (7, 2))
+        decision = Decision(
+            chunk=chunk.astype(np.float32), latent={}, log_prob=np.zeros(1, np.float32), value=0.0, version=1
+        )
+        request = recorder.runner.advance(0, decision)
+    return recorder.results[0]
+
+
+@pytest.mark.parametrize(("tolerance", "success"), [(0.3, True), (0.001, False)])
+@pytest.mark.parametrize("seed", range(3))
+def test_filming_changes_nothing(seed: int, tolerance: float, success: bool):
+    plain = simulated_episode(False, seed, tolerance)
+    filmed = simulated_episode(True, seed, tolerance)
+    assert plain.success is success and plain.frames == []
+    assert len(filmed.frames) >= filmed.steps // 2 and all(f.shape == (8, 8, 3) for f in filmed.frames)
+    assert replace(filmed, plan=plain.plan, frames=[]) == plain
+
+
+def test_closing_closes_the_worlds():
+    worlds = [ScriptedWorld(), ScriptedWorld()]
+    Recorder(worlds, [], CONFIG).runner.close()
+    assert all(world.closed for world in worlds)

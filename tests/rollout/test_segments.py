@@ -1,0 +1,88 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The bookkeeping of one episode."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.experience import TASK, Decision, Observation, Segment
+from accerl_lerobot.rollout.segments import SegmentBuilder
+
+
+def observation(step: int) -> Observation:
+    return {"observation.state": np.array([step], np.float32), TASK: "push"}
+
+
+def decision(step: int, version: int = 0) -> Decision:
+    return Decision(
+        chunk=np.zeros((2, 1), np.float32),
+        latent={"x": np.array([step, -step], np.float32)},
+        log_prob=np.array([step / 10], np.float64),
+        value=100.0 + step,
+        version=version,
+    )
+
+
+def collected(count: int, terminated: bool = False) -> SegmentBuilder:
+    builder = SegmentBuilder(observation(0), length=4)
+    for step in range(count):
+        following = None if terminated and step == count - 1 else observation(step + 1)
+        builder.add(decision(step, version=step), reward=float(step), steps=step + 1, following=following)
+    return builder
+
+
+def states(segment: Segment) -> list[float]:
+    return segment.observations["observation.state"][:, 0].tolist()
+
+
+def test_a_segment_has_one_observation_more_than_decisions():
+    segment = collected(3).cut("k")
+    assert len(segment) == 3 and states(segment) == [0, 1, 2, 3]
+
+
+def test_everything_about_a_decision_stays_together():
+    segment = collected(3).cut("k")
+    assert segment.latent["x"].tolist() == [[0, 0], [1, -1], [2, -2]]
+    np.testing.assert_allclose(segment.log_prob[:, 0], [0, 0.1, 0.2], rtol=1e-6)
+    assert segment.value.tolist() == [100, 101, 102]
+    assert segment.reward.tolist() == [0, 1, 2]
+    assert segment.version.tolist() == [0, 1, 2] and segment.steps.tolist() == [1, 2, 3]
+    assert segment.log_prob.dtype == segment.reward.dtype == np.float32
+    assert segment.version.dtype == segment.steps.dtype == np.int64
+    assert segment.task == "push" and TASK not in segment.observations
+
+
+def test_the_next_segment_begins_where_this_one_was_cut():
+    builder = collected(3)
+    builder.cut("k1")
+    builder.add(decision(3), reward=0.0, steps=1, following=observation(4))
+    assert states(builder.cut("k2")) == [3, 4]
+
+
+def test_after_a_termination_the_bootstrap_row_repeats_the_observation_before():
+    segment = collected(2, terminated=True).cut("k", terminated=True, success=True)
+    assert states(segment) == [0, 1, 1] and segment.terminated and segment.success
+
+
+def test_full_at_its_length():
+    assert not collected(3).full and collected(4).full
+
+
+@pytest.mark.parametrize(("terminated", "truncated"), [(False, False), (True, False), (False, True)])
+def test_how_it_ended_is_kept(terminated: bool, truncated: bool):
+    segment = collected(2).cut("k", terminated, truncated, episode={"return": 3.0})
+    assert (segment.terminated, segment.truncated) == (terminated, truncated)
+    assert segment.episode == {"return": 3.0} and segment.source == "real" and segment.key == "k"

@@ -1,0 +1,214 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The rollout process's loop, with inference and replay played by the test."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from typing import Any
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.experience import Decision, Request, Segment
+from accerl_lerobot.rollout import worker as module
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
+from accerl_lerobot.rollout.worker import AT_THE_DOOR, RolloutWorker
+from tests.local_ray import Handle, Local
+from tests.rollout.worlds import evaluate
+
+WORLD = SimulatedConfig(max_steps=8, tolerance=0.05)
+
+
+class OverError(Exception):
+    """Ends a loop that has no end."""
+
+
+def planned(count: int) -> list[EpisodePlan]:
+    return [evaluate(seed=50 + i, index=i, task="match") for i in range(count)]
+
+
+class Stage:
+    """A worker whose loop runs on a thread; `inference` answers at once, `replay` as the test says."""
+
+    def __init__(self, config: RolloutConfig, insert: Callable[[list[Segment]], Any]) -> None:
+        self.worker = RolloutWorker(WORLD, config, ("match",), 0, 0, 0, (8, 2))
+        self.episodes: list[EpisodeResult] = []
+        self.explored = 0
+        self.over = False
+        self.held: list[tuple[Future[list[Decision]], int]] | None = None
+        self.failure: BaseException | None = None
+        self._insert = insert
+        self.thread = threading.Thread(target=self._run, daemon=True)
+        self.thread.start()
+
+    def order(self, training: bool, plans: list[EpisodePlan] | None = None) -> module.Report:
+        report = self.worker.report(training, plans or [])
+        self.episodes += report.episodes
+        return report
+
+    @property
+    def evaluated(self) -> list[EpisodeResult]:
+        return [e for e in self.episodes if not e.plan.explore]
+
+    def until(self, condition: Callable[[], bool], training: bool = True) -> None:
+        for _ in range(3000):
+            self.order(training)
+            if condition():
+                return
+            assert self.failure is None
+            time.sleep(0.005)
+        raise AssertionError("it did not happen")
+
+    def _decide(self, requests: list[Request]) -> list[Decision] | Future[list[Decision]]:
+        if self.over:
+            raise OverError
+        self.explored += sum(r.explore for r in requests)
+        if self.held is not None and not requests[0].explore:
+            self.held.append((Future(), len(requests)))
+            return self.held[-1][0]
+        return [a_decision() for _ in requests]
+
+    def hold(self) -> None:
+        """Lets evaluation decisions wait until `release`."""
+        self.held = []
+
+    def release(self) -> None:
+        held, self.held = self.held or [], None
+        for future, count in held:
+            future.set_result([a_decision() for _ in range(count)])
+
+    def _run(self) -> None:
+        try:
+            self.worker.run(Handle(decide=self._decide), Handle(insert=self._insert))
+        except OverError:
+            pass
+        except BaseException as error:
+            self.failure = error
+
+
+def a_decision() -> Decision:
+    zeros = np.zeros((4, 2), np.float32)
+    return Decision(chunk=zeros, latent={"x": zeros}, log_prob=np.zeros(4, np.float32), value=0.0, version=0)
+
+
+@pytest.fixture
+def stage(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Stage]]:
+    monkeypatch.setattr(module, "ray", Local)
+    made: list[Stage] = []
+
+    def make(insert: Callable[[list[Segment]], Any], **config: Any) -> Stage:
+        made.append(Stage(RolloutConfig(**{"worlds": 4, "segment_length": 2, **config}), insert))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.over = True
+        one.release()
+        one.worker.report(False, planned(8))  # something to ask for, whatever it waits for
+        one.thread.join(timeout=30)
+        assert not one.thread.is_alive()
+
+
+def test_nothing_runs_before_it_is_told_to(stage):
+    one = stage(lambda segments: True)
+    time.sleep(0.05)
+    assert one.order(training=False).counters["decisions"] == 0 and one.explored == 0
+
+
+def test_training_episodes_reach_replay_and_the_report(stage):
+    inserted: list[Segment] = []
+    one = stage(lambda segments: inserted.extend(segments) or True)
+    one.until(lambda: len(one.episodes) >= 5)
+    assert all(e.plan.explore for e in one.episodes)
+    seeds = [e.plan.seed for e in one.episodes]
+    assert len(set(seeds)) == len(seeds), "an episode was reported twice or run twice"
+    assert len({s.key for s in inserted}) == len(inserted) > 0
+
+
+def test_planned_episodes_are_reported_once_each(stage):
+    one = stage(lambda segments: True)
+    one.order(True, planned(10))
+    one.until(lambda: len(one.evaluated) >= 10)
+    before = len(one.episodes)
+    one.until(lambda: len(one.episodes) >= before + 4)
+    assert sorted(e.plan.index for e in one.evaluated) == list(range(10))
+
+
+def test_exploring_pauses_while_replay_keeps_segments_at_the_door_and_evaluation_goes_on(stage):
+    door: list[Future[bool]] = []
+    one = stage(lambda segments: door.append(Future()) or door[-1], segment_length=1)
+    one.hold()
+    one.order(True, planned(2))  # two slots evaluate, two explore
+    one.until(lambda: len(door) >= AT_THE_DOOR)
+    time.sleep(0.1)  # were exploring to go on, it would now
+    explored = one.explored
+    assert explored <= 2 * AT_THE_DOOR and not one.evaluated
+    one.release()
+    one.until(lambda: len(one.evaluated) == 2)
+    assert one.explored == explored
+    for future in door:
+        future.set_result(True)
+    one.until(lambda: one.explored > explored)
+
+
+def test_the_end_of_training_abandons_its_episodes_and_frees_their_slots(stage):
+    shut: list[Future[bool]] = []
+    one = stage(lambda segments: shut.append(Future()) or shut[-1])
+    one.until(lambda: len(shut) >= AT_THE_DOOR)
+    one.order(False, planned(6))
+    one.until(lambda: len(one.evaluated) == 6, training=False)
+
+
+def test_an_insert_that_fails_ends_the_worker(stage):
+    def insert(segments: list[Segment]) -> bool:
+        raise OSError("replay is gone")
+
+    one = stage(insert)
+    one.order(True)
+    one.thread.join(timeout=10)
+    assert isinstance(one.failure, OSError)
+
+
+def test_a_restarted_worker_uses_other_keys_and_other_seeds(monkeypatch: pytest.MonkeyPatch):
+    plans = []
+    for incarnation in (0, 1):
+        worker = RolloutWorker(WORLD, RolloutConfig(), ("match",), 0, 0, incarnation, (8, 2))
+        worker.report(True, [])
+        plans.append([worker._next_plan() for _ in range(20)])
+    seeds = [{plan.seed for plan in some} for some in plans]
+    assert len(seeds[0]) == 20 and not seeds[0] & seeds[1]
+
+
+def test_a_world_that_hangs_shows_in_the_report(stage, monkeypatch: pytest.MonkeyPatch):
+    release = threading.Event()
+    one = stage(lambda segments: True)
+    advance = one.worker._runner.advance
+    monkeypatch.setattr(one.worker._runner, "advance", lambda *a: (release.wait(20), advance(*a))[1])
+    one.until(lambda: one.order(True).in_world_s > 0.2)
+    release.set()
+    one.until(lambda: len(one.episodes) >= 2)
+    assert one.order(True).in_world_s < 0.2
+
+
+def test_the_process_needs_no_torch():
+    code = "import sys, accerl_lerobot.rollout.worker; print(*{'torch', 'lerobot'} & set(sys.modules))"
+    found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert found.stdout.strip() == ""

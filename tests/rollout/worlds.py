@@ -1,0 +1,131 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A world that follows a script, and decisions made of nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from accerl_lerobot.envs import ChunkResult, World, WorldSpec
+from accerl_lerobot.experience import TASK, Decision, Observation, Request, Segment
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig, RolloutRunner
+
+CHUNK = 2
+CAMERA = "observation.images.front"
+
+
+class ScriptedWorld(World):
+    """Every step earns 1; an episode ends after `steps` steps in the way `end` says.
+
+    ``observation.state`` is (seed, steps so far), which names every observation.
+
+    Args:
+        steps: length of an episode in env steps.
+        end: ``success`` (terminates), ``failure`` (terminates) or ``limit`` (truncates).
+        nan_at: step of an episode whose reward is NaN; 0 for never.
+    """
+
+    def __init__(self, steps: int = 5, end: str = "success", nan_at: int = 0) -> None:
+        self.steps, self.end, self.nan_at = steps, end, nan_at
+        one = np.ones(1, np.float32)
+        self.spec = WorldSpec(
+            images={CAMERA: (8, 8, 3)}, state_dim=2, action_dim=1, action_low=-one, action_high=one,
+            fps=10, max_steps=steps, tasks=("push", "pull"),
+        )  # fmt: skip
+        self.seed = self.now = 0
+        self.task = ""
+        self.closed = False
+
+    def reset(self, seed: int, task: str) -> Observation:
+        self.seed, self.task, self.now = seed, task, 0
+        return self._observe()
+
+    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
+        rewards = []
+        for _ in actions:
+            self.now += 1
+            rewards.append(np.nan if self.now == self.nan_at else 1.0)
+            if self.now == self.steps:
+                break
+        over = self.now == self.steps
+        terminated = over and self.end != "limit"
+        return ChunkResult(
+            observation=None if terminated else self._observe(),
+            rewards=np.asarray(rewards, np.float32),
+            terminated=terminated,
+            truncated=over and self.end == "limit",
+            success=over and self.end == "success",
+        )
+
+    def render(self, height: int, width: int) -> np.ndarray:
+        return np.full((height, width, 3), self.now, np.uint8)
+
+    def close(self) -> None:
+        self.closed = True
+
+    def _observe(self) -> Observation:
+        state = np.array([self.seed, self.now], np.float32)
+        return {CAMERA: self.render(8, 8), "observation.state": state, TASK: self.task}
+
+
+def decide(request: Request, version: int = 0) -> Decision:
+    """A decision whose latent, log-prob and value all are the step it was made at: they can be told apart."""
+    step = float(np.asarray(request.observation["observation.state"])[1])
+    return Decision(
+        chunk=np.zeros((CHUNK, 1), np.float32),
+        latent={"x": np.array([step, step], np.float32)},
+        log_prob=np.array([-step], np.float32),
+        value=step,
+        version=version,
+    )
+
+
+class Recorder:
+    """A runner whose plans, segments and results are at hand.
+
+    Args:
+        worlds: one per slot.
+        plans: handed out in order, then None.
+        config: of the runner.
+    """
+
+    def __init__(
+        self, worlds: list[World], plans: list[EpisodePlan], config: RolloutConfig, name: str = "r0.0"
+    ) -> None:
+        self.plans = list(plans)
+        self.segments: list[Segment] = []
+        self.results: list[EpisodeResult] = []
+        self.runner = RolloutRunner(
+            worlds, lambda: self.plans.pop(0) if self.plans else None, config, name,
+            self.segments.append, self.results.append, film=(8, 2),
+        )  # fmt: skip
+
+    def play(self, version: int = 0) -> list[list[Request]]:
+        """Runs all plans, slot by slot in turn; the requests each slot made."""
+        made: list[list[Request]] = [[] for _ in range(len(self.runner))]
+        due = {slot: self.runner.start(slot) for slot in range(len(self.runner))}
+        while any(due.values()):
+            for slot, request in due.items():
+                if request is not None:
+                    made[slot].append(request)
+                    due[slot] = self.runner.advance(slot, decide(request, version))
+        return made
+
+
+def explore(seed: int = 1, task: str = "push") -> EpisodePlan:
+    return EpisodePlan(task=task, seed=seed, explore=True)
+
+
+def evaluate(seed: int = 1, index: int = 0, task: str = "push") -> EpisodePlan:
+    return EpisodePlan(task=task, seed=seed, explore=False, index=index, group="eval")

@@ -1,0 +1,74 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Runs small enough for tests."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from accerl_lerobot.config import LaunchConfig, RunConfig
+from accerl_lerobot.engine import Engine, Progress
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.evaluation.config import EvaluationConfig
+from accerl_lerobot.policies.loading import PolicyConfig
+from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
+from accerl_lerobot.trainer.config import TrainerConfig
+
+HANGS_S = 240.0
+
+
+def tiny_run(checkpoint: Path, **rooms: Any) -> RunConfig:
+    """A run on the simulated world from `checkpoint`; `rooms` replaces whole sections."""
+    defaults: dict[str, Any] = {
+        "env": SimulatedConfig(max_steps=16),
+        "policy": PolicyConfig(path=str(checkpoint), device="cpu"),
+        "rollout": RolloutConfig(worlds=4, segment_length=3),
+        "replay": ReplayConfig(capacity=64, min_decisions=16, ahead=32, samples_per_insert=2.0),
+        "trainer": TrainerConfig(updates=12, batch_decisions=16, warmup_updates=2, value_warmup_updates=2),
+        "evaluation": EvaluationConfig(episodes=6, videos=1, video_size=32),
+        "launch": LaunchConfig(stall_s=120),
+    }
+    return RunConfig(**{**defaults, **rooms})
+
+
+def polls(engine: Engine) -> Iterator[Progress]:
+    """Polls again and again; a test that waits for minutes hangs."""
+    deadline = time.monotonic() + HANGS_S
+    while time.monotonic() < deadline:
+        yield engine.poll()
+    raise AssertionError(f"what was waited for did not happen within {HANGS_S:.0f} s")
+
+
+def collect(engine: Engine, group: str, count: int) -> list[EpisodeResult]:
+    """Polls until `group` has `count` results."""
+    results: list[EpisodeResult] = []
+    for progress in polls(engine):
+        results += [e for e in progress.episodes if e.plan.group == group]
+        if len(results) >= count:
+            break
+    return results
+
+
+def drive(engine: Engine) -> list[Progress]:
+    """Polls until the training is done; everything that was reported."""
+    history: list[Progress] = []
+    for progress in polls(engine):
+        history.append(progress)
+        if progress.done:
+            break
+    return history

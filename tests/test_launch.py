@@ -1,0 +1,209 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The asynchronous engine with the real workers: one run at learning rate 0 that loses a rollout worker.
+
+At rate 0 every policy is the same policy, so whatever happens to weights, observations and latents on their
+way through the processes must leave every importance ratio at 1.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from accerl_lerobot.config import RunConfig
+from accerl_lerobot.engine import Progress
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.evaluation.config import evaluation_plans
+from accerl_lerobot.replay import ReplayConfig, lag_bound
+from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
+from accerl_lerobot.trainer.config import TrainerConfig
+from tests.runs import collect, polls, tiny_run
+
+UPDATES = 40
+DURING = 12
+
+
+@dataclass
+class Story:
+    """What was reported, in order."""
+
+    config: RunConfig
+    directory: Path
+    before: list[EpisodeResult] = field(default_factory=list)
+    after: list[EpisodeResult] = field(default_factory=list)
+    history: list[Progress] = field(default_factory=list)
+    saved: int = -1
+    """Version saved in the middle of training."""
+    pids: set[int] = field(default_factory=set)
+
+    @property
+    def updates(self) -> list[dict[str, float]]:
+        return [update for progress in self.history for update in progress.updates]
+
+    @property
+    def episodes(self) -> list[EpisodeResult]:
+        return [episode for progress in self.history for episode in progress.episodes]
+
+    def has(self, group: str) -> int:
+        return sum(e.plan.group == group for e in self.episodes)
+
+
+@pytest.fixture(scope="module")
+def story(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Story]:
+    from accerl_lerobot.launch import RayEngine
+
+    config = tiny_run(
+        tiny_checkpoint,
+        env=SimulatedConfig(max_steps=16, step_ms=2.0),
+        rollout=RolloutConfig(workers=2, worlds=3, segment_length=3),
+        replay=ReplayConfig(capacity=96, min_decisions=16, ahead=32, samples_per_insert=2.0),
+        trainer=TrainerConfig(
+            updates=UPDATES,
+            batch_decisions=16,
+            lr=0.0,
+            value_lr=0.0,
+            warmup_updates=0,
+            value_warmup_updates=0,
+        ),
+    )
+    told = Story(config, tmp_path_factory.mktemp("saved"))
+    engine = RayEngine(config, ("match",))
+    try:
+        pids = engine.pids()
+        engine.plan(evaluation_plans(("match",), 6, "before", film=1))
+        told.before = collect(engine, "before", 6)
+        engine.train()
+        planned = killed = False
+        for progress in polls(engine):
+            told.history.append(progress)
+            if progress.done and told.has("during") >= DURING:
+                break
+            if not planned and progress.version >= 4:
+                planned = True
+                engine.plan(evaluation_plans(("match",), DURING, "during"))
+            elif planned and not killed:
+                killed = True
+                os.kill(pids["rollout 1"], signal.SIGKILL)
+                told.saved = engine.save(told.directory / "middle")
+        engine.plan(evaluation_plans(("match",), 6, "after"))
+        told.after = collect(engine, "after", 6)
+        engine.save(told.directory / "end")
+        told.pids = {*pids.values(), *engine.pids().values()}
+        yield told
+    finally:
+        engine.close()
+
+
+def test_all_updates_are_made_and_reported_once(story: Story):
+    assert [u["update"] for u in story.updates] == [float(i + 1) for i in range(UPDATES)]
+    assert story.history[-1].version == UPDATES
+    versions = [p.version for p in story.history]
+    assert versions == sorted(versions)
+
+
+def test_at_learning_rate_zero_every_ratio_is_one(story: Story):
+    assert max(u["ratio_max_dev"] for u in story.updates) <= 1e-5
+    assert max(abs(u["approx_kl"]) for u in story.updates) <= 1e-8
+    assert all(u["ess"] > 0.9999 and u["clip_fraction"] == 0 and u["skipped"] == 0 for u in story.updates)
+
+
+def test_samples_lag_behind_and_the_lag_is_bounded(story: Story):
+    config = story.config
+    under_way = config.rollout.workers * config.rollout.worlds * config.rollout.segment_length
+    bound = lag_bound(
+        config.replay, batch_decisions=config.trainer.batch_decisions, in_flight=2 * under_way, pickup=2,
+        prefetch=1,
+    )  # fmt: skip
+    lags = [u["lag_max"] for u in story.updates]
+    assert 0 < max(lags) <= bound
+    assert all(0 <= u["lag_mean"] <= u["lag_max"] for u in story.updates)
+
+
+def test_the_books_of_replay_balance(story: Story):
+    books = story.history[-1].replay
+    for unit in ("segments", "decisions"):
+        gone = sum(books[f"{how}_{unit}"] for how in ("evicted", "retired", "lost"))
+        assert books[f"inserted_{unit}"] == books[f"stored_{unit}"] + gone
+    assert books["duplicates"] == 0 and books["dropped_nonfinite"] == 0
+    # What the trainer learned from is what replay handed out: no batch was drawn and then forgotten.
+    assert books["trained_decisions"] == sum(u["decisions"] for u in story.updates)
+    assert books["trained_decisions"] <= story.config.replay.samples_per_insert * books["inserted_decisions"]
+
+
+def test_the_worker_that_was_killed_was_started_again_once(story: Story):
+    assert story.history[-1].rollout["restarts"] == 1.0
+    restarts = [p.rollout["restarts"] for p in story.history]
+    assert restarts == sorted(restarts) and restarts[0] == 0.0
+
+
+def test_counters_never_fall_not_even_when_a_worker_is_lost(story: Story):
+    for name in ("env_steps", "decisions", "episodes"):
+        values = [p.rollout[name] for p in story.history]
+        assert values == sorted(values) and values[-1] > values[0], name
+
+
+def test_every_planned_episode_has_exactly_one_result(story: Story):
+    for results, count in ((story.before, 6), (story.after, 6)):
+        assert sorted(r.plan.index for r in results) == list(range(count))
+    during = [e.plan.index for e in story.episodes if e.plan.group == "during"]
+    assert sorted(during) == list(range(DURING))
+    assert story.has("train") > 0
+    explored = [e.plan.seed for e in story.episodes if e.plan.explore]
+    assert len(set(explored)) == len(explored), "an exploring episode was reported twice"
+
+
+def test_evaluation_uses_the_weights_of_its_time(story: Story):
+    assert {r.versions for r in story.before} == {(0, 0)}
+    assert {r.versions for r in story.after} == {(UPDATES, UPDATES)}
+    during = [e.versions for e in story.episodes if e.plan.group == "during"]
+    assert all(0 < old <= new <= UPDATES for old, new in during)
+
+
+def test_equal_weights_and_seeds_give_equal_evaluations(story: Story):
+    """Batches differ between the two, and the process that ran them may; the episodes must not."""
+    before, after = (
+        {r.plan.index: (r.success, r.steps, r.decisions) for r in results}
+        for results in (story.before, story.after)
+    )
+    assert before == after
+
+
+def test_only_what_was_to_be_filmed_is_filmed(story: Story):
+    assert [bool(r.frames) for r in sorted(story.before, key=lambda r: r.plan.index)] == [True] + [False] * 5
+
+
+def test_what_is_saved_during_training_loads_again(story: Story, tiny_checkpoint: Path):
+    import torch
+    from safetensors.torch import load_file
+
+    from accerl_lerobot.policies.loading import PolicyConfig, load_adapter
+
+    assert 4 <= story.saved <= UPDATES
+    weights = load_file(tiny_checkpoint / "model.safetensors")
+    for name in ("middle", "end"):
+        saved = load_file(story.directory / name / "model.safetensors")
+        assert saved.keys() == weights.keys()
+        assert all(torch.equal(saved[k], weights[k]) for k in weights), "learning rate 0 moved the policy"
+    load_adapter(PolicyConfig(path=str(story.directory / "middle"), device="cpu"))
+
+
+def test_inference_reports_what_it_did(story: Story):
+    last = story.history[-1].inference
+    assert last["batches"] > 0 and 0 < last["version"] <= UPDATES and last["batch_size_mean"] >= 1

@@ -1,0 +1,229 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What becomes of a run when one of its processes fails, hangs or is killed.
+
+Which weights decide does not matter here, so inference and trainer are stand-ins that start at once; rollout
+and replay are real. The run with everything real is in ``test_launch.py``.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import ray
+
+from accerl_lerobot import launch
+from accerl_lerobot.config import LaunchConfig
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.evaluation.config import evaluation_plans
+from accerl_lerobot.inference import worker as inference_worker
+from accerl_lerobot.launch import RayEngine
+from accerl_lerobot.policies.loading import PolicyConfig
+from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
+from accerl_lerobot.trainer import worker as trainer_worker
+from accerl_lerobot.trainer.config import TrainerConfig
+from tests.light_workers import NO_WEIGHTS, LightInference, LightTrainer, light_ray
+from tests.runs import collect, drive, polls, tiny_run
+
+__all__ = ["light_ray"]
+
+SLOW = SimulatedConfig(max_steps=16, step_ms=1.0)
+HARD = SimulatedConfig(max_steps=16, tolerance=0.02, step_ms=5.0)
+TWO = RolloutConfig(workers=2, worlds=2, segment_length=3)
+ENDLESS = TrainerConfig(updates=1_000_000, batch_decisions=16)
+
+
+@pytest.fixture
+def engine(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., RayEngine]]:
+    monkeypatch.setattr(launch, "POLL_S", 0.1)
+    monkeypatch.setattr(inference_worker, "InferenceWorker", LightInference)
+    monkeypatch.setattr(trainer_worker, "TrainerWorker", LightTrainer)
+    made: list[RayEngine] = []
+
+    def make(**rooms: Any) -> RayEngine:
+        config = tiny_run(Path("nowhere"), **{"env": SLOW, **rooms})
+        made.append(RayEngine(config, ("match",)))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+def until_failure(engine: RayEngine) -> str:
+    """Polls until the run ends with an error; its text."""
+    with pytest.raises(RuntimeError) as caught:
+        drive(engine)
+    return str(caught.value)
+
+
+def until_training(engine: RayEngine) -> None:
+    engine.train()
+    for progress in polls(engine):
+        if progress.version >= 2:
+            return
+
+
+def gone(pid: int) -> bool:
+    """Whether a process ends within a minute."""
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        try:
+            status = Path(f"/proc/{pid}/stat").read_text()
+        except FileNotFoundError:
+            return True
+        if status.rsplit(")", 1)[1].split()[0] == "Z":  # ended, and not yet collected by its parent
+            return True
+        time.sleep(0.1)
+    return False
+
+
+def test_a_run_ends_by_itself_and_closing_leaves_no_process(engine):
+    one = engine(rollout=TWO)
+    pids = one.pids()
+    assert set(pids) == {"inference", "replay", "trainer", "rollout 0", "rollout 1"}
+    one.plan(evaluation_plans(("match",), 5, "before"))
+    assert sorted(r.plan.index for r in collect(one, "before", 5)) == list(range(5))
+    one.train()
+    history = drive(one)
+    assert [u["update"] for p in history for u in p.updates] == [float(i) for i in range(1, 13)]
+    assert history[-1].version == 12 and history[-1].replay["trained_decisions"] >= 12 * 16
+    one.plan(evaluation_plans(("match",), 5, "after"))
+    assert {r.versions for r in collect(one, "after", 5)} == {(12, 12)}
+    os.kill(pids["trainer"], signal.SIGKILL)  # it has done its work, but has not been asked to save it
+    with pytest.raises(RuntimeError, match="trainer worker failed for good:"):
+        collect(one, "nothing", 1)
+    one.close()
+    one.close()
+    assert [name for name, pid in pids.items() if not gone(pid)] == []
+
+
+def test_what_cannot_be_done_is_refused_and_an_exception_in_the_trainer_ends_the_run(engine, tmp_path: Path):
+    one = engine(trainer=ENDLESS)
+    one.plan(evaluation_plans(("match",), 2, "a"))
+    with pytest.raises(ValueError, match="episode 0 of 'a' is planned twice"):
+        one.plan(evaluation_plans(("match",), 1, "a"))
+    with pytest.raises(RuntimeError, match=r"trainer worker failed in save(.|\n)*no space left"):
+        one.save(tmp_path)
+    assert len(collect(one, "a", 2)) == 2
+    one.plan(evaluation_plans(("match",), 1, "a"))
+    assert len(collect(one, "a", 1)) == 1
+    until_training(one)
+    ray.get(one._trainer.actor.fail.remote())
+    text = until_failure(one)
+    assert text.startswith("trainer worker failed for good:")
+    assert "the optimiser fell over" in text and "light_workers.py" in text
+
+
+def test_a_worker_that_does_not_start_is_an_error_and_the_others_are_ended(engine, monkeypatch):
+    closed: list[RayEngine] = []
+    close = RayEngine.close
+    monkeypatch.setattr(RayEngine, "close", lambda self: (closed.append(self), close(self)))
+    with pytest.raises(RuntimeError, match=r"trainer worker failed in ready(.|\n)*no weights there"):
+        engine(policy=PolicyConfig(path=NO_WEIGHTS))
+    assert len(closed) == 1
+    for worker in closed[0]._everyone():
+        with pytest.raises(ray.exceptions.RayActorError):
+            ray.get(worker.actor.ready.remote(), timeout=60)
+
+
+def test_a_world_that_keeps_crashing_ends_the_run_with_its_own_traceback(engine):
+    one = engine(env=SimulatedConfig(crash_after=30), rollout=RolloutConfig(worlds=2, max_restarts=2))
+    one.train()
+    restarts: list[float] = []
+    with pytest.raises(RuntimeError, match="rollout 0 worker failed for good after 2 restarts") as caught:
+        for progress in polls(one):
+            restarts.append(progress.rollout["restarts"])
+    assert max(restarts) == 2.0
+    text = str(caught.value)
+    assert "simulated crash after 30 env steps" in text and "simulated.py" in text and "step_chunk" in text
+
+
+def lose_a_rollout_worker(one: RayEngine, how: signal.Signals) -> None:
+    """Two workers, so that one goes on; every planned episode has one result, whoever runs it."""
+    until_training(one)
+    pid = one.pids()["rollout 1"]
+    one.plan(evaluation_plans(("match",), 24, "during"))
+    results: list[EpisodeResult] = list(one.poll().episodes)
+    os.kill(pid, how)
+    left = 5  # polls after everything has come: nothing comes twice later on
+    for progress in polls(one):
+        results += progress.episodes
+        if sum(r.plan.group == "during" for r in results) >= 24 and progress.rollout["restarts"] >= 1:
+            left -= 1
+        if not left:
+            break
+    assert sorted(r.plan.index for r in results if r.plan.group == "during") == list(range(24))
+    assert progress.replay["duplicates"] == 0
+    assert progress.rollout["restarts"] == 1.0 or how is signal.SIGSTOP  # a busy machine may seem to hang
+    explored = [r.plan.seed for r in results if r.plan.explore]
+    assert len(set(explored)) == len(explored)
+    assert one.pids()["rollout 1"] != pid and gone(pid)
+
+
+def test_a_rollout_worker_that_is_killed_is_replaced_and_a_replay_that_is_killed_ends_the_run(engine):
+    one = engine(env=HARD, rollout=TWO, trainer=ENDLESS)
+    lose_a_rollout_worker(one, signal.SIGKILL)
+    os.kill(one.pids()["replay"], signal.SIGKILL)
+    assert until_failure(one).startswith("replay worker failed for good:")
+
+
+def test_a_rollout_worker_that_hangs_is_replaced_and_an_inference_that_hangs_ends_the_run(engine):
+    one = engine(env=HARD, rollout=TWO, trainer=ENDLESS, launch=LaunchConfig(stall_s=7.0))
+    lose_a_rollout_worker(one, signal.SIGSTOP)
+    pid = one.pids()["inference"]
+    os.kill(pid, signal.SIGSTOP)
+    assert "inference worker has not answered for" in until_failure(one)
+    one.close()
+    assert gone(pid)
+
+
+def test_an_inference_that_is_killed_ends_the_run_and_not_those_who_relied_on_it(engine):
+    one = engine(trainer=ENDLESS)
+    until_training(one)
+    os.kill(one.pids()["inference"], signal.SIGKILL)
+    assert until_failure(one).startswith("inference worker failed for good:")
+
+
+def test_an_exception_in_the_inference_service_is_reported_as_its_own(engine):
+    one = engine(trainer=ENDLESS)
+    until_training(one)
+    ray.get(one._inference.actor.fail.remote())
+    text = until_failure(one)
+    assert text.startswith("inference worker failed for good:")
+    assert "the forward pass fell over" in text and "serve" in text
+
+
+def test_a_world_that_does_not_return_is_no_reason_to_wait_for_ever(engine):
+    endless = SimulatedConfig(max_steps=16, step_ms=1e6)
+    one = engine(
+        env=endless, rollout=RolloutConfig(worlds=1, max_restarts=0), launch=LaunchConfig(stall_s=5.0)
+    )
+    one.train()
+    text = until_failure(one)
+    assert text.startswith("rollout 0 worker failed for good:") and "its world has not returned for" in text
+
+
+def test_a_run_in_which_nothing_moves_ends(engine):
+    one = engine(launch=LaunchConfig(stall_s=5.0), trainer=ENDLESS)
+    until_training(one)
+    ray.get(one._trainer.actor.idle.remote())  # rollouts fill replay up, then wait at the door
+    text = until_failure(one)
+    assert text.startswith("nothing moved for 5 s") and "raise launch.stall_s" in text

@@ -1,0 +1,146 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The one-process engine: deterministic, and it learns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.config import RunConfig
+from accerl_lerobot.engine import Engine, Progress
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.evaluation.config import evaluation_plans
+from accerl_lerobot.local import LocalEngine
+from accerl_lerobot.policies.flow import FlowSamplerConfig
+from accerl_lerobot.policies.loading import PolicyConfig
+from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.trainer.config import TrainerConfig
+from tests.runs import collect, drive, tiny_run
+
+
+def train(config: RunConfig) -> tuple[list[Progress], dict[str, np.ndarray]]:
+    engine = LocalEngine(config, ("match",))
+    engine.train()
+    history = drive(engine)
+    weights = engine._adapter.export_trainable()
+    engine.close()
+    return history, weights
+
+
+def updates(history: list[Progress]) -> list[dict[str, float]]:
+    return [update for progress in history for update in progress.updates]
+
+
+def test_two_runs_are_equal_to_the_last_bit(tiny_checkpoint: Path):
+    runs = [train(tiny_run(tiny_checkpoint, seed=3)) for _ in range(2)]
+    assert len(updates(runs[0][0])) == 12
+    assert updates(runs[0][0]) == updates(runs[1][0])
+    assert runs[0][0][-1].replay == runs[1][0][-1].replay
+    for name, tensor in runs[0][1].items():
+        np.testing.assert_array_equal(tensor, runs[1][1][name])
+
+
+def test_another_seed_is_another_run(tiny_checkpoint: Path):
+    one, other = (updates(train(tiny_run(tiny_checkpoint, seed=seed))[0]) for seed in (3, 4))
+    assert one != other
+
+
+def success(engine: Engine, episodes: int = 128) -> float:
+    engine.plan(evaluation_plans(("match",), episodes, "test"))
+    return float(np.mean([r.success for r in collect(engine, "test", episodes)]))
+
+
+def learning_run(checkpoint: Path, **rooms: Any) -> RunConfig:
+    """Two decisions an episode, and a reward at every step: about the easiest task with a future."""
+    defaults: dict[str, Any] = {
+        "env": SimulatedConfig(max_steps=8, tolerance=0.3, reward="dense", terminate_on_success=False),
+        "policy": PolicyConfig(
+            path=str(checkpoint), device="cpu", sampler=FlowSamplerConfig(noise_level=0.6)
+        ),
+        "rollout": RolloutConfig(worlds=32, segment_length=8),
+        "replay": ReplayConfig(capacity=1024, min_decisions=128, ahead=256, samples_per_insert=2.0),
+        "algorithm": GIPOConfig(gamma=0.5),
+        "trainer": TrainerConfig(
+            updates=100, batch_decisions=128, lr=2e-3, value_lr=3e-3, warmup_updates=3, value_warmup_updates=5
+        ),
+    }
+    return tiny_run(checkpoint, **{**defaults, **rooms})
+
+
+def test_a_random_policy_learns_the_task(tiny_checkpoint: Path):
+    engine = LocalEngine(learning_run(tiny_checkpoint), ("match",))
+    before = success(engine)
+    engine.train()
+    history = drive(engine)
+    after = success(engine)
+    engine.close()
+    assert before < 0.5
+    assert after > 0.8, f"{before:.0%} → {after:.0%}"
+    rewards = [u["reward_mean"] for u in updates(history)]
+    assert np.mean(rewards[-10:]) > np.mean(rewards[:10]) + 0.5
+
+
+def test_without_learning_success_stays_where_it_was(tiny_checkpoint: Path):
+    """The control of the test above: at rate 0 the same run changes nothing, to the last episode."""
+    frozen = TrainerConfig(updates=4, batch_decisions=128, lr=0.0, value_lr=1e-3)
+    engine = LocalEngine(learning_run(tiny_checkpoint, trainer=frozen), ("match",))
+    before = success(engine)
+    engine.train()
+    history = drive(engine)
+    assert success(engine) == before
+    engine.close()
+    assert max(u["ratio_max_dev"] for u in updates(history)) <= 1e-5
+    assert any(u["lag_mean"] > 0 for u in updates(history))
+
+
+def test_planned_episodes_run_without_training_and_are_not_learned_from(tiny_checkpoint: Path):
+    engine = LocalEngine(tiny_run(tiny_checkpoint), ("match",))
+    engine.plan(evaluation_plans(("match",), 9, "test", film=1))
+    results = collect(engine, "test", 9)
+    progress = engine.poll()
+    engine.close()
+    assert sorted(r.plan.index for r in results) == list(range(9))
+    assert progress.version == 0 and progress.replay["inserted_segments"] == 0
+    assert [bool(r.frames) for r in sorted(results, key=lambda r: r.plan.index)] == [True] + [False] * 8
+
+
+def test_an_episode_cannot_be_planned_twice_while_it_has_no_result(tiny_checkpoint: Path):
+    engine = LocalEngine(tiny_run(tiny_checkpoint), ("match",))
+    engine.plan(evaluation_plans(("match",), 2, "test"))
+    with pytest.raises(ValueError, match="episode 0 of 'test' is planned twice"):
+        engine.plan(evaluation_plans(("match",), 1, "test"))
+    collect(engine, "test", 2)
+    engine.plan(evaluation_plans(("match",), 1, "test"))
+    engine.close()
+
+
+def test_a_nan_from_the_world_is_counted_and_the_run_goes_on(tiny_checkpoint: Path):
+    config = tiny_run(tiny_checkpoint, env=SimulatedConfig(max_steps=16, nan_after=21))
+    history, _ = train(config)
+    assert history[-1].done and history[-1].rollout["dropped_nonfinite"] > 0
+    assert history[-1].replay["dropped_nonfinite"] == 0, "the runner should have kept it from replay"
+
+
+def test_a_world_that_crashes_ends_the_run_with_its_own_error(tiny_checkpoint: Path):
+    engine = LocalEngine(tiny_run(tiny_checkpoint, env=SimulatedConfig(crash_after=9)), ("match",))
+    engine.train()
+    with pytest.raises(RuntimeError, match="simulated crash after 9 env steps"):
+        drive(engine)
+    engine.close()

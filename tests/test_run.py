@@ -1,0 +1,265 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A run from its command to its summary, in one process."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from accerl_lerobot import run
+from accerl_lerobot.config import LaunchConfig, RunConfig, parse
+from accerl_lerobot.console import Console
+from accerl_lerobot.engine import Engine, Progress
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.config import EvaluationConfig
+from accerl_lerobot.policies.loading import PolicyConfig
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
+from accerl_lerobot.trainer.config import TrainerConfig
+from tests.runs import tiny_run
+
+
+@dataclass
+class Finished:
+    config: RunConfig
+    directory: Path
+    summary: dict[str, Any]
+
+
+def local_run(checkpoint: Path, output_dir: Path | None, **rooms: Any) -> RunConfig:
+    defaults: dict[str, Any] = {
+        "env": SimulatedConfig(max_steps=12, tolerance=0.4),
+        "evaluation": EvaluationConfig(
+            episodes=8, every_updates=4, episodes_during=4, videos=1, video_size=32, video_every=1
+        ),
+        "trainer": TrainerConfig(updates=12, batch_decisions=16, warmup_updates=2, value_warmup_updates=2),
+        "launch": LaunchConfig(engine="local"),
+        "output_dir": None if output_dir is None else str(output_dir),
+        "save_every_updates": 5,
+    }
+    return tiny_run(checkpoint, **{**defaults, **rooms})
+
+
+@pytest.fixture(scope="module")
+def finished(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    config = local_run(tiny_checkpoint, tmp_path_factory.mktemp("outputs") / "run")
+    directory = run.make_output_dir(config)
+    return Finished(config, directory, run.train(config, directory, Console()))
+
+
+def records(directory: Path, kind: str) -> list[dict[str, Any]]:
+    lines = [json.loads(line) for line in (directory / "metrics.jsonl").read_text().splitlines()]
+    return [line for line in lines if line["kind"] == kind]
+
+
+def test_the_summary_has_what_is_promised(finished: Finished):
+    summary = json.loads((finished.directory / "summary.json").read_text())
+    assert summary == finished.summary
+    for when in ("before", "after"):
+        assert 0.0 <= summary[f"success_{when}"] <= 1.0 and summary[f"n_{when}"] == 8
+        low, high = summary[f"ci95_{when}"]
+        assert 0.0 <= low <= summary[f"success_{when}"] <= high <= 1.0 and low < high
+        assert summary["ci95"][when] == [low, high]
+    assert summary["n"] == 8 and summary["updates"] == 12
+    assert summary["env_steps"] >= summary["decisions"] > 0 and summary["trained_decisions"] >= 12 * 16
+    assert 0 <= summary["lag_mean"] <= summary["lag_max"]
+    assert summary["wall_s"] >= summary["rl_s"] > 0 and summary["restarts"] == 0
+
+
+def test_the_run_directory_is_complete(finished: Finished):
+    assert {path.name for path in finished.directory.iterdir()} == {
+        "config.yaml", "metrics.jsonl", "tensorboard", "checkpoints", "success_curve.png", "summary.json",
+        "before_after.mp4",
+    }  # fmt: skip
+    assert list((finished.directory / "tensorboard").iterdir())
+
+
+def test_every_update_is_logged_once(finished: Finished):
+    train = records(finished.directory, "train")
+    assert [r["update"] for r in train] == list(range(1, 13))
+    assert {"loss", "approx_kl", "lag_mean", "lr", "ratio_max_dev", "skipped"} <= train[0].keys()
+    assert max(r["lag_max"] for r in train) == finished.summary["lag_max"]
+
+
+def test_evaluations_are_logged_in_order_with_the_weights_they_used(finished: Finished):
+    found = records(finished.directory, "evaluation")
+    # Three were planned while training, after 4 and 8 updates; the one after 12 is the one after training.
+    assert [r["group"] for r in found] == ["before", "during-1", "during-2", "after"]
+    assert [r["n"] for r in found] == [8, 4, 4, 8]
+    assert (found[0]["version_min"], found[0]["version_max"]) == (0, 0)
+    assert (found[-1]["version_min"], found[-1]["version_max"]) == (12, 12)
+    assert all(0 < r["version_min"] <= r["version_max"] <= 12 for r in found[1:3])
+    steps = [r["env_steps"] for r in found]
+    assert steps == sorted(steps) and steps[-1] == finished.summary["env_steps"]
+
+
+def test_checkpoints_load_again(finished: Finished):
+    from accerl_lerobot.policies.loading import load_adapter
+
+    checkpoints = finished.directory / "checkpoints"
+    names = sorted(path.name for path in checkpoints.iterdir() if not path.is_symlink())
+    assert names == ["000005", "000010", "000012"]
+    assert (checkpoints / "last").resolve().name == "000012"
+    step = json.loads((checkpoints / "000010" / "training_state" / "training_step.json").read_text())
+    assert step["step"] == 10
+    weights = []
+    for name in ("000005", "last"):
+        policy = PolicyConfig(path=str(checkpoints / name / "pretrained_model"), device="cpu")
+        weights.append(load_adapter(policy).export_trainable())
+    assert weights[0].keys() == weights[1].keys()
+    assert any((weights[0][k] != weights[1][k]).any() for k in weights[0])
+
+
+def test_the_video_shows_before_and_after(finished: Finished):
+    imageio = pytest.importorskip("imageio.v2")
+    with imageio.get_reader(finished.directory / "before_after.mp4") as reader:
+        frames = [frame for frame in reader]  # noqa: C416 - its length is unknown, so `list` fails
+    height, width, channels = frames[0].shape
+    assert len(frames) > 10 and channels == 3 and height == 32 and width == 2 * 32 + 4
+    assert any((frame != frames[0]).any() for frame in frames)
+
+
+def test_the_curve_is_a_picture(finished: Finished):
+    imageio = pytest.importorskip("imageio.v2")
+    picture = imageio.imread(finished.directory / "success_curve.png")
+    assert picture.shape[:2] == (480, 840) and picture.std() > 5
+
+
+def test_the_config_reloads_to_an_equal_one(finished: Finished):
+    file = finished.directory / "config.yaml"
+    assert parse(RunConfig, [f"--config_path={file}"]) == finished.config
+    assert yaml.safe_load(file.read_text())["trainer"]["updates"] == 12
+
+
+def test_an_existing_folder_is_refused(finished: Finished):
+    with pytest.raises(InputError, match="the folder exists"):
+        run.make_output_dir(finished.config)
+
+
+def test_without_a_name_the_folder_is_named_after_the_time(
+    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    path = run.make_output_dir(local_run(tiny_checkpoint, None, job_name="mine"))
+    assert path.is_dir() and path.parts[0] == "outputs" and path.name.endswith("_mine")
+
+
+def test_a_policy_that_does_not_fit_the_world_is_refused_before_any_worker_starts(
+    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(run, "make_engine", lambda *_: pytest.fail("a worker was started"))
+    config = local_run(tiny_checkpoint, tmp_path, env=SimulatedConfig(action_dim=3, state_dim=6))
+    with pytest.raises(InputError, match=r"policy.path"):
+        run.train(config, tmp_path, Console())
+
+
+class Scripted(Engine):
+    """Answers every evaluation at once, except what is planned while training: that ends after it."""
+
+    def __init__(self, config: RunConfig) -> None:
+        self.config = config
+        self.planned: list[EpisodePlan] = []
+        self.late: list[EpisodePlan] = []
+        self.version = 0
+        self.steps = 0.0
+        self.training = self.closed = False
+        self.failure: Exception | None = None
+
+    def plan(self, plans: list[EpisodePlan]) -> None:
+        (self.late if self.training else self.planned).extend(plans)
+
+    def train(self) -> None:
+        self.training = True
+
+    def poll(self) -> Progress:
+        if self.failure is not None:
+            raise self.failure
+        updates = []
+        if self.training:
+            self.version += 1
+            self.steps += 10
+            updates = [{"update": float(self.version), "lag_mean": 0.0, "lag_max": 0.0, "ratio_max_dev": 0.0}]
+            self.training = self.version < self.config.trainer.updates
+        elif self.version and self.planned:
+            self.planned, self.late = self.late + self.planned, []
+            self.steps += 1000
+        ready, self.planned = self.planned, []
+        return Progress(
+            version=self.version,
+            done=self.version == self.config.trainer.updates,
+            updates=updates,
+            episodes=[_succeeded(plan) for plan in ready],
+            rollout={"env_steps": self.steps, "decisions": 1.0},
+        )
+
+    def save(self, directory: Path) -> int:
+        directory.mkdir(parents=True)
+        return self.version
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def _succeeded(plan: EpisodePlan) -> EpisodeResult:
+    return EpisodeResult(plan=plan, success=True, episode_return=0.0, steps=3, decisions=1, versions=(0, 0))
+
+
+def scripted(monkeypatch: pytest.MonkeyPatch, config: RunConfig) -> Scripted:
+    engine = Scripted(config)
+    monkeypatch.setattr(run, "make_engine", lambda *_: engine)
+    monkeypatch.setattr(run, "check_policy", lambda *_: None)
+    return engine
+
+
+def test_an_evaluation_that_ends_after_training_is_not_lost(
+    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    config = local_run(tiny_checkpoint, tmp_path, save_every_updates=0)
+    engine = scripted(monkeypatch, config)
+    summary = run.train(config, tmp_path, Console())
+    found = records(tmp_path, "evaluation")
+    assert [r["group"] for r in found] == ["before", "during-1", "during-2", "after"]
+    assert [r["n"] for r in found] == [8, 4, 4, 8]
+    # What is stepped to evaluate after training is no experience that was learned from.
+    assert summary["env_steps"] == found[-1]["env_steps"] == found[-2]["env_steps"] == 12 * 10
+    assert engine.closed and (tmp_path / "checkpoints" / "last").is_symlink()
+
+
+@pytest.mark.parametrize("error", [RuntimeError("inference worker failed for good"), KeyboardInterrupt()])
+def test_a_run_that_fails_closes_the_engine_and_keeps_its_own_error(
+    error: BaseException, tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    config = local_run(tiny_checkpoint, tmp_path)
+    engine = scripted(monkeypatch, config)
+    monkeypatch.setattr(engine, "train", lambda: (_ for _ in ()).throw(error))
+    with pytest.raises(type(error)) as caught:
+        run.train(config, tmp_path, Console())
+    assert caught.value is error and engine.closed
+    assert len(records(tmp_path, "evaluation")) == 1, "what was measured before is kept"
+    assert not (tmp_path / "summary.json").exists()
+
+
+def test_the_engine_is_the_one_that_was_asked_for(tiny_checkpoint: Path):
+    from accerl_lerobot.local import LocalEngine
+
+    config = local_run(tiny_checkpoint, None)
+    engine = run.make_engine(replace(config, seed=1), ("match",))
+    assert isinstance(engine, LocalEngine)
+    engine.close()

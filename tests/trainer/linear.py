@@ -1,0 +1,95 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A policy of a few numbers, and segments it could have made."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from accerl_lerobot.experience import Decision, Request, Segment
+from accerl_lerobot.policies.base import Evaluation, PolicyAdapter
+
+STATE = "observation.state"
+STD = 0.5
+
+
+class LinearAdapter(PolicyAdapter):
+    """Latent ~ N(W·state, STD²), two factors, one per latent entry; V = v·state + b."""
+
+    def __init__(self, seed: int = 0) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        self.weight = nn.Parameter(0.3 * torch.randn(2, 3, generator=generator))
+        self.value_head = nn.Linear(3, 1)
+        with torch.no_grad():
+            self.value_head.weight.copy_(torch.randn(1, 3, generator=generator))
+            self.value_head.bias.fill_(0.3)
+        self.device = torch.device("cpu")
+
+    def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
+        raise NotImplementedError
+
+    def evaluate(
+        self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
+    ) -> Evaluation:
+        assert len(tasks) == len(observations[STATE]) == len(latent["x"])
+        state = torch.from_numpy(observations[STATE])
+        z = (latent["x"] - state @ self.weight.T) / STD
+        entropy = torch.zeros(len(state))
+        return Evaluation(log_prob=-0.5 * z * z, entropy=entropy, value=self.value_head(state)[:, 0])
+
+    @torch.no_grad()
+    def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
+        assert len(tasks) == len(observations[STATE])
+        return self.value_head(torch.from_numpy(observations[STATE]))[:, 0]
+
+    def trainable(self) -> dict[str, nn.Parameter]:
+        critic = {f"value_head.{k}": p for k, p in self.value_head.named_parameters()}
+        return {"policy.weight": self.weight, **critic}
+
+    def self_check(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> float:
+        return 0.0
+
+    def copy(self) -> dict[str, Tensor]:
+        """The weights as they are now."""
+        return {k: p.detach().clone() for k, p in self.trainable().items()}
+
+
+def make_segments(lengths: Sequence[int], version: int = 0, seed: int = 0, **replace: Any) -> list[Segment]:
+    """Segments with random content; log-probs are those of a policy a little off from the current one."""
+    rng = np.random.default_rng(seed)
+    return [_segment(rng, n, f"{seed}.{i}", version, replace) for i, n in enumerate(lengths)]
+
+
+def _segment(rng: np.random.Generator, n: int, key: str, version: int, replace: dict[str, Any]) -> Segment:
+    fields: dict[str, Any] = {
+        "observations": {STATE: rng.standard_normal((n + 1, 3), dtype=np.float32)},
+        "task": f"task {key}",
+        "latent": {"x": rng.standard_normal((n, 2), dtype=np.float32)},
+        "log_prob": rng.standard_normal((n, 2), dtype=np.float32) - 2.0,
+        "value": np.full(n, 100.0, np.float32),  # stale: no critic here says so
+        "reward": rng.standard_normal(n, dtype=np.float32),
+        "version": np.full(n, version, np.int64),
+        "steps": np.ones(n, np.int64),
+        "terminated": False,
+        "truncated": False,
+        "success": False,
+        "key": key,
+    }
+    return Segment(**{**fields, **replace})

@@ -1,0 +1,290 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""One update, on a policy small enough to compute by hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.experience import Segment
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.update import NonFiniteError, Update, collate
+from tests.trainer.linear import STATE, LinearAdapter, make_segments
+
+PLAIN = TrainerConfig(
+    updates=100, lr=1e-2, value_lr=1e-2, warmup_updates=0, value_warmup_updates=0, grad_clip=1e9
+)
+LENGTHS = (3, 5, 1, 4)
+
+
+def make_update(config: TrainerConfig = PLAIN, seed: int = 0, **algorithm: float) -> Update:
+    return Update(LinearAdapter(seed), GIPOConfig(**algorithm), config)
+
+
+def returns_by_hand(
+    segments: Sequence[Segment], values: Sequence[np.ndarray], gamma: float, lam: float
+) -> np.ndarray:
+    """λ-returns, decision by decision, from the values of each segment's T + 1 observations."""
+    found: list[float] = []
+    for segment, value in zip(segments, values, strict=True):
+        advantage, back = 0.0, []
+        for t in reversed(range(len(segment))):
+            last = t == len(segment) - 1
+            following = 0.0 if last and segment.terminated else value[t + 1]
+            delta = segment.reward[t] + gamma * following - value[t]
+            advantage = delta + gamma * lam * (0.0 if last else advantage)
+            back.append(advantage + value[t])
+        found += back[::-1]
+    return np.asarray(found)
+
+
+def critic_values(update: Update, segments: Sequence[Segment]) -> list[np.ndarray]:
+    return [update.adapter.values(s.observations, [s.task] * (len(s) + 1)).numpy() for s in segments]
+
+
+# ---- batches
+
+
+def test_collate_lays_segments_end_to_end():
+    segments = make_segments((2, 3), version=4)
+    segments[1].terminated = True
+    batch = collate(segments)
+    assert batch.reward.shape == (5,) and batch.log_prob.shape == (5, 2) and batch.latent["x"].shape == (5, 2)
+    np.testing.assert_array_equal(batch.reward.numpy()[2:], segments[1].reward)
+    # Each decision stands beside the observation it was made on; the extra one is the bootstrap's.
+    np.testing.assert_array_equal(batch.observations[STATE][:2], segments[0].observations[STATE][:2])
+    np.testing.assert_array_equal(batch.observations[STATE][2:], segments[1].observations[STATE][:3])
+    np.testing.assert_array_equal(batch.last_observations[STATE][0], segments[0].observations[STATE][2])
+    np.testing.assert_array_equal(batch.last_observations[STATE][1], segments[1].observations[STATE][3])
+    assert batch.tasks == ["task 0.0"] * 2 + ["task 0.1"] * 3 and batch.segment_tasks == [
+        "task 0.0",
+        "task 0.1",
+    ]
+    assert batch.lengths.tolist() == [2, 3] and batch.terminated.tolist() == [False, True]
+    assert batch.version.tolist() == [4] * 5
+
+
+def test_collate_copies_so_that_a_stored_segment_cannot_change():
+    segments = make_segments((3,))
+    batch = collate(segments)
+    batch.latent["x"][:] = 9.0
+    batch.reward[:] = 9.0
+    assert not (segments[0].latent["x"] == 9.0).any() and not (segments[0].reward == 9.0).any()
+
+
+@pytest.mark.parametrize("micro_batch", [1, 4, 5, 12, 13, 1000])
+def test_micro_batches_give_the_gradient_of_the_whole_batch(micro_batch: int):
+    whole, parts = make_update(), make_update(replace(PLAIN, micro_batch=micro_batch))
+    segments = make_segments(LENGTHS)
+    expected, found = whole.step(segments), parts.step(segments)
+    for name, parameter in whole.adapter.trainable().items():
+        other = parts.adapter.trainable()[name].grad
+        assert parameter.grad is not None and parameter.grad.abs().max() > 1e-3
+        torch.testing.assert_close(other, parameter.grad, rtol=1e-5, atol=1e-6)
+    for name in ("loss", "value_loss", "approx_kl", "ratio_max_dev", "return_mean", "decisions"):
+        assert found[name] == pytest.approx(expected[name], rel=1e-5, abs=1e-6), name
+    assert found["decisions"] == sum(LENGTHS)
+
+
+# ---- targets
+
+
+@pytest.mark.parametrize("micro_batch", [1000, 4])
+def test_values_are_recomputed_bootstraps_included(micro_batch: int):
+    update = make_update(replace(PLAIN, micro_batch=micro_batch), gamma=0.9, lam=0.8)
+    segments = make_segments(LENGTHS)
+    segments[1].terminated = True
+    segments[3].truncated = True
+    now = critic_values(update, segments)
+    stale = [np.append(s.value, s.value[-1]) for s in segments]
+    found = update.step(segments)
+    assert found["return_mean"] == pytest.approx(returns_by_hand(segments, now, 0.9, 0.8).mean(), abs=1e-5)
+    assert found["return_mean"] != pytest.approx(returns_by_hand(segments, stale, 0.9, 0.8).mean(), abs=1.0)
+    # The critic's own error is against those returns, so it, too, must be of the current critic.
+    mine = np.concatenate([v[:-1] for v in now])
+    error = np.square(mine - returns_by_hand(segments, now, 0.9, 0.8)).mean()
+    assert found["value_loss"] == pytest.approx(error, rel=1e-4)
+
+
+def test_values_stored_with_the_samples_change_nothing():
+    segments = make_segments(LENGTHS)
+    others = [replace(s, value=s.value - 50.0) for s in segments]
+    assert make_update().step(segments) == make_update().step(others)
+
+
+def test_a_time_limit_is_bootstrapped_and_a_termination_is_not():
+    (segment,) = make_segments((2,))
+    means = {}
+    for name in ("terminated", "truncated", "cut"):
+        update = make_update(gamma=0.9, lam=1.0)
+        ended = replace(segment, terminated=name == "terminated", truncated=name == "truncated")
+        last = critic_values(update, [segment])[0][-1]
+        means[name] = update.step([ended])["return_mean"]
+    assert means["truncated"] == means["cut"]
+    # λ = 1: the bootstrap enters the last return with γ and the first with γ².
+    assert means["cut"] - means["terminated"] == pytest.approx((0.9 + 0.81) / 2 * last, abs=1e-5)
+    assert abs(last) > 0.1
+
+
+# ---- schedules
+
+
+def test_learning_rates_warm_up_and_stay():
+    config = replace(PLAIN, warmup_updates=4)
+    assert [config.lr_share(i) for i in range(6)] == [0.25, 0.5, 0.75, 1.0, 1.0, 1.0]
+
+
+def test_learning_rates_fall_like_a_cosine():
+    config = replace(PLAIN, updates=110, warmup_updates=10, schedule="cosine", final_lr_share=0.2)
+    assert config.lr_share(9) == config.lr_share(10) == 1.0
+    assert config.lr_share(60) == pytest.approx(0.6)  # half way
+    assert config.lr_share(35) == pytest.approx(0.2 + 0.8 * 0.5 * (1 + math.cos(math.pi / 4)))
+    assert config.lr_share(110) == config.lr_share(500) == pytest.approx(0.2)
+
+
+def test_the_optimiser_uses_the_schedule():
+    config = replace(PLAIN, lr=0.1, value_lr=0.01, warmup_updates=4, value_warmup_updates=2)
+    update = make_update(config)
+    rates = [update.step(make_segments(LENGTHS, seed=i)) for i in range(5)]
+    assert [m["lr"] for m in rates] == pytest.approx([0.0, 0.0, 0.075, 0.1, 0.1])
+    assert [m["value_lr"] for m in rates] == pytest.approx([0.0025, 0.005, 0.0075, 0.01, 0.01])
+    assert [g["lr"] for g in update.optimizer.param_groups] == [0.1, 0.01]
+
+
+def test_at_first_only_the_critic_learns():
+    update = make_update(replace(PLAIN, value_warmup_updates=3, weight_decay=0.1))
+    before = update.adapter.copy()
+    for i in range(3):
+        update.step(make_segments(LENGTHS, seed=i))
+    after = update.adapter.copy()
+    assert torch.equal(after["policy.weight"], before["policy.weight"])
+    assert not torch.equal(after["value_head.weight"], before["value_head.weight"])
+    update.step(make_segments(LENGTHS, seed=3))
+    assert not torch.equal(update.adapter.copy()["policy.weight"], before["policy.weight"])
+
+
+def test_while_only_the_critic_learns_the_policys_gradient_does_not_scale_its_own():
+    config = replace(PLAIN, value_warmup_updates=1, grad_clip=1e-3)
+    update, loud = make_update(config), make_update(config)
+    segments = make_segments(LENGTHS)
+    norm = update.step(segments)["grad_norm"]
+    for segment in segments:
+        segment.log_prob -= 3.0  # ratios of e³: another policy gradient, the same critic's
+    assert loud.step(segments)["grad_norm"] == pytest.approx(norm, rel=1e-6)
+
+
+def test_at_learning_rate_zero_nothing_of_the_policy_moves():
+    update = make_update(replace(PLAIN, lr=0.0))
+    before = update.adapter.copy()
+    for i in range(4):
+        update.step(make_segments(LENGTHS, seed=i))
+    after = update.adapter.copy()
+    assert torch.equal(after["policy.weight"], before["policy.weight"])
+    assert not torch.equal(after["value_head.weight"], before["value_head.weight"])
+    frozen = make_update(replace(PLAIN, lr=0.0, value_lr=0.0))
+    frozen.step(make_segments(LENGTHS))
+    assert all(torch.equal(p, before[k]) for k, p in frozen.adapter.copy().items())
+
+
+def test_gradients_are_clipped_to_their_norm():
+    update = make_update(replace(PLAIN, grad_clip=0.01))
+    norm = update.step(make_segments(LENGTHS))["grad_norm"]
+    assert norm > 0.1
+    grads = [p.grad for p in update.adapter.trainable().values()]
+    assert torch.stack([g.norm() for g in grads if g is not None]).norm() == pytest.approx(0.01, rel=1e-3)
+
+
+def test_learning_moves_towards_what_was_rewarded():
+    update = make_update(replace(PLAIN, lr=0.02), lam=0.0, gamma=0.0)
+    rng = np.random.default_rng(0)
+    aim = torch.tensor([[0.5, -0.5, 0.2], [0.1, 0.4, -0.3]])
+
+    def distance() -> float:
+        return float((update.adapter.copy()["policy.weight"] - aim).norm())
+
+    start = distance()
+    for i in range(80):
+        (segment,) = make_segments((64,), seed=i)
+        state = torch.from_numpy(segment.observations[STATE][:-1])
+        with torch.no_grad():
+            mean = state @ update.adapter.weight.T
+            noise = torch.from_numpy(rng.standard_normal((64, 2)).astype(np.float32))
+            latent = mean + 0.5 * noise
+        segment.latent["x"] = latent.numpy()
+        segment.log_prob = (-0.5 * noise * noise).numpy()
+        segment.reward = (-(latent - state @ aim.T).square().sum(1)).numpy()
+        assert update.step([segment])["ratio_max_dev"] < 1e-4
+    assert distance() < 0.4 * start
+
+
+# ---- what is not finite
+
+
+def nonfinite(seed: int = 0) -> list[Segment]:
+    segments = make_segments(LENGTHS, seed=seed)
+    segments[1].reward[2] = np.nan
+    return segments
+
+
+def test_a_loss_that_is_not_finite_is_skipped_and_counted():
+    update = make_update()
+    before = update.adapter.copy()
+    metrics = update.step(nonfinite())
+    assert metrics["skipped"] == 1 and not math.isfinite(metrics["loss"])
+    assert all(torch.equal(p, before[k]) for k, p in update.adapter.copy().items())
+    assert update.version == 1
+    assert update.step(make_segments(LENGTHS))["skipped"] == 1
+    after = update.adapter.copy()
+    assert all(torch.isfinite(p).all() for p in after.values())
+    assert not torch.equal(after["policy.weight"], before["policy.weight"])
+
+
+def test_a_gradient_that_is_not_finite_is_skipped_even_if_the_loss_is():
+    update = make_update()
+    before = update.adapter.copy()
+    update.adapter.weight.register_hook(lambda gradient: gradient * float("inf"))
+    metrics = update.step(make_segments(LENGTHS))
+    assert math.isfinite(metrics["loss"]) and metrics["skipped"] == 1
+    assert all(torch.equal(p, before[k]) for k, p in update.adapter.copy().items())
+
+
+def test_so_many_in_a_row_are_an_error_and_a_finite_one_between_starts_the_count_again():
+    update = make_update(replace(PLAIN, max_nonfinite=3))
+    for _ in range(2):
+        update.step(nonfinite())
+    update.step(make_segments(LENGTHS))
+    for _ in range(2):
+        update.step(nonfinite())
+    with pytest.raises(NonFiniteError, match="3 updates in a row"):
+        update.step(nonfinite())
+    assert update.skipped == 5
+
+
+# ---- versions
+
+
+def test_the_version_counts_updates_and_the_lag_is_measured_before_the_step():
+    update = make_update()
+    for version in range(3):
+        assert update.version == version
+        metrics = update.step(make_segments((2, 2), version=0))
+        assert metrics["lag_mean"] == metrics["lag_max"] == version
+    assert update.version == 3

@@ -1,0 +1,133 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The trainer process's loop, with replay and the readers played by the test."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.experience import Segment
+from accerl_lerobot.policies import loading
+from accerl_lerobot.policies.loading import PolicyConfig
+from accerl_lerobot.trainer import worker as module
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.worker import TrainerWorker
+from accerl_lerobot.weights import ray_channel
+from tests.local_ray import Handle, Local
+from tests.trainer.linear import LinearAdapter, make_segments
+
+
+class Stage:
+    """A trainer, a replay that counts what it is asked for, and a reader that keeps what it is sent."""
+
+    def __init__(self, batches: int = 1000, **config: Any) -> None:
+        self.asked: list[tuple[int, int]] = []
+        self.received: list[tuple[int, dict[str, np.ndarray]]] = []
+        self.replay = Handle(sample=self._sample)
+        self.reader = Handle(receive_weights=lambda *published: self.received.append(published))
+        self._batches = batches
+        defaults = {"updates": 6, "batch_decisions": 7, "warmup_updates": 0, "value_warmup_updates": 0}
+        self.worker = TrainerWorker(
+            PolicyConfig(path="nowhere"), GIPOConfig(), TrainerConfig(**{**defaults, **config}), seed=0
+        )
+
+    def run(self) -> int:
+        return self.worker.run(self.replay, [self.reader])
+
+    def _sample(self, decisions: int, version: int) -> list[Segment]:
+        self.asked.append((decisions, version))
+        return make_segments((4, 3), seed=len(self.asked)) if len(self.asked) <= self._batches else []
+
+
+@pytest.fixture(autouse=True)
+def _without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "ray", Local)
+    monkeypatch.setattr(ray_channel, "ray", Local)
+    monkeypatch.setattr(loading, "load_adapter", lambda policy: LinearAdapter())
+
+
+def test_it_makes_its_updates_and_draws_no_batch_more():
+    stage = Stage(updates=6)
+    assert stage.run() == 6
+    # Each batch is drawn ahead, for the version that will be current when it is used.
+    assert stage.asked == [(7, version) for version in range(6)]
+
+
+def test_every_update_is_reported_once_and_in_order():
+    stage = Stage(updates=6)
+    stage.run()
+    records = stage.worker.metrics()
+    assert [r["update"] for r in records] == [1, 2, 3, 4, 5, 6] and stage.worker.metrics() == []
+    assert all(r["wait_s"] >= 0 and r["update_s"] > 0 and r["publish_s"] >= 0 for r in records)
+
+
+def test_no_record_is_lost_to_a_reader_on_another_thread():
+    stage = Stage(updates=80)
+    records: list[dict[str, float]] = []
+    over = threading.Event()
+
+    def read() -> None:
+        while not over.is_set():
+            records.extend(stage.worker.metrics())
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    stage.run()
+    over.set()
+    reader.join()
+    records += stage.worker.metrics()
+    assert [r["update"] for r in records] == list(range(1, 81))
+
+
+@pytest.mark.parametrize(("every", "versions"), [(1, [0, 1, 2, 3, 4, 5]), (2, [0, 2, 4, 5]), (9, [0, 5])])
+def test_it_publishes_the_first_weights_every_so_many_and_the_last(every: int, versions: list[int]):
+    stage = Stage(updates=5, publish_every=every)
+    stage.run()
+    assert [version for version, _ in stage.received] == versions
+    last = stage.worker._update.adapter.export_trainable()
+    for name, tensor in stage.received[-1][1].items():
+        np.testing.assert_array_equal(tensor, last[name])
+    first, last_sent = stage.received[0][1], stage.received[-1][1]
+    assert any(not np.array_equal(first[name], last_sent[name]) for name in first)
+
+
+def test_a_closed_replay_ends_it_early():
+    stage = Stage(batches=2, updates=6)
+    assert stage.run() == 2 and len(stage.worker.metrics()) == 2
+
+
+def test_what_is_saved_is_a_whole_version(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Saving waits for an update to end, and the next one for the saving."""
+    stage = Stage(updates=300)
+    seen: list[tuple[int, int]] = []
+
+    def save(adapter: LinearAdapter, directory: Path, policy: PolicyConfig) -> None:
+        before = adapter.copy()
+        version = stage.worker._update.version
+        threading.Event().wait(0.01)
+        assert all(bool((p == before[k]).all()) for k, p in adapter.copy().items())
+        seen.append((version, stage.worker._update.version))
+
+    monkeypatch.setattr(loading, "save_pretrained", save)
+    runner = threading.Thread(target=stage.run)
+    runner.start()
+    saved = [stage.worker.save(str(tmp_path)) for _ in range(8)]
+    runner.join()
+    assert saved == [before for before, _ in seen] == [after for _, after in seen]

@@ -1,0 +1,176 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Weights through Ray's object store, read by processes that hold nothing but a shelf."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import ray
+
+from accerl_lerobot.weights.channel import Tensors, WeightChannel
+from accerl_lerobot.weights.ray_channel import RayPublisher
+from tests.light_workers import light_ray
+from tests.weights.contract import CHECKS, Check, filled, values_of
+
+__all__ = ["light_ray"]
+
+
+class Shelf:
+    """A reader process with room for many readers; as slow as it is told to be."""
+
+    def __init__(self) -> None:
+        self._received: dict[str, list[tuple[int, Tensors]]] = {}
+        self._open = threading.Event()
+        self._open.set()
+
+    def shut(self) -> None:
+        self._open.clear()
+
+    def open(self) -> None:
+        self._open.set()
+
+    def receive(self, name: str, version: int, tensors: Tensors) -> int:
+        self._open.wait(60)
+        self._received.setdefault(name, []).append((version, tensors))
+        return version
+
+    def newest(self, name: str) -> tuple[int, Tensors] | None:
+        received = self._received.get(name)
+        return received[-1] if received else None
+
+    def versions(self, name: str) -> list[int]:
+        return [version for version, _ in self._received.get(name, [])]
+
+
+class Reader:
+    """One name on a shelf, looking like an actor handle with ``receive_weights``."""
+
+    count = 0
+
+    def __init__(self, shelf: Any) -> None:
+        Reader.count += 1
+        self.shelf, self.name = shelf, f"reader{Reader.count}"
+        self.receive_weights = self
+
+    def remote(self, version: int, tensors: Any) -> Any:
+        return self.shelf.receive.remote(self.name, version, tensors)
+
+    def newest(self) -> tuple[int, Tensors] | None:
+        return ray.get(self.shelf.newest.remote(self.name))
+
+    def versions(self) -> list[int]:
+        return ray.get(self.shelf.versions.remote(self.name))
+
+
+@pytest.fixture(scope="module")
+def shelves(light_ray: None) -> Iterator[list[Any]]:
+    made = [ray.remote(Shelf).options(num_cpus=0, max_concurrency=4).remote() for _ in range(2)]
+    yield made
+    for shelf in made:
+        ray.kill(shelf)
+
+
+class Delivered(WeightChannel):
+    """The publisher with its reader, as one channel: what is published has arrived."""
+
+    def __init__(self, shelf: Any) -> None:
+        self.reader = Reader(shelf)
+        self.publisher = RayPublisher([self.reader])
+
+    def publish(self, version: int, tensors: Tensors) -> None:
+        self.publisher.publish(version, tensors)
+        self.publisher.flush()
+
+    def newest(self, than: int) -> tuple[int, Tensors] | None:
+        found = self.reader.newest()
+        return None if found is None or found[0] <= than else found
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+def test_contract(check: Check, shelves: list[Any]):
+    check(lambda: Delivered(shelves[0]))
+
+
+def test_a_slow_reader_skips_versions_and_does_not_hold_up_the_publisher(shelves: list[Any]):
+    slow, quick = Reader(shelves[0]), Reader(shelves[1])
+    publisher = RayPublisher([slow, quick])
+    ray.get(shelves[0].shut.remote())
+    for version in range(10):  # would not return if it waited for the reader whose gate is shut
+        publisher.publish(version, filled(float(version)))
+    assert slow.versions() == []
+    ray.get(shelves[0].open.remote())
+    publisher.flush()
+    # One set was under way; those between were skipped; the last one was delivered by `flush`.
+    assert slow.versions() == [0, 9]
+    assert quick.versions() == sorted(set(quick.versions())) and quick.versions()[-1] == 9
+    for reader in (slow, quick):
+        found = reader.newest()
+        assert found is not None and values_of(found[1]) == {9.0}
+
+
+def test_a_reader_that_caught_up_is_sent_the_newest_by_the_next_publication(shelves: list[Any]):
+    reader = Reader(shelves[0])
+    publisher = RayPublisher([reader])
+    ray.get(shelves[0].shut.remote())
+    for version in (1, 2, 3):
+        publisher.publish(version, filled(float(version)))
+    ray.get(shelves[0].open.remote())
+    publisher.flush()
+    assert reader.versions() == [1, 3]
+    publisher.publish(7, filled(7.0))
+    publisher.flush()
+    assert reader.versions() == [1, 3, 7]
+
+
+def test_flush_sends_nothing_twice_and_nothing_before_the_first_publication(shelves: list[Any]):
+    reader = Reader(shelves[0])
+    publisher = RayPublisher([reader])
+    publisher.flush()
+    assert reader.versions() == []
+    publisher.publish(1, filled(1.0))
+    publisher.flush()
+    publisher.flush()
+    assert reader.versions() == [1]
+
+
+def test_what_a_reader_holds_stays_whole_when_many_more_are_published(shelves: list[Any]):
+    reader = Reader(shelves[0])
+    publisher = RayPublisher([reader])
+    buffers = filled(0.0, size=50_000)  # large enough to lie in shared memory
+    for version in range(1, 31):
+        for tensor in buffers.values():
+            tensor[:] = version
+        publisher.publish(version, buffers)
+    publisher.flush()
+    held = ray.get(shelves[0].versions.remote(reader.name))
+    assert held == sorted(set(held)) and held[-1] == 30
+    found = reader.newest()
+    assert found is not None and found[0] == 30 and values_of(found[1]) == {30.0}
+
+
+def test_a_dead_reader_is_an_error_at_the_next_publication(light_ray: None):
+    shelf = ray.remote(Shelf).options(num_cpus=0).remote()
+    publisher = RayPublisher([Reader(shelf)])
+    publisher.publish(0, {"a": np.zeros(1, np.float32)})
+    publisher.flush()
+    ray.kill(shelf)
+    with pytest.raises(ray.exceptions.RayActorError):
+        for version in range(1, 1000):
+            publisher.publish(version, {"a": np.zeros(1, np.float32)})
+            publisher.flush()
