@@ -123,9 +123,8 @@ class Update:
         critic_group["lr"] = self.config.value_lr * share
         self.optimizer.zero_grad(set_to_none=True)
         metrics = self._backward(batch)
-        if (
-            critic_only
-        ):  # before the norm is taken: noise in the policy's gradient must not scale the critic's
+        if critic_only:
+            # Before the norm is taken: noise in the policy's gradient must not scale the critic's.
             for parameter in self._policy_parameters:
                 parameter.grad = None
         norm = torch.nn.utils.clip_grad_norm_(self._parameters, self.config.grad_clip)

@@ -251,9 +251,8 @@ def test_older_weights_are_ignored_even_while_newer_ones_are_loaded(play):
         while not adapter.entered.is_set():
             await asyncio.sleep(0.0005)
         await worker.receive_weights(3, weights(3))  # version 4 is being written just now
-        await worker.receive_weights(4, weights(4))
-        (decision,) = await worker.decide(requests(0))
-        assert decision.version == 4 and adapter.loaded == [4]
+        versions = [(await worker.decide(requests(i)))[0].version for i in range(3)]
+        assert versions == [4, 4, 4] and adapter.loaded == [4]
 
     play(scene, CountingAdapter(delay=0.01), max_batch=1, max_wait_s=0.0)
 

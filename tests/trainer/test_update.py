@@ -144,6 +144,21 @@ def test_a_time_limit_is_bootstrapped_and_a_termination_is_not():
     assert abs(last) > 0.1
 
 
+def test_advantages_are_normalised_over_the_batch():
+    """Neither the size of rewards nor a constant in all of them changes what the policy learns."""
+    gradients = []
+    for scale, shift in ((1.0, 0.0), (20.0, 7.0)):
+        update = make_update(gamma=0.0)
+        torch.nn.init.zeros_(update.adapter.value_head.weight)
+        segments = make_segments(LENGTHS)
+        for segment in segments:
+            segment.reward = segment.reward * np.float32(scale) + np.float32(shift)
+        update.step(segments)
+        gradients.append(update.adapter.weight.grad)
+    assert gradients[0].abs().max() > 1e-3
+    torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-4, atol=1e-6)
+
+
 # ---- schedules
 
 

@@ -115,7 +115,7 @@ def test_a_closed_replay_ends_it_early():
 
 def test_what_is_saved_is_a_whole_version(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     """Saving waits for an update to end, and the next one for the saving."""
-    stage = Stage(updates=300)
+    stage = Stage(batches=1_000_000, updates=1_000_000)
     seen: list[tuple[int, int]] = []
 
     def save(adapter: LinearAdapter, directory: Path, policy: PolicyConfig) -> None:
@@ -128,6 +128,9 @@ def test_what_is_saved_is_a_whole_version(monkeypatch: pytest.MonkeyPatch, tmp_p
     monkeypatch.setattr(loading, "save_pretrained", save)
     runner = threading.Thread(target=stage.run)
     runner.start()
+    while stage.worker._update.version < 3:
+        threading.Event().wait(0.001)
     saved = [stage.worker.save(str(tmp_path)) for _ in range(8)]
+    stage._batches = 0
     runner.join()
     assert saved == [before for before, _ in seen] == [after for _, after in seen]
