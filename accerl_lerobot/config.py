@@ -64,7 +64,10 @@ class LaunchConfig:
     engine: str = "ray"
     """ray: asynchronous workers. local: the same parts in one process, deterministic, for tests."""
     stall_s: float = 300.0
-    """A run in which nothing at all moved for so many seconds ends with an error; > 0."""
+    """How long, in seconds, a worker may owe an answer or a world a step, and a run stand still; > 0.
+
+    A rollout worker is started again then; any other, and a run in which nothing moves, ends with an error.
+    """
 
     def __post_init__(self) -> None:
         if self.engine not in ("ray", "local"):

@@ -91,7 +91,9 @@ def check_new(plans: Sequence[EpisodePlan], outstanding: Container[tuple[str, in
     Raises:
         ValueError: see there.
     """
-    keys = [episode_key(p) for p in plans]
-    again = [key for i, key in enumerate(keys) if key in outstanding or key in keys[:i]]
-    if again:
-        raise ValueError(f"episode {again[0][1]} of {again[0][0]!r} is planned twice")
+    keys: set[tuple[str, int]] = set()
+    for plan in plans:
+        key = episode_key(plan)
+        if key in keys or key in outstanding:
+            raise ValueError(f"episode {plan.index} of {plan.group!r} is planned twice")
+        keys.add(key)

@@ -115,9 +115,10 @@ class RayEngine(Engine):
             mine = plans[seat.index :: len(self._seats)]
             seat.outstanding |= {episode_key(p): p for p in mine}
             seat.unsent += mine
+        self._last_change = time.monotonic()  # whatever the caller did before took its time
 
     def train(self) -> None:
-        self._training = True
+        self._training, self._last_change = True, time.monotonic()
         self._trainer.work = self._trainer.actor.run.remote(self._replay.actor, [self._inference.actor])
 
     def poll(self) -> Progress:
@@ -145,7 +146,9 @@ class RayEngine(Engine):
         return progress
 
     def save(self, directory: Path) -> int:
-        return int(self._trainer.call("save", str(directory.absolute()), timeout=self._limit))
+        version = int(self._trainer.call("save", str(directory.absolute()), timeout=self._limit))
+        self._last_change = time.monotonic()  # the trainer could not move meanwhile
+        return version
 
     def close(self) -> None:
         if self._closed:
@@ -228,7 +231,7 @@ class RayEngine(Engine):
             return
         ended = set(ray.wait(list(works), num_returns=len(works), timeout=0)[0])
         for reference, worker in works.items():
-            if reference in ended:
+            if reference in ended and worker.work is reference:
                 self._ended(worker)
 
     def _ended(self, worker: Watched) -> None:
@@ -258,10 +261,10 @@ class RayEngine(Engine):
     def _finish(self, version: int) -> None:
         """The trainer has made its updates; its records and those of replay are completed."""
         self._done, self._version = True, version
-        self._updates += self._trainer.answer(timeout=self._limit) or []
+        self._updates += self._hear(self._trainer, self._limit) or []
         self._updates += self._trainer.call("metrics", timeout=self._limit)
         self._replay.call("close", timeout=self._limit)
-        self._replay.answer(timeout=self._limit)
+        self._hear(self._replay, self._limit)
         self._replay_metrics = self._replay.call("metrics", timeout=self._limit)
 
     def _listen(self) -> list[EpisodeResult]:
@@ -285,9 +288,9 @@ class RayEngine(Engine):
                         episodes.append(episode)
         return episodes
 
-    def _hear(self, worker: Watched) -> Any:
+    def _hear(self, worker: Watched, timeout: float = 0.0) -> Any:
         try:
-            return worker.answer()
+            return worker.answer(timeout)
         except RayError as error:
             raise RuntimeError(f"{worker.name} worker failed for good:\n{error}") from error
 

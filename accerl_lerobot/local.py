@@ -21,6 +21,7 @@ For tests and debugging. Weights reach the acting policy at once, so the lag com
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from dataclasses import asdict
 from pathlib import Path
@@ -34,6 +35,8 @@ from accerl_lerobot.experience import Request
 from accerl_lerobot.replay import Replay
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutRunner
 from accerl_lerobot.seeds import train_seed
+
+logger = logging.getLogger(__name__)
 
 
 class LocalEngine(Engine):
@@ -105,7 +108,10 @@ class LocalEngine(Engine):
         return self._update.version
 
     def close(self) -> None:
-        self._runner.close()
+        try:
+            self._runner.close()
+        except Exception:
+            logger.exception("could not close all worlds")
 
     @property
     def _exploring(self) -> bool:

@@ -131,6 +131,17 @@ def test_an_episode_cannot_be_planned_twice_while_it_has_no_result(tiny_checkpoi
     engine.close()
 
 
+def test_closing_does_not_hide_why_it_is_called(tiny_checkpoint: Path, caplog: pytest.LogCaptureFixture):
+    engine = LocalEngine(tiny_run(tiny_checkpoint), ("match",))
+
+    def close() -> None:
+        raise OSError("the renderer is gone")
+
+    engine._runner.close = close  # type: ignore[method-assign]
+    engine.close()
+    assert "the renderer is gone" in caplog.text
+
+
 def test_a_nan_from_the_world_is_counted_and_the_run_goes_on(tiny_checkpoint: Path):
     config = tiny_run(tiny_checkpoint, env=SimulatedConfig(max_steps=16, nan_after=21))
     history, _ = train(config)
