@@ -50,15 +50,11 @@ def check_start(config: RunConfig) -> None:
 
         open_metadata(config.dataset)
     if config.sft.init_path is None:
-        from accerl_lerobot.policies.loading import ADAPTERS
+        from accerl_lerobot.policies.loading import check_type, sampler_config
 
         check_sft_policy(config.sft)
-        kind = config.sft.policy["type"]
-        if kind not in ADAPTERS:
-            remedy = (
-                f"RL needs a likelihood, and this type has none here yet; use one of {', '.join(ADAPTERS)}"
-            )
-            raise InputError("sft.policy.type", kind, remedy)
+        kind = check_type(config.sft.policy["type"], "sft.policy.type", "RL needs a likelihood: ")
+        sampler_config(config.policy, kind)
 
 
 def check_sft_policy(config: SFTConfig) -> None:

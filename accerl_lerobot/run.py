@@ -116,6 +116,7 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
             str(resolve_device(config.policy.device)),
             task_texts(meta),
             on_step=lambda step, loss: stage.update(step, f"loss {loss:.3f}"),
+            revision=dataset.revision,
         )
     # From here on the run is one that improves a checkpoint.
     return replace(config, policy=replace(config.policy, path=str(path)), sft=replace(config.sft, steps=0))

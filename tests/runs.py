@@ -24,7 +24,7 @@ from accerl_lerobot.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine import Engine, Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.config import EvaluationConfig
-from accerl_lerobot.policies.loading import PolicyConfig
+from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig

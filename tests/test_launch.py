@@ -193,7 +193,8 @@ def test_what_is_saved_during_training_loads_again(story: Story, tiny_checkpoint
     import torch
     from safetensors.torch import load_file
 
-    from accerl_lerobot.policies.loading import PolicyConfig, load_adapter
+    from accerl_lerobot.policies.config import PolicyConfig
+    from accerl_lerobot.policies.loading import load_adapter
 
     assert 4 <= story.saved <= UPDATES
     weights = load_file(tiny_checkpoint / "model.safetensors")

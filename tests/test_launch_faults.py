@@ -35,7 +35,7 @@ from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
 from accerl_lerobot.launch import RayEngine
-from accerl_lerobot.policies.loading import PolicyConfig
+from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.trainer import worker as trainer_worker
 from accerl_lerobot.trainer.config import TrainerConfig

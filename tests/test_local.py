@@ -27,8 +27,8 @@ from accerl_lerobot.engine import Engine, Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.local import LocalEngine
-from accerl_lerobot.policies.flow import FlowSamplerConfig
-from accerl_lerobot.policies.loading import PolicyConfig
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.samplers import FlowSamplerConfig
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig

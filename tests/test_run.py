@@ -30,7 +30,7 @@ from accerl_lerobot.engine import Engine, Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
-from accerl_lerobot.policies.loading import PolicyConfig
+from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.runs import tiny_run

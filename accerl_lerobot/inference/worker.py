@@ -39,7 +39,7 @@ import numpy as np
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import Batcher
-from accerl_lerobot.policies.loading import PolicyConfig
+from accerl_lerobot.policies.config import PolicyConfig
 
 
 @dataclass(frozen=True, kw_only=True)

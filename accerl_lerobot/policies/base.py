@@ -30,8 +30,7 @@ from torch import Tensor, nn
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Decision, Request
-from accerl_lerobot.policies.processing import Processing
-from accerl_lerobot.policies.value_head import ValueHead
+from accerl_lerobot.policies.value_head import Value
 
 if TYPE_CHECKING:
     from accerl_lerobot.envs.base import WorldSpec
@@ -47,18 +46,18 @@ class Evaluation:
     """(B, L), same factors as `Decision.log_prob`."""
     entropy: Tensor
     """(B,)."""
-    value: Tensor
-    """(B,)."""
+    value: Value
+    """Of B observations."""
+    factors: Tensor | None = None
+    """bool (B, L), False where a factor does not exist, such as a token after the terminator."""
 
 
 class PolicyAdapter(nn.Module, ABC):
-    """One LeRobot policy as a stochastic policy with a critic; one subclass per family of likelihood."""
+    """One policy as the engine sees it: stochastic, with a density and a critic.
 
-    policy: Any
-    """The LeRobot policy; holds the weights that are exported."""
-    processing: Processing
-    """The policy's LeRobot processors."""
-    value_head: ValueHead
+    `adapter.LeRobotAdapter` is the one that runs use; tests have small ones of their own.
+    """
+
     device: torch.device
 
     @abstractmethod
@@ -83,15 +82,11 @@ class PolicyAdapter(nn.Module, ABC):
 
     @abstractmethod
     def trainable(self) -> dict[str, nn.Parameter]:
-        """The parameters the trainer updates and publishes, critic included, by name."""
+        """What the trainer updates and publishes, by name; the critic's begin with ``value_head.``"""
 
-    @abstractmethod
-    def self_check(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> float:
-        """Largest difference between this adapter's sampler without exploration and LeRobot's own.
-
-        Raises:
-            RuntimeError: they are different samplers, as after an incompatible LeRobot upgrade.
-        """
+    def actions(self) -> int | None:
+        """Into how many actions the L factors of a log-prob fall, in order and equally; None: they do not."""
+        return None
 
     def load_trainable(self, tensors: dict[str, np.ndarray]) -> None:
         """Copies published weights in place: all of them, or none when they do not fit.

@@ -30,10 +30,12 @@ is that of the path. Which steps:
           the policy in which *only* the drawn transition is new: E_μ[ρ f(a)] is that policy's E[f(a)], not
           π's. Cheap for large models; the ratio is still 1 at equal weights.
 
-Two noise laws, `FlowSamplerConfig.noise`: ``euler`` keeps the ODE's mean and adds a constant std, so that
+Three noise laws, `FlowSamplerConfig.noise`: ``euler`` keeps the ODE's mean and adds a constant std, so that
 under ``last`` the executed mean is the stock action; it does not preserve the ODE's marginals. ``flow_sde``
 scales the noise with t and corrects the drift, so that under ``all`` it does preserve them, up to the step
-size. Everything here is a pure function of tensors; the velocity is a callable.
+size. ``learned`` keeps the ODE's mean and learns the std within bounds (ReinFlow, arXiv 2505.22094); the
+density of x₀, which the weights do not change, is left out. Everything but `FlowFamily` is a pure function of
+tensors; the velocity is a callable.
 
 Shapes: B batch, K actions per chunk, D = max_action_dim (real dims first, then padding), A real dims,
 N steps, L log-prob factors: one per executed row under ``last``; one per row otherwise, since all rows feed
@@ -43,51 +45,24 @@ back.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import Request
+from accerl_lerobot.policies.family import Action, Encoded, Family, Model, Score, exploring, normal
+from accerl_lerobot.policies.samplers import FlowSamplerConfig
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 """(x (B, K, D), t (B,)) → v (B, K, D)."""
+Std = Callable[[Tensor], Tensor]
+"""t (B,) → std (B, 1, D) of a step that begins there."""
 
 LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
-
-
-@dataclass(frozen=True, kw_only=True)
-class FlowSamplerConfig:
-    """How a flow policy explores; saved with checkpoints, since a stored latent means nothing without it."""
-
-    stochastic: str = "last"
-    """Which denoising steps are Gaussian: last, all or one."""
-    noise: str = "euler"
-    """euler (stock mean, constant std) or flow_sde (marginal-preserving, std grows with t)."""
-    noise_level: float = 0.2
-    """(0, 2]. euler: total injected std in normalised action units. flow_sde: the factor a of
-    σ_t = a·√(t/(1−t))."""
-    padded: str = "joint"
-    """Padded action dims under ``all`` and ``one``: joint (noise in them, counted in the density; the stock
-    sampler as noise → 0) or analytic (overwritten by t·ε_pad after every step: exact given ε_pad and free of
-    untrained velocities' variance, but not the stock sampler). Without effect under ``last``."""
-
-    def __post_init__(self) -> None:
-        choices = {
-            "stochastic": ("last", "all", "one"),
-            "noise": ("euler", "flow_sde"),
-            "padded": ("joint", "analytic"),
-        }
-        for name, allowed in choices.items():
-            if getattr(self, name) not in allowed:
-                raise InputError(
-                    f"policy.sampler.{name}", getattr(self, name), f"use one of {', '.join(allowed)}"
-                )
-        if not 0 < self.noise_level <= 2:
-            raise InputError(
-                "policy.sampler.noise_level", self.noise_level, "use a value in (0, 2]; 0.2 is usual"
-            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,6 +87,14 @@ class FlowShape:
         return mask
 
 
+def integrate(velocity: Velocity, x0: Tensor, shape: FlowShape) -> Tensor:
+    """LeRobot's Euler loop from noise (B, K, D) to actions (B, K, D), padding included."""
+    x, n = x0, shape.num_steps
+    for k in range(n):
+        x = x + (-1.0 / n) * velocity(x, x.new_full((len(x),), step_time(k, n)))
+    return x
+
+
 def factors(shape: FlowShape, config: FlowSamplerConfig) -> int:
     """L. Rows without a density are left out: as constant factors they would dilute means over factors."""
     return shape.executed if config.stochastic == "last" else shape.chunk_size
@@ -123,7 +106,7 @@ def step_time(k: int, num_steps: int) -> float:
 
 
 def transition(
-    x: Tensor, v: Tensor, t: Tensor, shape: FlowShape, config: FlowSamplerConfig
+    x: Tensor, v: Tensor, t: Tensor, shape: FlowShape, config: FlowSamplerConfig, std: Std | None = None
 ) -> tuple[Tensor, Tensor]:
     """Mean and std of one Gaussian denoising step.
 
@@ -131,11 +114,17 @@ def transition(
         x: (B, K, D) at time t.
         v: (B, K, D) velocity there.
         t: (B,) in (0, 1].
+        shape: the sizes.
+        config: the noise law.
+        std: the learnt one, needed under ``learned``.
 
     Returns:
-        mean (B, K, D) and std (B, 1, 1).
+        mean (B, K, D) and std (B, 1, 1) or (B, 1, D).
     """
     delta = 1.0 / shape.num_steps
+    if config.noise == "learned":
+        assert std is not None
+        return x + (-delta) * v, std(t)
     t = t.to(x)[:, None, None]
     ode = x + (-delta) * v
     if config.noise == "euler":
@@ -161,6 +150,7 @@ def sample(
     explore: Tensor,
     shape: FlowShape,
     config: FlowSamplerConfig,
+    std: Std | None = None,
 ) -> tuple[Tensor, dict[str, Tensor], Tensor]:
     """Denoises a batch, some samples exploring and the others by the stock ODE.
 
@@ -181,13 +171,13 @@ def sample(
         t = x0.new_full((x0.shape[0],), step_time(k, n))
         v = velocity(x, t)
         noisy = explore & _is_stochastic(k, index, n, config)
-        mean, std = transition(x, v, t, shape, config)
-        step = torch.where(noisy[:, None, None], mean + std * eps[:, k], x + (-1.0 / n) * v)
+        mean, width = transition(x, v, t, shape, config, std)
+        step = torch.where(noisy[:, None, None], mean + width * eps[:, k], x + (-1.0 / n) * v)
         if config.padded == "analytic" and config.stochastic != "last":
             pad = step_time(k + 1, n) * x0[..., shape.action_dim :]
             overwritten = torch.cat([step[..., : shape.action_dim], pad], -1)
             step = torch.where(explore[:, None, None], overwritten, step)
-        counted = gaussian_log_prob(step, mean, std, _counted(k, mask, shape, config))
+        counted = gaussian_log_prob(step, mean, width, _counted(k, mask, shape, config))
         logp = logp + torch.where(noisy[:, None], counted, 0.0)
         x = step
         path.append(x)
@@ -195,7 +185,11 @@ def sample(
 
 
 def log_prob(
-    velocity: Velocity, latent: dict[str, Tensor], shape: FlowShape, config: FlowSamplerConfig
+    velocity: Velocity,
+    latent: dict[str, Tensor],
+    shape: FlowShape,
+    config: FlowSamplerConfig,
+    std: Std | None = None,
 ) -> Tensor:
     """Log-density of stored latents under the current velocity field, (B, L), differentiable."""
     path, n = latent["path"], shape.num_steps
@@ -206,27 +200,29 @@ def log_prob(
         # Gathered, not computed from `index`: single-precision arithmetic would differ from `step_time` in
         # the last bit, which a sinusoidal time embedding of period 4e-3 turns into a log-prob error of 1e-4.
         t = path.new_tensor([step_time(k, n) for k in range(n)])[index]
-        mean, std = transition(path[:, 0], velocity(path[:, 0], t), t, shape, config)
+        mean, width = transition(path[:, 0], velocity(path[:, 0], t), t, shape, config, std)
         # The last step's density covers executed entries only; earlier ones feed back, so all of them count.
         rows = torch.stack([_counted(k, mask, shape, config) for k in range(n)])[index]
-        return gaussian_log_prob(path[:, 1], mean, std, rows)
+        return gaussian_log_prob(path[:, 1], mean, width, rows)
     if config.stochastic == "last":
         x = path[:, 0]
         for k in range(n - 1):
             x = x + (-1.0 / n) * velocity(x, x.new_full((b,), step_time(k, n)))
         t = x.new_full((b,), step_time(n - 1, n))
-        mean, std = transition(x, velocity(x, t), t, shape, config)
-        return gaussian_log_prob(path[:, 1], mean, std, mask)[:, : factors(shape, config)]
+        mean, width = transition(x, velocity(x, t), t, shape, config, std)
+        return gaussian_log_prob(path[:, 1], mean, width, mask)[:, : factors(shape, config)]
     total = path.new_zeros(b, shape.chunk_size)
     for k in range(n):
         t = path.new_full((b,), step_time(k, n))
-        mean, std = transition(path[:, k], velocity(path[:, k], t), t, shape, config)
-        total = total + gaussian_log_prob(path[:, k + 1], mean, std, _counted(k, mask, shape, config))
+        mean, width = transition(path[:, k], velocity(path[:, k], t), t, shape, config, std)
+        total = total + gaussian_log_prob(path[:, k + 1], mean, width, _counted(k, mask, shape, config))
     return total
 
 
-def entropy(latent: dict[str, Tensor], shape: FlowShape, config: FlowSamplerConfig) -> Tensor:
-    """Differential entropy (B,) of the Gaussian steps that were drawn; the weights do not change it."""
+def entropy(
+    latent: dict[str, Tensor], shape: FlowShape, config: FlowSamplerConfig, std: Std | None = None
+) -> Tensor:
+    """Differential entropy (B,) of the Gaussian steps that were drawn; only ``learned`` weights change it."""
     path, n = latent["path"], shape.num_steps
     b = path.shape[0]
     mask = shape.action_mask().to(path.device)
@@ -234,9 +230,9 @@ def entropy(latent: dict[str, Tensor], shape: FlowShape, config: FlowSamplerConf
     per_step = []
     for k in range(n):
         t = path.new_full((b,), step_time(k, n))
-        _, std = transition(zero, zero, t, shape, config)
-        count = _counted(k, mask, shape, config).sum()
-        per_step.append(count * (torch.log(std[:, 0, 0]) + LOG_SQRT_2PI + 0.5))
+        _, width = transition(zero, zero, t, shape, config, std)
+        each = (torch.log(width) + LOG_SQRT_2PI + 0.5).expand(b, *mask.shape)
+        per_step.append(torch.where(_counted(k, mask, shape, config), each, 0.0).sum((1, 2)))
     steps = torch.stack(per_step, 1)
     if config.stochastic == "all":
         return steps.sum(1)
@@ -270,3 +266,112 @@ def _latent(path: list[Tensor], index: Tensor, config: FlowSamplerConfig) -> dic
     stacked = torch.stack(path, 1)
     rows = torch.arange(len(index), device=index.device)
     return {"path": torch.stack([stacked[rows, index], stacked[rows, index + 1]], 1), "index": index}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlowContext:
+    """`Encoded.context` of a flow model."""
+
+    velocity: Velocity
+    """Conditioned on the observations; output in fp32."""
+
+
+class FlowModel(Model):
+    """A LeRobot policy that denoises a chunk with a velocity field; `Encoded.context` is a `FlowContext`."""
+
+    shape: FlowShape
+
+    @abstractmethod
+    def stock(self, batch: dict[str, Tensor], noise: Tensor) -> Tensor:
+        """LeRobot's own chunk (B, K, A) in normalised units from noise (B, K, D)."""
+
+
+def difference(model: FlowModel, batch: dict[str, Tensor], encoded: Encoded) -> float:
+    """Largest difference between `integrate` and LeRobot's own sampler on equal noise."""
+    shape = model.shape
+    size = (len(encoded.features), shape.chunk_size, shape.padded_dim)
+    x0 = torch.randn(size, generator=torch.Generator().manual_seed(0)).to(encoded.features.device)
+    stock = model.stock(batch, x0.clone())
+    ours = integrate(encoded.context.velocity, x0, shape)
+    return float((ours[..., : shape.action_dim] - stock).abs().max())
+
+
+class NoiseHead(nn.Module):
+    """The std of ``noise=learned``, per observation, step and action dim; starts at `noise_level`.
+
+    Args:
+        width: of the features it reads, without shaping them.
+        shape: how many dims and steps.
+        config: its bounds.
+    """
+
+    def __init__(self, width: int, shape: FlowShape, config: FlowSamplerConfig) -> None:
+        super().__init__()
+        self.steps, self.dims = shape.num_steps, shape.padded_dim
+        self.low, self.high = math.log(config.noise_min), math.log(config.noise_max)
+        self.norm, self.out = nn.LayerNorm(width), nn.Linear(width, self.steps * self.dims)
+        share = (math.log(config.noise_level) - self.low) / (self.high - self.low)
+        nn.init.zeros_(self.out.weight)
+        nn.init.constant_(self.out.bias, math.log(share / (1 - share)))
+
+    def forward(self, encoded: Encoded) -> Std:
+        """The std of each step, given the observations."""
+        weights = encoded.mask / encoded.mask.sum(-1, keepdim=True)
+        pooled = (weights[..., None] * encoded.features.detach().float()).sum(1)
+        raw = self.out(self.norm(pooled)).float().view(-1, self.steps, self.dims)
+        widths = torch.exp(self.low + (self.high - self.low) * torch.sigmoid(raw))
+
+        def std(t: Tensor) -> Tensor:
+            k = ((1 - t) * self.steps).round().long()
+            return widths.gather(1, k[:, None, None].expand(-1, 1, self.dims))
+
+        return std
+
+
+class FlowFamily(Family):
+    """Flow policies explored by noise in their denoising steps; the functions above do the work.
+
+    Args:
+        model: the policy.
+        sampler: how it explores.
+    """
+
+    def __init__(self, model: FlowModel, sampler: FlowSamplerConfig) -> None:
+        super().__init__()
+        self.model, self.sampler, self.shape = model, sampler, model.shape
+        self.noise = NoiseHead(model.width, self.shape, sampler) if sampler.noise == "learned" else None
+
+    def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
+        """See the base class."""
+        x0, eps, index = self._noise(requests, encoded.features.device)
+        explore, shape = exploring(requests, x0.device), self.shape
+        velocity, std = encoded.context.velocity, self._std(encoded)
+        x, latent, log_prob = sample(velocity, x0, eps, index, explore, shape, self.sampler, std)
+        return Action(chunk=x[:, : shape.executed, : shape.action_dim], latent=latent, log_prob=log_prob)
+
+    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
+        """See the base class."""
+        velocity, std = encoded.context.velocity, self._std(encoded)
+        return Score(
+            log_prob=log_prob(velocity, latent, self.shape, self.sampler, std),
+            entropy=entropy(latent, self.shape, self.sampler, std),
+        )
+
+    def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
+        """See the base class."""
+        return difference(self.model, batch, encoded)
+
+    @property
+    def actions(self) -> int:
+        """Every factor is one row of the chunk."""
+        return factors(self.shape, self.sampler)
+
+    def _std(self, encoded: Encoded) -> Std | None:
+        return None if self.noise is None else self.noise(encoded)
+
+    def _noise(self, requests: Sequence[Request], device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+        """x0 (B, K, D), eps (B, N, K, D) and the drawn step (B,), each from its own request's seed."""
+        n, size = self.shape.num_steps, (self.shape.chunk_size, self.shape.padded_dim)
+        x0, eps = normal(requests, size, (n, *size), device=device)
+        index = [np.random.default_rng((r.noise_seed, n)).integers(n) for r in requests]
+        return x0, eps, torch.tensor(index, device=device)

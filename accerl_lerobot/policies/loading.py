@@ -25,20 +25,26 @@ import json
 import logging
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import draccus
 import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
+from torch import nn
 
 from accerl_lerobot.checkpoint import BACKBONE, relocate
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.base import OBS_STATE, PolicyAdapter
-from accerl_lerobot.policies.flow import FlowSamplerConfig
+from accerl_lerobot.policies.adapter import LeRobotAdapter
+from accerl_lerobot.policies.base import OBS_STATE
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.family import Model
 from accerl_lerobot.policies.processing import IMAGES, Processing
-from accerl_lerobot.policies.value_head import ValueHeadConfig
+from accerl_lerobot.policies.samplers import SamplerConfig
+from accerl_lerobot.policies.tuning import merged_state_dict, tune
+from accerl_lerobot.policies.value_head import ValueHead
 
 logger = logging.getLogger(__name__)
 
@@ -46,41 +52,24 @@ CONFIG = "config.json"
 WEIGHTS = "model.safetensors"
 OURS = "accerl.json"
 VALUE_HEAD = "value_head.safetensors"
-FILES = ("*.json", WEIGHTS, "policy_*.safetensors", VALUE_HEAD, f"{BACKBONE}/*")
+FAMILY = "family.safetensors"
+FILES = ("*.json", WEIGHTS, "policy_*.safetensors", VALUE_HEAD, FAMILY, f"{BACKBONE}/*")
 """What is fetched of a checkpoint on the Hub."""
-ADAPTERS = {"smolvla": "accerl_lerobot.policies.smolvla:SmolVLAAdapter"}
-"""LeRobot policy type → adapter class. A further policy of a known family is one line."""
+MODELS = "accerl_lerobot.policies.models"
+POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "smolvla": (f"{MODELS}.smolvla:SmolVLA", ("flow", "noise_space")),
+}
+"""LeRobot policy type → its model, and the families that suit it, the default one first."""
+FAMILIES = {
+    "flow": "accerl_lerobot.policies.flow:FlowFamily",
+    "noise_space": "accerl_lerobot.policies.noise_space:NoiseSpaceFamily",
+}
+"""Family → class; its config is registered under the same name in `samplers`."""
 
 NO_DENSITY = {
     "tdmpc": "it plans by sampling and has no action density; LeRobot trains it with its own RL objective",
     "vqbet": "LeRobot does not return its code log-probs; use smolvla",
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class PolicyConfig:
-    """Which policy is improved, and how it explores."""
-
-    path: str | None = None
-    """Local checkpoint directory or Hub id (``lerobot/smolvla_base``). None: the run's own SFT makes it."""
-    revision: str | None = None
-    """Hub revision."""
-    device: str = "auto"
-    """cpu, cuda, or auto."""
-    sampler: FlowSamplerConfig = field(default_factory=FlowSamplerConfig)
-    value_head: ValueHeadConfig = field(default_factory=ValueHeadConfig)
-    rename_map: dict[str, str] = field(default_factory=dict)
-    """World feature name → policy feature name, as in LeRobot's ``--rename_map``."""
-    num_steps: int | None = None
-    """Denoising steps; None keeps the checkpoint's. Written into what is saved."""
-    n_action_steps: int | None = None
-    """Rows of a chunk that are executed before the next decision; None keeps the checkpoint's."""
-
-    def __post_init__(self) -> None:
-        for name in ("num_steps", "n_action_steps"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise InputError(f"policy.{name}", value, "use at least 1, or null to keep the checkpoint's")
 
 
 def resolve_device(name: str) -> torch.device:
@@ -99,22 +88,47 @@ def resolve_device(name: str) -> torch.device:
         raise InputError("policy.device", name, "use cpu, cuda or auto") from error
 
 
+def check_type(policy_type: Any, field: str, prefix: str = "") -> str:
+    """Refuses a LeRobot policy type that has no likelihood here; `prefix` begins the remedy.
+
+    Raises:
+        InputError: it has none.
+    """
+    if policy_type not in POLICIES:
+        why = NO_DENSITY.get(policy_type, f"no likelihood for it here; use one of {', '.join(POLICIES)}")
+        raise InputError(field, policy_type, prefix + why)
+    return str(policy_type)
+
+
+def sampler_config(config: PolicyConfig, policy_type: str) -> SamplerConfig:
+    """How a policy of this type explores in this run.
+
+    Raises:
+        InputError: the sampler asked for is of a family that does not suit it.
+    """
+    families = POLICIES[policy_type][1]
+    if config.sampler is None:
+        default: SamplerConfig = SamplerConfig.get_choice_class(families[0])()
+        return default
+    if config.sampler.type not in families:
+        remedy = f"a {policy_type} policy explores by {' or '.join(families)}"
+        raise InputError("policy.sampler.type", config.sampler.type, remedy)
+    return config.sampler
+
+
 def load_lerobot_config(config: PolicyConfig) -> Any:
     """The checkpoint's LeRobot policy config, without its weights.
 
     Raises:
         InputError: no checkpoint there, or a policy type without a likelihood here.
     """
-    import draccus
     import lerobot.policies  # noqa: F401  fills the registry of policy types
     from lerobot.configs.policies import PreTrainedConfig
 
     folder = _checkpoint_folder(config)
     try:
         name = json.loads((folder / CONFIG).read_text()).get("type")
-        if name not in ADAPTERS:
-            why = NO_DENSITY.get(name, f"no likelihood for it yet; use one of {', '.join(ADAPTERS)}")
-            raise InputError("policy.type", name, f"{config.path} is of this type: {why}")
+        sampler_config(config, check_type(name, "policy.type", f"{config.path} is of this type: "))
         lerobot_config = PreTrainedConfig.from_pretrained(folder)
     except InputError:
         raise
@@ -122,16 +136,10 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
         remedy = f"its config.json is not one of this LeRobot's policies ({_brief(error)})"
         raise InputError("policy.path", config.path, remedy) from error
     lerobot_config.device = str(resolve_device(config.device))
-    if config.num_steps is not None:
-        lerobot_config.num_steps = config.num_steps
-    if config.n_action_steps is not None:
-        if config.n_action_steps > lerobot_config.chunk_size:
-            remedy = f"use 1 to {lerobot_config.chunk_size}, the chunk the policy predicts"
-            raise InputError("policy.n_action_steps", config.n_action_steps, remedy)
-        lerobot_config.n_action_steps = config.n_action_steps
-    if (folder / BACKBONE).is_dir():
+    _override(lerobot_config, config)
+    if (folder / BACKBONE).is_dir() and hasattr(lerobot_config, "vlm_model_name"):
         lerobot_config.vlm_model_name = str((folder / BACKBONE).resolve())
-    backbone = Path(lerobot_config.vlm_model_name)
+    backbone = Path(getattr(lerobot_config, "vlm_model_name", ""))
     if backbone.is_absolute() and not backbone.is_dir():
         remedy = (
             f"its backbone was in {backbone}, which is gone; put a copy into {BACKBONE}/ beside config.json"
@@ -140,7 +148,7 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     return lerobot_config
 
 
-def load_adapter(config: PolicyConfig) -> PolicyAdapter:
+def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
     """Loads policy, processors and critic; proves that the weights are the file's and the sampler LeRobot's.
 
     Raises:
@@ -156,10 +164,11 @@ def load_adapter(config: PolicyConfig) -> PolicyAdapter:
     except Exception as error:
         raise InputError("policy.path", config.path, f"the weights did not load ({_brief(error)})") from error
     _verify_weights(policy, folder, config)
+    model: Model = _imported(POLICIES[lerobot_config.type][0])(policy)
     device = torch.device(lerobot_config.device)
-    overrides: dict[str, Any] = {"device_processor": {"device": str(device)}}
+    overrides = {"device_processor": {"device": str(device)}, **model.processor_overrides}
     if (folder / BACKBONE).is_dir():
-        overrides["tokenizer_processor"] = {"tokenizer_name": lerobot_config.vlm_model_name}
+        overrides["tokenizer_processor"] = {"tokenizer_name": str((folder / BACKBONE).resolve())}
     try:
         pre, post = make_pre_post_processors(
             lerobot_config, pretrained_path=str(folder), preprocessor_overrides=overrides
@@ -168,34 +177,37 @@ def load_adapter(config: PolicyConfig) -> PolicyAdapter:
         raise InputError(
             "policy.path", config.path, f"its LeRobot processors did not load ({_brief(error)})"
         ) from error
-    module, _, name = ADAPTERS[lerobot_config.type].partition(":")
-    adapter_class = getattr(importlib.import_module(module), name)
     processing = Processing(pre, post, device, config.rename_map)
-    adapter: PolicyAdapter = adapter_class(policy, processing, config.sampler, config.value_head)
+    sampler = sampler_config(config, lerobot_config.type)
+    family = _imported(FAMILIES[sampler.type])(model, sampler)
+    adapter = LeRobotAdapter(
+        policy, processing, model, family, ValueHead(model.width, config.value_head), config.precision
+    )
     if (folder / OURS).is_file():
-        _load_ours(adapter, folder, config)
+        _load_ours(adapter, folder)
     adapter.self_check(*example_observations(lerobot_config, config.rename_map))
+    tune(policy, model, family, config.tuning)
     return adapter
 
 
-def save_pretrained(adapter: PolicyAdapter, directory: Path, config: PolicyConfig) -> None:
-    """Writes LeRobot's ``pretrained_model`` layout plus our sampler options and critic into `directory`."""
+def save_pretrained(adapter: LeRobotAdapter, directory: Path, config: PolicyConfig) -> None:
+    """Writes LeRobot's ``pretrained_model`` layout, and what is ours beside it, into `directory`."""
     directory.mkdir(parents=True, exist_ok=True)
     lerobot_config = adapter.policy.config
-    source = Path(lerobot_config.vlm_model_name)
+    source = Path(getattr(lerobot_config, "vlm_model_name", ""))
     if source.is_absolute() and source.resolve() != (directory / BACKBONE).resolve():
         # The policy's own file holds the backbone's weights, unless LeRobot builds it from the backbone's.
         weights = () if lerobot_config.load_vlm_weights else ("*.safetensors", "*.bin", "*.pt", "*.pth")
         ignore = shutil.ignore_patterns(*weights)
         shutil.copytree(source, directory / BACKBONE, ignore=ignore, dirs_exist_ok=True)
-    adapter.policy.save_pretrained(directory)
+    adapter.policy.save_pretrained(directory, state_dict=merged_state_dict(adapter.policy))
     adapter.processing.preprocessor.save_pretrained(directory)
     adapter.processing.postprocessor.save_pretrained(directory)
     relocate(directory, directory)
-    critic = {k: v.detach().cpu().contiguous() for k, v in adapter.value_head.state_dict().items()}
-    save_file(critic, directory / VALUE_HEAD)
+    _save_module(adapter.value_head, directory / VALUE_HEAD)
+    _save_module(adapter.family, directory / FAMILY)
     ours = {
-        "sampler": asdict(config.sampler),
+        "sampler": draccus.encode(adapter.family.sampler, SamplerConfig),
         "value_head": asdict(config.value_head),
         "rename_map": config.rename_map,
     }
@@ -268,18 +280,20 @@ def _verify_weights(policy: Any, folder: Path, config: PolicyConfig) -> None:
             raise InputError("policy.path", config.path, remedy)
 
 
-def _load_ours(adapter: PolicyAdapter, folder: Path, config: PolicyConfig) -> None:
-    """Loads the critic, and says where this run's options differ from those the checkpoint was made with."""
+def _load_ours(adapter: LeRobotAdapter, folder: Path) -> None:
+    """Loads critic and family, and says where this run's options differ from those they were made with."""
     ours = json.loads((folder / OURS).read_text())
-    there, here = ours.get("sampler", {}), asdict(config.sampler)
+    there = ours.get("sampler", {})
+    here = draccus.encode(adapter.family.sampler, SamplerConfig)
     differing = [k for k in here if k in there and there[k] != here[k]]
     if differing:
         logger.warning(
             "this run explores unlike the one that made the checkpoint (evaluation is not affected): %s",
             ", ".join(f"policy.sampler.{k}={here[k]}, there {there[k]}" for k in differing),
         )
-    there, here = ours.get("value_head", {}), asdict(config.value_head)
-    differing = [k for k in ("pooling", "hidden") if there.get(k) != here[k]]
+    _load_module(adapter.family, folder / FAMILY, "sampler's own weights are", "they start anew")
+    there, here = ours.get("value_head", {}), asdict(adapter.value_head.config)
+    differing = [k for k in ("pooling", "hidden", "bins") if there.get(k, here[k]) != here[k]]
     if differing:
         logger.warning(
             "the checkpoint's critic is not loaded, a new one starts at V = 0: %s",
@@ -287,6 +301,43 @@ def _load_ours(adapter: PolicyAdapter, folder: Path, config: PolicyConfig) -> No
         )
     elif (folder / VALUE_HEAD).is_file():
         adapter.value_head.load_state_dict(load_file(folder / VALUE_HEAD))
+
+
+def _save_module(module: nn.Module, path: Path) -> None:
+    """Its weights as safetensors; no file where it has none."""
+    state = {k: v.detach().cpu().contiguous() for k, v in module.state_dict().items()}
+    if state:
+        save_file(state, path)
+
+
+def _load_module(module: nn.Module, path: Path, what: str, otherwise: str) -> None:
+    state = load_file(path) if path.is_file() else {}
+    mine = module.state_dict()
+    if {k: v.shape for k, v in state.items()} == {k: v.shape for k, v in mine.items()}:
+        module.load_state_dict(state)
+    elif state and mine:
+        logger.warning("the checkpoint's %s not loaded, %s: they are of another shape", what, otherwise)
+
+
+def _override(lerobot_config: Any, config: PolicyConfig) -> None:
+    """Puts a run's choices of denoising steps and executed rows into the LeRobot config."""
+    if config.num_steps is not None:
+        names = [n for n in ("num_steps", "num_inference_steps") if hasattr(lerobot_config, n)]
+        if not names:
+            remedy = f"a {lerobot_config.type} policy does not denoise; leave the field out"
+            raise InputError("policy.num_steps", config.num_steps, remedy)
+        setattr(lerobot_config, names[0], config.num_steps)
+    if config.n_action_steps is not None:
+        chunk = int(getattr(lerobot_config, "chunk_size", 0) or getattr(lerobot_config, "horizon", 1))
+        if config.n_action_steps > chunk:
+            remedy = f"use 1 to {chunk}, the chunk the policy predicts"
+            raise InputError("policy.n_action_steps", config.n_action_steps, remedy)
+        lerobot_config.n_action_steps = config.n_action_steps
+
+
+def _imported(path: str) -> Any:
+    module, _, name = path.partition(":")
+    return getattr(importlib.import_module(module), name)
 
 
 def _brief(error: BaseException) -> str:

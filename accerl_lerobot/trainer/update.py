@@ -166,14 +166,14 @@ class Update:
             observations, tasks = _rows(batch.observations, batch.tasks, rows)
             evaluation = self.adapter.evaluate(observations, tasks, latent)
             if targets is None:
-                targets = self._targets(batch, evaluation.value.detach().cpu(), bootstrap)
-            device = evaluation.value.device
+                targets = self._targets(batch, evaluation.value.mean.detach().cpu(), bootstrap)
+            device = evaluation.log_prob.device
             output = compute_loss(
                 LossInputs(
                     log_prob_new=evaluation.log_prob,
                     log_prob_old=batch.log_prob[rows].to(device),
                     advantage=targets[0][rows].to(device),
-                    value=evaluation.value,
+                    value=evaluation.value.mean,
                     returns=targets[1][rows].to(device),
                     entropy=evaluation.entropy,
                 ),

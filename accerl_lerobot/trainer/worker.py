@@ -31,7 +31,7 @@ from typing import Any
 import ray
 
 from accerl_lerobot.algorithms import AlgorithmConfig
-from accerl_lerobot.policies.loading import PolicyConfig
+from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.weights.ray_channel import RayPublisher
 

@@ -258,7 +258,8 @@ def test_a_moved_checkpoint_is_started_from_a_copy(
     tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     from accerl_lerobot.checkpoint import relocate
-    from accerl_lerobot.policies.loading import PolicyConfig, save_pretrained
+    from accerl_lerobot.policies.config import PolicyConfig
+    from accerl_lerobot.policies.loading import save_pretrained
 
     start = tmp_path / "start"
     save_pretrained(adapter_at(tiny_checkpoint), start, PolicyConfig(path=str(tiny_checkpoint)))

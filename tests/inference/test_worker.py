@@ -27,7 +27,7 @@ import pytest
 from accerl_lerobot.experience import TASK, Decision, Request
 from accerl_lerobot.inference.worker import InferenceConfig, InferenceWorker, ServiceStoppedError
 from accerl_lerobot.policies import loading
-from accerl_lerobot.policies.loading import PolicyConfig
+from accerl_lerobot.policies.config import PolicyConfig
 
 NAMES = ("a", "b", "c")
 

@@ -24,7 +24,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from accerl_lerobot.policies.flow import FlowSamplerConfig, FlowShape
+from accerl_lerobot.policies.flow import FlowShape
+from accerl_lerobot.policies.samplers import FlowSamplerConfig
 
 SlowVelocity = Callable[[np.ndarray, float, int], np.ndarray]
 """(x (K, D), t, which sample of the batch) → v (K, D)."""

@@ -25,7 +25,8 @@ from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.base import check_fit, stack_observations
-from accerl_lerobot.policies.loading import PolicyConfig, load_lerobot_config
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.loading import load_lerobot_config
 from tests.conftest import write_smolvla
 from tests.policies.tiny import requests
 

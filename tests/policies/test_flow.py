@@ -25,7 +25,8 @@ from torch import Tensor
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies import flow
-from accerl_lerobot.policies.flow import FlowSamplerConfig, FlowShape
+from accerl_lerobot.policies.flow import FlowShape
+from accerl_lerobot.policies.samplers import FlowSamplerConfig
 from tests.policies import oracle
 
 SAMPLERS = [

@@ -26,7 +26,8 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.policies import flow
-from accerl_lerobot.policies.flow import FlowSamplerConfig, FlowShape, Velocity
+from accerl_lerobot.policies.flow import FlowShape, Velocity
+from accerl_lerobot.policies.samplers import FlowSamplerConfig
 
 SHAPE = FlowShape(num_steps=3, chunk_size=2, executed=1, padded_dim=3, action_dim=1)
 SAMPLES = 150_000

@@ -22,22 +22,22 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import draccus
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
 from accerl_lerobot.checkpoint import BACKBONE, PRETRAINED, save_checkpoint
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.flow import FlowSamplerConfig
+from accerl_lerobot.policies.config import PolicyConfig, ValueHeadConfig
 from accerl_lerobot.policies.loading import (
-    PolicyConfig,
     example_observations,
     load_adapter,
     load_lerobot_config,
     resolve_device,
     save_pretrained,
 )
-from accerl_lerobot.policies.value_head import ValueHeadConfig
+from accerl_lerobot.policies.samplers import FlowSamplerConfig, SamplerConfig
 from tests.conftest import write_smolvla
 from tests.policies.tiny import adapter_at, perturb, requests
 
@@ -87,11 +87,11 @@ def test_the_folder_above_the_checkpoint(copied: Path):
 @pytest.mark.parametrize(
     ("kind", "why"),
     [
-        ("act", "no likelihood for it yet; use one of smolvla"),
-        ("gaussian_actor", "no likelihood for it yet; use one of smolvla"),
+        ("act", "no likelihood for it here; use one of smolvla"),
+        ("gaussian_actor", "no likelihood for it here; use one of smolvla"),
         ("tdmpc", "it plans by sampling and has no action density"),
         ("vqbet", "LeRobot does not return its code log-probs"),
-        ("my_policy", "no likelihood for it yet; use one of smolvla"),
+        ("my_policy", "no likelihood for it here; use one of smolvla"),
     ],
 )
 def test_a_policy_without_a_likelihood(copied: Path, kind: str, why: str):
@@ -216,7 +216,8 @@ def test_devices(monkeypatch: pytest.MonkeyPatch):
 def test_overridden_steps_are_used_and_saved(tiny_checkpoint: Path, tmp_path: Path):
     path = saved(tiny_checkpoint, tmp_path / "saved", num_steps=2, n_action_steps=3)
     adapter = adapter_at(path)
-    assert (adapter.shape.num_steps, adapter.shape.executed, adapter.shape.chunk_size) == (2, 3, 4)
+    shape = adapter.family.shape
+    assert (shape.num_steps, shape.executed, shape.chunk_size) == (2, 3, 4)
     assert adapter.decide(requests(1), 0)[0].chunk.shape == (3, 2)
 
 
@@ -240,7 +241,7 @@ def test_a_moved_checkpoint_needs_nothing_from_where_it_was_made(tmp_path: Path)
     pre, post = make_pre_post_processors(stock.config, pretrained_path=str(path))
     asked = requests(1, explore=False)
     observation = asked[0].observation
-    noise, _, _ = adapter._noise(asked)
+    noise, _, _ = adapter.family._noise(asked, adapter.device)
     batch = pre(
         {
             "observation.state": torch.from_numpy(observation["observation.state"]),
@@ -340,7 +341,8 @@ def test_another_sampler_is_pointed_out(
 ):
     path = saved(tiny_checkpoint, tmp_path / "saved", sampler=FlowSamplerConfig(noise_level=0.4))
     stored = json.loads((path / "accerl.json").read_text())["sampler"]
-    assert stored == {"stochastic": "last", "noise": "euler", "noise_level": 0.4, "padded": "joint"}
+    assert stored == draccus.encode(FlowSamplerConfig(noise_level=0.4), SamplerConfig)
+    assert stored["type"] == "flow" and stored["noise_level"] == 0.4
     with caplog.at_level(logging.WARNING):
         adapter_at(path, FlowSamplerConfig(noise_level=0.4))
         assert caplog.text == ""

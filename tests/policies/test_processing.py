@@ -20,11 +20,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from accerl_lerobot.policies.base import PolicyAdapter, stack_observations
+from accerl_lerobot.policies.adapter import LeRobotAdapter
+from accerl_lerobot.policies.base import stack_observations
 from tests.policies.tiny import TEXTS, adapter_at, requests
 
 
-def prepared(adapter: PolicyAdapter, count: int = 3) -> tuple[dict, dict]:
+def prepared(adapter: LeRobotAdapter, count: int = 3) -> tuple[dict, dict]:
     observations, tasks = stack_observations(requests(count))
     return observations, adapter.processing.prepare(observations, tasks)
 

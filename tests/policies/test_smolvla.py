@@ -18,6 +18,7 @@ from __future__ import annotations
 import copy
 import itertools
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,10 +27,12 @@ import torch
 
 from accerl_lerobot.experience import Request, Segment
 from accerl_lerobot.policies import flow
-from accerl_lerobot.policies.base import PolicyAdapter, stack_observations
-from accerl_lerobot.policies.flow import FlowSamplerConfig
-from accerl_lerobot.policies.loading import PolicyConfig, save_pretrained
-from accerl_lerobot.policies.value_head import ValueHeadConfig
+from accerl_lerobot.policies.adapter import LeRobotAdapter
+from accerl_lerobot.policies.base import stack_observations
+from accerl_lerobot.policies.config import PolicyConfig, ValueHeadConfig
+from accerl_lerobot.policies.flow import FlowFamily
+from accerl_lerobot.policies.loading import save_pretrained
+from accerl_lerobot.policies.samplers import FlowSamplerConfig
 from accerl_lerobot.rollout.segments import SegmentBuilder
 from tests.conftest import write_smolvla
 from tests.policies import oracle
@@ -60,22 +63,22 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def loaded(path: Path) -> PolicyAdapter:
+def loaded(path: Path) -> LeRobotAdapter:
     return adapter_at(path)
 
 
 @pytest.fixture
-def adapter(loaded: PolicyAdapter) -> PolicyAdapter:
+def adapter(loaded: LeRobotAdapter) -> LeRobotAdapter:
     """One of its own for each test."""
     return copy.deepcopy(loaded)
 
 
-def exploring(adapter: PolicyAdapter, config: FlowSamplerConfig) -> PolicyAdapter:
-    adapter.sampler = config
-    return adapter
+def exploring(adapter: LeRobotAdapter, config: FlowSamplerConfig) -> LeRobotAdapter:
+    family = FlowFamily(adapter.model, config)
+    return LeRobotAdapter(adapter.policy, adapter.processing, adapter.model, family, adapter.value_head)
 
 
-def as_segment(asked: list[Request], adapter: PolicyAdapter, length: int) -> Segment:
+def as_segment(asked: list[Request], adapter: LeRobotAdapter, length: int) -> Segment:
     """Plays requests as one episode, in which each decision is made alone."""
     builder = SegmentBuilder(asked[0].observation, length)
     for i in range(length):
@@ -84,7 +87,7 @@ def as_segment(asked: list[Request], adapter: PolicyAdapter, length: int) -> Seg
 
 
 @pytest.mark.parametrize("config", SAMPLERS, ids=name)
-def test_equal_weights_give_ratio_one_across_batch_sizes(adapter: PolicyAdapter, config: FlowSamplerConfig):
+def test_equal_weights_give_ratio_one_across_batch_sizes(adapter: LeRobotAdapter, config: FlowSamplerConfig):
     adapter, asked = exploring(adapter, config), requests(64)
     together = adapter.decide(asked, 0)
     alone = [adapter.decide([request], 0)[0] for request in asked[:16]]
@@ -97,14 +100,15 @@ def test_equal_weights_give_ratio_one_across_batch_sizes(adapter: PolicyAdapter,
 
 
 @pytest.mark.parametrize("config", SAMPLERS, ids=name)
-def test_other_weights_give_the_oracle_s_ratio(adapter: PolicyAdapter, config: FlowSamplerConfig):
+def test_other_weights_give_the_oracle_s_ratio(adapter: LeRobotAdapter, config: FlowSamplerConfig):
     adapter, asked = exploring(adapter, config), requests(4)
     decisions = adapter.decide(asked, 0)
     latent, old = stored(decisions)
     perturb(adapter, 0.3)
     observations, tasks = stack_observations(asked)
     fields = [
-        adapter._prefix({k: v[i : i + 1] for k, v in observations.items()}, [tasks[i]])[0] for i in range(4)
+        adapter._encode({k: v[i : i + 1] for k, v in observations.items()}, [tasks[i]]).context.velocity
+        for i in range(4)
     ]
 
     def slow(x: np.ndarray, t: float, sample: int) -> np.ndarray:
@@ -112,7 +116,7 @@ def test_other_weights_give_the_oracle_s_ratio(adapter: PolicyAdapter, config: F
             v = fields[sample](torch.from_numpy(x).float()[None], torch.tensor([t], dtype=torch.float32))
         return v[0].numpy().astype(np.float64)
 
-    shape = adapter.shape
+    shape = adapter.family.shape
     index = np.asarray(latent["index"]) if "index" in latent else np.zeros(4, int)
     path_ = np.full((4, shape.num_steps + 1, shape.chunk_size, shape.padded_dim), np.nan)
     if config.stochastic == "all":
@@ -128,7 +132,7 @@ def test_other_weights_give_the_oracle_s_ratio(adapter: PolicyAdapter, config: F
     assert np.abs(change).max() > 0.05, "the weights must have moved the policy"
 
 
-def test_a_decision_does_not_depend_on_its_batch(adapter: PolicyAdapter):
+def test_a_decision_does_not_depend_on_its_batch(adapter: LeRobotAdapter):
     asked = requests(24)
     alone = [adapter.decide([request], 7)[0] for request in asked]
     together = adapter.decide(asked, 7)
@@ -142,7 +146,7 @@ def test_a_decision_does_not_depend_on_its_batch(adapter: PolicyAdapter):
         assert one.log_prob.shape == (3,) and one.log_prob.dtype == np.float32
 
 
-def test_the_same_batch_gives_the_same_decisions_to_the_bit(adapter: PolicyAdapter):
+def test_the_same_batch_gives_the_same_decisions_to_the_bit(adapter: LeRobotAdapter):
     asked = requests(5)
     one, other = adapter.decide(asked, 0), adapter.decide(asked, 0)
     assert pickle.dumps(one) == pickle.dumps(other)
@@ -150,7 +154,7 @@ def test_the_same_batch_gives_the_same_decisions_to_the_bit(adapter: PolicyAdapt
     assert pickle.dumps(adapter.decide(asked, 0)) == pickle.dumps(one), "no global generator is read"
 
 
-def test_seed_observation_and_instruction_all_matter(adapter: PolicyAdapter):
+def test_seed_observation_and_instruction_all_matter(adapter: LeRobotAdapter):
     first = requests(1)[0]
     observation = first.observation
     others = [
@@ -171,7 +175,7 @@ def test_seed_observation_and_instruction_all_matter(adapter: PolicyAdapter):
 
 @pytest.mark.parametrize("config", SAMPLERS, ids=name)
 def test_ratio_one_after_save_and_load_and_a_segment_s_journey(
-    adapter: PolicyAdapter, path: Path, tmp_path: Path, config: FlowSamplerConfig
+    adapter: LeRobotAdapter, path: Path, tmp_path: Path, config: FlowSamplerConfig
 ):
     adapter, asked = exploring(adapter, config), requests(9)
     perturb(adapter, 0.1)
@@ -186,16 +190,16 @@ def test_ratio_one_after_save_and_load_and_a_segment_s_journey(
         )
     ratio = (evaluation.log_prob - torch.from_numpy(segment.log_prob)).sum(1).exp()
     assert (ratio - 1).abs().max() <= TOLERANCE
-    assert np.abs(evaluation.value.numpy() - segment.value).max() <= TOLERANCE
+    assert np.abs(evaluation.value.mean.numpy() - segment.value).max() <= TOLERANCE
     assert np.abs(segment.value).max() > 0, "the critic was saved and loaded, not made anew"
 
 
 @pytest.mark.parametrize("config", SAMPLERS, ids=name)
-def test_not_exploring_is_lerobot_s_own_sampler(adapter: PolicyAdapter, config: FlowSamplerConfig):
+def test_not_exploring_is_lerobot_s_own_sampler(adapter: LeRobotAdapter, config: FlowSamplerConfig):
     adapter, asked = exploring(adapter, config), requests(6, explore=False)
     observations, tasks = stack_observations(asked)
     assert adapter.self_check(observations, tasks) == 0.0
-    noise, _, _ = adapter._noise(asked)
+    noise, _, _ = adapter.family._noise(asked, adapter.device)
     batch = adapter.processing.prepare(observations, tasks)
     stock = adapter.processing.unnormalise(adapter.policy.predict_action_chunk(batch, noise=noise))
     adapter.policy.reset()
@@ -205,25 +209,26 @@ def test_not_exploring_is_lerobot_s_own_sampler(adapter: PolicyAdapter, config: 
     assert np.abs(noisy - chunks).max() > 1e-2
 
 
-def test_the_executed_noise_has_the_configured_size(adapter: PolicyAdapter):
+def test_the_executed_noise_has_the_configured_size(adapter: LeRobotAdapter):
     # Under ``last`` and euler the executed action is the stock one plus N(0, 0.2²) in normalised units;
     # the checkpoint's action std is 0.5.
-    adapter.sampler = FlowSamplerConfig(stochastic="last", noise="euler", noise_level=0.2)
+    adapter = exploring(adapter, FlowSamplerConfig(stochastic="last", noise="euler", noise_level=0.2))
     noisy = np.stack([d.chunk for d in adapter.decide(requests(200), 0)])
     stock = np.stack([d.chunk for d in adapter.decide(requests(200, explore=False), 0)])
     added = (noisy - stock) / 0.5
     assert abs(added.mean()) < 0.02 and added.std() == pytest.approx(0.2, rel=0.06)
 
 
-def test_a_changed_velocity_is_refused(adapter: PolicyAdapter, monkeypatch: pytest.MonkeyPatch):
+def test_a_changed_velocity_is_refused(adapter: LeRobotAdapter, monkeypatch: pytest.MonkeyPatch):
     observations, tasks = stack_observations(requests(2))
-    prefix = adapter._prefix
+    encode = adapter.model.encode
 
-    def tampered(observations, tasks):  # noqa: ANN001, ANN202
-        velocity, value = prefix(observations, tasks)
-        return (lambda x, t: 1.001 * velocity(x, t)), value
+    def tampered(batch):  # noqa: ANN001, ANN202
+        encoded = encode(batch)
+        context = flow.FlowContext(velocity=lambda x, t: 1.001 * encoded.context.velocity(x, t))
+        return replace(encoded, context=context)
 
-    monkeypatch.setattr(adapter, "_prefix", tampered)
+    monkeypatch.setattr(adapter.model, "encode", tampered)
     with pytest.raises(
         RuntimeError, match=r"does not fit LeRobot 0\.6\.1: it differs from its sampler by \d"
     ):
@@ -248,32 +253,36 @@ def test_an_incompatible_lerobot_fails_at_load(path: Path, monkeypatch: pytest.M
         adapter_at(path)
 
 
-def test_weights_that_compute_nan_are_refused(adapter: PolicyAdapter):
+def test_weights_that_compute_nan_are_refused(adapter: LeRobotAdapter):
     with torch.no_grad():
         adapter.policy.model.action_out_proj.bias.fill_(float("nan"))
     with pytest.raises(RuntimeError, match="differs from its sampler by nan"):
         adapter.self_check(*stack_observations(requests(2)))
 
 
-def test_values_are_those_of_evaluate_and_carry_no_gradient(adapter: PolicyAdapter):
+def test_values_are_those_of_evaluate_and_carry_no_gradient(adapter: LeRobotAdapter):
     perturb(adapter, 0.1)
     asked = requests(6)
     observations, tasks = stack_observations(asked)
     latent, _ = stored(adapter.decide(asked, 0))
     values = adapter.values(observations, tasks)
     evaluation = adapter.evaluate(observations, tasks, latent)
-    assert not values.requires_grad and evaluation.value.requires_grad and evaluation.log_prob.requires_grad
-    assert torch.equal(values, evaluation.value.detach()) and values.shape == evaluation.entropy.shape == (6,)
+    assert (
+        not values.requires_grad and evaluation.value.mean.requires_grad and evaluation.log_prob.requires_grad
+    )
+    assert torch.equal(
+        values, evaluation.value.mean.detach()
+    ) and values.shape == evaluation.entropy.shape == (6,)
     assert values.std() > 0
 
 
 @pytest.mark.parametrize("stochastic", ["last", "all", "one"])
-def test_gradients_reach_every_trainable_parameter(adapter: PolicyAdapter, stochastic: str):
+def test_gradients_reach_every_trainable_parameter(adapter: LeRobotAdapter, stochastic: str):
     adapter, asked = exploring(adapter, FlowSamplerConfig(stochastic=stochastic)), requests(8)
     perturb(adapter, 0.1)  # the critic starts at zero, where only its output layer has a gradient
     latent, _ = stored(adapter.decide(asked, 0))
     evaluation = adapter.evaluate(*stack_observations(asked), latent)
-    (evaluation.log_prob.sum() + evaluation.value.sum()).backward()
+    (evaluation.log_prob.sum() + evaluation.value.mean.sum()).backward()
     parameters = adapter.trainable()
     silent = [k for k, p in parameters.items() if p.grad is None or not p.grad.abs().max() > 0]
     assert silent == []
@@ -286,7 +295,7 @@ def test_the_value_loss_reaches_the_backbone_only_when_asked(path: Path, detach:
     perturb(adapter, 0.1)
     asked = requests(4)
     latent, _ = stored(adapter.decide(asked, 0))
-    adapter.evaluate(*stack_observations(asked), latent).value.square().sum().backward()
+    adapter.evaluate(*stack_observations(asked), latent).value.mean.square().sum().backward()
     reached = {k for k, p in adapter.trainable().items() if p.grad is not None and p.grad.abs().max() > 0}
     critic = {k for k in adapter.trainable() if k.startswith("value_head.")}
     assert critic <= reached
@@ -294,7 +303,7 @@ def test_the_value_loss_reaches_the_backbone_only_when_asked(path: Path, detach:
 
 
 @pytest.mark.parametrize("config", [c for c in SAMPLERS if c.padded == "joint"], ids=name)
-def test_log_prob_s_gradient_against_finite_differences(adapter: PolicyAdapter, config: FlowSamplerConfig):
+def test_log_prob_s_gradient_against_finite_differences(adapter: LeRobotAdapter, config: FlowSamplerConfig):
     # fp32: along the gradient itself, where the change is large against rounding.
     adapter, asked = exploring(adapter, config), requests(8)
     decisions = adapter.decide(asked, 0)
@@ -317,7 +326,7 @@ def test_log_prob_s_gradient_against_finite_differences(adapter: PolicyAdapter, 
         assert (scores[0] - scores[1]) / (2 * step) == pytest.approx(norm, rel=0.02), part
 
 
-def test_published_weights_go_round_and_make_the_same_policy(loaded: PolicyAdapter):
+def test_published_weights_go_round_and_make_the_same_policy(loaded: LeRobotAdapter):
     trainer, reader, asked = copy.deepcopy(loaded), copy.deepcopy(loaded), requests(5)
     perturb(trainer, 0.1)
     exported = trainer.export_trainable()
@@ -332,7 +341,7 @@ def test_published_weights_go_round_and_make_the_same_policy(loaded: PolicyAdapt
     assert np.array_equal(exported["value_head.out.bias"], reader.export_trainable()["value_head.out.bias"])
 
 
-def test_weights_that_do_not_fit_change_nothing(adapter: PolicyAdapter):
+def test_weights_that_do_not_fit_change_nothing(adapter: LeRobotAdapter):
     good = adapter.export_trainable()
     moved = {k: v + 1 for k, v in good.items()}
     first = next(iter(moved))
@@ -345,7 +354,7 @@ def test_weights_that_do_not_fit_change_nothing(adapter: PolicyAdapter):
 
 
 def test_training_touches_neither_normalisation_nor_what_lerobot_froze(
-    adapter: PolicyAdapter, path: Path, tmp_path: Path
+    adapter: LeRobotAdapter, path: Path, tmp_path: Path
 ):
     asked = requests(4)
     state = {k: v.clone() for k, v in adapter.policy.state_dict().items()}
@@ -353,7 +362,7 @@ def test_training_touches_neither_normalisation_nor_what_lerobot_froze(
     latent, _ = stored(adapter.decide(asked, 0))
     optimizer = torch.optim.AdamW(trainable.values(), lr=1e-2)
     evaluation = adapter.evaluate(*stack_observations(asked), latent)
-    (evaluation.log_prob.sum() + evaluation.value.sum()).backward()
+    (evaluation.log_prob.sum() + evaluation.value.mean.sum()).backward()
     optimizer.step()
     save_pretrained(adapter, tmp_path / "trained", PolicyConfig(path=str(path), device="cpu"))
     files = sorted(f.name for f in path.glob("policy_*processor*.safetensors"))
@@ -367,7 +376,7 @@ def test_training_touches_neither_normalisation_nor_what_lerobot_froze(
 
 
 @pytest.mark.parametrize("config", [c for c in SAMPLERS if c.stochastic == "last"], ids=name)
-def test_only_executed_entries_are_scored(adapter: PolicyAdapter, config: FlowSamplerConfig):
+def test_only_executed_entries_are_scored(adapter: LeRobotAdapter, config: FlowSamplerConfig):
     adapter, asked = exploring(adapter, config), requests(4)
     decisions = adapter.decide(asked, 0)
     for decision in decisions:
@@ -380,10 +389,12 @@ def test_only_executed_entries_are_scored(adapter: PolicyAdapter, config: FlowSa
 
 
 @pytest.mark.parametrize(("stochastic", "points"), [("last", 2), ("all", 4), ("one", 2)])
-def test_the_latent_is_as_small_as_re_scoring_allows(adapter: PolicyAdapter, stochastic: str, points: int):
+def test_the_latent_is_as_small_as_re_scoring_allows(adapter: LeRobotAdapter, stochastic: str, points: int):
     decision = exploring(adapter, FlowSamplerConfig(stochastic=stochastic)).decide(requests(1), 0)[0]
     assert decision.latent["path"].shape == (points, 5, 4)
 
 
-def test_the_shape_is_the_policy_s(adapter: PolicyAdapter):
-    assert adapter.shape == flow.FlowShape(num_steps=3, chunk_size=5, executed=3, padded_dim=4, action_dim=2)
+def test_the_shape_is_the_policy_s(adapter: LeRobotAdapter):
+    assert adapter.family.shape == flow.FlowShape(
+        num_steps=3, chunk_size=5, executed=3, padded_dim=4, action_dim=2
+    )

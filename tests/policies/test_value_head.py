@@ -19,7 +19,8 @@ import pytest
 import torch
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.value_head import ValueHead, ValueHeadConfig
+from accerl_lerobot.policies.config import ValueHeadConfig
+from accerl_lerobot.policies.value_head import ValueHead
 
 
 def head(**options: object) -> ValueHead:
@@ -38,17 +39,17 @@ def inputs() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_a_new_critic_says_zero():
-    assert torch.equal(ValueHead(6, ValueHeadConfig())(*inputs()), torch.zeros(2))
+    assert torch.equal(ValueHead(6, ValueHeadConfig())(*inputs()).mean, torch.zeros(2))
 
 
 @pytest.mark.parametrize("pooling", ["attention", "mean"])
 def test_padding_is_not_read(pooling: str):
     critic, (features, mask) = head(pooling=pooling), inputs()
-    value = critic(features, mask)
+    value = critic(features, mask).mean
     assert value.shape == (2,) and value.std() > 0
     other = torch.where(mask[..., None], features, 100.0)
-    assert torch.equal(critic(other, mask), value)
-    alone = critic(features[1:, :2], mask[1:, :2])
+    assert torch.equal(critic(other, mask).mean, value)
+    alone = critic(features[1:, :2], mask[1:, :2]).mean
     assert torch.allclose(alone, value[1:], atol=1e-6)
 
 
@@ -56,12 +57,12 @@ def test_mean_pooling_by_hand_and_attention_that_differs():
     (features, mask), mean, attention = inputs(), head(pooling="mean"), head(pooling="attention")
     pooled = torch.stack([features[0, :3].mean(0), features[1, :2].mean(0)])
     expected = mean.out(torch.relu(mean.hidden(mean.norm(pooled))))[:, 0]
-    assert torch.allclose(mean(features, mask), expected, atol=1e-6)
+    assert torch.allclose(mean(features, mask).mean, expected, atol=1e-6)
     assert attention.query is not None
     scores = features[1, :2] @ attention.query / 6**0.5
     pooled = (torch.softmax(scores, 0)[:, None] * features[1, :2]).sum(0)
     expected = attention.out(torch.relu(attention.hidden(attention.norm(pooled))))[0]
-    assert torch.allclose(attention(features, mask)[1], expected, atol=1e-5)
+    assert torch.allclose(attention(features, mask).mean[1], expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("detach", [True, False])
@@ -69,14 +70,14 @@ def test_detach(detach: bool):
     features, mask = inputs()
     features.requires_grad_()
     critic = head(detach=detach)
-    critic(features, mask).sum().backward()
+    critic(features, mask).mean.sum().backward()
     assert all(p.grad is not None and p.grad.abs().max() > 0 for p in critic.parameters())
     assert (features.grad is None) == detach
 
 
 def test_half_precision_features_are_read_in_full():
     features, mask = inputs()
-    assert head()(features.bfloat16(), mask).dtype == torch.float32
+    assert head()(features.bfloat16(), mask).mean.dtype == torch.float32
 
 
 @pytest.mark.parametrize(("name", "value"), [("pooling", "max"), ("hidden", 0)])

@@ -24,9 +24,11 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.experience import TASK, Decision, Request
+from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import PolicyAdapter, stack_observations
-from accerl_lerobot.policies.flow import FlowSamplerConfig
-from accerl_lerobot.policies.loading import PolicyConfig, load_adapter
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.loading import load_adapter
+from accerl_lerobot.policies.samplers import SamplerConfig
 
 TEXTS = ("Match the target", "Go", "Mirror the target slowly, then stay")
 """Of different lengths, so that a batch pads some of them."""
@@ -48,8 +50,7 @@ def requests(count: int, *, explore: bool = True, seed: int = 0) -> list[Request
     ]
 
 
-def adapter_at(path: Path, sampler: FlowSamplerConfig | None = None, **options: Any) -> PolicyAdapter:
-    sampler = sampler or FlowSamplerConfig()
+def adapter_at(path: Path, sampler: SamplerConfig | None = None, **options: Any) -> LeRobotAdapter:
     return load_adapter(PolicyConfig(path=str(path), device="cpu", sampler=sampler, **options))
 
 

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 from accerl_lerobot.experience import Decision, Request, Segment
 from accerl_lerobot.policies.base import Evaluation, PolicyAdapter
+from accerl_lerobot.policies.value_head import Value
 
 STATE = "observation.state"
 STD = 0.5
@@ -52,7 +53,8 @@ class LinearAdapter(PolicyAdapter):
         state = torch.from_numpy(observations[STATE])
         z = (latent["x"] - state @ self.weight.T) / STD
         entropy = torch.zeros(len(state))
-        return Evaluation(log_prob=-0.5 * z * z, entropy=entropy, value=self.value_head(state)[:, 0])
+        value = Value(mean=self.value_head(state)[:, 0])
+        return Evaluation(log_prob=-0.5 * z * z, entropy=entropy, value=value)
 
     @torch.no_grad()
     def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
@@ -62,9 +64,6 @@ class LinearAdapter(PolicyAdapter):
     def trainable(self) -> dict[str, nn.Parameter]:
         critic = {f"value_head.{k}": p for k, p in self.value_head.named_parameters()}
         return {"policy.weight": self.weight, **critic}
-
-    def self_check(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> float:
-        return 0.0
 
     def copy(self) -> dict[str, Tensor]:
         """The weights as they are now."""

@@ -25,7 +25,7 @@ import pytest
 from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies import loading
-from accerl_lerobot.policies.loading import PolicyConfig
+from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.trainer import worker as module
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.worker import TrainerWorker

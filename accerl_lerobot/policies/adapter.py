@@ -1,0 +1,156 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A LeRobot policy with its processors, a likelihood and a critic."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from accerl_lerobot.experience import Decision, Request
+from accerl_lerobot.policies.base import Evaluation, PolicyAdapter, stack_observations
+from accerl_lerobot.policies.family import Encoded, Family, Model
+from accerl_lerobot.policies.processing import Processing
+from accerl_lerobot.policies.value_head import Value, ValueHead
+
+SELF_CHECK_TOLERANCE = 1e-5
+"""Largest difference, in normalised action units, between our sampler and LeRobot's; fp32 noise is 1e-6."""
+
+
+class LeRobotAdapter(PolicyAdapter):
+    """Puts a model and a family together.
+
+    Args:
+        policy: the LeRobot policy; holds the weights that are exported.
+        processing: its LeRobot processors.
+        model: runs `policy`.
+        family: samples and scores.
+        value_head: the critic.
+        precision: fp32, or bf16 for the network under autocast. Densities are computed in fp32 either way.
+    """
+
+    def __init__(
+        self,
+        policy: Any,
+        processing: Processing,
+        model: Model,
+        family: Family,
+        value_head: ValueHead,
+        precision: str = "fp32",
+    ) -> None:
+        super().__init__()
+        self.policy, self.processing, self.model = policy, processing, model
+        self.device = next(policy.parameters()).device
+        self.family, self.value_head = family.to(self.device), value_head.to(self.device)
+        self.precision = precision
+        self.policy.eval()
+
+    @torch.no_grad()
+    def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
+        """See the base class; each decision's noise is its own request's, whatever batch it lands in."""
+        arrays, tasks = stack_observations(requests)
+        with self._autocast():
+            encoded = self._encode(arrays, tasks)
+            action = self.family.act(encoded, requests)
+        value = self._value(encoded).mean.cpu().numpy()
+        chunk = self.processing.unnormalise(action.chunk.float()).cpu().numpy()
+        latent = {k: v.cpu().numpy() for k, v in action.latent.items()}
+        log_prob = action.log_prob.float().cpu().numpy()
+        return [
+            Decision(
+                chunk=chunk[i],
+                latent={k: v[i] for k, v in latent.items()},
+                log_prob=log_prob[i],
+                value=float(value[i]),
+                version=version,
+            )
+            for i in range(len(requests))
+        ]
+
+    def evaluate(
+        self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
+    ) -> Evaluation:
+        """See the base class."""
+        with self._autocast():
+            encoded = self._encode(observations, tasks)
+            score = self.family.score(encoded, {k: v.to(self.device) for k, v in latent.items()})
+        return Evaluation(
+            log_prob=score.log_prob,
+            entropy=score.entropy,
+            value=self._value(encoded),
+            factors=score.factors,
+        )
+
+    @torch.no_grad()
+    def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
+        """See the base class."""
+        with self._autocast():
+            encoded = self._encode(observations, tasks)
+        return self._value(encoded).mean
+
+    def trainable(self) -> dict[str, nn.Parameter]:
+        """See the base class; `tuning` has decided what of the policy that is."""
+        parts = {"policy": self.policy, "family": self.family, "value_head": self.value_head}
+        return {
+            f"{part}.{name}": parameter
+            for part, module in parts.items()
+            for name, parameter in module.named_parameters()
+            if parameter.requires_grad
+        }
+
+    def actions(self) -> int | None:
+        """See the base class."""
+        return self.family.actions
+
+    @torch.no_grad()
+    def self_check(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> float:
+        """Largest difference between our sampler without exploration and LeRobot's own on equal noise.
+
+        Raises:
+            RuntimeError: above `SELF_CHECK_TOLERANCE`, or LeRobot's internals have changed.
+        """
+        try:
+            batch = self.processing.prepare(observations, tasks)
+            difference = self.family.difference(batch, self.model.encode(batch))
+        except (AttributeError, ImportError, KeyError, TypeError) as error:
+            raise self._incompatible(f"cannot drive it ({type(error).__name__}: {error})") from error
+        self.policy.reset()
+        if not difference <= SELF_CHECK_TOLERANCE:
+            raise self._incompatible(f"differs from its sampler by {difference:.2e}")
+        return difference
+
+    def _encode(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Encoded:
+        return self.model.encode(self.processing.prepare(observations, tasks))
+
+    def _value(self, encoded: Encoded) -> Value:
+        value: Value = self.value_head(encoded.features, encoded.mask)
+        return value
+
+    def _autocast(self) -> contextlib.AbstractContextManager[Any]:
+        if self.precision == "fp32":
+            return contextlib.nullcontext()
+        return torch.autocast(self.device.type, torch.bfloat16)
+
+    def _incompatible(self, what: str) -> RuntimeError:
+        import lerobot
+
+        return RuntimeError(
+            f"our adapter of {self.policy.name} does not fit LeRobot {lerobot.__version__}: it {what}, so "
+            "log-probs would be those of another policy; install the LeRobot version that this package pins"
+        )

@@ -1,0 +1,130 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The two halves of an adapter: a *model* runs one LeRobot policy type, a *family* gives it a likelihood.
+
+    observations ──processors──► batch ──Model.encode──► Encoded ──Family.act──► chunk, latent, log-prob
+                                                            └──────Family.score(latent) ──► log-prob
+
+A model knows LeRobot's internals and nothing of densities; a family knows densities and asks the model for
+what its `Encoded.context` offers, a velocity field for instance. `loading.POLICIES` says which go together.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from accerl_lerobot.experience import Request
+
+
+@dataclass(frozen=True, kw_only=True)
+class Encoded:
+    """A batch of B observations, read once by the network."""
+
+    features: Tensor
+    """(B, P, width), what the critic reads."""
+    mask: Tensor
+    """bool (B, P), True where a feature is of something real."""
+    context: Any
+    """What the family samples from; each family's file says what that is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Action:
+    """What a family answers for a batch."""
+
+    chunk: Tensor
+    """(B, K, A), K executed actions in the policy's normalised units."""
+    latent: dict[str, Tensor]
+    """Each (B, ...): what was sampled, all that `Family.score` needs beside the observations."""
+    log_prob: Tensor
+    """(B, L); zero where not exploring."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Score:
+    """Stored latents under the current weights."""
+
+    log_prob: Tensor
+    """(B, L), differentiable."""
+    entropy: Tensor
+    """(B,)."""
+    factors: Tensor | None = None
+    """See `base.Evaluation`."""
+
+
+class Model(ABC):
+    """One LeRobot policy type; holds the policy and no weights of its own.
+
+    Raises:
+        InputError: an option of this checkpoint would make its density wrong.
+    """
+
+    backbone: ClassVar[str | None] = None
+    """Prefix of the parameters that ``policy.tuning.mode=expert`` freezes; None: it has no expert."""
+    processor_overrides: ClassVar[dict[str, dict[str, Any]]] = {}
+    """LeRobot processor step → options that its inference needs and its training does not."""
+
+    policy: Any
+    width: int
+    """Of the features."""
+
+    @abstractmethod
+    def encode(self, batch: dict[str, Tensor]) -> Encoded:
+        """Reads a preprocessed batch."""
+
+
+class Family(nn.Module, ABC):
+    """One way of acting at random with a known density; may own parameters, which are trained."""
+
+    frozen: ClassVar[bool] = False
+    """True: only the family's own parameters are trained, never the policy's."""
+
+    @abstractmethod
+    def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
+        """Samples; where a request does not explore, LeRobot's own sampler."""
+
+    @abstractmethod
+    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
+        """Re-scores what `act` stored."""
+
+    @abstractmethod
+    def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
+        """Largest difference, in normalised units, between our sampler at rest and LeRobot's own."""
+
+    @property
+    @abstractmethod
+    def actions(self) -> int | None:
+        """See `base.PolicyAdapter.actions`."""
+
+
+def normal(requests: Sequence[Request], *sizes: tuple[int, ...], device: torch.device) -> list[Tensor]:
+    """Standard normal tensors, each (B, *size), row i from request i's own seed, whatever its batch."""
+    columns: list[list[np.ndarray]] = [[] for _ in sizes]
+    for request in requests:
+        rng = np.random.default_rng(request.noise_seed)
+        for column, size in zip(columns, sizes, strict=True):
+            column.append(rng.standard_normal(size, dtype=np.float32))
+    return [torch.from_numpy(np.stack(column)).to(device) for column in columns]
+
+
+def exploring(requests: Sequence[Request], device: torch.device) -> Tensor:
+    """bool (B,)."""
+    return torch.tensor([r.explore for r in requests], device=device)

@@ -1,0 +1,109 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Steering a frozen flow policy by its initial noise (DSRL, Wagenmaker et al., arXiv 2506.15799).
+
+The policy's Euler loop maps noise to actions and is left as it is; what acts at random, and is learnt, is a
+small head that says which noise to start from, z ~ N(m(o), s(o)²). Its density is a Gaussian's, so the ratio
+is exact, costs no velocity pass to re-score, and every objective here applies; the paper uses SAC instead.
+
+What is learnt lies beside the checkpoint in ``family.safetensors``; stock LeRobot loads the frozen policy
+without it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from accerl_lerobot.experience import Request
+from accerl_lerobot.policies import flow
+from accerl_lerobot.policies.family import Action, Encoded, Family, Score, exploring, normal
+from accerl_lerobot.policies.samplers import NoiseSpaceSamplerConfig
+
+
+class NoiseSpaceFamily(Family):
+    """A Gaussian over the noise a flow policy starts from.
+
+    Args:
+        model: the frozen policy.
+        sampler: bounds of the Gaussian.
+    """
+
+    frozen = True
+
+    def __init__(self, model: flow.FlowModel, sampler: NoiseSpaceSamplerConfig) -> None:
+        super().__init__()
+        self.model, self.sampler, self.shape = model, sampler, model.shape
+        self.rows = self.shape.chunk_size if sampler.per_row else 1
+        size = self.rows * self.shape.padded_dim
+        self.norm = nn.LayerNorm(model.width)
+        self.hidden = nn.Linear(model.width, sampler.hidden)
+        self.mean = nn.Linear(sampler.hidden, size)
+        self.width = nn.Linear(sampler.hidden, size)
+        for layer in (self.mean, self.width):
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
+        self.low, self.high = math.log(sampler.std_min), math.log(sampler.std_max)
+        share = (math.log(sampler.std) - self.low) / (self.high - self.low)
+        nn.init.constant_(self.width.bias, math.log(share / (1 - share)))
+
+    def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
+        """See the base class; at rest it starts from the mean, see `NoiseSpaceSamplerConfig.at_rest`."""
+        mean, std = self._gaussian(encoded)
+        shape, size = self.shape, tuple(mean.shape[1:])
+        (eps,) = normal(requests, size, device=mean.device)
+        explore = exploring(requests, mean.device)
+        noisy = explore | (self.sampler.at_rest == "sample")
+        z = torch.where(noisy[:, None, None], mean + std * eps, mean)
+        x = flow.integrate(encoded.context.velocity, z.expand(-1, shape.chunk_size, -1), shape)
+        return Action(
+            chunk=x[:, : shape.executed, : shape.action_dim],
+            latent={"z": z},
+            log_prob=torch.where(explore[:, None], _log_prob(z, mean, std), 0.0),
+        )
+
+    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
+        """See the base class."""
+        mean, std = self._gaussian(encoded)
+        entropy = (torch.log(std) + flow.LOG_SQRT_2PI + 0.5).sum((1, 2))
+        return Score(log_prob=_log_prob(latent["z"], mean, std), entropy=entropy)
+
+    def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
+        """See the base class: the frozen policy is the one LeRobot runs."""
+        return flow.difference(self.model, batch, encoded)
+
+    @property
+    def actions(self) -> int:
+        """One factor per row of noise."""
+        return self.rows
+
+    def _gaussian(self, encoded: Encoded) -> tuple[Tensor, Tensor]:
+        """Mean and std of z, each (B, rows, D)."""
+        weights = encoded.mask / encoded.mask.sum(-1, keepdim=True)
+        pooled = (weights[..., None] * encoded.features.float()).sum(1)
+        hidden = torch.relu(self.hidden(self.norm(pooled)))
+        size = (-1, self.rows, self.shape.padded_dim)
+        bound = self.sampler.bound
+        mean = bound * torch.tanh(self.mean(hidden).float() / bound)
+        width = self.low + (self.high - self.low) * torch.sigmoid(self.width(hidden).float())
+        return mean.view(size), torch.exp(width).view(size)
+
+
+def _log_prob(z: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """(B, rows), summed over dims; padded ones act on the others, so they are part of the choice."""
+    unit = (z - mean) / std
+    return (-0.5 * unit * unit - torch.log(std) - flow.LOG_SQRT_2PI).sum(-1)

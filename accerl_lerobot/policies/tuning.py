@@ -1,0 +1,83 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Which of a policy's weights are trained, and how low-rank adapters become plain weights again."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from torch import Tensor, nn
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.config import TuningConfig
+from accerl_lerobot.policies.family import Family, Model
+
+
+def tune(policy: Any, model: Model, family: Family, config: TuningConfig) -> None:
+    """Sets what is trainable in `policy`; puts low-rank adapters in, for ``lora``.
+
+    Raises:
+        InputError: the policy has no expert, or ``lora`` targets nothing in it.
+    """
+    if family.frozen:
+        if config.mode not in ("checkpoint", "full"):
+            remedy = "this sampler leaves the whole policy as it is; leave the field out"
+            raise InputError("policy.tuning.mode", config.mode, remedy)
+        policy.requires_grad_(False)
+    elif config.mode == "full":
+        policy.requires_grad_(True)
+    elif config.mode == "expert":
+        if model.backbone is None:
+            remedy = f"{policy.name} has no action expert apart from a backbone; use full or lora"
+            raise InputError("policy.tuning.mode", "expert", remedy)
+        for name, parameter in policy.named_parameters():
+            parameter.requires_grad_(not name.startswith(model.backbone))
+    elif config.mode == "lora":
+        _inject(policy, config)
+
+
+def merged_state_dict(policy: nn.Module) -> dict[str, Tensor] | None:
+    """The weights with low-rank adapters added in, under their plain names; None where there are none."""
+    if not any(".lora_" in name for name, _ in policy.named_parameters()):
+        return None
+    from peft.tuners.lora import Linear
+
+    layers = {name: m for name, m in policy.named_modules() if isinstance(m, Linear)}
+    state = {k: v for k, v in policy.state_dict().items() if ".lora_" not in k}
+    for name, layer in layers.items():
+        weight = state[f"{name}.base_layer.weight"]
+        state[f"{name}.base_layer.weight"] = weight + layer.get_delta_weight("default").to(weight)
+    return {k.replace(".base_layer.", "."): v.detach().cpu().contiguous() for k, v in state.items()}
+
+
+def _inject(policy: Any, config: TuningConfig) -> None:
+    from peft import LoraConfig, inject_adapter_in_model
+
+    targets = config.targets or (policy._get_default_peft_targets() or {}).get("target_modules")
+    if targets is None:
+        remedy = f"LeRobot names no default for {policy.name}; give a regular expression of module names"
+        raise InputError("policy.tuning.targets", None, remedy)
+    linear = [name for name, module in policy.named_modules() if isinstance(module, nn.Linear)]
+    try:
+        matching = [name for name in linear if re.fullmatch(targets, name)]
+    except re.error as error:
+        raise InputError("policy.tuning.targets", targets, f"not a regular expression: {error}") from error
+    if not matching:
+        some = ", ".join(linear[:: max(1, len(linear) // 3)][:3])
+        remedy = f"matches none of the policy's {len(linear)} linear layers, such as {some}"
+        raise InputError("policy.tuning.targets", targets, remedy)
+    policy.requires_grad_(False)
+    lora = LoraConfig(r=config.rank, lora_alpha=config.alpha, target_modules=matching, lora_dropout=0.0)
+    inject_adapter_in_model(lora, policy)
