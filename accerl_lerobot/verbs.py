@@ -224,7 +224,7 @@ def _write_evaluation(out: Path, summary: dict[str, Any], results: list[EpisodeR
         if result.frames:
             outcome = "success" if result.success else "failure"
             name = f"{result.plan.task.replace('/', '-')}_{result.plan.seed}_{outcome}.mp4"
-            write_video(out / name, [result.frames], fps=20)
+            write_video(out / name, [[result.frames]], fps=20)
 
 
 def _discard_unused(directory: Path) -> None:
