@@ -164,7 +164,7 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
     except Exception as error:
         raise InputError("policy.path", config.path, f"the weights did not load ({_brief(error)})") from error
     _verify_weights(policy, folder, config)
-    model: Model = _imported(POLICIES[lerobot_config.type][0])(policy)
+    model: Model = imported(POLICIES[lerobot_config.type][0])(policy)
     device = torch.device(lerobot_config.device)
     overrides = {"device_processor": {"device": str(device)}, **model.processor_overrides}
     if (folder / BACKBONE).is_dir():
@@ -179,7 +179,7 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
         ) from error
     processing = Processing(pre, post, device, config.rename_map)
     sampler = sampler_config(config, lerobot_config.type)
-    family = _imported(FAMILIES[sampler.type])(model, sampler)
+    family = imported(FAMILIES[sampler.type])(model, sampler)
     adapter = LeRobotAdapter(
         policy, processing, model, family, ValueHead(model.width, config.value_head), config.precision
     )
@@ -335,7 +335,8 @@ def _override(lerobot_config: Any, config: PolicyConfig) -> None:
         lerobot_config.n_action_steps = config.n_action_steps
 
 
-def _imported(path: str) -> Any:
+def imported(path: str) -> Any:
+    """What an entry of `POLICIES` or `FAMILIES` names."""
     module, _, name = path.partition(":")
     return getattr(importlib.import_module(module), name)
 
