@@ -146,7 +146,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--policy.rename_map=3"], "policy.rename_map=3: use a mapping such as {key: value}"),
     (["--wandb.enable=perhaps"], "wandb.enable='perhaps': use true or false"),
     (["--env.task=[a]"], "env.task=['a']: use text"),
-    (["--algorithm.level=token"], "algorithm.level='token': use one of action, chunk"),
+    (["--algorithm.level=row"], "algorithm.level='row': use one of token, action, chunk"),
     (["--algorithm.type=gippo"], "algorithm.type='gippo': did you mean gipo? Otherwise use one of gipo, ppo"),
     (["--algorithm.sigma=0"], "algorithm.sigma=0.0: use a number above 0"),
     (["--env.type=mujoco"], "env.type='mujoco': use one of lerobot, metaworld, simulated"),

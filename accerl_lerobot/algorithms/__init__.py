@@ -30,7 +30,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from accerl_lerobot.algorithms.contract import AlgorithmConfig, Level, LossInputs, LossOutput
+from accerl_lerobot.algorithms.contract import AlgorithmConfig, Level, LossInputs, LossOutput, check_level
 from accerl_lerobot.algorithms.gipo import GIPOConfig, gipo_loss
 from accerl_lerobot.algorithms.ppo import PPOConfig, ppo_loss
 
@@ -58,6 +58,7 @@ __all__ = [
     "LossInputs",
     "LossOutput",
     "PPOConfig",
+    "check_level",
     "compute_loss",
     "gipo_loss",
     "ppo_loss",

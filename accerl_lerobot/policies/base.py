@@ -61,6 +61,23 @@ class PolicyAdapter(nn.Module, ABC):
     value_head: ValueHead
     device: torch.device
 
+    @property
+    @abstractmethod
+    def actions(self) -> int | None:
+        """Into how many equal groups of consecutive log-prob factors the L fall, one per action of the chunk.
+
+        None if they do not align with actions: ratios per action are refused then.
+        """
+
+    def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
+        """bool (B, L), False for log-prob factors that a latent does not have, such as tokens after the
+        terminator; None if all latents have all of them.
+
+        Args:
+            latent: each (B, ...), as `decide` returned them.
+        """
+        return None
+
     @abstractmethod
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
         """Acts on a batch, without gradient. Answers in the order of the requests."""

@@ -87,6 +87,11 @@ class SmolVLAAdapter(PolicyAdapter):
         self.value_head = ValueHead(width, value_head).to(self.device)
         self.policy.eval()
 
+    @property
+    def actions(self) -> int:
+        """See the base class; a factor is a row of the chunk."""
+        return flow.factors(self.shape, self.sampler)
+
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
         """See the base class; each decision's noise is its own request's, whatever batch it lands in."""
         arrays, tasks = stack_observations(requests)

@@ -25,60 +25,21 @@ Shapes: S segments, T decisions of the longest one, N decisions in all.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from accerl_lerobot.algorithms import AlgorithmConfig, LossInputs, compute_loss
+from accerl_lerobot.algorithms import AlgorithmConfig, LossInputs, check_level, compute_loss
 from accerl_lerobot.algorithms.diagnostics import lag_metrics
 from accerl_lerobot.algorithms.gae import decision_mask, gae
 from accerl_lerobot.algorithms.normalise import moments, normalise
+from accerl_lerobot.algorithms.ratio import present
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.base import PolicyAdapter
+from accerl_lerobot.trainer.batch import Batch, collate, pick, split
 from accerl_lerobot.trainer.config import TrainerConfig
-
-
-@dataclass(frozen=True, kw_only=True)
-class Batch:
-    """Segments laid end to end: N rows of decisions, plus one bootstrap observation per segment."""
-
-    observations: dict[str, np.ndarray]
-    """Each (N, ...)."""
-    tasks: list[str]
-    latent: dict[str, Tensor]
-    """Each (N, ...)."""
-    log_prob: Tensor
-    """(N, L) of the behaviour policy."""
-    reward: Tensor
-    """(N,)."""
-    version: np.ndarray
-    """int64 (N,)."""
-    lengths: Tensor
-    """int64 (S,)."""
-    terminated: Tensor
-    """bool (S,)."""
-    last_observations: dict[str, np.ndarray]
-    """Each (S, ...)."""
-    segment_tasks: list[str]
-
-
-def collate(segments: Sequence[Segment]) -> Batch:
-    """Lays segments end to end."""
-    keys, names = segments[0].observations.keys(), segments[0].latent.keys()
-    return Batch(
-        observations={k: np.concatenate([s.observations[k][:-1] for s in segments]) for k in keys},
-        tasks=[s.task for s in segments for _ in range(len(s))],
-        latent={k: torch.from_numpy(np.concatenate([s.latent[k] for s in segments])) for k in names},
-        log_prob=torch.from_numpy(np.concatenate([s.log_prob for s in segments])),
-        reward=torch.from_numpy(np.concatenate([s.reward for s in segments])),
-        version=np.concatenate([s.version for s in segments]),
-        lengths=torch.tensor([len(s) for s in segments]),
-        terminated=torch.tensor([s.terminated for s in segments]),
-        last_observations={k: np.stack([s.observations[k][-1] for s in segments]) for k in keys},
-        segment_tasks=[s.task for s in segments],
-    )
 
 
 class NonFiniteError(RuntimeError):
@@ -95,6 +56,7 @@ class Update:
     """
 
     def __init__(self, adapter: PolicyAdapter, algorithm: AlgorithmConfig, config: TrainerConfig) -> None:
+        check(algorithm, adapter)
         self.adapter, self.algorithm, self.config = adapter, algorithm, config
         self.version = 0
         self.skipped = 0
@@ -154,36 +116,40 @@ class Update:
 
     def _backward(self, batch: Batch) -> dict[str, float]:
         """Accumulates gradients over micro-batches; returns metrics weighted by their decisions."""
-        n = len(batch.reward)
-        chunks = np.split(np.arange(n), range(self.config.micro_batch, n, self.config.micro_batch))
+        parts = split(np.arange(len(batch)), self.config.micro_batch)
         bootstrap = self._values(batch.last_observations, batch.segment_tasks)
         targets: tuple[Tensor, Tensor] | None = None
-        if len(chunks) > 1:  # a single micro-batch supplies the values that GAE needs by its own forward pass
+        if len(parts) > 1:  # a single micro-batch supplies the values that GAE needs by its own forward pass
             targets = self._targets(batch, self._values(batch.observations, batch.tasks), bootstrap)
+        factors = self.adapter.factors(batch.latent)
         total: dict[str, float] = {}
-        for rows in chunks:
-            latent = {k: v[rows] for k, v in batch.latent.items()}
-            observations, tasks = _rows(batch.observations, batch.tasks, rows)
-            evaluation = self.adapter.evaluate(observations, tasks, latent)
+        for rows in parts:
+            evaluation = self.adapter.evaluate(*batch.part(rows))
             if targets is None:
                 targets = self._targets(batch, evaluation.value.detach().cpu(), bootstrap)
             device = evaluation.value.device
-            output = compute_loss(
-                LossInputs(
-                    log_prob_new=evaluation.log_prob,
-                    log_prob_old=batch.log_prob[rows].to(device),
-                    advantage=targets[0][rows].to(device),
-                    value=evaluation.value,
-                    returns=targets[1][rows].to(device),
-                    entropy=evaluation.entropy,
-                ),
-                self.algorithm,
+            returns = targets[1][rows].to(device)
+            inputs = LossInputs(
+                log_prob_new=evaluation.log_prob,
+                log_prob_old=batch.log_prob[rows].to(device),
+                actions=self.adapter.actions,
+                advantage=targets[0][rows].to(device),
+                value=evaluation.value,
+                value_error=(evaluation.value - returns).square(),
+                returns=returns,
+                entropy=evaluation.entropy,
+                factors=None if factors is None else factors[rows].to(device),
+                ratios_per_decision=None if factors is None else self._ratios_per_decision(factors),
             )
-            share = len(rows) / n
+            output = compute_loss(inputs, self.algorithm)
+            share = len(rows) / len(batch)
             (output.loss * share).backward()
             _merge(total, {k: float(v) for k, v in output.metrics.items()}, share)
         assert targets is not None
         return total | {"return_mean": float(targets[1].mean()), "reward_mean": float(batch.reward.mean())}
+
+    def _ratios_per_decision(self, factors: Tensor) -> float:
+        return float(present(factors, self.algorithm.level, self.adapter.actions).sum()) / len(factors)
 
     def _targets(self, batch: Batch, values: Tensor, bootstrap: Tensor) -> tuple[Tensor, Tensor]:
         """Normalised advantages and returns, each (N,)."""
@@ -204,15 +170,19 @@ class Update:
 
     def _values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
         """V of each row, (rows,), without gradient, at most `micro_batch` rows at a time."""
-        size, n = self.config.micro_batch, len(tasks)
-        rows = np.split(np.arange(n), range(size, n, size))
-        return torch.cat([self.adapter.values(*_rows(observations, tasks, r)).cpu().float() for r in rows])
+        parts = split(np.arange(len(tasks)), self.config.micro_batch)
+        return torch.cat([self.adapter.values(*pick(observations, tasks, r)).cpu().float() for r in parts])
 
 
-def _rows(
-    observations: dict[str, np.ndarray], tasks: Sequence[str], rows: np.ndarray
-) -> tuple[dict[str, np.ndarray], list[str]]:
-    return {k: v[rows] for k, v in observations.items()}, [tasks[i] for i in rows]
+def check(algorithm: AlgorithmConfig, adapter: PolicyAdapter) -> None:
+    """Refuses what this policy, or this trainer, cannot do.
+
+    Raises:
+        InputError: names the algorithm's field.
+    """
+    check_level(algorithm.level, adapter.actions)
+    if algorithm.advantage == "group":
+        raise InputError("algorithm.advantage", "group", "segments carry no group advantages yet; use gae")
 
 
 def _merge(total: dict[str, float], metrics: dict[str, float], share: float) -> None:

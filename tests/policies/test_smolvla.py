@@ -387,3 +387,10 @@ def test_the_latent_is_as_small_as_re_scoring_allows(adapter: PolicyAdapter, sto
 
 def test_the_shape_is_the_policy_s(adapter: PolicyAdapter):
     assert adapter.shape == flow.FlowShape(num_steps=3, chunk_size=5, executed=3, padded_dim=4, action_dim=2)
+
+
+@pytest.mark.parametrize("config", SAMPLERS, ids=name)
+def test_each_factor_is_an_action_and_all_of_them_exist(adapter: PolicyAdapter, config: FlowSamplerConfig):
+    decision = exploring(adapter, config).decide(requests(1), 0)[0]
+    assert decision.log_prob.shape == (adapter.actions,)
+    assert adapter.factors(stored([decision])[0]) is None

@@ -30,7 +30,10 @@ STD = 0.5
 
 
 class LinearAdapter(PolicyAdapter):
-    """Latent ~ N(W·state, STD²), two factors, one per latent entry; V = v·state + b."""
+    """Latent ~ N(W·state, STD²), two factors, one per latent entry; V = v·state + b.
+
+    A latent with a ``count`` has only that many factors.
+    """
 
     def __init__(self, seed: int = 0) -> None:
         super().__init__()
@@ -41,6 +44,13 @@ class LinearAdapter(PolicyAdapter):
             self.value_head.weight.copy_(torch.randn(1, 3, generator=generator))
             self.value_head.bias.fill_(0.3)
         self.device = torch.device("cpu")
+
+    @property
+    def actions(self) -> int | None:
+        return 2
+
+    def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
+        return torch.arange(2) < latent["count"][:, None] if "count" in latent else None
 
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
         raise NotImplementedError
