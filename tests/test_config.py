@@ -147,7 +147,12 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--wandb.enable=perhaps"], "wandb.enable='perhaps': use true or false"),
     (["--env.task=[a]"], "env.task=['a']: use text"),
     (["--algorithm.level=row"], "algorithm.level='row': use one of token, action, chunk"),
-    (["--algorithm.type=gippo"], "algorithm.type='gippo': did you mean gipo? Otherwise use one of gipo, ppo"),
+    (
+        ["--algorithm.type=gippo"],
+        "algorithm.type='gippo': did you mean gipo? Otherwise use one of awr, decoupled, gipo, is, ppo, sapo",
+    ),
+    (["--algorithm.type=is", "--algorithm.cap=0.5"], "algorithm.cap=0.5: use a finite number from 1 up"),
+    (["--algorithm.type=decoupled", "--algorithm.proximal_every=0"], "algorithm.proximal_every=0: use at"),
     (["--algorithm.sigma=0"], "algorithm.sigma=0.0: use a number above 0"),
     (["--env.type=mujoco"], "env.type='mujoco': use one of lerobot, metaworld, simulated"),
     (["--env.task=drawer-v3"], "env.task='drawer-v3': 'drawer-v3' is not a MetaWorld task; did you mean"),

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""GIPO and PPO against slow oracles, by hand, and by the sign and size of their gradients."""
+"""What holds for every algorithm, and GIPO and PPO by hand; `test_peers` has the others by hand."""
 
 import math
 import subprocess
@@ -27,9 +27,13 @@ import torch
 from accerl_lerobot.algorithms import (
     ALGORITHMS,
     AlgorithmConfig,
+    AWRConfig,
+    DecoupledConfig,
     GIPOConfig,
+    ImportanceConfig,
     LossInputs,
     PPOConfig,
+    SAPOConfig,
     compute_loss,
     gipo_loss,
     ppo_loss,
@@ -44,10 +48,20 @@ CONFIGS: list[AlgorithmConfig] = [
     GIPOConfig(level="chunk", reference_coef=0.3),
     PPOConfig(level="action", kl_coef=0.2, reference_coef=0.1),
     PPOConfig(level="chunk", clip_low=0.1, clip_high=0.4, entropy_coef=0.01),
+    DecoupledConfig(level="token", kl_coef=0.1, behaviour_cap=1.2, clip_high=0.3),
+    DecoupledConfig(level="chunk", reference_coef=0.2, behaviour_cap=math.inf),
+    SAPOConfig(level="token", entropy_coef=0.02),
+    SAPOConfig(level="chunk", tau_positive=0.5, tau_negative=3.0, kl_coef=0.1),
+    ImportanceConfig(level="action", cap=1.1, reference_coef=0.1),
+    ImportanceConfig(level="chunk"),
+    AWRConfig(level="action", beta=0.5, cap=3.0, kl_coef=0.1),
+    AWRConfig(level="chunk", beta=math.inf, reference_coef=0.1),
 ]
 each_config = pytest.mark.parametrize("config", CONFIGS, ids=lambda c: f"{c.type}-{c.level}")
 each_algorithm = pytest.mark.parametrize(
-    "config", [GIPOConfig(kl_coef=0.0), PPOConfig()], ids=lambda c: c.type
+    "config",
+    [GIPOConfig(kl_coef=0.0), PPOConfig(), DecoupledConfig(), SAPOConfig(), ImportanceConfig()],
+    ids=lambda c: c.type,
 )
 
 
@@ -61,10 +75,24 @@ def logs_of(inputs: LossInputs, level: str, under: torch.Tensor | None = None) -
 def policy_loss_of(inputs: LossInputs, config: AlgorithmConfig) -> float:
     """The algorithm's own term by its oracle."""
     logs, advantage = logs_of(inputs, config.level), inputs.advantage.numpy()
-    if isinstance(config, GIPOConfig):
-        return oracle.gipo(logs, advantage, config.sigma, config.sigma_negative or config.sigma)
-    assert isinstance(config, PPOConfig)
-    return oracle.ppo(logs, advantage, config.clip_low, config.clip_high)
+    match config:
+        case GIPOConfig():
+            return oracle.gipo(logs, advantage, config.sigma, config.sigma_negative or config.sigma)
+        case DecoupledConfig():
+            moved = logs_of(inputs, config.level, inputs.log_prob_proximal)
+            pairs = [zip(row, other, strict=True) for row, other in zip(logs, moved, strict=True)]
+            behaviour = [[all_ - near for all_, near in row] for row in pairs]
+            clip = (config.clip_low, config.clip_high)
+            return oracle.decoupled(moved, behaviour, advantage, *clip, config.behaviour_cap)
+        case PPOConfig():
+            return oracle.ppo(logs, advantage, config.clip_low, config.clip_high)
+        case SAPOConfig():
+            return oracle.sapo(logs, advantage, config.tau_positive, config.tau_negative)
+        case ImportanceConfig():
+            return oracle.importance(logs, advantage, math.inf if config.cap is None else config.cap)
+    assert isinstance(config, AWRConfig)
+    zero = torch.zeros_like(inputs.log_prob_old)
+    return oracle.awr(logs_of(inputs, config.level, zero), advantage, config.beta, config.cap)
 
 
 def loss_of(inputs: LossInputs, config: AlgorithmConfig) -> float:
@@ -162,10 +190,10 @@ def test_gipo_gradient_is_that_of_importance_sampling_with_the_weight_held_still
 
 @each_algorithm
 @pytest.mark.parametrize("level", ["action", "chunk"])
-def test_on_policy_both_are_the_plain_policy_gradient(config: AlgorithmConfig, level: Any) -> None:
+def test_on_policy_all_are_the_plain_policy_gradient(config: AlgorithmConfig, level: Any) -> None:
     """At ρ = 1 the gradient is −E[Â ∇log π]: of the chunk, or of its factors one by one (1/L of it)."""
-    inputs = make_inputs(spread=0.0)
-    config = type(config)(level=level, kl_coef=0.3)  # the KL has no gradient there
+    inputs = make_inputs(spread=0.0)  # π_prox is μ as well
+    config = replace(config, level=level, kl_coef=0.3)  # the KL has no gradient there
     terms = inputs.log_prob_new.mean(1) if level == "action" else inputs.log_prob_new.sum(1)
     expected = gradient(inputs, -(terms * inputs.advantage).mean())
     torch.testing.assert_close(gradient(inputs, compute_loss(inputs, config).loss), expected)
@@ -316,6 +344,18 @@ def test_every_registered_config_has_a_loss() -> None:
         (PPOConfig, {"clip_low": 1.0}),
         (PPOConfig, {"clip_high": 0.0}),
         (PPOConfig, {"value_coef": -0.5}),
+        (DecoupledConfig, {"clip_low": 0.0}),
+        (DecoupledConfig, {"behaviour_cap": 0.9}),
+        (DecoupledConfig, {"behaviour_cap": math.nan}),
+        (DecoupledConfig, {"proximal_every": 0}),
+        (SAPOConfig, {"tau_positive": 0.0}),
+        (SAPOConfig, {"tau_negative": math.inf}),
+        (ImportanceConfig, {"cap": 0.5}),
+        (ImportanceConfig, {"cap": math.inf}),
+        (AWRConfig, {"beta": 0.0}),
+        (AWRConfig, {"beta": math.nan}),
+        (AWRConfig, {"cap": 0.9}),
+        (AWRConfig, {"cap": math.inf}),
     ],
 )
 def test_impossible_settings_are_refused(config: type[AlgorithmConfig], settings: dict[str, Any]) -> None:
