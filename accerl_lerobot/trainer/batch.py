@@ -27,6 +27,9 @@ from torch import Tensor
 
 from accerl_lerobot.experience import Segment
 
+Part = tuple[dict[str, np.ndarray], list[str], dict[str, Tensor]]
+"""Observations, tasks and latents of some decisions, as `PolicyAdapter.evaluate` takes them."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Batch:
@@ -54,8 +57,8 @@ class Batch:
     def __len__(self) -> int:
         return len(self.tasks)
 
-    def part(self, rows: np.ndarray) -> tuple[dict[str, np.ndarray], list[str], dict[str, Tensor]]:
-        """Observations, tasks and latents of some rows, as `PolicyAdapter.evaluate` takes them."""
+    def part(self, rows: np.ndarray) -> Part:
+        """Some of the rows."""
         observations, tasks = pick(self.observations, self.tasks, rows)
         return observations, tasks, {k: v[rows] for k, v in self.latent.items()}
 

@@ -15,6 +15,7 @@
 
     values of the current critic (bootstraps too) → GAE → advantages normalised over the batch → loss → step
 
+What else the loss asks for, log-probs under older weights, comes from `anchors`.
 Values stored with the samples are stale by their lag, so they are recomputed; the stored log-probs are not,
 since they are what the ratio divides by. Knows no process: the Ray worker and the single-process mode both
 call `Update.step`.
@@ -38,8 +39,10 @@ from accerl_lerobot.algorithms.ratio import present
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.base import PolicyAdapter
-from accerl_lerobot.trainer.batch import Batch, collate, pick, split
+from accerl_lerobot.trainer.anchors import CRITIC, Anchors
+from accerl_lerobot.trainer.batch import Batch, Part, collate, pick, split
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.probe import Probe
 
 
 class NonFiniteError(RuntimeError):
@@ -61,9 +64,13 @@ class Update:
         self.version = 0
         self.skipped = 0
         self._skipped_in_a_row = 0
+        self.anchors = Anchors(adapter)
+        if algorithm.reference_coef:
+            self.anchors.take("reference", self.version)
+        self._probe = Probe(self.anchors, config)
         named = adapter.trainable()
-        critic = [p for k, p in named.items() if k.startswith("value_head.")]
-        self._policy_parameters = [p for k, p in named.items() if not k.startswith("value_head.")]
+        critic = [p for k, p in named.items() if k.startswith(CRITIC)]
+        self._policy_parameters = [p for k, p in named.items() if not k.startswith(CRITIC)]
         self._parameters = self._policy_parameters + critic
         groups = [
             {"params": self._policy_parameters, "lr": config.lr},
@@ -78,6 +85,9 @@ class Update:
             NonFiniteError: `TrainerConfig.max_nonfinite` updates in a row were not finite.
         """
         batch = collate(segments)
+        mismatch = self._probe.read(batch)
+        if self._is_proximal and self.algorithm.proximal_updates > 1:
+            self.anchors.take("proximal", self.version)
         share = self.config.lr_share(self.version)
         critic_only = self.version < self.config.value_warmup_updates
         policy_group, critic_group = self.optimizer.param_groups
@@ -97,13 +107,20 @@ class Update:
             self._skip()
         lag = lag_metrics(torch.from_numpy(batch.version), self.version)
         self.version += 1
-        metrics |= {name: float(value) for name, value in lag.items()}
+        self._probe.renew(self.version)
+        metrics |= mismatch | {name: float(value) for name, value in lag.items()}
         return metrics | {
             "grad_norm": float(norm),
             "lr": float(policy_group["lr"]),
             "value_lr": float(critic_group["lr"]),
             "skipped": float(self.skipped),
         }
+
+    @property
+    def _is_proximal(self) -> bool:
+        """Whether the weights of now are the proximal ones."""
+        every = self.algorithm.proximal_updates
+        return every > 0 and self.version % every == 0
 
     def _skip(self) -> None:
         self.skipped += 1
@@ -124,7 +141,12 @@ class Update:
         factors = self.adapter.factors(batch.latent)
         total: dict[str, float] = {}
         for rows in parts:
-            evaluation = self.adapter.evaluate(*batch.part(rows))
+            part = batch.part(rows)
+            reference = self._under("reference", part)
+            proximal = None if self._is_proximal else self._under("proximal", part)
+            evaluation = self.adapter.evaluate(*part)
+            if self._is_proximal:
+                proximal = evaluation.log_prob.detach()
             if targets is None:
                 targets = self._targets(batch, evaluation.value.detach().cpu(), bootstrap)
             device = evaluation.value.device
@@ -140,6 +162,8 @@ class Update:
                 entropy=evaluation.entropy,
                 factors=None if factors is None else factors[rows].to(device),
                 ratios_per_decision=None if factors is None else self._ratios_per_decision(factors),
+                log_prob_reference=reference,
+                log_prob_proximal=proximal,
             )
             output = compute_loss(inputs, self.algorithm)
             share = len(rows) / len(batch)
@@ -147,6 +171,10 @@ class Update:
             _merge(total, {k: float(v) for k, v in output.metrics.items()}, share)
         assert targets is not None
         return total | {"return_mean": float(targets[1].mean()), "reward_mean": float(batch.reward.mean())}
+
+    def _under(self, name: str, part: Part) -> Tensor | None:
+        """log-probs (rows, L) under a copy; None if there is none."""
+        return self.anchors.log_prob(name, *part) if name in self.anchors else None
 
     def _ratios_per_decision(self, factors: Tensor) -> float:
         return float(present(factors, self.algorithm.level, self.adapter.actions).sum()) / len(factors)

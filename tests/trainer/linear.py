@@ -81,6 +81,17 @@ class LinearAdapter(PolicyAdapter):
         return {k: p.detach().clone() for k, p in self.trainable().items()}
 
 
+def decided_by(adapter: LinearAdapter, segments: Sequence[Segment], version: int) -> list[Segment]:
+    """Stamps segments as decisions of these weights, log-probs included."""
+    for segment in segments:
+        observations = {k: v[:-1] for k, v in segment.observations.items()}
+        latent = {k: torch.from_numpy(v) for k, v in segment.latent.items()}
+        with torch.no_grad():
+            scored = adapter.evaluate(observations, [segment.task] * len(segment), latent)
+        segment.log_prob, segment.version = scored.log_prob.numpy(), np.full(len(segment), version)
+    return list(segments)
+
+
 def make_segments(lengths: Sequence[int], version: int = 0, seed: int = 0, **replace: Any) -> list[Segment]:
     """Segments with random content; log-probs are those of a policy a little off from the current one."""
     rng = np.random.default_rng(seed)
