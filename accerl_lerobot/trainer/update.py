@@ -15,10 +15,9 @@
 
     values of the current critic (bootstraps too) → GAE → advantages normalised over the batch → loss → step
 
-What else the loss asks for, log-probs under older weights, comes from `anchors`.
 Values stored with the samples are stale by their lag, so they are recomputed; the stored log-probs are not,
-since they are what the ratio divides by. Knows no process: the Ray worker and the single-process mode both
-call `Update.step`.
+since they are what the ratio divides by. Log-probs under older weights come from `anchors`. Knows no process:
+the Ray worker and the single-process mode both call `Update.step`.
 
 Shapes: S segments, T decisions of the longest one, N decisions in all.
 """
