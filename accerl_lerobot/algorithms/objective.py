@@ -84,12 +84,8 @@ def assemble(
         pull: (N, F), what stands before Â∇log π; None: ω·ρ.
     """
     mask = inputs.mask
-    error, entropy = inputs.value_error, inputs.entropy
-    if mask is not None:
-        error, entropy = error.masked_fill(~mask, 0.0), entropy.masked_fill(~mask, 0.0)
-    value_loss = masked_mean(error, mask)
+    value_loss, mean_entropy = masked_mean(inputs.value_error, mask), masked_mean(inputs.entropy, mask)
     kl = mean_over_ratios(kl_from_behaviour(log_ratio), inputs, config.level)
-    mean_entropy = masked_mean(entropy, mask)
 
     loss = policy_loss + config.value_coef * value_loss
     if config.kl_coef:
