@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.algorithms import ALGORITHMS, AlgorithmConfig, GIPOConfig
 from accerl_lerobot.config import RunConfig
 from accerl_lerobot.engine import Engine, Progress
 from accerl_lerobot.envs import SimulatedConfig
@@ -60,6 +60,31 @@ def test_two_runs_are_equal_to_the_last_bit(tiny_checkpoint: Path):
 def test_another_seed_is_another_run(tiny_checkpoint: Path):
     one, other = (updates(train(tiny_run(tiny_checkpoint, seed=seed))[0]) for seed in (3, 4))
     assert one != other
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_every_algorithm_trains(name: str, tiny_checkpoint: Path):
+    algorithm = AlgorithmConfig.get_choice_class(name)(reference_coef=0.1, level="chunk")
+    history, weights = train(tiny_run(tiny_checkpoint, algorithm=algorithm))
+    found = updates(history)
+    assert len(found) == 12 and found[-1]["skipped"] == 0
+    assert all(np.isfinite(value) for update in found for value in update.values())
+    assert found[0]["kl_reference"] == 0.0 < found[-1]["kl_reference"]
+    assert all(np.isfinite(tensor).all() for tensor in weights.values())
+
+
+def test_acting_and_learning_agree_on_log_probs(tiny_checkpoint: Path):
+    """While weights change, and although not every version is published."""
+    trainer = TrainerConfig(
+        updates=16, batch_decisions=16, lr=1e-3, warmup_updates=2, value_warmup_updates=2,
+        publish_every=2, probe_every=3,
+    )  # fmt: skip
+    history, _ = train(tiny_run(tiny_checkpoint, trainer=trainer))
+    found = [u for u in updates(history) if "logprob/mismatch_max" in u]
+    assert len(found) >= 3 and found[0]["update"] == 1
+    assert max(u["logprob/mismatch_max"] for u in found) <= 1e-4
+    assert all(u["logprob/mismatch_clip"] == 0.0 for u in found)
+    assert max(u["ratio_max_dev"] for u in found[1:]) > 1e-3, "the weights should have moved"
 
 
 def success(engine: Engine, episodes: int = 128) -> float:

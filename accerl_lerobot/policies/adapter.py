@@ -61,6 +61,15 @@ class LeRobotAdapter(PolicyAdapter):
         self.precision = precision
         self.policy.eval()
 
+    @property
+    def actions(self) -> int | None:
+        """See the base class."""
+        return self.family.actions
+
+    def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
+        """See the base class."""
+        return self.family.factors(latent)
+
     @torch.no_grad()
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
         """See the base class; each decision's noise is its own request's, whatever batch it lands in."""
@@ -94,7 +103,6 @@ class LeRobotAdapter(PolicyAdapter):
             log_prob=score.log_prob,
             entropy=score.entropy,
             value=self._value(encoded),
-            factors=score.factors,
         )
 
     @torch.no_grad()
@@ -113,10 +121,6 @@ class LeRobotAdapter(PolicyAdapter):
             for name, parameter in module.named_parameters()
             if parameter.requires_grad
         }
-
-    def actions(self) -> int | None:
-        """See the base class."""
-        return self.family.actions
 
     @torch.no_grad()
     def self_check(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> float:

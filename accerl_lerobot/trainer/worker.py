@@ -83,8 +83,7 @@ class TrainerWorker:
             with self._lock:
                 metrics = self._update.step(segments)
             updated = time.monotonic()
-            last = self._update.version == config.updates
-            if self._update.version % config.publish_every == 0 or last:
+            if config.publishes(self._update.version):
                 publisher.publish(self._update.version, self._export())
             metrics |= {
                 "update": float(self._update.version),

@@ -30,7 +30,9 @@ from accerl_lerobot.policies.config import TuningConfig
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     build = bench.BUILDERS["smolvla"]
-    sizes = backbone.BackboneConfig(hidden=32, heads=2, kv_heads=1, vision_hidden=16, vision_layers=1, patch=32)
+    sizes = backbone.BackboneConfig(
+        hidden=32, heads=2, kv_heads=1, vision_hidden=16, vision_layers=1, patch=32
+    )
     monkeypatch.setattr(backbone, "SMOLVLM2_500M", sizes)
 
     def shrunk(config: BenchPolicyConfig, directory: Path) -> Any:

@@ -412,3 +412,11 @@ def test_half_precision_is_a_little_off_and_log_probs_stay_in_full(path: Path):
     evaluation.log_prob.sum().backward()
     assert all(p.dtype == torch.float32 for p in half.trainable().values())
     assert any(p.grad is not None and p.grad.abs().max() > 0 for p in half.trainable().values())
+
+
+@pytest.mark.parametrize("config", SAMPLERS, ids=name)
+def test_each_factor_is_an_action_and_all_of_them_exist(adapter: LeRobotAdapter, config: FlowSamplerConfig):
+    adapter = exploring(adapter, config)
+    decision = adapter.decide(requests(1), 0)[0]
+    assert decision.log_prob.shape == (adapter.actions,)
+    assert adapter.factors(stored([decision])[0]) is None

@@ -18,15 +18,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
+from accerl_lerobot.trainer.batch import collate
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.update import NonFiniteError, Update, collate
+from accerl_lerobot.trainer.update import NonFiniteError, Update
 from tests.trainer.linear import STATE, LinearAdapter, make_segments
 
 PLAIN = TrainerConfig(
@@ -35,8 +38,16 @@ PLAIN = TrainerConfig(
 LENGTHS = (3, 5, 1, 4)
 
 
-def make_update(config: TrainerConfig = PLAIN, seed: int = 0, **algorithm: float) -> Update:
+def make_update(config: TrainerConfig = PLAIN, seed: int = 0, **algorithm: Any) -> Update:
     return Update(LinearAdapter(seed), GIPOConfig(**algorithm), config)
+
+
+def with_counts(segments: list[Segment]) -> list[Segment]:
+    """Every other decision has one factor instead of two; the last segment's have none missing."""
+    for segment in segments[:-1]:
+        segment.latent["count"] = 1 + np.arange(len(segment)) % 2
+    segments[-1].latent["count"] = np.full(len(segments[-1]), 2)
+    return segments
 
 
 def returns_by_hand(
@@ -102,6 +113,45 @@ def test_micro_batches_give_the_gradient_of_the_whole_batch(micro_batch: int):
     for name in ("loss", "value_loss", "approx_kl", "ratio_max_dev", "return_mean", "decisions"):
         assert found[name] == pytest.approx(expected[name], rel=1e-5, abs=1e-6), name
     assert found["decisions"] == sum(LENGTHS)
+
+
+@pytest.mark.parametrize("level", ["token", "action", "chunk"])
+def test_micro_batches_add_up_when_decisions_have_different_numbers_of_factors(level: Any):
+    segments = with_counts(make_segments(LENGTHS))
+    whole, parts, blind = (
+        make_update(replace(PLAIN, micro_batch=size), level=level) for size in (1000, 5, 1000)
+    )
+    whole.step(segments)
+    parts.step(segments)
+    torch.testing.assert_close(parts.adapter.weight.grad, whole.adapter.weight.grad, rtol=1e-5, atol=1e-6)
+    blind.step(make_segments(LENGTHS))
+    assert not torch.allclose(blind.adapter.weight.grad, whole.adapter.weight.grad, rtol=1e-2)
+
+
+def test_what_a_latent_does_not_have_is_not_learnt_from():
+    update, other = make_update(), make_update()
+    segments, changed = with_counts(make_segments(LENGTHS)), with_counts(make_segments(LENGTHS))
+    for segment in changed:
+        missing = segment.latent["count"] < 2
+        segment.latent["x"][missing, 1] += 3.0
+        segment.log_prob[missing, 1] = np.nan
+    assert update.step(segments) == other.step(changed)
+    assert torch.equal(update.adapter.weight.grad, other.adapter.weight.grad)
+
+
+# ---- what is refused
+
+
+def test_ratios_per_action_need_a_policy_with_actions(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(LinearAdapter, "actions", None)
+    with pytest.raises(InputError, match="algorithm.level='action': use token or chunk"):
+        make_update()
+    make_update(level="chunk").step(make_segments(LENGTHS))
+
+
+def test_group_advantages_are_refused_until_segments_carry_them():
+    with pytest.raises(InputError, match="algorithm.advantage='group'"):
+        make_update(advantage="group")
 
 
 # ---- targets
