@@ -15,6 +15,9 @@
 
     values of the current critic (bootstraps too) → GAE → advantages normalised over the batch → loss → step
 
+With ``advantage=group`` the advantages are those that the rollout workers stamped on the segments. GAE then
+only makes the critic's targets; where ``value_coef`` is 0, not even those, and V is not computed beforehand.
+
 Values stored with the samples are stale by their lag, so they are recomputed; the stored log-probs are not,
 since they are what the ratio divides by. Knows no process: the Ray worker and the single-process mode both
 call `Update.step`.
@@ -62,11 +65,14 @@ class Batch:
     last_observations: dict[str, np.ndarray]
     """Each (S, ...)."""
     segment_tasks: list[str]
+    advantage: Tensor | None = None
+    """(N,), stamped by the rollout workers; None: not on all segments."""
 
 
 def collate(segments: Sequence[Segment]) -> Batch:
     """Lays segments end to end."""
     keys, names = segments[0].observations.keys(), segments[0].latent.keys()
+    stamped = [s.advantage for s in segments if s.advantage is not None]
     return Batch(
         observations={k: np.concatenate([s.observations[k][:-1] for s in segments]) for k in keys},
         tasks=[s.task for s in segments for _ in range(len(s))],
@@ -78,6 +84,7 @@ def collate(segments: Sequence[Segment]) -> Batch:
         terminated=torch.tensor([s.terminated for s in segments]),
         last_observations={k: np.stack([s.observations[k][-1] for s in segments]) for k in keys},
         segment_tasks=[s.task for s in segments],
+        advantage=torch.from_numpy(np.concatenate(stamped)) if len(stamped) == len(segments) else None,
     )
 
 
@@ -96,6 +103,8 @@ class Update:
 
     def __init__(self, adapter: PolicyAdapter, algorithm: AlgorithmConfig, config: TrainerConfig) -> None:
         self.adapter, self.algorithm, self.config = adapter, algorithm, config
+        self._grouped = algorithm.advantage == "group"
+        self._critic = not self._grouped or algorithm.value_coef > 0
         self.version = 0
         self.skipped = 0
         self._skipped_in_a_row = 0
@@ -117,7 +126,7 @@ class Update:
         """
         batch = collate(segments)
         share = self.config.lr_share(self.version)
-        critic_only = self.version < self.config.value_warmup_updates
+        critic_only = self.version < self.config.value_warmup_updates and not self._grouped
         policy_group, critic_group = self.optimizer.param_groups
         policy_group["lr"] = 0.0 if critic_only else self.config.lr * share
         critic_group["lr"] = self.config.value_lr * share
@@ -186,9 +195,11 @@ class Update:
         return total | {"return_mean": float(targets[1].mean()), "reward_mean": float(batch.reward.mean())}
 
     def _targets(self, batch: Batch, values: Tensor, bootstrap: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalised advantages and returns, each (N,)."""
+        """Advantages, normalised unless they come from groups, and returns, each (N,)."""
         mask = decision_mask(batch.lengths, int(batch.lengths.max()))
         padded = torch.zeros(mask.shape)
+        if not self._critic:
+            values = torch.zeros_like(values)
         reward, value = (padded.masked_scatter(mask, x.float()) for x in (batch.reward, values))
         advantages, returns = gae(
             reward,
@@ -199,12 +210,20 @@ class Update:
             gamma=self.algorithm.gamma,
             lam=self.algorithm.lam,
         )
+        if self._grouped:
+            if batch.advantage is None:
+                raise ValueError(
+                    "algorithm.advantage=group, but a segment carries none: set rollout.group_size"
+                )
+            return batch.advantage, returns[mask]
         advantages = normalise(advantages, moments(advantages, mask), mask)
         return advantages[mask], returns[mask]
 
     def _values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
         """V of each row, (rows,), without gradient, at most `micro_batch` rows at a time."""
         size, n = self.config.micro_batch, len(tasks)
+        if not self._critic:  # V is neither used nor learnt
+            return torch.zeros(n)
         rows = np.split(np.arange(n), range(size, n, size))
         return torch.cat([self.adapter.values(*_rows(observations, tasks, r)).cpu().float() for r in rows])
 
