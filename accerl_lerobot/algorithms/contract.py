@@ -46,7 +46,8 @@ class AlgorithmConfig(draccus.ChoiceRegistry):
     lam: float = 0.95
     """λ of GAE per decision, in [0, 1]: 0 trusts the critic, 1 the observed rewards."""
     advantage: Literal["gae", "group"] = "gae"
-    """gae, or group: stamped on segments by the rollout workers."""
+    """``gae``: from the critic. ``group``: relative to other episodes from the same start, stamped on
+    segments by the rollout worker; V is not used then, and `value_coef` may as well be 0."""
     level: Level = "action"
     """What one importance ratio covers: each of the L factors, or their product over the whole ``chunk``."""
     value_coef: float = 0.5
@@ -68,10 +69,10 @@ class AlgorithmConfig(draccus.ChoiceRegistry):
         for name in ("value_coef", "kl_coef", "entropy_coef"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise InputError(f"algorithm.{name}", getattr(self, name), "use a finite number, 0 or larger")
-        if self.advantage not in ("gae", "group"):
-            raise InputError("algorithm.advantage", self.advantage, "use gae or group")
         if self.level not in ("action", "chunk"):
             raise InputError("algorithm.level", self.level, "use action or chunk")
+        if self.advantage not in ("gae", "group"):
+            raise InputError("algorithm.advantage", self.advantage, "use gae or group")
 
 
 @dataclass(frozen=True, kw_only=True)
