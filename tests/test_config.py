@@ -159,6 +159,9 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--env.max_steps=0"], "env.max_steps=0: use 1 to 500 env steps"),
     (["--seed=100"], "seed=100: use 0 to 99"),
     (["--launch.engine=slurm"], "launch.engine='slurm': use ray or local"),
+    (["--rollout.group_size=1"], "rollout.group_size=1: groups of one have no comparison; use 0"),
+    (["--rollout.group_advantage=gae"], "rollout.group_advantage='gae': use one of grpo, rloo, grpo_no_std"),
+    (["--algorithm.advantage=group"], "algorithm.advantage='group': add --rollout.group_size=8, say"),
     (["--replay.ahead=3"], "replay.ahead=3: use at least one batch, 128, or both sides wait for each other"),
     (["--dataset.root=x"], "dataset.repo_id=None: name the dataset in dataset.root"),
     (["--demos.seed=1"], "demos.seed=1: a run's demonstrations take its own seed; use --seed"),
@@ -216,6 +219,12 @@ def test_a_mistake_in_a_recipe_is_named_like_one_on_the_command_line(
     path.write_text("trainer:\n  updates: lots\n")
     assert cli.main(["train", str(path)]) == 2
     assert capsys.readouterr().err == "accerl: trainer.updates='lots': use a whole number\n"
+
+
+def test_groups_serve_either_kind_of_advantage() -> None:
+    for advantage in ("gae", "group"):
+        config = parse(RunConfig, ["--rollout.group_size=2", f"--algorithm.advantage={advantage}"])
+        assert (config.algorithm.advantage, config.rollout.group_size) == (advantage, 2)
 
 
 def test_long_values_are_shortened() -> None:

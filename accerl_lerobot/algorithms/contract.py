@@ -117,7 +117,7 @@ class LossInputs:
     not align with actions, as with compressed tokens: level ``action`` is refused then.
     """
     advantage: Tensor
-    """(N,), normalised by the caller."""
+    """(N,), normalised over the batch by the caller, or relative to a group of episodes."""
     value: Tensor
     """(N,), V of the current critic; measured, not trained."""
     value_error: Tensor

@@ -44,7 +44,10 @@ class TrainerConfig:
     """constant, or cosine: falls to `final_lr_share` of the peak over `updates`."""
     final_lr_share: float = 0.1
     value_warmup_updates: int = 20
-    """First updates, in which only the critic head learns: advantages of an untrained one are noise."""
+    """First updates, in which only the critic head learns: advantages of an untrained one are noise.
+
+    None with ``algorithm.advantage=group``, which asks no critic.
+    """
     grad_clip: float = 1.0
     """Largest gradient norm; > 0."""
     weight_decay: float = 0.0

@@ -15,6 +15,9 @@
 
     values of the current critic (bootstraps too) → GAE → advantages normalised over the batch → loss → step
 
+With ``advantage=group`` the advantages are those that the rollout workers stamped on the segments. GAE then
+only makes the critic's targets; where ``value_coef`` is 0, not even those, and V is not computed beforehand.
+
 Values stored with the samples are stale by their lag, so they are recomputed; the stored log-probs are not,
 since they are what the ratio divides by. Log-probs under older weights come from `anchors`. Knows no process:
 the Ray worker and the single-process mode both call `Update.step`.
@@ -35,7 +38,6 @@ from accerl_lerobot.algorithms.diagnostics import lag_metrics
 from accerl_lerobot.algorithms.gae import decision_mask, gae
 from accerl_lerobot.algorithms.normalise import moments, normalise
 from accerl_lerobot.algorithms.ratio import present
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.base import PolicyAdapter
 from accerl_lerobot.trainer.anchors import CRITIC, Anchors
@@ -58,8 +60,10 @@ class Update:
     """
 
     def __init__(self, adapter: PolicyAdapter, algorithm: AlgorithmConfig, config: TrainerConfig) -> None:
-        check(algorithm, adapter)
+        check_level(algorithm.level, adapter.actions)
         self.adapter, self.algorithm, self.config = adapter, algorithm, config
+        self._grouped = algorithm.advantage == "group"
+        self._critic = not self._grouped or algorithm.value_coef > 0
         self.version = 0
         self.skipped = 0
         self._skipped_in_a_row = 0
@@ -88,7 +92,7 @@ class Update:
         if self._is_proximal and self.algorithm.proximal_updates > 1:
             self.anchors.take("proximal", self.version)
         share = self.config.lr_share(self.version)
-        critic_only = self.version < self.config.value_warmup_updates
+        critic_only = self.version < self.config.value_warmup_updates and not self._grouped
         policy_group, critic_group = self.optimizer.param_groups
         policy_group["lr"] = 0.0 if critic_only else self.config.lr * share
         critic_group["lr"] = self.config.value_lr * share
@@ -179,9 +183,11 @@ class Update:
         return float(present(factors, self.algorithm.level, self.adapter.actions).sum()) / len(factors)
 
     def _targets(self, batch: Batch, values: Tensor, bootstrap: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalised advantages and returns, each (N,)."""
+        """Advantages, normalised unless they come from groups, and returns, each (N,)."""
         mask = decision_mask(batch.lengths, int(batch.lengths.max()))
         padded = torch.zeros(mask.shape)
+        if not self._critic:
+            values = torch.zeros_like(values)
         reward, value = (padded.masked_scatter(mask, x.float()) for x in (batch.reward, values))
         advantages, returns = gae(
             reward,
@@ -192,24 +198,21 @@ class Update:
             gamma=self.algorithm.gamma,
             lam=self.algorithm.lam,
         )
+        if self._grouped:
+            if batch.advantage is None:
+                raise ValueError(
+                    "algorithm.advantage=group, but a segment carries none: set rollout.group_size"
+                )
+            return batch.advantage, returns[mask]
         advantages = normalise(advantages, moments(advantages, mask), mask)
         return advantages[mask], returns[mask]
 
     def _values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
         """V of each row, (rows,), without gradient, at most `micro_batch` rows at a time."""
+        if not self._critic:  # V is neither used nor learnt
+            return torch.zeros(len(tasks))
         parts = split(np.arange(len(tasks)), self.config.micro_batch)
         return torch.cat([self.adapter.values(*pick(observations, tasks, r)).cpu().float() for r in parts])
-
-
-def check(algorithm: AlgorithmConfig, adapter: PolicyAdapter) -> None:
-    """Refuses what this policy, or this trainer, cannot do.
-
-    Raises:
-        InputError: names the algorithm's field.
-    """
-    check_level(algorithm.level, adapter.actions)
-    if algorithm.advantage == "group":
-        raise InputError("algorithm.advantage", "group", "segments carry no group advantages yet; use gae")
 
 
 def _merge(total: dict[str, float], metrics: dict[str, float], share: float) -> None:
