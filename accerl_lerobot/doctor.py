@@ -302,7 +302,8 @@ def pace(config: RunConfig) -> Iterator[Check]:
     in_flight = _under_way(config)
     ahead = 1 if config.launch.engine == "ray" else 0  # of publications under way, and of batches drawn early
     arguments = {"batch_decisions": trainer.batch_decisions, "in_flight": in_flight}
-    arguments |= {"publish_every": trainer.publish_every, "pickup": ahead, "prefetch": ahead}
+    pickup = ahead + trainer.hold_back
+    arguments |= {"publish_every": trainer.publish_every, "pickup": pickup, "prefetch": ahead}
     bound = lag_bound(replay, **arguments)
     of_pace = lag_bound(dataclasses.replace(replay, max_lag=sys.maxsize), **arguments)
     text = f"at most {bound} updates with {in_flight} decisions under way"

@@ -16,7 +16,8 @@
     every poll:   all worlds get a decision and step it → segments enter replay, as far as the pace allows
                   → one update, if the pace allows it
 
-For tests and debugging. Weights reach the acting policy at once, so the lag comes from replay alone.
+For tests and debugging. Weights reach the acting policy at once, so the lag comes from replay alone, unless
+`trainer.hold_back` asks for more.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from accerl_lerobot.experience import Request, Segment
 from accerl_lerobot.replay import Replay
 from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutRunner
+from accerl_lerobot.weights.held_back import HeldBack
 
 logger = logging.getLogger(__name__)
 
@@ -58,6 +60,10 @@ class LocalEngine(Engine):
         self._config = config
         self._adapter = load_adapter(config.policy)
         self._update = Update(self._adapter, config.algorithm, config.trainer)
+        self._held, self._acting, self._acting_version = HeldBack(config.trainer.hold_back), self._adapter, 0
+        if config.trainer.hold_back:
+            self._acting = load_adapter(config.policy)
+            self._acting.load_trainable(self._adapter.export_trainable())
         self._replay = Replay(config.replay)
         self._rng = np.random.default_rng(config.seed)
         self._outstanding: set[tuple[str, int]] = set()
@@ -96,6 +102,7 @@ class LocalEngine(Engine):
             segments = self._replay.sample(n, self._update.version, self._rng)
             if segments:
                 updates.append(self._update.step(segments) | {"update": float(self._update.version)})
+                self._publish()
         episodes = list(self._episodes)
         self._episodes.clear()
         self._outstanding -= {episode_key(e.plan) for e in episodes}
@@ -106,7 +113,7 @@ class LocalEngine(Engine):
             episodes=episodes,
             rollout={k: float(v) for k, v in asdict(self._runner.counters).items()},
             replay=self._replay.metrics(),
-            inference={"version": float(self._update.version)},
+            inference={"version": float(self._acting_version)},
         )
 
     def save(self, directory: Path) -> int:
@@ -140,13 +147,24 @@ class LocalEngine(Engine):
         slots = [s for s, r in self._due.items() if may_explore or not r.explore]
         if not slots:
             return
-        decisions = self._adapter.decide([self._due[s] for s in slots], self._update.version)
+        decisions = self._acting.decide([self._due[s] for s in slots], self._acting_version)
         for slot, decision in zip(slots, decisions, strict=True):
             request = self._runner.advance(slot, decision)
             if request is None:
                 del self._due[slot]
             else:
                 self._due[slot] = request
+
+    def _publish(self) -> None:
+        """Hands weights to the policy that acts, which is the trainer's own unless they are held back."""
+        version = self._update.version
+        if self._acting is self._adapter:
+            self._acting_version = version
+            return
+        weights, last = self._adapter.export_trainable(), version == self._config.trainer.updates
+        for number, tensors in self._held.push(version, weights, last=last):
+            self._acting.load_trainable(tensors)
+            self._acting_version = number
 
     def _store(self) -> None:
         """Lets in what stands at the door, one segment at a time: a group's come all at once."""

@@ -194,7 +194,7 @@ def lag_bound(
             With environments of about equal speed: `decisions_under_way`, twice that to be safe. One worker
             that hangs breaks this assumption; `max_lag` then retires its segment.
         publish_every: updates from one publication of the weights to the next.
-        pickup: updates made while a publication travels to the inference service.
+        pickup: updates made while a publication travels to the inference service, or is held back.
         prefetch: batches drawn ahead of the update that uses them.
     """
     decisions = max(config.ahead, config.min_decisions) + 2 * in_flight + config.capacity

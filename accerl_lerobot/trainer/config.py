@@ -54,6 +54,8 @@ class TrainerConfig:
     betas: tuple[float, float] = (0.9, 0.95)
     publish_every: int = 1
     """Updates between two publications of the weights."""
+    hold_back: int = 0
+    """Updates by which published weights are held back: lag on purpose, to study it; 0: none."""
     probe_every: int = 25
     """Updates between two measurements of the mismatch between acting and learning; 0: none.
 
@@ -72,7 +74,7 @@ class TrainerConfig:
         for name in ("lr", "value_lr"):
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"trainer.{name}", getattr(self, name), "use a value in [0, 1), e.g. 1e-4")
-        for name in ("warmup_updates", "value_warmup_updates", "weight_decay", "probe_every"):
+        for name in ("warmup_updates", "value_warmup_updates", "weight_decay", "hold_back", "probe_every"):
             if getattr(self, name) < 0:
                 raise InputError(f"trainer.{name}", getattr(self, name), "use 0 or more")
         if self.schedule not in ("constant", "cosine"):
