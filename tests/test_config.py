@@ -163,7 +163,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--rollout.group_advantage=gae"], "rollout.group_advantage='gae': use one of grpo, rloo, grpo_no_std"),
     (
         ["--trainer.hold_back=50"],
-        "replay.max_lag=50: use more than trainer.hold_back, 50, or all is thrown away",
+        "replay.max_lag=50: use more than trainer.hold_back, 50, or all is",
     ),
     (["--algorithm.advantage=group"], "algorithm.advantage='group': add --rollout.group_size=8, say"),
     (["--replay.ahead=3"], "replay.ahead=3: use at least one batch, 128, or both sides wait for each other"),
