@@ -41,6 +41,7 @@ from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import OBS_STATE
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Model
+from accerl_lerobot.policies.plugins import register_policies
 from accerl_lerobot.policies.processing import IMAGES, Processing
 from accerl_lerobot.policies.samplers import SamplerConfig
 from accerl_lerobot.policies.tuning import merged_state_dict, tune
@@ -58,11 +59,13 @@ FILES = ("*.json", WEIGHTS, "policy_*.safetensors", VALUE_HEAD, FAMILY, f"{BACKB
 MODELS = "accerl_lerobot.policies.models"
 POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "smolvla": (f"{MODELS}.smolvla:SmolVLA", ("flow", "noise_space")),
+    "smolvla_bins": (f"{MODELS}.smolvla_bins:SmolVLABins", ("tokens",)),
 }
 """LeRobot policy type → its model, and the families that suit it, the default one first."""
 FAMILIES = {
     "flow": "accerl_lerobot.policies.flow:FlowFamily",
     "noise_space": "accerl_lerobot.policies.noise_space:NoiseSpaceFamily",
+    "tokens": "accerl_lerobot.policies.tokens:TokenFamily",
 }
 """Family → class; its config is registered under the same name in `samplers`."""
 
@@ -122,9 +125,9 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     Raises:
         InputError: no checkpoint there, or a policy type without a likelihood here.
     """
-    import lerobot.policies  # noqa: F401  fills the registry of policy types
     from lerobot.configs.policies import PreTrainedConfig
 
+    register_policies()
     folder = _checkpoint_folder(config)
     try:
         name = json.loads((folder / CONFIG).read_text()).get("type")
