@@ -132,7 +132,7 @@ class LeRobotAdapter(PolicyAdapter):
         try:
             batch = self.processing.prepare(observations, tasks)
             difference = self.family.difference(batch, self.model.encode(batch))
-        except (AttributeError, ImportError, KeyError, TypeError) as error:
+        except (AttributeError, ImportError, KeyError, NotImplementedError, TypeError) as error:
             raise self._incompatible(f"cannot drive it ({type(error).__name__}: {error})") from error
         self.policy.reset()
         if not difference <= SELF_CHECK_TOLERANCE:
