@@ -76,7 +76,7 @@ def family(squashed: bool, own_std: bool, sampler: GaussianSamplerConfig | None 
 
 def payoff(chunk: Tensor) -> Tensor:
     """Depends on every executed entry, and on two of them together."""
-    return torch.tanh(2 * chunk[:, 0, 0] + chunk[:, 1, 1]) + 0.5 * chunk[:, 0, 1] ** 2 - 0.3 * chunk[:, 1, 0]
+    return torch.tanh(2 * chunk[:, 0, 0] + chunk[:, 1, 1]) + 0.5 * chunk[:, 0, 1] ** 2 + 0.6 * chunk[:, 1, 0]
 
 
 def deviation(one: Tensor, other: Tensor) -> float:
