@@ -58,6 +58,8 @@ class PolicyContract:
     shape: ClassVar[tuple[int, int]] = (3, 2)
     """Of a chunk: executed rows, action dims."""
     image: ClassVar[int] = 16
+    slack: ClassVar[float] = 0.02
+    """Relative error of finite differences: ReLUs bend, and smaller steps drown in rounding."""
     one_token: ClassVar[bool] = False
     """Whether the critic's features are one token, among which an attention query has nothing to choose."""
 
@@ -172,7 +174,7 @@ class PolicyContract:
         for part in self.parts:
             gradients = {k: p.grad.clone() for k, p in named.items() if part in k}
             norm = float(torch.cat([g.flatten() for g in gradients.values()]).norm())
-            home, scores, X
+            home, scores, step = {k: named[k].detach().clone() for k in gradients}, [], 0.005 / norm
             for sign in (1, -1):
                 with torch.no_grad():
                     for key, gradient in gradients.items():
@@ -181,7 +183,7 @@ class PolicyContract:
             with torch.no_grad():
                 for key, value in home.items():
                     named[key].copy_(value)
-            assert (scores[0] - scores[1]) / (2 * step) == pytest.approx(norm, rel=0.02), part
+            assert (scores[0] - scores[1]) / (2 * step) == pytest.approx(norm, rel=self.slack), part
 
     def test_published_weights_make_the_same_policy(self, loaded: LeRobotAdapter):
         trainer, reader, asked = copy.deepcopy(loaded), copy.deepcopy(loaded), self.ask(4)
