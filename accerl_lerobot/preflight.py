@@ -71,7 +71,7 @@ def check_sft_policy(config: SFTConfig) -> Any:
     kind = config.policy["type"]
     names = policy_fields(kind, "sft.policy.type")
     if config.backbone is not None and "vlm_model_name" not in names:
-        remedy = f"a {kind} policy has no vision-language backbone; leave the section out"
+        remedy = f"{kind} has no vision-language backbone; leave the section out"
         raise InputError("sft.backbone", config.backbone, remedy)
     for key, value in fields.items():
         if key not in names:

@@ -116,7 +116,10 @@ class PolicyContract:
             assert one.chunk.shape == self.shape and one.chunk.dtype == np.float32 and one.version == 7
             assert one.log_prob.shape == (adapter.actions(),) and one.log_prob.dtype == np.float32
         torch.manual_seed(1)
+        state = torch.get_rng_state()
         assert pickle.dumps(adapter.decide(asked, 7)) == pickle.dumps(together), "no global generator is read"
+        adapter.self_check(*stack_observations(asked))
+        assert torch.equal(torch.get_rng_state(), state), "nor moved"
 
     def test_seed_and_observation_matter(self, adapter: LeRobotAdapter):
         first = self.ask(1)[0]
