@@ -81,6 +81,8 @@ class Model(ABC):
     """LeRobot processor step → options that its inference needs and its training does not."""
 
     policy: Any
+    idle: tuple[str, ...] = ()
+    """Prefixes of the parameters that no action depends on; never trained, nor published."""
     width: int
     """Of the features."""
 

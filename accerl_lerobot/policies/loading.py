@@ -60,12 +60,17 @@ MODELS = "accerl_lerobot.policies.models"
 POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "smolvla": (f"{MODELS}.smolvla:SmolVLA", ("flow", "noise_space")),
     "smolvla_bins": (f"{MODELS}.smolvla_bins:SmolVLABins", ("tokens",)),
+    "act": (f"{MODELS}.act:ACT", ("gaussian",)),
+    "gaussian_actor": (f"{MODELS}.gaussian_actor:GaussianActor", ("gaussian",)),
+    "diffusion": (f"{MODELS}.diffusion:Diffusion", ("diffusion",)),
 }
 """LeRobot policy type → its model, and the families that suit it, the default one first."""
 FAMILIES = {
     "flow": "accerl_lerobot.policies.flow:FlowFamily",
     "noise_space": "accerl_lerobot.policies.noise_space:NoiseSpaceFamily",
     "tokens": "accerl_lerobot.policies.tokens:TokenFamily",
+    "gaussian": "accerl_lerobot.policies.gaussian:GaussianFamily",
+    "diffusion": "accerl_lerobot.policies.diffusion:DiffusionFamily",
 }
 """Family → class; its config is registered under the same name in `samplers`."""
 
@@ -103,6 +108,17 @@ def check_type(policy_type: Any, field: str, prefix: str = "") -> str:
     return str(policy_type)
 
 
+def check_observations(policy_config: Any, field: str) -> None:
+    """Refuses a policy that looks back; what worlds observe between two decisions is not kept.
+
+    Raises:
+        InputError: it reads more than one observation.
+    """
+    if policy_config.n_obs_steps != 1:
+        remedy = "RL shows a policy one observation at a time; use one trained with n_obs_steps=1"
+        raise InputError(field, policy_config.n_obs_steps, remedy)
+
+
 def sampler_config(config: PolicyConfig, policy_type: str) -> SamplerConfig:
     """How a policy of this type explores in this run.
 
@@ -131,7 +147,8 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     folder = _checkpoint_folder(config)
     try:
         name = json.loads((folder / CONFIG).read_text()).get("type")
-        sampler_config(config, check_type(name, "policy.type", f"{config.path} is of this type: "))
+        kind = check_type(name, "policy.type", f"{config.path} is of this type: ")
+        sampler = sampler_config(config, kind)
         lerobot_config = PreTrainedConfig.from_pretrained(folder)
     except InputError:
         raise
@@ -140,6 +157,8 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
         raise InputError("policy.path", config.path, remedy) from error
     lerobot_config.device = str(resolve_device(config.device))
     _override(lerobot_config, config)
+    sampler.override(lerobot_config)
+    check_observations(lerobot_config, "policy.n_obs_steps")
     if (folder / BACKBONE).is_dir() and hasattr(lerobot_config, "vlm_model_name"):
         lerobot_config.vlm_model_name = str((folder / BACKBONE).resolve())
     backbone = Path(getattr(lerobot_config, "vlm_model_name", ""))
@@ -266,8 +285,12 @@ def _verify_weights(policy: Any, folder: Path, config: PolicyConfig) -> None:
     """Compares all tensors with the file: LeRobot loads non-strictly, some policies swallow load errors."""
     stored, loaded = load_file(folder / WEIGHTS), policy.state_dict()
     # No action is computed with the language model's output layer, and savers drop it where it is tied.
+    # Nor is a tensor missing that a policy holds under several names: savers keep one of them.
+    held = {loaded[k].data_ptr() for k in stored.keys() & loaded.keys()}
     missing = sorted(
-        k for k in loaded.keys() - stored.keys() if not k.endswith("vlm_with_expert.vlm.lm_head.weight")
+        k
+        for k in loaded.keys() - stored.keys()
+        if not k.endswith("vlm_with_expert.vlm.lm_head.weight") and loaded[k].data_ptr() not in held
     )
     unexpected = sorted(stored.keys() - loaded.keys())
     if missing or unexpected:
@@ -324,6 +347,9 @@ def _load_module(module: nn.Module, path: Path, what: str, otherwise: str) -> No
 
 def _override(lerobot_config: Any, config: PolicyConfig) -> None:
     """Puts a run's choices of denoising steps and executed rows into the LeRobot config."""
+    if hasattr(lerobot_config, "pretrained_backbone_weights"):
+        # The checkpoint has them; LeRobot would download torchvision's first, even when told to stay offline.
+        lerobot_config.pretrained_backbone_weights = None
     if config.num_steps is not None:
         names = [n for n in ("num_steps", "num_inference_steps") if hasattr(lerobot_config, n)]
         if not names:
