@@ -34,6 +34,7 @@ from typing import Any
 from accerl_lerobot.checkpoint import BACKBONE, relocate
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.backbone import BackboneConfig, write_backbone
+from accerl_lerobot.policies.plugins import discovery, register_policies
 
 logger = logging.getLogger(__name__)
 
@@ -115,6 +116,7 @@ def sft_command(
     module = "accerl_lerobot.demos.cached_train" if config.cache else "lerobot.scripts.lerobot_train"
     command = [sys.executable, "-m", module]
     command += [f"--policy.{key}={_as_argument(value)}" for key, value in policy.items()]
+    command += discovery(kind)
     command += [f"--dataset.repo_id={repo_id}"] + ([f"--dataset.root={root}"] if root else [])
     command += [f"--dataset.revision={revision}"] if revision else []
     command += [
@@ -220,9 +222,9 @@ def policy_fields(kind: str, field: str) -> set[str]:
     Raises:
         InputError: LeRobot has no such type, or cannot fine-tune it; blames `field`.
     """
-    import lerobot.policies  # noqa: F401  fills the registry of policy types
     from lerobot.configs.policies import PreTrainedConfig
 
+    register_policies()
     choices = PreTrainedConfig.get_known_choices()
     if kind not in choices:
         raise InputError(field, kind, f"LeRobot has {', '.join(sorted(choices))}")

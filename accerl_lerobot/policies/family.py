@@ -66,8 +66,6 @@ class Score:
     """(B, L), differentiable."""
     entropy: Tensor
     """(B,)."""
-    factors: Tensor | None = None
-    """See `base.Evaluation`."""
 
 
 class Model(ABC):
@@ -115,6 +113,10 @@ class Family(nn.Module, ABC):
     @abstractmethod
     def actions(self) -> int | None:
         """See `base.PolicyAdapter.actions`."""
+
+    def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
+        """See `base.PolicyAdapter.factors`."""
+        return None
 
 
 def normal(requests: Sequence[Request], *sizes: tuple[int, ...], device: torch.device) -> list[Tensor]:

@@ -41,6 +41,7 @@ from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import OBS_STATE
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Model
+from accerl_lerobot.policies.plugins import register_policies
 from accerl_lerobot.policies.processing import IMAGES, Processing
 from accerl_lerobot.policies.samplers import SamplerConfig
 from accerl_lerobot.policies.tuning import merged_state_dict, tune
@@ -61,6 +62,7 @@ POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "act": (f"{MODELS}.act:ACT", ("gaussian",)),
     "gaussian_actor": (f"{MODELS}.gaussian_actor:GaussianActor", ("gaussian",)),
     "diffusion": (f"{MODELS}.diffusion:Diffusion", ("diffusion",)),
+    "smolvla_bins": (f"{MODELS}.smolvla_bins:SmolVLABins", ("tokens",)),
 }
 """LeRobot policy type → its model, and the families that suit it, the default one first."""
 FAMILIES = {
@@ -68,6 +70,7 @@ FAMILIES = {
     "noise_space": "accerl_lerobot.policies.noise_space:NoiseSpaceFamily",
     "gaussian": "accerl_lerobot.policies.gaussian:GaussianFamily",
     "diffusion": "accerl_lerobot.policies.diffusion:DiffusionFamily",
+    "tokens": "accerl_lerobot.policies.tokens:TokenFamily",
 }
 """Family → class; its config is registered under the same name in `samplers`."""
 
@@ -138,9 +141,9 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     Raises:
         InputError: no checkpoint there, or a policy type without a likelihood here.
     """
-    import lerobot.policies  # noqa: F401  fills the registry of policy types
     from lerobot.configs.policies import PreTrainedConfig
 
+    register_policies()
     folder = _checkpoint_folder(config)
     try:
         name = json.loads((folder / CONFIG).read_text()).get("type")
@@ -183,7 +186,7 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
     except Exception as error:
         raise InputError("policy.path", config.path, f"the weights did not load ({_brief(error)})") from error
     _verify_weights(policy, folder, config)
-    model: Model = _imported(POLICIES[lerobot_config.type][0])(policy)
+    model: Model = imported(POLICIES[lerobot_config.type][0])(policy)
     device = torch.device(lerobot_config.device)
     overrides = {"device_processor": {"device": str(device)}, **model.processor_overrides}
     if (folder / BACKBONE).is_dir():
@@ -198,7 +201,7 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
         ) from error
     processing = Processing(pre, post, device, config.rename_map)
     sampler = sampler_config(config, lerobot_config.type)
-    family = _imported(FAMILIES[sampler.type])(model, sampler)
+    family = imported(FAMILIES[sampler.type])(model, sampler)
     adapter = LeRobotAdapter(
         policy, processing, model, family, ValueHead(model.width, config.value_head), config.precision
     )
@@ -361,7 +364,8 @@ def _override(lerobot_config: Any, config: PolicyConfig) -> None:
         lerobot_config.n_action_steps = config.n_action_steps
 
 
-def _imported(path: str) -> Any:
+def imported(path: str) -> Any:
+    """What an entry of `POLICIES` or `FAMILIES` names."""
     module, _, name = path.partition(":")
     return getattr(importlib.import_module(module), name)
 
