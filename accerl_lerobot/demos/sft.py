@@ -65,8 +65,7 @@ class SFTConfig:
     num_threads: int = 2
     """CPU threads of the trainer."""
     init_path: str | None = None
-    """LeRobot checkpoint to start from; None starts a new policy from `policy`. One on the Hub of a type of
-    ours (`policies/plugins.py`) needs its ``--policy.discover_packages_path`` in `extra_args`."""
+    """LeRobot checkpoint to start from; None starts a new policy from `policy`."""
     policy: dict[str, Any] = field(default_factory=lambda: {"type": "smolvla"})
     """Fields of LeRobot's own policy config for a new policy, ``type`` among them."""
     backbone: BackboneConfig | None = None

@@ -59,18 +59,18 @@ FILES = ("*.json", WEIGHTS, "policy_*.safetensors", VALUE_HEAD, FAMILY, f"{BACKB
 MODELS = "accerl_lerobot.policies.models"
 POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "smolvla": (f"{MODELS}.smolvla:SmolVLA", ("flow", "noise_space")),
-    "smolvla_bins": (f"{MODELS}.smolvla_bins:SmolVLABins", ("tokens",)),
     "act": (f"{MODELS}.act:ACT", ("gaussian",)),
     "gaussian_actor": (f"{MODELS}.gaussian_actor:GaussianActor", ("gaussian",)),
     "diffusion": (f"{MODELS}.diffusion:Diffusion", ("diffusion",)),
+    "smolvla_bins": (f"{MODELS}.smolvla_bins:SmolVLABins", ("tokens",)),
 }
 """LeRobot policy type → its model, and the families that suit it, the default one first."""
 FAMILIES = {
     "flow": "accerl_lerobot.policies.flow:FlowFamily",
     "noise_space": "accerl_lerobot.policies.noise_space:NoiseSpaceFamily",
-    "tokens": "accerl_lerobot.policies.tokens:TokenFamily",
     "gaussian": "accerl_lerobot.policies.gaussian:GaussianFamily",
     "diffusion": "accerl_lerobot.policies.diffusion:DiffusionFamily",
+    "tokens": "accerl_lerobot.policies.tokens:TokenFamily",
 }
 """Family → class; its config is registered under the same name in `samplers`."""
 

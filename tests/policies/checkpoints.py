@@ -29,6 +29,7 @@ def write_policy(
     kind: str,
     *,
     image: int = 16,
+    camera: str = "observation.images.front",
     state_dim: int = 4,
     action_dim: int = 2,
     stats: dict[str, Any] | None = None,
@@ -40,7 +41,8 @@ def write_policy(
     Args:
         directory: where to.
         kind: LeRobot's policy type.
-        image: side of ``observation.images.front`` in pixels; 0: the policy reads none.
+        image: its side in pixels; 0: the policy reads none.
+        camera: what the image is called.
         state_dim: of ``observation.state``.
         action_dim: of the action.
         stats: normalisation; None: states and actions of std 0.5 around 0, or within ±2.
@@ -53,8 +55,7 @@ def write_policy(
 
     inputs = {"observation.state": PolicyFeature(type=FeatureType.STATE, shape=(state_dim,))}
     if image:
-        camera = PolicyFeature(type=FeatureType.VISUAL, shape=(3, image, image))
-        inputs = {"observation.images.front": camera} | inputs
+        inputs = {camera: PolicyFeature(type=FeatureType.VISUAL, shape=(3, image, image))} | inputs
     config = make_policy_config(
         kind,
         input_features=inputs,
