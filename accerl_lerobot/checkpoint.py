@@ -28,7 +28,11 @@ from typing import Any
 
 PRETRAINED = "pretrained_model"
 BACKBONE = "backbone"
-"""Folder beside the weights with the vision-language backbone's config and tokeniser, when they are local."""
+"""Folder beside the weights with the vision-language backbone's config and tokeniser."""
+PREPROCESSOR = "policy_preprocessor.json"
+"""LeRobot's file of the processor steps before the policy."""
+TOKENIZER_STEP = "tokenizer_processor"
+"""LeRobot's name for the one of them that holds the tokeniser of instructions."""
 
 
 def save_checkpoint(checkpoints: Path, write: Callable[[Path], int], state: dict[str, Any]) -> Path:
@@ -70,7 +74,7 @@ def save_checkpoint(checkpoints: Path, write: Callable[[Path], int], state: dict
 def relocate(directory: Path, home: Path) -> None:
     """Points a checkpoint's config and tokeniser at the backbone files in its own folder.
 
-    LeRobot 0.6.1 stores a local backbone by absolute path.
+    LeRobot 0.6.1 stores a local backbone by absolute path. Names on the Hub are left as they are.
 
     Args:
         directory: where the files are now.
@@ -79,11 +83,27 @@ def relocate(directory: Path, home: Path) -> None:
     if not (directory / BACKBONE).is_dir():
         return
     name = str((home / BACKBONE).absolute())
-    config = json.loads((directory / "config.json").read_text())
-    config["vlm_model_name"] = name
+    config, processor = _named(directory)
+    for fields, field in _local_names(config, processor):
+        fields[field] = name
     (directory / "config.json").write_text(json.dumps(config, indent=4) + "\n")
-    processor = json.loads((directory / "policy_preprocessor.json").read_text())
-    for step in processor["steps"]:
-        if step.get("registry_name") == "tokenizer_processor":
-            step["config"]["tokenizer_name"] = name
-    (directory / "policy_preprocessor.json").write_text(json.dumps(processor, indent=4) + "\n")
+    (directory / PREPROCESSOR).write_text(json.dumps(processor, indent=4) + "\n")
+
+
+def displaced(directory: Path) -> bool:
+    """Whether a checkpoint has its own backbone folder and its files name one that is not there."""
+    if not (directory / BACKBONE).is_dir():
+        return False
+    return any(not Path(fields[field]).is_dir() for fields, field in _local_names(*_named(directory)))
+
+
+def _named(directory: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    config = json.loads((directory / "config.json").read_text())
+    return config, json.loads((directory / PREPROCESSOR).read_text())
+
+
+def _local_names(config: dict[str, Any], processor: dict[str, Any]) -> list[tuple[dict[str, Any], str]]:
+    """Where a checkpoint's files name a folder: (mapping, key), for reading and for writing."""
+    tokenizers = [s["config"] for s in processor["steps"] if s.get("registry_name") == TOKENIZER_STEP]
+    places = [(config, "vlm_model_name"), *((fields, "tokenizer_name") for fields in tokenizers)]
+    return [(fields, key) for fields, key in places if Path(fields.get(key) or "").is_absolute()]

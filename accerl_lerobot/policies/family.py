@@ -79,10 +79,14 @@ class Model(ABC):
 
     backbone: ClassVar[str | None] = None
     """Prefix of the parameters that ``policy.tuning.mode=expert`` freezes; None: it has no expert."""
+    unread: ClassVar[tuple[str, ...]] = ()
+    """Names of tensors that nothing is computed with; savers drop them where they are tied."""
     processor_overrides: ClassVar[dict[str, dict[str, Any]]] = {}
     """LeRobot processor step → options that its inference needs and its training does not."""
 
     policy: Any
+    idle: tuple[str, ...] = ()
+    """Prefixes of the parameters that no action depends on; never trained, nor published."""
     width: int
     """Of the features."""
 

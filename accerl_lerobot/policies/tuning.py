@@ -46,6 +46,9 @@ def tune(policy: Any, model: Model, family: Family, config: TuningConfig) -> Non
             parameter.requires_grad_(not name.startswith(model.backbone))
     elif config.mode == "lora":
         _inject(policy, config)
+    for name, parameter in policy.named_parameters():
+        if name.startswith((*model.unread, *model.idle)):
+            parameter.requires_grad_(False)
 
 
 def merged_state_dict(policy: nn.Module) -> dict[str, Tensor] | None:

@@ -162,7 +162,11 @@ def test_two_steps_of_lerobot_s_trainer_give_a_checkpoint(tmp_path: Path):
     assert path == tmp_path / "sft" / "checkpoints" / "last" / "pretrained_model"
     assert "End of training" in (tmp_path / "sft.log").read_text()
     adapter = adapter_at(path)
-    assert (adapter.shape.executed, adapter.shape.action_dim, adapter.shape.padded_dim) == (4, 4, 4)
+    assert (
+        adapter.family.shape.executed,
+        adapter.family.shape.action_dim,
+        adapter.family.shape.padded_dim,
+    ) == (4, 4, 4)
     assert list(adapter.policy.config.image_features) == [CAMERA]
     item = stock_dataset()[100]
     observation = {
