@@ -27,6 +27,7 @@ from safetensors.torch import load_file, save_file
 
 from accerl_lerobot.checkpoint import BACKBONE, PRETRAINED, displaced, relocate, save_checkpoint
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies import verify
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, save_pretrained
 from tests.policies.tiny import adapter_at, perturb, requests
@@ -153,6 +154,7 @@ def test_an_embedding_that_lerobot_replaces_is_noticed(copied: Path, monkeypatch
         return {EMBEDDING: tensors.pop(EMBEDDING)} | tensors
 
     monkeypatch.setattr(safetensors.torch, "load_file", embedding_first)
+    monkeypatch.setattr(verify, "load_file", embedding_first)
     with pytest.raises(InputError, match="embed_tokens.weight differs from the file"):
         adapter_at(copied)
 
