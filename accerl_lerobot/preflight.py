@@ -63,9 +63,11 @@ def check_sft_policy(config: SFTConfig) -> None:
     Raises:
         InputError: LeRobot has no such policy, no such field, or refuses a value.
     """
-    import lerobot.policies  # noqa: F401  fills the registry of policy types
     from lerobot.configs.policies import PreTrainedConfig
 
+    from accerl_lerobot.policies.plugins import register_policies
+
+    register_policies()
     fields: dict[str, Any] = {k: v for k, v in config.policy.items() if k != "type"}
     kind, choices = config.policy["type"], PreTrainedConfig.get_known_choices()
     if kind not in choices:

@@ -34,6 +34,7 @@ from typing import Any
 from accerl_lerobot.checkpoint import displaced, relocate
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.backbone import BackboneConfig, write_backbone
+from accerl_lerobot.policies.plugins import discovery
 
 logger = logging.getLogger(__name__)
 
@@ -59,7 +60,8 @@ class SFTConfig:
     num_threads: int = 2
     """CPU threads of the trainer."""
     init_path: str | None = None
-    """LeRobot checkpoint to start from; None starts a new policy from `policy`."""
+    """LeRobot checkpoint to start from; None starts a new policy from `policy`. One on the Hub of a type of
+    ours (`policies/plugins.py`) needs its ``--policy.discover_packages_path`` in `extra_args`."""
     policy: dict[str, Any] = field(default_factory=lambda: {"type": "smolvla"})
     """Fields of LeRobot's own policy config for a new policy, ``type`` among them."""
     backbone: BackboneConfig | None = None
@@ -91,9 +93,9 @@ def sft_command(
     """The ``lerobot-train`` command line of this warm start."""
     fields: dict[str, Any]
     if config.init_path is not None:
-        fields = {"path": config.init_path}
+        fields, policy_type = {"path": config.init_path}, _stored_config(config.init_path).get("type")
     else:
-        fields = dict(config.policy)
+        fields, policy_type = dict(config.policy), config.policy["type"]
         if config.backbone is not None:
             fields["vlm_model_name"] = str((output_dir.parent / "backbone").resolve())
             fields["load_vlm_weights"] = False
@@ -102,6 +104,7 @@ def sft_command(
     module = "accerl_lerobot.demos.cached_train" if config.cache else "lerobot.scripts.lerobot_train"
     command = [sys.executable, "-m", module]
     command += [f"--policy.{key}={_as_argument(value)}" for key, value in fields.items()]
+    command += discovery(policy_type)
     command += [f"--dataset.repo_id={repo_id}"] + ([f"--dataset.root={root}"] if root else [])
     command += [f"--dataset.revision={revision}"] if revision else []
     command += [
@@ -196,6 +199,13 @@ def _with_backbone_in_place(config: SFTConfig, copy: Path) -> SFTConfig:
     shutil.copytree(start, copy)
     relocate(copy, copy)
     return replace(config, init_path=str(copy))
+
+
+def _stored_config(path: str) -> dict[str, Any]:
+    """The ``config.json`` of a checkpoint on this machine; empty where there is none."""
+    file = Path(path).expanduser() / "config.json"
+    config: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {}
+    return config
 
 
 def _as_argument(value: Any) -> str:

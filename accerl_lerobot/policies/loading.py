@@ -40,6 +40,7 @@ from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import OBS_STATE
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Model
+from accerl_lerobot.policies.plugins import register_policies
 from accerl_lerobot.policies.portable import keep_names, save_backbone, tokenizer_overrides, use_backbone
 from accerl_lerobot.policies.processing import IMAGES, Processing
 from accerl_lerobot.policies.samplers import SamplerConfig
@@ -61,11 +62,13 @@ POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "smolvla": (f"{MODELS}.smolvla:SmolVLA", ("flow", "noise_space")),
     "pi0": (f"{MODELS}.pi0:Pi0", ("flow", "noise_space")),
     "pi05": (f"{MODELS}.pi0:Pi05", ("flow", "noise_space")),
+    "smolvla_bins": (f"{MODELS}.smolvla_bins:SmolVLABins", ("tokens",)),
 }
 """LeRobot policy type → its model, and the families that suit it, the default one first."""
 FAMILIES = {
     "flow": "accerl_lerobot.policies.flow:FlowFamily",
     "noise_space": "accerl_lerobot.policies.noise_space:NoiseSpaceFamily",
+    "tokens": "accerl_lerobot.policies.tokens:TokenFamily",
 }
 """Family → class; its config is registered under the same name in `samplers`."""
 
@@ -125,9 +128,9 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     Raises:
         InputError: no checkpoint there, or a policy type without a likelihood here.
     """
-    import lerobot.policies  # noqa: F401  fills the registry of policy types
     from lerobot.configs.policies import PreTrainedConfig
 
+    register_policies()
     folder = _checkpoint_folder(config)
     try:
         name = json.loads((folder / CONFIG).read_text()).get("type")

@@ -118,3 +118,18 @@ class NoiseSpaceSamplerConfig(SamplerConfig):
             raise InputError("policy.sampler.at_rest", self.at_rest, "use mean or sample")
         if self.hidden < 1:
             raise InputError("policy.sampler.hidden", self.hidden, "use a positive width")
+
+
+@SamplerConfig.register_subclass("tokens")
+@dataclass(frozen=True, kw_only=True)
+class TokenSamplerConfig(SamplerConfig):
+    """Token policies: every token is drawn from the softmax of its logits; see `tokens.py`."""
+
+    temperature: float = 1.0
+    """(0, 10]. Logits are divided by it, when acting and when re-scoring: below 1 the most likely tokens are
+    drawn more often, above 1 less often."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.temperature <= 10:
+            remedy = "use a value in (0, 10]; 1 samples what was trained"
+            raise InputError("policy.sampler.temperature", self.temperature, remedy)

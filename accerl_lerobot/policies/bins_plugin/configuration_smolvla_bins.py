@@ -1,0 +1,126 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Config of ``smolvla_bins``; fields it shares with LeRobot's smolvla have smolvla's names and meaning."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
+
+PACKAGE = "accerl_lerobot.policies.bins_plugin"
+
+
+@PreTrainedConfig.register_subclass("smolvla_bins")
+@dataclass
+class SmolVLABinsConfig(PreTrainedConfig):
+    """A vision-language model, a query token per action dimension of a chunk, and a head onto bins."""
+
+    chunk_size: int = 8
+    """Actions of a chunk."""
+    n_action_steps: int = 8
+    """Of these, how many are executed."""
+    num_bins: int = 256
+    """Bins per action dimension, of equal width over [-1, 1] in normalised units; an action beyond is taken
+    as the outermost bin."""
+
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.MEAN_STD,
+            "ACTION": NormalizationMode.MIN_MAX,
+        }
+    )
+    """Actions must come to [-1, 1]: MIN_MAX, or QUANTILES, which spends no bins on outliers and cannot
+    reproduce them. MIN_MAX, because LeRobot takes a dataset's quantile to be the mean of its episodes'
+    quantiles, and so may cut off far more than the 2 % it says."""
+
+    vlm_model_name: str = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
+    """Hub id or folder of a SmolVLM."""
+    load_vlm_weights: bool = True
+    """Whether a new policy starts from that model's weights or from random ones; unlike in smolvla, where
+    random ones are the default. False in every checkpoint, whose own file holds the weights."""
+    num_vlm_layers: int = 16
+    """How many of its language-model layers are kept, the first ones; 0 keeps all."""
+    freeze_vision_encoder: bool = True
+    freeze_language_model: bool = False
+    """True trains only queries, state projection, head and the images' connector."""
+    resize_imgs_with_padding: tuple[int, int] | None = (512, 512)
+    """Width and height."""
+    tokenizer_max_length: int = 48
+    pad_language_to: str = "longest"
+
+    optimizer_lr: float = 1e-4
+    optimizer_betas: tuple[float, float] = (0.9, 0.95)
+    optimizer_eps: float = 1e-8
+    optimizer_weight_decay: float = 1e-10
+    optimizer_grad_clip_norm: float = 10
+    scheduler_warmup_steps: int = 1_000
+    scheduler_decay_steps: int = 30_000
+    scheduler_decay_lr: float = 2.5e-6
+
+    discover_packages_path: str = PACKAGE
+    """Where this type comes from. A field, because LeRobot 0.6.1 takes the flag
+    ``--policy.discover_packages_path`` for an override of the config when ``--policy.path`` is given too."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 1 <= self.n_action_steps <= self.chunk_size:
+            raise ValueError(f"n_action_steps={self.n_action_steps}: use 1 to chunk_size={self.chunk_size}")
+        if self.num_bins < 2:
+            raise ValueError(f"num_bins={self.num_bins}: use at least 2")
+        bounded = (NormalizationMode.MIN_MAX, NormalizationMode.QUANTILES)
+        if (mode := self.normalization_mapping.get("ACTION")) not in bounded:
+            raise ValueError(f"normalization_mapping.ACTION={mode}: bins need MIN_MAX or QUANTILES")
+
+    def validate_features(self) -> None:
+        """Refuses features it cannot read.
+
+        Raises:
+            ValueError: no image or no action.
+        """
+        if not self.image_features:
+            raise ValueError("smolvla_bins needs at least one image among its input features")
+        if self.action_feature is None:
+            raise ValueError("smolvla_bins needs an action among its output features")
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        return AdamWConfig(
+            lr=self.optimizer_lr,
+            betas=self.optimizer_betas,
+            eps=self.optimizer_eps,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.optimizer_grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
+        return CosineDecayWithWarmupSchedulerConfig(
+            peak_lr=self.optimizer_lr,
+            decay_lr=self.scheduler_decay_lr,
+            num_warmup_steps=self.scheduler_warmup_steps,
+            num_decay_steps=self.scheduler_decay_steps,
+        )
+
+    @property
+    def observation_delta_indices(self) -> None:
+        return None
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        return list(range(self.chunk_size))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None

@@ -1,0 +1,206 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The tokens family's likelihood: a chunk is a sequence of L tokens, each drawn from a softmax of V logits.
+
+Two kinds of model. A *parallel* one gives the logits of all positions in one pass, and tokens are independent
+given the observations (OpenVLA-OFT, arXiv 2502.19645; AcceRL, arXiv 2603.18464). An *autoregressive* one
+gives position l from the tokens before it (π0-FAST, arXiv 2501.09747), and ends with a terminator token.
+
+    π(tokens | o) = Π_l softmax(logits_l / temperature)[token_l]
+
+Position l is a factor of the log-prob as long as no terminator precedes it; the terminator itself is one.
+What a model decodes from the tokens is a function of them, so their density is the action's: exact, with
+nothing left out.
+
+A token is drawn by inverting the distribution function at one uniform number per position, which comes from
+the request's own seed: what a request gets does not depend on its batch, and costs L random numbers, not L·V.
+
+GIPO's KL(μ‖π) would be exact over the V tokens if μ's logits were kept: V numbers per factor instead of one,
+57 kB a decision for 56 factors of 256 bins. They are not; it is estimated from samples as for every family.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from accerl_lerobot.experience import Request
+from accerl_lerobot.policies.family import Action, Encoded, Family, Model, Score, exploring
+from accerl_lerobot.policies.samplers import TokenSamplerConfig
+
+Choose = Callable[[Tensor, int], Tensor]
+"""(logits (B, V), position) → tokens (B,), int64."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TokenContext:
+    """`Encoded.context` of a token model: logits given the observations.
+
+    Logits are in the dtype the network computes in, -inf where a token is impossible.
+    """
+
+    logits: Callable[[Tensor], Tensor]
+    """tokens (B, L) → logits (B, L, V), differentiable; position l depends on ``tokens[:, :l]`` only, and in
+    a parallel model on no token at all."""
+    generate: Callable[[Choose], None] | None = None
+    """Autoregressive models, None in parallel ones. Calls `Choose` for positions 0, 1, … and feeds the model
+    with what it answers; ends after L positions, or once the answer is the terminator in every row (a row
+    that has ended goes on getting it). The logits are those of the call above, up to rounding."""
+
+
+class TokenModel(Model):
+    """A LeRobot policy that chooses tokens; `Encoded.context` is a `TokenContext`."""
+
+    parallel: bool
+    """All positions in one pass."""
+    terminator: int | None
+    """The token after which the others mean nothing; None: all L always count."""
+    length: int
+    """L, most tokens of a decision. Tokens that reach no executed action have no place among them."""
+    rows: int | None
+    """Into how many actions the tokens fall, in order and equally; None: they do not, as with FAST."""
+
+    @abstractmethod
+    def chunk(self, tokens: Tensor) -> Tensor:
+        """Tokens (B, L), terminators to the end after the first, to the executed (B, K, A), normalised."""
+
+    @abstractmethod
+    def stock(self, batch: dict[str, Tensor]) -> Tensor:
+        """LeRobot's own greedy chunk (B, K, A) in normalised units, executed rows only."""
+
+
+def draw(logits: Tensor, uniform: Tensor, temperature: float) -> Tensor:
+    """Tokens (...) from logits (..., V): the distribution function inverted at `uniform` (...) in [0, 1)."""
+    # In double precision: in single the sum is off by more than many a token's probability.
+    cumulative = torch.softmax(logits.float() / temperature, -1).double().cumsum(-1)
+    place = uniform.to(cumulative)[..., None] * cumulative[..., -1:]
+    tokens = torch.searchsorted(cumulative, place, right=True)[..., 0]
+    return tokens.clamp(max=logits.shape[-1] - 1)  # only where logits are NaN, which the log-prob shows
+
+
+def token_log_prob(logits: Tensor, tokens: Tensor, temperature: float) -> Tensor:
+    """Of each token (...), in fp32, from logits (..., V)."""
+    log_probs = torch.log_softmax(logits.float() / temperature, -1)
+    return log_probs.gather(-1, tokens[..., None])[..., 0]
+
+
+def token_entropy(logits: Tensor, temperature: float) -> Tensor:
+    """Entropy (...) in nats of the distribution over the V tokens, exact."""
+    log_probs = torch.log_softmax(logits.float() / temperature, -1)
+    finite = log_probs.masked_fill(log_probs == -torch.inf, 0.0)  # 0·log 0 is 0, and so is its gradient
+    return -(log_probs.exp() * finite).sum(-1)
+
+
+def existing(tokens: Tensor, terminator: int | None) -> Tensor:
+    """bool (B, L): up to and including the first terminator."""
+    if terminator is None:
+        return torch.ones_like(tokens, dtype=torch.bool)
+    ends = (tokens == terminator).long()
+    return ends.cumsum(1) - ends == 0
+
+
+class TokenFamily(Family):
+    """Token policies explored by sampling at a temperature; the functions above do the work.
+
+    The latent is ``tokens``, int64 (L,), the terminator from the first one on.
+
+    Args:
+        model: the policy.
+        sampler: how it explores.
+    """
+
+    def __init__(self, model: TokenModel, sampler: TokenSamplerConfig) -> None:
+        super().__init__()
+        self.model, self.sampler = model, sampler
+
+    def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
+        """See the base class; where a request does not explore, the most likely token."""
+        device, length = encoded.features.device, self.model.length
+        explore = exploring(requests, device)
+        draws = np.stack([np.random.default_rng(r.noise_seed).random(length) for r in requests])
+        uniform = torch.from_numpy(draws).to(device)
+        tokens, log_prob = self._decide(encoded, explore, uniform)
+        counted = explore[:, None] & existing(tokens, self.model.terminator)
+        return Action(
+            chunk=self.model.chunk(tokens),
+            latent={"tokens": tokens},
+            log_prob=torch.where(counted, log_prob, 0.0),
+        )
+
+    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
+        """See the base class; the entropy is that of the distributions the factors were drawn from."""
+        tokens, temperature = latent["tokens"], self.sampler.temperature
+        logits = encoded.context.logits(tokens)
+        factors = existing(tokens, self.model.terminator)
+        return Score(
+            log_prob=torch.where(factors, token_log_prob(logits, tokens, temperature), 0.0),
+            entropy=torch.where(factors, token_entropy(logits, temperature), 0.0).sum(1),
+            factors=None if self.model.terminator is None else factors,
+        )
+
+    def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
+        """See the base class; greedy chunks are compared, then the log-probs of the two passes.
+
+        An autoregressive model has two ways to its logits, and a policy may be trained in another layout than
+        it acts in. That changes log-probs by far more than rounding does, which is what is let pass here.
+        """
+        size = (len(encoded.features), self.model.length)
+        device = encoded.features.device
+        greedy = torch.zeros(size[0], dtype=torch.bool, device=device)
+        tokens, acted = self._decide(encoded, greedy, torch.zeros(size, device=device))
+        difference = float((self.model.chunk(tokens) - self.model.stock(batch)).abs().max())
+        logits = encoded.context.logits(tokens)
+        scored = token_log_prob(logits, tokens, self.sampler.temperature)
+        gap = (scored - acted)[existing(tokens, self.model.terminator)].abs().max()
+        # A NaN is not below: argmax finds a token among NaNs too.
+        return difference if gap <= torch.finfo(logits.dtype).eps ** 0.5 else difference + float(gap)
+
+    @property
+    def actions(self) -> int | None:
+        """See the base class."""
+        return self.model.rows
+
+    def _decide(self, encoded: Encoded, explore: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
+        """Tokens and their log-probs, each (B, L), in one pass or position by position."""
+        context: TokenContext = encoded.context
+        model, temperature = self.model, self.sampler.temperature
+
+        def pick(logits: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:
+            chosen = explore.view(-1, *[1] * (uniform.dim() - 1))
+            tokens = torch.where(chosen, draw(logits, uniform, temperature), logits.argmax(-1))
+            return tokens, token_log_prob(logits, tokens, temperature)
+
+        if model.parallel:
+            return pick(context.logits(torch.zeros_like(uniform, dtype=torch.long)), uniform)
+        fill = 0 if model.terminator is None else model.terminator
+        tokens = torch.full_like(uniform, fill, dtype=torch.long)
+        log_prob = torch.zeros_like(uniform, dtype=torch.float32)
+        running = torch.ones_like(explore)
+
+        def choose(logits: Tensor, position: int) -> Tensor:
+            picked, each = pick(logits, uniform[:, position])
+            tokens[:, position] = torch.where(running, picked, fill)
+            log_prob[:, position] = each
+            if model.terminator is not None:
+                running.logical_and_(picked != model.terminator)
+            return tokens[:, position]
+
+        assert context.generate is not None
+        context.generate(choose)
+        return tokens, log_prob

@@ -1,0 +1,378 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The LeRobot plugin ``smolvla_bins``: its network, its loss, and its way through LeRobot's own commands."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from accerl_lerobot.checkpoint import BACKBONE, PRETRAINED, save_checkpoint
+from accerl_lerobot.demos.sft import SFTConfig, run_sft, sft_command
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.backbone import BackboneConfig
+from accerl_lerobot.policies.base import stack_observations
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.loading import load_adapter, save_pretrained
+from accerl_lerobot.policies.plugins import PLUGINS, discovery, register_policies
+from accerl_lerobot.preflight import check_sft_policy
+from tests.policies.tiny import adapter_at, log_ratio, perturb, requests
+from tests.policies.tiny_bins import write_bins
+
+DATASET = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
+CHUNK, DIMS, BINS = 3, 2, 8
+SFT = SFTConfig(
+    steps=60,
+    batch_size=16,
+    lr=5e-3,
+    warmup_steps=5,
+    num_threads=1,
+    policy={
+        "type": "smolvla_bins",
+        "num_vlm_layers": 2,
+        "chunk_size": 4,
+        "n_action_steps": 4,
+        "num_bins": 32,
+        "resize_imgs_with_padding": [32, 32],
+        "freeze_vision_encoder": False,
+    },
+    backbone=BackboneConfig(
+        hidden=32, heads=2, kv_heads=1, vision_hidden=16, vision_layers=1, vision_heads=2, patch=8, image=32
+    ),
+    extra_args=["--log_freq=10"],
+)
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("plugin") / PRETRAINED
+    return write_bins(directory, chunk=CHUNK, executed=2, num_bins=BINS, action_range=(-1.0, 3.0))
+
+
+@pytest.fixture
+def loaded(path: Path) -> tuple[Any, Any, Any]:
+    """Policy and processors, by LeRobot alone."""
+    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+
+    policy = get_policy_class("smolvla_bins").from_pretrained(path)
+    return policy, *make_pre_post_processors(policy.config, pretrained_path=str(path))
+
+
+def observed(count: int, seed: int = 0) -> dict[str, Any]:
+    """A batch as LeRobot's loader makes it; the instructions have unequal lengths."""
+    draw = torch.Generator().manual_seed(seed)
+    return {
+        "observation.images.front": torch.rand(count, 3, 32, 32, generator=draw),
+        "observation.state": torch.randn(count, 4, generator=draw),
+        "task": ["Go", "Match the target", "Mirror the target slowly"][:count],
+        "action": 4 * torch.rand(count, CHUNK, DIMS, generator=draw) - 1,
+        "action_is_pad": torch.tensor([[False] * CHUNK, [False, True, True], [False, False, True]])[:count],
+    }
+
+
+def slow_hidden(policy: Any, image: Tensor, tokens: Tensor, state: Tensor) -> Tensor:
+    """The language model of one sample in double precision, by the formulas of a Llama, without padding.
+
+    Rotary embeddings, grouped heads, RMS norms, gated SiLU; who sees whom is written out pair by pair.
+    """
+    model = policy.model.double()
+    vlm, text = model.vlm, model.vlm.text_model
+    pixels = vlm.connector(vlm.vision_model(pixel_values=(2 * image - 1)[None].double()).last_hidden_state)[0]
+    words = text.embed_tokens.weight[tokens]
+    place = state.double() @ model.state_proj.weight.T + model.state_proj.bias
+    x = torch.cat([pixels, words, place[None], model.queries])
+    n, prefix, end = len(x), len(pixels) + len(words), len(pixels) + len(words) + 1
+    sees = torch.zeros(n, n, dtype=torch.bool)
+    for i in range(n):
+        for j in range(n):
+            sees[i, j] = j < prefix or (i >= prefix and j < end) or i >= end
+    config = text.config
+    size, heads, shared = config.head_dim, config.num_attention_heads, config.num_key_value_heads
+
+    def norm(x: Tensor, layer: Any) -> Tensor:
+        return x / torch.sqrt(x.square().mean(-1, keepdim=True) + config.rms_norm_eps) * layer.weight
+
+    def turned(x: Tensor) -> Tensor:
+        half = size // 2
+        angles = torch.arange(n)[:, None] / config.rope_parameters["rope_theta"] ** (
+            torch.arange(half) / half
+        )
+        cos, sin = (f(angles.double())[:, None] for f in (torch.cos, torch.sin))
+        a, b = x[..., :half], x[..., half:]
+        return torch.cat([a * cos - b * sin, b * cos + a * sin], -1)
+
+    for layer in text.layers:
+        y, attention = norm(x, layer.input_layernorm), layer.self_attn
+        q = turned((y @ attention.q_proj.weight.T).view(n, heads, size))
+        k = turned((y @ attention.k_proj.weight.T).view(n, shared, size))
+        v = (y @ attention.v_proj.weight.T).view(n, shared, size)
+        mixed = []
+        for head in range(heads):
+            mine = head // (heads // shared)
+            scores = (q[:, head] @ k[:, mine].T / size**0.5).masked_fill(~sees, -torch.inf)
+            mixed.append(torch.softmax(scores, -1) @ v[:, mine])
+        x = x + torch.cat(mixed, -1) @ attention.o_proj.weight.T
+        y, mlp = norm(x, layer.post_attention_layernorm), layer.mlp
+        gate = torch.nn.functional.silu(y @ mlp.gate_proj.weight.T)
+        x = x + (gate * (y @ mlp.up_proj.weight.T)) @ mlp.down_proj.weight.T
+    return norm(x, text.norm)[end:]
+
+
+@torch.no_grad()
+def test_the_network_is_the_formulas(loaded: tuple[Any, Any, Any]):
+    policy, pre, _ = loaded
+    draw = torch.Generator().manual_seed(3)
+    for parameter in policy.parameters():  # fresh weights hardly attend to anything in particular
+        parameter += 0.3 * torch.randn(parameter.shape, generator=draw)
+    batch = pre(observed(3))
+    tokens, mask = batch["observation.language.tokens"], batch["observation.language.attention_mask"].bool()
+    assert not mask.all()
+    hidden = policy.hidden(batch)
+    for i in range(3):
+        image, state = batch["observation.images.front"][i], batch["observation.state"][i]
+        expected = slow_hidden(policy, image, tokens[i][mask[i]], state)
+        assert (hidden[i] - expected).abs().max() < 1e-4
+    assert hidden.shape == (3, CHUNK * DIMS, 32) and hidden.std() > 0.1
+
+
+def test_bins_by_hand(loaded: tuple[Any, Any, Any]):
+    policy = loaded[0]
+    actions = torch.tensor([-1.0, -0.751, -0.749, 0.0, 0.999, 1.0, 7.0, -7.0])
+    tokens = policy.encode_actions(actions)
+    assert tokens.tolist() == [0, 0, 1, 4, 7, 7, 7, 0]
+    assert policy.decode_tokens(tokens).tolist() == [
+        -0.875,
+        -0.875,
+        -0.625,
+        0.125,
+        0.875,
+        0.875,
+        0.875,
+        -0.875,
+    ]
+    every = torch.arange(BINS)
+    assert torch.equal(policy.encode_actions(policy.decode_tokens(every)), every)
+
+
+def test_the_loss_by_hand(loaded: tuple[Any, Any, Any]):
+    policy, pre, _ = loaded
+    raw = observed(3)
+    batch = pre(raw)
+    assert np.allclose(batch["action"], (raw["action"] + 1) / 2 - 1, atol=1e-6), "[-1, 3] became [-1, 1]"
+    with torch.no_grad():
+        logits = policy.model.logits(policy.hidden(batch)).view(3, CHUNK, DIMS, BINS).double().numpy()
+    sums, distances = np.zeros(3), []
+    for b in range(3):
+        for k in range(CHUNK):
+            for a in range(DIMS):
+                if raw["action_is_pad"][b, k]:
+                    continue
+                wanted = min(int((float(raw["action"][b, k, a]) + 1) / 4 * BINS), BINS - 1)
+                row = logits[b, k, a]
+                sums[b] += np.log(np.exp(row).sum()) - row[wanted]
+                said = (2 * row.argmax() + 1) / BINS - 1
+                distances.append(abs(said - float(batch["action"][b, k, a])))
+    counts = DIMS * np.array([3, 1, 2])
+    loss, info = policy.forward(batch)
+    assert loss.item() == pytest.approx(sums.sum() / counts.sum(), rel=1e-5)
+    assert info == {"loss": pytest.approx(loss.item()), "l1": pytest.approx(np.mean(distances), rel=1e-5)}
+    each, _ = policy.forward(batch, reduction="none")
+    assert np.allclose(each.detach(), sums / counts, rtol=1e-5)
+    del batch["action_is_pad"]
+    assert policy.forward(batch)[0].item() != pytest.approx(loss.item(), rel=1e-3)
+
+
+def test_the_loss_trains_what_is_not_frozen(path: Path, loaded: tuple[Any, Any, Any], tmp_path: Path):
+    from lerobot.policies.factory import get_policy_class
+
+    _, pre, _ = loaded
+    expected = {
+        (False, False): {"vision_model", "connector", "text_model", "queries", "state_proj", "head"},
+        (True, False): {"connector", "text_model", "queries", "state_proj", "head"},
+        (True, True): {"connector", "queries", "state_proj", "head"},
+    }
+    for (vision, language), parts in expected.items():
+        where = write_bins(
+            tmp_path / f"{vision}{language}", chunk=CHUNK, num_bins=BINS, executed=1,
+            freeze_vision_encoder=vision, freeze_language_model=language,
+        )  # fmt: skip
+        policy = get_policy_class("smolvla_bins").from_pretrained(where)
+        policy.forward(pre(observed(3)))[0].backward()
+        reached = {
+            name for name, p in policy.named_parameters() if p.grad is not None and p.grad.abs().max() > 0
+        }
+        assert reached == {name for name, p in policy.named_parameters() if p.requires_grad}
+        assert {name.removeprefix("model.").removeprefix("vlm.").split(".")[0] for name in reached} == parts
+        assert len(policy.get_optim_params()) == len(reached)
+
+
+def test_a_policy_without_state_and_with_two_cameras(tmp_path: Path):
+    from lerobot.configs.types import FeatureType, PolicyFeature
+    from lerobot.policies.factory import get_policy_class
+
+    camera = PolicyFeature(type=FeatureType.VISUAL, shape=(3, 32, 32))
+    names = ("observation.images.a", "observation.images.b")
+    where = write_bins(tmp_path / "two", executed=1, input_features=dict.fromkeys(names, camera))
+    policy = get_policy_class("smolvla_bins").from_pretrained(where)
+    batch = {name: torch.rand(2, 3, 24, 32, generator=torch.Generator().manual_seed(1)) for name in names}
+    batch["observation.language.tokens"] = torch.ones(2, 3, dtype=torch.long)
+    batch["observation.language.attention_mask"] = torch.ones(2, 3, dtype=torch.bool)
+    first = policy.hidden(batch)
+    assert (policy.hidden(batch | {names[1]: 1 - batch[names[1]]}) - first).abs().max() > 1e-4
+    assert "model.state_proj.weight" not in policy.state_dict()
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"chunk_size": 2, "n_action_steps": 3}, "n_action_steps=3: use 1 to chunk_size=2"),
+        ({"num_bins": 1}, "num_bins=1: use at least 2"),
+        ({"normalization_mapping": {"ACTION": "MEAN_STD"}}, "bins need MIN_MAX or QUANTILES"),
+        ({"nun_bins": 8}, "no such field; did you mean num_bins"),
+    ],
+)
+def test_bad_fields_are_refused_before_any_training(fields: dict[str, Any], message: str):
+    with pytest.raises(InputError, match=f"^sft.policy.*{message}"):
+        check_sft_policy(SFTConfig(policy={"type": "smolvla_bins"} | fields))
+    check_sft_policy(SFTConfig(policy={"type": "smolvla_bins", "num_bins": 2}))
+
+
+def test_a_policy_that_sees_nothing_is_refused(tmp_path: Path):
+    with pytest.raises(ValueError, match="needs at least one image"):
+        write_bins(tmp_path / "blind", input_features={})
+
+
+def test_a_new_policy_has_the_backbone_s_weights_when_asked(path: Path, tmp_path: Path):
+    from transformers import AutoConfig, AutoModelForImageTextToText
+
+    config = json.loads((path / "config.json").read_text())
+    backbone = Path(shutil.copytree(config["vlm_model_name"], tmp_path / "vlm"))
+    torch.manual_seed(5)
+    pretrained = AutoModelForImageTextToText.from_config(AutoConfig.from_pretrained(backbone)).to(
+        torch.bfloat16
+    )
+    pretrained.save_pretrained(backbone)
+    where = write_bins(
+        tmp_path / "new", vlm_model_name=str(backbone), load_vlm_weights=True, num_vlm_layers=1
+    )
+    adapter = adapter_at(where)
+    mine = adapter.policy.model.vlm.state_dict()
+    theirs = pretrained.model.state_dict()
+    assert {k for k in theirs if k not in mine} == {k for k in theirs if "text_model.layers.1." in k} != set()
+    assert all(v.dtype == torch.float32 and torch.equal(v, theirs[k].float()) for k, v in mine.items())
+    assert json.loads((where / "config.json").read_text())["load_vlm_weights"] is False
+    save_pretrained(adapter, tmp_path / "saved", PolicyConfig(path=str(where), device="cpu"))
+    files = {f.name for f in (tmp_path / "saved" / BACKBONE).iterdir()}
+    assert "tokenizer.json" in files and not any(f.endswith(".safetensors") for f in files)
+
+
+def test_a_moved_checkpoint_needs_nothing_from_where_it_was_made(tmp_path: Path):
+    origin = write_bins(tmp_path / "origin" / PRETRAINED)
+    config = PolicyConfig(path=str(origin), device="cpu")
+    adapter = load_adapter(config)
+    perturb(adapter, 0.1)
+
+    def write(directory: Path) -> int:
+        save_pretrained(adapter, directory, config)
+        return 12
+
+    final = save_checkpoint(tmp_path / "run" / "checkpoints", write, {})
+    shutil.rmtree(tmp_path / "origin")
+    asked = requests(3)
+    decisions = adapter.decide(asked, 0)
+    assert pickle.dumps(adapter_at(final / PRETRAINED).decide(asked, 0)) == pickle.dumps(decisions)
+    moved = Path(shutil.move(final, tmp_path / "elsewhere"))
+    assert pickle.dumps(adapter_at(moved / PRETRAINED).decide(asked, 0)) == pickle.dumps(decisions)
+
+
+def test_bf16_moves_log_probs_little(path: Path):
+    asked = requests(32)
+    fp32 = adapter_at(path)
+    perturb(fp32, 0.3)
+    bf16 = adapter_at(path, precision="bf16")
+    bf16.load_trainable(fp32.export_trainable())
+    change = log_ratio(bf16, asked, fp32.decide(asked, 0))
+    assert 0 < change.abs().max() < 0.1
+    batch = bf16.processing.prepare(*stack_observations(asked))
+    with torch.autocast("cpu", torch.bfloat16):
+        encoded = bf16.model.encode(batch)
+    assert encoded.context.logits(torch.zeros(32, 4, dtype=torch.long)).dtype == torch.float32
+
+
+def test_where_lerobot_finds_the_type(path: Path, tmp_path: Path):
+    from lerobot.configs.parser import load_plugin
+    from lerobot.configs.policies import PreTrainedConfig
+
+    register_policies()
+    assert set(PLUGINS) <= set(PreTrainedConfig.get_known_choices())
+    load_plugin(PLUGINS["smolvla_bins"])  # every submodule, as LeRobot's commands do
+    flag = f"--policy.discover_packages_path={PLUGINS['smolvla_bins']}"
+    assert discovery("smolvla_bins") == [flag] and discovery("smolvla") == discovery(None) == []
+    # What `lerobot-eval --policy.path` makes of the flag: an override of the checkpoint's config.
+    override = [flag.replace("--policy.", "--")]
+    assert PreTrainedConfig.from_pretrained(path, cli_overrides=override).num_bins == BINS
+    new = sft_command(SFT, "a/b", None, tmp_path / "sft", 0, "cpu")
+    assert flag in new and "--policy.type=smolvla_bins" in new
+    further = SFTConfig(steps=1, init_path=str(path))
+    assert flag in sft_command(further, "a/b", None, tmp_path / "sft", 0, "cpu")
+    for other in (SFTConfig(steps=1), SFTConfig(steps=1, init_path="org/policy")):
+        assert flag not in sft_command(other, "a/b", None, tmp_path / "sft", 0, "cpu")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[int, float]]]:
+    """A checkpoint of LeRobot's own trainer, in a process of its own, and its loss on the way."""
+    losses: list[tuple[int, float]] = []
+    output = tmp_path_factory.mktemp("sft") / "sft"
+    path = run_sft(
+        SFT, "accerl/metaworld_tiny", str(DATASET), output, seed=0, texts=["Open a drawer"],
+        on_step=lambda step, loss: losses.append((step, loss)),
+    )  # fmt: skip
+    return path, losses
+
+
+def test_lerobot_s_trainer_lowers_the_loss(trained: tuple[Path, list[tuple[int, float]]]):
+    path, losses = trained
+    assert [step for step, _ in losses] == [10, 20, 30, 40, 50, 60]
+    assert losses[-1][1] < losses[0][1] - 0.3 and losses[-1][1] < np.log(32) - 0.5  # log 32: knows nothing
+    adapter = adapter_at(path)
+    assert adapter.family.model.length == 16 and adapter.actions() == 4
+    stats = json.loads((DATASET / "meta" / "stats.json").read_text())["action"]
+    ends = torch.tensor([-1.0, 1.0])[:, None, None].expand(2, 1, 4)
+    assert np.allclose(adapter.processing.unnormalise(ends)[:, 0], [stats["min"], stats["max"]], atol=1e-5)
+
+
+def test_lerobot_eval_runs_the_checkpoint(trained: tuple[Path, list[tuple[int, float]]], tmp_path: Path):
+    command = [
+        sys.executable, "-m", "lerobot.scripts.lerobot_eval", f"--policy.path={trained[0]}",
+        *discovery("smolvla_bins"), "--policy.device=cpu",
+        "--env.discover_packages_path=accerl_lerobot.envs.lerobot_plugin", "--env.type=accerl_metaworld",
+        "--env.task=drawer-open-v3", "--env.image_size=64", "--env.max_steps=8",
+        "--eval.n_episodes=2", "--eval.batch_size=1", f"--output_dir={tmp_path / 'eval'}",
+    ]  # fmt: skip
+    done = subprocess.run(command, env=dict(os.environ), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    results = json.loads((tmp_path / "eval" / "eval_info.json").read_text())
+    assert results["overall"]["n_episodes"] == 2

@@ -1,0 +1,382 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The tokens family against a slow oracle, on two models small enough to enumerate what they can say."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import Request
+from accerl_lerobot.policies import tokens as tk
+from accerl_lerobot.policies.family import Encoded
+from accerl_lerobot.policies.samplers import SamplerConfig, TokenSamplerConfig
+from accerl_lerobot.policies.tokens import TokenContext, TokenFamily, TokenModel
+
+VOCABULARY, LENGTH, WIDTH = 4, 3, 5
+END = 3
+
+
+class Recurrent(TokenModel):
+    """Autoregressive: h ← tanh(h + E[token]), logits = U h; the observation is the first h."""
+
+    parallel, terminator, length, rows, width = False, END, LENGTH, None, WIDTH
+
+    def __init__(self, perturbation: float = 0.0, late: bool = False) -> None:
+        draw = torch.Generator().manual_seed(1)
+        self.embedding = torch.randn(VOCABULARY, WIDTH, generator=draw)
+        self.out = torch.randn(VOCABULARY, WIDTH, generator=draw)
+        self.decoder = torch.randn(LENGTH, VOCABULARY, 2, generator=draw)
+        self.out += perturbation * torch.randn(VOCABULARY, WIDTH, generator=draw)
+        self.embedding += perturbation * torch.randn(VOCABULARY, WIDTH, generator=draw)
+        self.late, self.calls = late, 0
+
+    def encode(self, batch: dict[str, Tensor]) -> Encoded:
+        start = batch["observation"]
+        mask = torch.ones(len(start), 1, dtype=torch.bool)
+
+        def logits(tokens: Tensor) -> Tensor:
+            h, rows = start, []
+            for position in range(LENGTH):
+                rows.append(h @ self.out.T)
+                fed = tokens[:, max(0, position - self.late)]  # `late`: as if trained in another layout
+                h = torch.tanh(h + self.embedding[fed])
+            return torch.stack(rows, 1)
+
+        def generate(choose: tk.Choose) -> None:
+            h = start
+            for position in range(LENGTH):
+                self.calls += 1
+                chosen = choose(h @ self.out.T, position)
+                assert chosen.dtype == torch.int64
+                if (chosen == END).all():
+                    break
+                h = torch.tanh(h + self.embedding[chosen])
+
+        context = TokenContext(logits=logits, generate=generate)
+        return Encoded(features=start[:, None], mask=mask, context=context)
+
+    def chunk(self, tokens: Tensor) -> Tensor:
+        """One action that hangs on all tokens and on where the terminator is."""
+        return sum(self.decoder[i, tokens[:, i]] for i in range(LENGTH))[:, None]
+
+    def stock(self, batch: dict[str, Tensor]) -> Tensor:
+        rows = []
+        for start in batch["observation"]:
+            said = _greedy(self, start.numpy().astype(np.float64))
+            rows.append(self.chunk(torch.tensor([said]))[0])
+        return torch.stack(rows)
+
+
+class Parallel(TokenModel):
+    """All logits at once, from the observation alone."""
+
+    parallel, terminator, length, rows, width = True, None, LENGTH, LENGTH, WIDTH
+
+    def __init__(self, perturbation: float = 0.0) -> None:
+        draw = torch.Generator().manual_seed(2)
+        self.out = torch.randn(LENGTH, VOCABULARY, WIDTH, generator=draw)
+        self.out += perturbation * torch.randn(LENGTH, VOCABULARY, WIDTH, generator=draw)
+
+    def encode(self, batch: dict[str, Tensor]) -> Encoded:
+        start = batch["observation"]
+        logits = torch.einsum("bw,lvw->blv", start, self.out)
+        mask = torch.ones(len(start), 1, dtype=torch.bool)
+        return Encoded(features=start[:, None], mask=mask, context=TokenContext(logits=lambda tokens: logits))
+
+    def chunk(self, tokens: Tensor) -> Tensor:
+        return (tokens / VOCABULARY)[..., None]
+
+    def stock(self, batch: dict[str, Tensor]) -> Tensor:
+        return self.chunk(torch.einsum("bw,lvw->blv", batch["observation"], self.out).argmax(-1))
+
+
+def slow_logits(model: Any, start: np.ndarray, said: tuple[int, ...]) -> np.ndarray:
+    """Logits (V,) of position ``len(said)``, in double precision."""
+    if isinstance(model, Parallel):
+        return model.out[len(said)].double().numpy() @ start
+    h = start
+    for token in said:
+        h = np.tanh(h + model.embedding[token].double().numpy())
+    return model.out.double().numpy() @ h
+
+
+def slow_probabilities(
+    model: Any, start: np.ndarray, said: tuple[int, ...], temperature: float
+) -> list[float]:
+    weights = [math.exp(x / temperature) for x in slow_logits(model, start, said)]
+    return [w / sum(weights) for w in weights]
+
+
+def _greedy(model: Any, start: np.ndarray) -> list[int]:
+    said: tuple[int, ...] = ()
+    while len(said) < LENGTH:
+        ended = model.terminator is not None and model.terminator in said
+        said += (END if ended else int(np.argmax(slow_logits(model, start, said))),)
+    return list(said)
+
+
+def sequences(model: Any) -> list[tuple[int, ...]]:
+    """All that the model can say, the terminator to the end after the first."""
+    every = itertools.product(range(VOCABULARY), repeat=LENGTH)
+    if model.terminator is None:
+        return list(every)
+    return [s for s in every if all(b == END for a, b in itertools.pairwise(s) if a == END)]
+
+
+def oracle(
+    model: Any, start: np.ndarray, said: tuple[int, ...], temperature: float
+) -> tuple[list, float, list]:
+    """Log-probs (L,), entropy and factors (L,) of one sequence."""
+    log_probs, entropy, exists = [], 0.0, []
+    for position in range(LENGTH):
+        exists.append(model.terminator is None or model.terminator not in said[:position])
+        if not exists[-1]:
+            log_probs.append(0.0)
+            continue
+        p = slow_probabilities(model, start, said[:position], temperature)
+        log_probs.append(math.log(p[said[position]]))
+        entropy -= sum(x * math.log(x) for x in p)
+    return log_probs, entropy, exists
+
+
+def observations(count: int, seed: int = 0) -> Tensor:
+    return torch.randn(count, WIDTH, generator=torch.Generator().manual_seed(seed))
+
+
+def requests(count: int, explore: bool = True, first: int = 0) -> list[Request]:
+    return [Request(observation={}, noise_seed=first + i, explore=explore) for i in range(count)]
+
+
+def family(model: Any, temperature: float = 1.0) -> TokenFamily:
+    return TokenFamily(model, TokenSamplerConfig(temperature=temperature))
+
+
+def encoded(model: Any, starts: Tensor) -> Encoded:
+    return model.encode({"observation": starts})
+
+
+MODELS = [Recurrent, Parallel]
+
+
+@pytest.mark.parametrize("temperature", [1.0, 0.5, 3.0])
+@pytest.mark.parametrize("kind", MODELS)
+def test_scores_are_the_oracle_s_for_all_that_can_be_said(kind: Any, temperature: float):
+    model = kind()
+    said = sequences(model)
+    start = observations(1)
+    score = family(model, temperature).score(
+        encoded(model, start.expand(len(said), -1)), {"tokens": torch.tensor(said)}
+    )
+    expected = [oracle(model, start[0].double().numpy(), s, temperature) for s in said]
+    assert np.allclose(score.log_prob, [e[0] for e in expected], atol=1e-5)
+    assert np.allclose(score.entropy, [e[1] for e in expected], atol=1e-5)
+    assert score.log_prob.sum(1).exp().sum() == pytest.approx(1.0, abs=1e-5), "a density over them"
+    if kind is Recurrent:
+        assert score.factors is not None and score.factors.tolist() == [e[2] for e in expected]
+        assert not score.factors.all()
+    else:
+        assert score.factors is None
+
+
+@pytest.mark.parametrize("temperature", [1.0, 0.5])
+@pytest.mark.parametrize("kind", MODELS)
+def test_what_acts_is_what_is_scored(kind: Any, temperature: float):
+    model, starts = kind(), observations(40)
+    tokens_family, read = family(model, temperature), encoded(model, starts)
+    action = tokens_family.act(read, requests(40))
+    score = tokens_family.score(read, action.latent)
+    assert action.latent.keys() == {"tokens"}
+    assert action.latent["tokens"].shape == (40, LENGTH) and action.latent["tokens"].dtype == torch.int64
+    assert (score.log_prob - action.log_prob).abs().max() <= 1e-6
+    assert action.log_prob.dtype == score.log_prob.dtype == torch.float32
+    assert torch.equal(action.chunk, model.chunk(action.latent["tokens"]))
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_without_exploring_the_most_likely_tokens_and_no_log_prob(kind: Any):
+    model, starts = kind(), observations(30)
+    action = family(model, 10.0).act(encoded(model, starts), requests(30, explore=False))
+    greedy = [_greedy(model, s.double().numpy()) for s in starts]
+    assert action.latent["tokens"].tolist() == greedy
+    assert not action.log_prob.any()
+    mixed = requests(15, explore=False) + requests(15, first=15)
+    action = family(model, 10.0).act(encoded(model, starts), mixed)
+    assert action.latent["tokens"][:15].tolist() == greedy[:15] and not action.log_prob[:15].any()
+    assert action.latent["tokens"][15:].tolist() != greedy[15:] and (action.log_prob[15:, 0] < 0).all()
+
+
+@pytest.mark.parametrize("temperature", [1.0, 0.4, 3.0])
+@pytest.mark.parametrize("kind", MODELS)
+def test_sequences_are_as_frequent_as_their_probability(kind: Any, temperature: float):
+    model, start, count = kind(), observations(1), 20_000
+    read = encoded(model, start.expand(count, -1))
+    action = family(model, temperature).act(read, requests(count))
+    seen = Counter(map(tuple, action.latent["tokens"].tolist()))
+    said = sequences(model)
+    assert seen.keys() <= set(said)
+    squares = 0.0
+    for sequence in said:
+        p = math.exp(sum(oracle(model, start[0].double().numpy(), sequence, temperature)[0]))
+        squares += (seen[sequence] - count * p) ** 2 / (count * p)
+    freedom = len(said) - 1
+    assert squares < freedom + 5 * math.sqrt(2 * freedom), "χ²"
+
+
+def test_positions_are_drawn_independently():
+    # One uniform number for all positions would give each its right marginal distribution.
+    model, count = Parallel(), 4000
+    model.out = torch.zeros_like(model.out)
+    action = family(model).act(encoded(model, observations(1).expand(count, -1)), requests(count))
+    correlation = np.corrcoef(action.latent["tokens"].numpy().T)
+    assert np.abs(correlation[np.triu_indices(LENGTH, 1)]).max() < 0.08
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_a_request_s_tokens_are_its_own(kind: Any):
+    model, starts, asked = kind(), observations(12), requests(12)
+    tokens_family = family(model)
+    together = tokens_family.act(encoded(model, starts), asked)
+    backwards = tokens_family.act(encoded(model, starts.flip(0)), asked[::-1])
+    assert torch.equal(backwards.latent["tokens"].flip(0), together.latent["tokens"])
+    for i in range(12):
+        alone = tokens_family.act(encoded(model, starts[i : i + 1]), [asked[i]])
+        assert torch.equal(alone.latent["tokens"][0], together.latent["tokens"][i])
+        assert (alone.log_prob[0] - together.log_prob[i]).abs().max() <= 1e-6
+    torch.manual_seed(5)
+    assert torch.equal(
+        tokens_family.act(encoded(model, starts), asked).latent["tokens"], together.latent["tokens"]
+    )
+    other = tokens_family.act(encoded(model, starts), requests(12, first=100))
+    assert not torch.equal(other.latent["tokens"], together.latent["tokens"])
+
+
+def test_nothing_after_the_terminator_counts():
+    model, count = Recurrent(), 60
+    tokens_family, read = family(model, 2.0), encoded(model, observations(count))
+    action = tokens_family.act(read, requests(count))
+    said = action.latent["tokens"]
+    after = (said == END).long().cumsum(1) - (said == END).long() > 0
+    assert after.any() and not after.all()
+    assert (said[after] == END).all() and not action.log_prob[after].any()
+    score = tokens_family.score(read, action.latent)
+    assert score.factors is not None and torch.equal(score.factors, ~after)
+    assert not score.log_prob[after].any() and (score.log_prob[~after] < 0).all()
+    # The terminator itself counts, and a different sequel to it changes nothing.
+    ends = (said == END) & ~after
+    assert ends.any() and (action.log_prob[ends] < 0).all()
+    garbled = torch.where(after, 1, said)
+    again = tokens_family.score(read, {"tokens": garbled})
+    assert torch.equal(again.log_prob, score.log_prob) and torch.equal(again.entropy, score.entropy)
+
+
+def test_generation_ends_when_all_have_ended():
+    model = Recurrent()
+    model.out[END] = 0.0
+    model.out[END, 0] = 100.0
+    starts = observations(3)
+    starts[:, 0] = 1.0
+    action = family(model).act(encoded(model, starts), requests(3))
+    assert model.calls == 1 and action.latent["tokens"].tolist() == [[END] * LENGTH] * 3
+    assert (action.log_prob[:, 0] > -1e-5).all() and not action.log_prob[:, 1:].any()
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_weighted_samples_of_mu_are_samples_of_pi(kind: Any):
+    old, new, start, count = kind(), kind(0.3), observations(1, seed=1), 20_000
+    starts = start.expand(count, -1)
+    action = family(old).act(encoded(old, starts), requests(count))
+    log_prob = family(new).score(encoded(new, starts), action.latent).log_prob
+    ratio = (log_prob - action.log_prob).sum(1).exp().double()
+
+    def payoff(chunk: Tensor) -> Tensor:
+        x = chunk.flatten(1).double()
+        return torch.tanh(2 * (x[:, 0] - x[:, -1])) + x[:, 0] ** 2
+
+    def exact(model: Any) -> float:
+        said = sequences(model)
+        each = [math.exp(sum(oracle(model, start[0].double().numpy(), s, 1.0)[0])) for s in said]
+        return float(np.dot(each, payoff(old.chunk(torch.tensor(said)))))
+
+    product = ratio * payoff(action.chunk)
+    error = float(product.std()) / math.sqrt(count)
+    assert abs(exact(old) - exact(new)) > 10 * error, "the weights must matter, or the test shows nothing"
+    assert abs(float(product.mean()) - exact(new)) < 4 * error
+    assert abs(float(ratio.mean()) - 1) < 4 * float(ratio.std()) / math.sqrt(count)
+
+
+def test_impossible_tokens_are_never_drawn_and_spoil_nothing():
+    logits = torch.tensor([[-torch.inf, 0.0, -torch.inf, 1.0, -torch.inf]], requires_grad=True)
+    edges = torch.tensor([0.0, 0.2, 1 - 2**-53], dtype=torch.float64)
+    assert tk.draw(logits.detach().expand(3, -1), edges, 1.0).tolist() == [1, 1, 3]
+    entropy = tk.token_entropy(logits, 1.0)
+    p = 1 / (1 + math.e)
+    assert entropy.item() == pytest.approx(-p * math.log(p) - (1 - p) * math.log(1 - p), abs=1e-6)
+    (entropy.sum() + tk.token_log_prob(logits, torch.tensor([3]), 1.0).sum()).backward()
+    assert logits.grad is not None and torch.isfinite(logits.grad).all()
+
+
+def test_a_large_vocabulary_is_drawn_from_without_rounding():
+    # A quarter of a million equal tokens: in single precision the distribution function stops short of 1.
+    size = 250_000
+    place = (torch.arange(50, dtype=torch.float64) + 0.5) / 50
+    drawn = tk.draw(torch.zeros(50, size), place, 1.0)
+    assert (drawn - (place * size).long()).abs().max() <= 1
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_the_self_check_passes_what_agrees(kind: Any):
+    model, batch = kind(), {"observation": observations(6)}
+    assert family(model, 2.0).difference(batch, model.encode(batch)) == 0.0
+
+
+def test_the_self_check_catches_another_layout_a_changed_sampler_and_nan():
+    batch = {"observation": observations(6)}
+    late = Recurrent(late=True)
+    assert family(late).difference(batch, late.encode(batch)) > 0.01
+    for kind in MODELS:
+        model = kind()
+        read = model.encode(batch)
+        stock = model.stock(batch)
+        model.stock = lambda batch, stock=stock: stock + 0.1  # type: ignore[method-assign]
+        assert family(model).difference(batch, read) == pytest.approx(0.1, abs=1e-6)
+        broken = {"observation": torch.full((2, WIDTH), torch.nan)}
+        model = kind()
+        model.stock = lambda batch, model=model: model.chunk(torch.zeros(2, LENGTH, dtype=torch.int64))  # type: ignore[method-assign]
+        assert math.isnan(family(model).difference(broken, model.encode(broken)))
+
+
+def test_nan_logits_are_visible_in_the_log_prob_and_break_nothing():
+    model = Parallel()
+    action = family(model).act(encoded(model, torch.full((2, WIDTH), torch.nan)), requests(2))
+    assert torch.isnan(action.log_prob).all() and (action.latent["tokens"] < VOCABULARY).all()
+
+
+def test_rows_are_the_actions():
+    assert family(Parallel()).actions == LENGTH and family(Recurrent()).actions is None
+
+
+@pytest.mark.parametrize("temperature", [0.0, -1.0, 10.1, math.nan, math.inf])
+def test_bad_temperatures_are_refused(temperature: float):
+    with pytest.raises(InputError, match=r"^policy\.sampler\.temperature="):
+        TokenSamplerConfig(temperature=temperature)
+    assert SamplerConfig.get_choice_class("tokens") is TokenSamplerConfig
