@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -89,6 +90,11 @@ class Model(ABC):
     """Prefixes of the parameters that no action depends on; never trained, nor published."""
     width: int
     """Of the features."""
+
+    @staticmethod
+    def loading() -> AbstractContextManager[None]:
+        """Holds while LeRobot builds policy and processors."""
+        return nullcontext()
 
     @abstractmethod
     def encode(self, batch: dict[str, Tensor]) -> Encoded:

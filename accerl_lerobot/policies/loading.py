@@ -34,7 +34,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-from accerl_lerobot.checkpoint import BACKBONE, TOKENIZER_STEP, relocate
+from accerl_lerobot.checkpoint import BACKBONE, relocate
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import OBS_STATE
@@ -62,6 +62,7 @@ POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "smolvla": (f"{MODELS}.smolvla:SmolVLA", ("flow", "noise_space")),
     "pi0": (f"{MODELS}.pi0:Pi0", ("flow", "noise_space")),
     "pi05": (f"{MODELS}.pi0:Pi05", ("flow", "noise_space")),
+    "pi0_fast": (f"{MODELS}.pi0_fast:Pi0Fast", ("tokens",)),
     "smolvla_bins": (f"{MODELS}.smolvla_bins:SmolVLABins", ("tokens",)),
 }
 """LeRobot policy type → its model, and the families that suit it, the default one first."""
@@ -158,27 +159,26 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
 
     lerobot_config = load_lerobot_config(config)
     folder = _checkpoint_folder(config)
+    model_class: type[Model] = _imported(POLICIES[lerobot_config.type][0])
     try:
-        policy = get_policy_class(lerobot_config.type).from_pretrained(folder, config=lerobot_config)
+        with model_class.loading():
+            policy = get_policy_class(lerobot_config.type).from_pretrained(folder, config=lerobot_config)
     except Exception as error:
         raise InputError("policy.path", config.path, f"the weights did not load ({_brief(error)})") from error
-    model_class: type[Model] = _imported(POLICIES[lerobot_config.type][0])
     verify_weights(policy, model_class, folder / WEIGHTS, config.path)
     model = model_class(policy)  # type: ignore[call-arg]
     device = torch.device(lerobot_config.device)
-    overrides = {
-        "device_processor": {"device": str(device)},
-        **model.processor_overrides,
-        **tokenizer_overrides(folder),
-    }
+    overrides = {"device_processor": {"device": str(device)}, **model.processor_overrides}
     try:
-        pre, post = make_pre_post_processors(
-            lerobot_config, pretrained_path=str(folder), preprocessor_overrides=overrides
-        )
-        keep_names(pre, folder)
+        overrides |= tokenizer_overrides(lerobot_config, folder)
+        with model.loading():
+            pre, post = make_pre_post_processors(
+                lerobot_config, pretrained_path=str(folder), preprocessor_overrides=overrides
+            )
+        keep_names(lerobot_config, pre, folder)
     except Exception as error:
         remedy = f"its LeRobot processors did not load ({_brief(error)})"
-        if TOKENIZER_STEP in str(error) and not (folder / BACKBONE).is_dir():
+        if "tokenizer_processor" in str(error) and not (folder / BACKBONE).is_dir():
             remedy += f"; a tokeniser that cannot be had from the Hub goes into {BACKBONE}/ beside {CONFIG}"
         raise InputError("policy.path", config.path, remedy) from error
     processing = Processing(pre, post, device, config.rename_map)

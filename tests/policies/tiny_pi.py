@@ -31,12 +31,20 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot.checkpoint import BACKBONE
+from accerl_lerobot.checkpoint import BACKBONE, FAST
+from accerl_lerobot.policies.fast import data_only
 
 PALIGEMMA = "google/paligemma-3b-pt-224"
 """The tokeniser that LeRobot's processors ask the Hub for."""
+ACTIONS = "lerobot/fast-action-tokenizer"
+"""The tokeniser of actions that π0-FAST asks for."""
 KINDS = ("pi0", "pi05")
+"""Of the flow family."""
 VOCABULARY = 400
+SKIP = 8
+"""PaliGemma's last tokens, which are none of FAST's; LeRobot's `fast_skip_tokens`."""
+SCALE, LOWEST, CHARACTERS = 8.0, -32, 64
+"""FAST rounds coefficients times the first to one of so many integers from the second on."""
 IMAGE = 32
 TEXTS = ("Match the target", "Mirror the target", "Task: , State: 0 1 2 3;\nAction: |")
 
@@ -78,6 +86,25 @@ def _shrunk(real: Any) -> Any:
     return build
 
 
+def write_fast(directory: Path) -> Path:
+    """A tokeniser of actions in the files that FAST's has: characters, two zeros in one, half a letter."""
+    from tokenizers import Tokenizer, decoders, models, pre_tokenizers
+    from transformers import PreTrainedTokenizerFast
+
+    byte_level = pre_tokenizers.ByteLevel(add_prefix_space=False)
+    letters = [byte_level.pre_tokenize_str(chr(i))[0][0] for i in range(CHARACTERS)]
+    half = byte_level.pre_tokenize_str("é")[0][0][0]  # decodes to U+FFFD
+    zeros = letters[-LOWEST] * 2
+    vocabulary = {token: i for i, token in enumerate([*letters, half, zeros])}
+    raw = Tokenizer(models.BPE(vocab=vocabulary, merges=[(letters[-LOWEST], letters[-LOWEST])]))
+    raw.pre_tokenizer, raw.decoder = byte_level, decoders.ByteLevel()
+    PreTrainedTokenizerFast(tokenizer_object=raw).save_pretrained(directory)
+    config = {"processor_class": "UniversalActionProcessor", "scale": SCALE, "min_token": LOWEST}
+    config["auto_map"] = {"AutoProcessor": "processing_action_tokenizer.UniversalActionProcessor"}
+    (directory / "processor_config.json").write_text(json.dumps(config))
+    return directory
+
+
 def write_tokenizer(directory: Path) -> Path:
     """Bytes, some words, and at the end fillers, which is where PaliGemma has tokens that are no text."""
     from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
@@ -106,15 +133,16 @@ def write_tokenizer(directory: Path) -> Path:
 
 @contextlib.contextmanager
 def hub(cache: Path) -> Iterator[None]:
-    """A Hub cache that holds PaliGemma's tokeniser, as after a download; nothing else reaches the Hub."""
+    """A Hub cache that holds both tokenisers, as after a download; nothing else reaches the Hub."""
     from huggingface_hub import constants
 
-    repository = cache / f"models--{PALIGEMMA.replace('/', '--')}"
-    if not repository.exists():
-        snapshot = write_tokenizer(repository / "snapshots" / "abc")
-        (snapshot / "config.json").write_text('{"model_type": "paligemma"}')
-        (repository / "refs").mkdir()
-        (repository / "refs" / "main").write_text("abc")
+    for name, write in ((PALIGEMMA, write_tokenizer), (ACTIONS, write_fast)):
+        repository = cache / f"models--{name.replace('/', '--')}"
+        if not repository.exists():
+            snapshot = write(repository / "snapshots" / "abc")
+            (snapshot / "config.json").write_text('{"model_type": "paligemma"}')
+            (repository / "refs").mkdir()
+            (repository / "refs" / "main").write_text("abc")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(constants, "HF_HUB_CACHE", str(cache))
         yield
@@ -138,7 +166,7 @@ def write_pi(
     """Saves a random policy with identity-like normalisation as LeRobot does; call it within `small`.
 
     Args:
-        kind: of `KINDS`.
+        kind: of `KINDS`, or pi0_fast, whose `num_steps` are its most tokens.
         prompt: tokens; the longest of `tiny.TEXTS` takes 20, and π0.5 adds 20 or so with the state.
         whole: with the tokeniser beside it, as our checkpoints have it; LeRobot's need the Hub for that.
     """
@@ -146,6 +174,7 @@ def write_pi(
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
 
+    fast = {"max_decoding_steps": num_steps, "max_action_tokens": 32, "fast_skip_tokens": SKIP}
     config = make_policy_config(
         kind,
         input_features={
@@ -160,17 +189,33 @@ def write_pi(
         max_state_dim=state_dim,
         max_action_dim=padded_dim,
         image_resolution=(IMAGE, IMAGE),
-        num_inference_steps=num_steps,
         tokenizer_max_length=prompt,
+        **({"num_inference_steps": num_steps} if kind in KINDS else fast),
         **fields,
     )
     torch.manual_seed(seed)
-    policy = get_policy_class(kind)(config)
+    cache = directory.parent / f"{directory.name}-hub"
+    with hub(cache), data_only():
+        policy = get_policy_class(kind)(config)
+        processors = make_pre_post_processors(config, dataset_stats=_stats(state_dim, action_dim))
     with torch.no_grad():
         for name, parameter in policy.named_parameters():
             if ".dense." in name:  # adaptive norms start at zero, where the time has no effect
                 parameter.normal_(std=0.1)
-    stats = {
+    for part in (policy, *processors):
+        part.save_pretrained(directory)
+    if whole:
+        write_tokenizer(directory / BACKBONE)
+        shutil.rmtree(cache)
+        if kind == "pi0_fast":
+            write_fast(directory / FAST)
+    return directory
+
+
+def _stats(state_dim: int, action_dim: int) -> dict[str, Any]:
+    import torch
+
+    return {
         name: {
             "mean": torch.zeros(size),
             "std": torch.full((size,), 0.5),
@@ -179,11 +224,3 @@ def write_pi(
         }
         for name, size in (("observation.state", state_dim), ("action", action_dim))
     }
-    cache = directory.parent / f"{directory.name}-hub"
-    with hub(cache):
-        for part in (policy, *make_pre_post_processors(config, dataset_stats=stats)):
-            part.save_pretrained(directory)
-    if whole:
-        write_tokenizer(directory / BACKBONE)
-        shutil.rmtree(cache)
-    return directory
