@@ -34,7 +34,7 @@ VERBS = {
     "sft": ("verbs:sft", "fine-tune on a LeRobotDataset with LeRobot's own trainer"),
     "eval": ("verbs:evaluate", "success of a checkpoint, with its confidence interval"),
     "doctor": ("doctor:main", "resolve a recipe and check this machine"),
-    "bench": ("verbs:bench", "measure: accerl bench world"),
+    "bench": ("verbs:bench", "measure: accerl bench world, accerl bench policy"),
 }
 
 
@@ -59,13 +59,15 @@ def usage() -> str:
     return "\n".join(lines)
 
 
-def show_help(verb: str) -> int:
-    """``accerl VERB --help``."""
+def show_help(verb: str, rest: list[str]) -> int:
+    """``accerl VERB --help``; for bench, of the measurement that is named, or of all."""
     from accerl_lerobot.field_help import help_text
     from accerl_lerobot.verbs import CONFIGS
 
-    name = "bench world" if verb == "bench" else verb
-    sys.stdout.write(help_text(name, CONFIGS[verb], VERBS[verb][1]) + "\n")
+    names = [name for name in CONFIGS if name.split()[0] == verb]
+    named = [name for name in names if name.split()[-1] in rest]
+    texts = [help_text(name, CONFIGS[name], VERBS[verb][1]) for name in named or names]
+    sys.stdout.write("\n\n".join(texts) + "\n")
     return 0
 
 
@@ -90,7 +92,7 @@ def main(arguments: list[str] | None = None) -> int:
     module, _, name = VERBS[verb][0].partition(":")
     try:
         if "-h" in rest or "--help" in rest:
-            return show_help(verb)
+            return show_help(verb, rest)
         function: Callable[[list[str]], int] = getattr(
             importlib.import_module(f"accerl_lerobot.{module}"), name
         )

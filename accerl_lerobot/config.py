@@ -120,6 +120,13 @@ class RunConfig:
             raise InputError("policy.path", self.policy.path, remedy)
         if self.sft.steps and self.sft.init_path is None:
             check_chunk(self.sft.policy)
+        if self.algorithm.advantage == "group" and not self.rollout.group_size:
+            raise InputError("algorithm.advantage", "group", "add --rollout.group_size=8, say: 2 or more")
+        if self.trainer.hold_back >= self.replay.max_lag:
+            remedy = (
+                f"use more than trainer.hold_back, {self.trainer.hold_back}, or all is thrown away as too old"
+            )
+            raise InputError("replay.max_lag", self.replay.max_lag, remedy)
         if self.trainer.updates:
             self.replay.check(
                 batch_decisions=self.trainer.batch_decisions, segment_decisions=self.rollout.segment_length

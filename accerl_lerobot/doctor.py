@@ -277,7 +277,7 @@ def memory_estimate_gib(config: RunConfig) -> float:
     tasks = len(getattr(config.env, "tasks", ("one",)))
     worlds = config.rollout.workers * config.rollout.worlds
     simulators = worlds * tasks * SIMULATOR_GIB if config.env.type == "metaworld" else 0.0
-    pictures = config.replay.capacity * observation_bytes(config) / GIB
+    pictures = (config.replay.capacity + _under_way(config)) * observation_bytes(config) / GIB
     if config.launch.engine == "local":
         return POLICY_PROCESS_GIB + simulators + pictures
     # The driver, inference and the trainer each load torch.
@@ -298,11 +298,12 @@ def pace(config: RunConfig) -> Iterator[Check]:
     """How far apart collecting and learning may run under this recipe, and how much it collects."""
     from accerl_lerobot.replay import lag_bound
 
-    rollout, replay, trainer = config.rollout, config.replay, config.trainer
-    in_flight = rollout.workers * rollout.worlds * rollout.segment_length
+    replay, trainer = config.replay, config.trainer
+    in_flight = _under_way(config)
     ahead = 1 if config.launch.engine == "ray" else 0  # of publications under way, and of batches drawn early
     arguments = {"batch_decisions": trainer.batch_decisions, "in_flight": in_flight}
-    arguments |= {"publish_every": trainer.publish_every, "pickup": ahead, "prefetch": ahead}
+    pickup = ahead + trainer.hold_back
+    arguments |= {"publish_every": trainer.publish_every, "pickup": pickup, "prefetch": ahead}
     bound = lag_bound(replay, **arguments)
     of_pace = lag_bound(dataclasses.replace(replay, max_lag=sys.maxsize), **arguments)
     text = f"at most {bound} updates with {in_flight} decisions under way"
@@ -314,10 +315,30 @@ def pace(config: RunConfig) -> Iterator[Check]:
     yield Check(name="lag", status=WARN if of_pace > bound else OK, text=text)
     collected = math.ceil(trainer.updates * trainer.batch_decisions / replay.samples_per_insert)
     text = f"{trainer.updates:,} updates of {trainer.batch_decisions} on about {collected:,} decisions"
-    executed = config.policy.n_action_steps or (config.sft.steps and config.sft.policy.get("n_action_steps"))
+    executed = _executed(config)
     if executed:
-        text += f", at most {collected * int(executed):,} env steps"
+        text += f", at most {collected * executed:,} env steps"
     yield Check(name="work", status=OK, text=text)
+
+
+def _executed(config: RunConfig) -> int:
+    """Actions of a chunk that are executed; 0 where only the checkpoint knows."""
+    of_sft = config.sft.steps and config.sft.policy.get("n_action_steps")
+    return int(config.policy.n_action_steps or of_sft or 0)
+
+
+def _under_way(config: RunConfig) -> int:
+    """Decisions on their way to replay; an unknown chunk counts as one action, the worst case."""
+    from accerl_lerobot.replay import decisions_under_way
+
+    rollout = config.rollout
+    return decisions_under_way(
+        workers=rollout.workers,
+        worlds=rollout.worlds,
+        segment_length=rollout.segment_length,
+        group_size=rollout.group_size,
+        episode_decisions=math.ceil(config.env.max_steps / (_executed(config) or 1)),
+    )
 
 
 def _resolve(arguments: list[str]) -> tuple[RunConfig | None, list[Check]]:

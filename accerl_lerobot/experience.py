@@ -102,6 +102,8 @@ class Segment:
     """Whether the episode had succeeded when the segment ended."""
     key: str
     """Unique: worker, incarnation, sequence number. Makes an insert idempotent."""
+    advantage: np.ndarray | None = None
+    """float32 (T,), how much better the episode went than others that started alike; None: not compared."""
     source: str = "real"
     """Which world it is from: ``real``, or the name of an imagined one."""
     episode: dict[str, float] = field(default_factory=dict)
@@ -119,6 +121,8 @@ class Segment:
         sizes = {"log_prob": len(self.log_prob), "value": len(self.value), "version": len(self.version)}
         sizes |= {"steps": len(self.steps)} | {f"latent.{k}": len(v) for k, v in self.latent.items()}
         sizes |= {k: len(v) - 1 for k, v in self.observations.items()}
+        if self.advantage is not None:
+            sizes["advantage"] = len(self.advantage)
         wrong = {k: n for k, n in sizes.items() if n != t}
         if wrong:
             raise ValueError(f"segment {self.key}: {t} rewards but {wrong}")

@@ -20,9 +20,9 @@
                           └──► trainer                          macro-asynchrony: no barrier, a measured lag
 
 The trainer is the clock: when it has made its updates the run is over. Another worker that ends is an event:
-a rollout worker is started again (its worlds hold nothing that is not in replay), a few times; any other ends
-the run with its own traceback. The same goes for one that hangs: nothing here waits for an answer without a
-limit. Workers get handles and never hold the conductor.
+a rollout worker is started again, a few times (with it go its unfinished segments and groups, nothing else);
+any other ends the run with its own traceback. The same goes for one that hangs: nothing here waits for an
+answer without a limit. Workers get handles and never hold the conductor.
 """
 
 from __future__ import annotations

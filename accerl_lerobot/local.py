@@ -13,10 +13,11 @@
 # limitations under the License.
 """The whole picture in one process, without Ray: the same parts, called in turn, deterministic for a seed.
 
-    every poll:   all worlds get a decision and step it → segments enter replay
+    every poll:   all worlds get a decision and step it → segments enter replay, as far as the pace allows
                   → one update, if the pace allows it
 
-For tests and debugging. Weights reach the acting policy at once, so the lag comes from replay alone.
+For tests and debugging. Weights reach the acting policy at once, so the lag comes from replay alone, unless
+`trainer.hold_back` asks for more.
 """
 
 from __future__ import annotations
@@ -31,10 +32,11 @@ import numpy as np
 from accerl_lerobot.config import RunConfig
 from accerl_lerobot.engine import Engine, Progress, check_new, episode_key
 from accerl_lerobot.envs import make_world
-from accerl_lerobot.experience import Request
+from accerl_lerobot.experience import Request, Segment
 from accerl_lerobot.replay import Replay
+from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutRunner
-from accerl_lerobot.seeds import train_seed
+from accerl_lerobot.weights.held_back import HeldBack
 
 logger = logging.getLogger(__name__)
 
@@ -55,39 +57,52 @@ class LocalEngine(Engine):
 
         torch.manual_seed(config.seed)
         torch.set_num_threads(config.trainer.num_threads)
-        self._config, self._tasks = config, tasks
+        self._config = config
         self._adapter = load_adapter(config.policy)
         self._update = Update(self._adapter, config.algorithm, config.trainer)
+        self._held, self._acting, self._acting_version = HeldBack(config.trainer.hold_back), self._adapter, 0
+        if config.trainer.hold_back:
+            self._acting = load_adapter(config.policy)
+            self._acting.load_trainable(self._adapter.export_trainable())
         self._replay = Replay(config.replay)
         self._rng = np.random.default_rng(config.seed)
-        self._planned: deque[EpisodePlan] = deque()
         self._outstanding: set[tuple[str, int]] = set()
         self._episodes: list[EpisodeResult] = []
         self._training = False
-        self._number = 0
+        self._outbox: deque[Segment] = deque()
         worlds = [make_world(config.env) for _ in range(config.rollout.worlds * config.rollout.workers)]
-        film = (config.evaluation.video_size, config.evaluation.video_every)
+        self._plans = EpisodePlans(config.rollout, tasks, seed=config.seed, worlds=len(worlds))
         self._runner = RolloutRunner(
-            worlds, self._next_plan, config.rollout, "local", self._replay.insert, self._episodes.append, film
+            worlds,
+            lambda: self._plans.next(self._exploring),
+            config.rollout,
+            "local",
+            self._outbox.append,
+            self._ended,
+            (config.evaluation.video_size, config.evaluation.video_every),
+            self._plans.groups,
         )
         self._due: dict[int, Request] = {}
 
     def plan(self, plans: list[EpisodePlan]) -> None:
         check_new(plans, self._outstanding)
         self._outstanding |= {episode_key(p) for p in plans}
-        self._planned.extend(plans)
+        self._plans.queue(plans)
 
     def train(self) -> None:
         self._training = True
 
     def poll(self) -> Progress:
+        self._store()
         self._act()
+        self._store()
         updates = []
         n = self._config.trainer.batch_decisions
         if self._exploring and self._replay.may_sample(n):
             segments = self._replay.sample(n, self._update.version, self._rng)
             if segments:
                 updates.append(self._update.step(segments) | {"update": float(self._update.version)})
+                self._publish()
         episodes = list(self._episodes)
         self._episodes.clear()
         self._outstanding -= {episode_key(e.plan) for e in episodes}
@@ -98,7 +113,7 @@ class LocalEngine(Engine):
             episodes=episodes,
             rollout={k: float(v) for k, v in asdict(self._runner.counters).items()},
             replay=self._replay.metrics(),
-            inference={"version": float(self._update.version)},
+            inference={"version": float(self._acting_version)},
         )
 
     def save(self, directory: Path) -> int:
@@ -119,6 +134,8 @@ class LocalEngine(Engine):
 
     def _act(self) -> None:
         """One decision in every world that may go on."""
+        if not self._exploring:
+            self._runner.abandon_groups()
         for slot in range(len(self._runner)):
             request = self._due.get(slot)
             if request is None or (request.explore and not self._exploring):
@@ -130,7 +147,7 @@ class LocalEngine(Engine):
         slots = [s for s, r in self._due.items() if may_explore or not r.explore]
         if not slots:
             return
-        decisions = self._adapter.decide([self._due[s] for s in slots], self._update.version)
+        decisions = self._acting.decide([self._due[s] for s in slots], self._acting_version)
         for slot, decision in zip(slots, decisions, strict=True):
             request = self._runner.advance(slot, decision)
             if request is None:
@@ -138,11 +155,22 @@ class LocalEngine(Engine):
             else:
                 self._due[slot] = request
 
-    def _next_plan(self) -> EpisodePlan | None:
-        if self._planned:
-            return self._planned.popleft()
-        if not self._exploring:
-            return None
-        number, self._number = self._number, self._number + 1
-        task = self._tasks[number % len(self._tasks)]
-        return EpisodePlan(task=task, seed=train_seed(self._config.seed, 0, number), explore=True)
+    def _publish(self) -> None:
+        """Hands weights to the policy that acts, which is the trainer's own unless they are held back."""
+        version = self._update.version
+        if self._acting is self._adapter:
+            self._acting_version = version
+            return
+        weights, last = self._adapter.export_trainable(), version == self._config.trainer.updates
+        for number, tensors in self._held.push(version, weights, last=last):
+            self._acting.load_trainable(tensors)
+            self._acting_version = number
+
+    def _store(self) -> None:
+        """Lets in what stands at the door, one segment at a time: a group's come all at once."""
+        while self._outbox and self._replay.may_insert():
+            self._replay.insert(self._outbox.popleft())
+
+    def _ended(self, result: EpisodeResult) -> None:
+        self._plans.report(result)
+        self._episodes.append(result)

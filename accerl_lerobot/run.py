@@ -46,7 +46,7 @@ from accerl_lerobot.engine import Engine, Progress
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import evaluation_plans
-from accerl_lerobot.evaluation.pictures import success_curve, write_video
+from accerl_lerobot.evaluation.pictures import before_after, success_curve
 from accerl_lerobot.evaluation.summary import summarise
 from accerl_lerobot.metrics import MetricsLog
 from accerl_lerobot.rollout.runner import EpisodeResult
@@ -208,9 +208,7 @@ class _Loop:
         self.steps = self._steps(last)
         self._save(last.version)
         after = self._evaluate("after", evaluation.episodes, self.steps)
-        clips = [r.frames for r in (*before[1], *after[1]) if r.frames]
-        if clips:
-            write_video(self.directory / "before_after.mp4", clips, fps=20)
+        before_after(self.directory / "before_after.mp4", before[1], after[1], fps=20)
         success_curve(self.directory / "success_curve.png", self.evaluations, self.curve)
         times = (time.monotonic() - started, warm_s, rl_s)
         summary = self._summary(before[0], after[0], last, times)

@@ -28,6 +28,8 @@ _DEMOS_PER_RUN = 1_000_000
 _WORKERS_PER_RUN = 1_000
 _EPISODES_PER_WORKER = 10_000
 _RUNS = 100
+_ALL_SEEDS = 2**32
+_DECISIONS_PER_EPISODE = 1_000_003
 
 
 def demo_seed(run_seed: int, index: int) -> int:
@@ -55,6 +57,17 @@ def train_seed(run_seed: int, worker: int, episode: int) -> int:
         raise ValueError(f"worker {worker}: a run has at most {_WORKERS_PER_RUN}")
     place = run_seed * _WORKERS_PER_RUN + worker
     return TRAIN_SEEDS.start + place * _EPISODES_PER_WORKER + episode % _EPISODES_PER_WORKER
+
+
+def noise_seed(episode_seed: int, member: int, decision: int) -> int:
+    """Seed of one decision's noise: of the episode and the decision, not of the slot or batch that runs it.
+
+    Args:
+        episode_seed: of the world, below 2**32.
+        member: which of the episodes with this seed, where several start alike; else 0.
+        decision: number within the episode, below 1,000,003.
+    """
+    return (member * _ALL_SEEDS + episode_seed) * _DECISIONS_PER_EPISODE + decision
 
 
 def eval_seed(index: int) -> int:

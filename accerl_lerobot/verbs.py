@@ -19,6 +19,7 @@ what a verb hands on should stay readable for programs.
 
 from __future__ import annotations
 
+import importlib
 import json
 import shutil
 import sys
@@ -27,6 +28,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
 from accerl_lerobot.config import DatasetConfig, LaunchConfig, RunConfig, check_chunk, parse
 from accerl_lerobot.console import Console
@@ -192,14 +194,16 @@ def evaluate(arguments: list[str]) -> int:
 
 
 def bench(arguments: list[str]) -> int:
-    """``accerl bench world``."""
-    from accerl_lerobot.bench import world
-
-    if not arguments or arguments[0] != "world":
-        raise InputError("bench", arguments[0] if arguments else "", "use: accerl bench world")
-    config: BenchWorldConfig = parse(BenchWorldConfig, arguments[1:])
-    result = world.bench_world(config)
-    Console().rich.print(world.table(result))
+    """``accerl bench world`` and ``accerl bench policy``."""
+    name = arguments[0] if arguments else ""
+    if f"bench {name}" not in CONFIGS:
+        benches = [verb for verb in CONFIGS if verb.startswith("bench ")]
+        raise InputError("bench", name, f"use: accerl {' or accerl '.join(benches)}")
+    config = parse(CONFIGS[f"bench {name}"], arguments[1:])
+    module: Any = importlib.import_module(f"accerl_lerobot.bench.{name}")
+    with redirect_stdout(sys.stderr):
+        result = getattr(module, f"bench_{name}")(config)
+    Console().rich.print(module.table(result))
     sys.stdout.write(json.dumps(result, indent=2) + "\n")
     return 0
 
@@ -210,7 +214,8 @@ CONFIGS: dict[str, type[Any]] = {
     "sft": SFTRun,
     "eval": EvalRun,
     "doctor": RunConfig,
-    "bench": BenchWorldConfig,
+    "bench world": BenchWorldConfig,
+    "bench policy": BenchPolicyConfig,
 }
 """Verb → what its command line is parsed into."""
 
@@ -224,7 +229,7 @@ def _write_evaluation(out: Path, summary: dict[str, Any], results: list[EpisodeR
         if result.frames:
             outcome = "success" if result.success else "failure"
             name = f"{result.plan.task.replace('/', '-')}_{result.plan.seed}_{outcome}.mp4"
-            write_video(out / name, [result.frames], fps=20)
+            write_video(out / name, [[result.frames]], fps=20)
 
 
 def _discard_unused(directory: Path) -> None:

@@ -58,7 +58,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_every_verb_has_a_function_and_a_config() -> None:
-    assert verbs.CONFIGS.keys() == cli.VERBS.keys()
+    assert {name.split()[0] for name in verbs.CONFIGS} == cli.VERBS.keys()
 
 
 @pytest.mark.parametrize("verb", list(cli.VERBS))
@@ -73,7 +73,13 @@ def test_verb_help_lists_fields_with_their_docstrings(verb: str, capsys: pytest.
         assert "env.type=metaworld (default)" in out and "--env.step_ms" in out
         assert "--algorithm.gamma=0.99                    Discount per decision" in out  # of the base class
     if verb == "bench":
-        assert "--chunk=10" in out
+        assert "--chunk=10" in out and "--precision=fp32" in out
+
+
+def test_help_of_one_measurement(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["bench", "policy", "--help"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("usage: accerl bench policy") and "--precision=fp32" in out and "--chunk" not in out
 
 
 def test_unknown_verb(capsys: pytest.CaptureFixture[str]) -> None:
@@ -270,7 +276,7 @@ def test_eval_in_one_process(
     summary = json.loads(stdout)
     assert summary == json.loads((out / "evaluation.json").read_text())
     assert summary["n"] == 4 and 0 <= summary["ci95"][0] <= summary["success"] <= summary["ci95"][1] <= 1
-    assert len(list(out.glob("match_*.mp4"))) == 1
+    assert len(list(out.glob("match_*.mp4"))) == 4
     assert "n=4" in stderr
     assert cli.main(arguments) == 2
     assert "the folder exists" in capsys.readouterr().err
@@ -283,4 +289,4 @@ def test_demos_refuses_an_existing_folder(tmp_path: Path, capsys: pytest.Capture
 
 def test_bench_without_a_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["bench"]) == 2
-    assert capsys.readouterr().err == "accerl: bench='': use: accerl bench world\n"
+    assert capsys.readouterr().err == "accerl: bench='': use: accerl bench world or accerl bench policy\n"

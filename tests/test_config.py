@@ -146,14 +146,26 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--policy.rename_map=3"], "policy.rename_map=3: use a mapping such as {key: value}"),
     (["--wandb.enable=perhaps"], "wandb.enable='perhaps': use true or false"),
     (["--env.task=[a]"], "env.task=['a']: use text"),
-    (["--algorithm.level=token"], "algorithm.level='token': use one of action, chunk"),
-    (["--algorithm.type=gippo"], "algorithm.type='gippo': did you mean gipo? Otherwise use one of gipo, ppo"),
+    (["--algorithm.level=row"], "algorithm.level='row': use one of token, action, chunk"),
+    (
+        ["--algorithm.type=gippo"],
+        "algorithm.type='gippo': did you mean gipo? Otherwise use one of awr, decoupled, gipo, is, ppo, sapo",
+    ),
+    (["--algorithm.type=is", "--algorithm.cap=0.5"], "algorithm.cap=0.5: use a finite number from 1 up"),
+    (["--algorithm.type=decoupled", "--algorithm.proximal_every=0"], "algorithm.proximal_every=0: use at"),
     (["--algorithm.sigma=0"], "algorithm.sigma=0.0: use a number above 0"),
     (["--env.type=mujoco"], "env.type='mujoco': use one of lerobot, metaworld, simulated"),
     (["--env.task=drawer-v3"], "env.task='drawer-v3': 'drawer-v3' is not a MetaWorld task; did you mean"),
     (["--env.max_steps=0"], "env.max_steps=0: use 1 to 500 env steps"),
     (["--seed=100"], "seed=100: use 0 to 99"),
     (["--launch.engine=slurm"], "launch.engine='slurm': use ray or local"),
+    (["--rollout.group_size=1"], "rollout.group_size=1: groups of one have no comparison; use 0"),
+    (["--rollout.group_advantage=gae"], "rollout.group_advantage='gae': use one of grpo, rloo, grpo_no_std"),
+    (
+        ["--trainer.hold_back=50"],
+        "replay.max_lag=50: use more than trainer.hold_back, 50, or all is",
+    ),
+    (["--algorithm.advantage=group"], "algorithm.advantage='group': add --rollout.group_size=8, say"),
     (["--replay.ahead=3"], "replay.ahead=3: use at least one batch, 128, or both sides wait for each other"),
     (["--dataset.root=x"], "dataset.repo_id=None: name the dataset in dataset.root"),
     (["--demos.seed=1"], "demos.seed=1: a run's demonstrations take its own seed; use --seed"),
@@ -211,6 +223,12 @@ def test_a_mistake_in_a_recipe_is_named_like_one_on_the_command_line(
     path.write_text("trainer:\n  updates: lots\n")
     assert cli.main(["train", str(path)]) == 2
     assert capsys.readouterr().err == "accerl: trainer.updates='lots': use a whole number\n"
+
+
+def test_groups_serve_either_kind_of_advantage() -> None:
+    for advantage in ("gae", "group"):
+        config = parse(RunConfig, ["--rollout.group_size=2", f"--algorithm.advantage={advantage}"])
+        assert (config.algorithm.advantage, config.rollout.group_size) == (advantage, 2)
 
 
 def test_long_values_are_shortened() -> None:

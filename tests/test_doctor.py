@@ -223,6 +223,14 @@ class TestResources:
         local = self.recipe(replay=replay, rollout=rollout, trainer=trainer, launch={"engine": "local"})
         assert checks(local)["lag"].text.startswith(f"at most {by_hand} updates")
 
+    def test_groups_are_under_way_for_longer(self) -> None:
+        """Two episodes of ⌈150 / 10⌉ decisions in each of 2 · 4 worlds; of 150 where the chunk is unknown."""
+        rollout = {"workers": 2, "worlds": 4, "segment_length": 8, "group_size": 4}
+        rooms: dict[str, Any] = {"rollout": rollout, "env": {"max_steps": 150}}
+        known = self.recipe(**rooms, policy={"n_action_steps": 10})
+        assert "with 240 decisions under way" in checks(known)["lag"].text
+        assert "with 2400 decisions under way" in checks(self.recipe(**rooms))["lag"].text
+
     def test_a_pace_that_would_waste_is_warned_about(self) -> None:
         lag = checks(self.recipe(replay={"max_lag": 3}))["lag"]
         assert lag.status == WARN and lag.text.startswith("at most 4 updates") and "thrown away" in lag.text

@@ -15,13 +15,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.algorithms import ALGORITHMS, AlgorithmConfig, GIPOConfig, PPOConfig
 from accerl_lerobot.config import RunConfig
 from accerl_lerobot.engine import Engine, Progress
 from accerl_lerobot.envs import SimulatedConfig
@@ -32,7 +33,7 @@ from accerl_lerobot.policies.samplers import FlowSamplerConfig
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
-from tests.runs import collect, drive, tiny_run
+from tests.runs import collect, drive, polls, tiny_run
 
 
 def train(config: RunConfig) -> tuple[list[Progress], dict[str, np.ndarray]]:
@@ -57,9 +58,54 @@ def test_two_runs_are_equal_to_the_last_bit(tiny_checkpoint: Path):
         np.testing.assert_array_equal(tensor, runs[1][1][name])
 
 
+def test_weights_held_back_act_so_many_updates_late(tiny_checkpoint: Path):
+    def lags(hold_back: int) -> tuple[list[float], Progress]:
+        trainer = TrainerConfig(
+            updates=14,
+            batch_decisions=16,
+            lr=1e-3,
+            value_warmup_updates=0,
+            hold_back=hold_back,
+            probe_every=4,
+        )
+        history, _ = train(tiny_run(tiny_checkpoint, trainer=trainer))
+        assert max(u.get("logprob/mismatch_max", 0.0) for u in updates(history)) < 1e-4
+        return [u["lag_mean"] for u in updates(history)], history[-1]
+
+    (prompt, end), (late, other_end) = lags(0), lags(4)
+    assert late[:1] == prompt[:1] == [0.0]
+    assert all(lag >= 4 for lag in late[5:]) and max(prompt) < 4, "samples of an acting policy 4 updates old"
+    assert end.inference["version"] == other_end.inference["version"] == 14, "the last weights act at once"
+
+
 def test_another_seed_is_another_run(tiny_checkpoint: Path):
     one, other = (updates(train(tiny_run(tiny_checkpoint, seed=seed))[0]) for seed in (3, 4))
     assert one != other
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_every_algorithm_trains(name: str, tiny_checkpoint: Path):
+    algorithm = AlgorithmConfig.get_choice_class(name)(reference_coef=0.1, level="chunk")
+    history, weights = train(tiny_run(tiny_checkpoint, algorithm=algorithm))
+    found = updates(history)
+    assert len(found) == 12 and found[-1]["skipped"] == 0
+    assert all(np.isfinite(value) for update in found for value in update.values())
+    assert found[0]["kl_reference"] == 0.0 < found[-1]["kl_reference"]
+    assert all(np.isfinite(tensor).all() for tensor in weights.values())
+
+
+def test_acting_and_learning_agree_on_log_probs(tiny_checkpoint: Path):
+    """While weights change, and although not every version is published."""
+    trainer = TrainerConfig(
+        updates=16, batch_decisions=16, lr=1e-3, warmup_updates=2, value_warmup_updates=2,
+        publish_every=2, probe_every=3,
+    )  # fmt: skip
+    history, _ = train(tiny_run(tiny_checkpoint, trainer=trainer))
+    found = [u for u in updates(history) if "logprob/mismatch_max" in u]
+    assert len(found) >= 3 and found[0]["update"] == 1
+    assert max(u["logprob/mismatch_max"] for u in found) <= 1e-4
+    assert all(u["logprob/mismatch_clip"] == 0.0 for u in found)
+    assert max(u["ratio_max_dev"] for u in found[1:]) > 1e-3, "the weights should have moved"
 
 
 def success(engine: Engine, episodes: int = 128) -> float:
@@ -95,6 +141,94 @@ def test_a_random_policy_learns_the_task(tiny_checkpoint: Path):
     assert after > 0.8, f"{before:.0%} → {after:.0%}"
     rewards = [u["reward_mean"] for u in updates(history)]
     assert np.mean(rewards[-10:]) > np.mean(rewards[:10]) + 0.5
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "form"),
+    [
+        (GIPOConfig(advantage="group", value_coef=0.0), "grpo"),
+        (PPOConfig(advantage="group", value_coef=0.0), "rloo"),
+    ],
+    ids=["gipo", "ppo"],
+)
+def test_a_random_policy_learns_the_task_from_groups_and_without_a_critic(
+    tiny_checkpoint: Path, algorithm: AlgorithmConfig, form: Any
+):
+    rollout = RolloutConfig(
+        worlds=32, segment_length=8, group_size=8, group_advantage=form, group_filter="return"
+    )
+    config = learning_run(tiny_checkpoint, algorithm=algorithm, rollout=rollout)
+    engine = LocalEngine(config, ("match",))
+    before = success(engine)
+    engine.train()
+    history = drive(engine)
+    after = success(engine)
+    engine.close()
+    assert before < 0.5
+    assert after > 0.8, f"{before:.0%} → {after:.0%}"
+    assert history[-1].rollout["groups_kept"] >= 100 * 128 / 2 / (8 * 2)
+
+
+def grouped(checkpoint: Path, **rooms: Any) -> RunConfig:
+    rollout = RolloutConfig(
+        worlds=4, segment_length=3, group_size=4, group_filter="none", task_sampling="failures"
+    )
+    algorithm = GIPOConfig(advantage="group")
+    return tiny_run(checkpoint, **{"rollout": rollout, "algorithm": algorithm, **rooms})
+
+
+def test_two_runs_with_groups_are_equal_to_the_last_bit(tiny_checkpoint: Path):
+    runs = [train(grouped(tiny_checkpoint))[0] for _ in range(2)]
+    assert updates(runs[0]) == updates(runs[1]) and runs[0][-1].rollout == runs[1][-1].rollout
+    assert runs[0][-1].rollout["groups_kept"] > 0
+
+
+def test_a_group_that_comes_at_once_waits_at_the_door(tiny_checkpoint: Path):
+    """16 segments of 2 decisions; the door shuts at 32 decisions that are still to be learnt from."""
+    rollout = RolloutConfig(worlds=8, segment_length=2, group_size=8, group_filter="none")
+    replay = ReplayConfig(capacity=96, min_decisions=16, ahead=32)
+    env = SimulatedConfig(max_steps=16, tolerance=0.01)
+    trainer = TrainerConfig(updates=12, batch_decisions=24)
+    config = grouped(tiny_checkpoint, rollout=rollout, replay=replay, env=env, trainer=trainer)
+    engine = LocalEngine(config, ("match",))
+    engine.train()
+    waiting, available = [], []
+    for progress in polls(engine):
+        waiting.append(len(engine._outbox))
+        available.append(engine._replay.pace.available)
+        if progress.done:
+            break
+    engine.close()
+    assert max(waiting) > 4 and max(available) <= 32 + 2 - 1
+    assert progress.rollout["groups_kept"] >= 8
+
+
+def test_groups_that_are_unfinished_when_training_ends_are_dropped(tiny_checkpoint: Path):
+    engine = LocalEngine(grouped(tiny_checkpoint), ("match",))
+    engine.train()
+    drive(engine)
+    success(engine, 8)
+    assert engine.poll().rollout["groups_dropped"] >= 1
+    assert engine._plans.groups is not None and engine._plans.groups.open == 0
+    engine.close()
+
+
+def test_tasks_that_fail_are_explored_more(tiny_checkpoint: Path):
+    """As if one of two tasks always failed and the other never did."""
+    config = tiny_run(
+        tiny_checkpoint,
+        env=SimulatedConfig(task="match,mirror", max_steps=8, tolerance=0.02),
+        rollout=RolloutConfig(worlds=8, segment_length=2, task_sampling="failures", task_window=20),
+        trainer=TrainerConfig(updates=20, batch_decisions=16, lr=0.0),
+    )
+    engine = LocalEngine(config, ("match", "mirror"))
+    report = engine._plans.report
+    engine._plans.report = lambda r: report(replace(r, success=r.plan.task == "mirror"))  # type: ignore[method-assign]
+    engine.train()
+    tasks = [e.plan.task for p in drive(engine) for e in p.episodes]
+    engine.close()
+    late = tasks[len(tasks) // 2 :]
+    assert len(late) > 30 and late.count("match") > 3 * late.count("mirror") > 0
 
 
 def test_without_learning_success_stays_where_it_was(tiny_checkpoint: Path):

@@ -123,7 +123,7 @@ def explained(section: str) -> set[str]:
     text = (ROOT / "docs" / "metrics.md").read_text()
     body = text.split(f"## `{section}`")[1].split("\n## ")[0]
     cells = [line.split("|")[1] for line in body.splitlines() if line.startswith("| `")]
-    return {name for cell in cells for name in re.findall(r"`([a-z_0-9]+)`", cell)}
+    return {name for cell in cells for name in re.findall(r"`([a-z_0-9/]+)`", cell)}
 
 
 def test_every_logged_number_is_explained(tiny_checkpoint: Path) -> None:
@@ -135,6 +135,7 @@ def test_every_logged_number_is_explained(tiny_checkpoint: Path) -> None:
         "--replay.min_decisions=32",
         "--trainer.batch_decisions=16",
         "--rollout.worlds=4",
+        "--algorithm.reference_coef=0.1",
     ]
     config = parse(RunConfig, arguments)
     engine = LocalEngine(config, ("match",))

@@ -220,7 +220,7 @@ def test_commands_in_the_documents_parse(path: str, line: str) -> None:
     _, verb, *arguments = shlex.split(line)
     assert verb in VERBS, path
     if verb == "bench":
-        arguments = arguments[1:]
+        verb, arguments = f"bench {arguments[0]}", arguments[1:]
     # A run's own config is one that train resolved, so its place is taken by no recipe at all.
     here = [a.replace("recipes/", f"{ROOT}/recipes/") for a in arguments if "RUN/config.yaml" not in a]
     parse(CONFIGS[verb], here, recipe_class=RunConfig)

@@ -20,7 +20,15 @@ import itertools
 import pytest
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.seeds import DEMO_SEEDS, EVAL_SEEDS, TRAIN_SEEDS, demo_seed, eval_seed, train_seed
+from accerl_lerobot.seeds import (
+    DEMO_SEEDS,
+    EVAL_SEEDS,
+    TRAIN_SEEDS,
+    demo_seed,
+    eval_seed,
+    noise_seed,
+    train_seed,
+)
 
 
 def test_ranges_are_disjoint_and_fit_32_bits():
@@ -41,6 +49,13 @@ def test_training_seeds_differ_between_runs_workers_and_episodes():
     places = itertools.product((0, 1, 99), (0, 1, 999), (0, 1, 9_999))
     seeds = [train_seed(*place) for place in places]
     assert len(set(seeds)) == len(seeds)
+
+
+def test_noise_differs_between_episodes_members_and_decisions():
+    corners = (0, 1, 2**32 - 1), (0, 1, 255), (0, 1, 999_999)
+    seeds = [noise_seed(*place) for place in itertools.product(*corners)]
+    assert len(set(seeds)) == len(seeds) and min(seeds) == 0
+    assert noise_seed(7, 0, 5) == 7 * 1_000_003 + 5
 
 
 @pytest.mark.parametrize("call", [lambda: demo_seed(1_000, 0), lambda: train_seed(100, 0, 0)])

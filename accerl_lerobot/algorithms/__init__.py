@@ -30,13 +30,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from accerl_lerobot.algorithms.contract import AlgorithmConfig, Level, LossInputs, LossOutput
+from accerl_lerobot.algorithms.awr import AWRConfig, awr_loss
+from accerl_lerobot.algorithms.contract import AlgorithmConfig, Level, LossInputs, LossOutput, check_level
+from accerl_lerobot.algorithms.decoupled import DecoupledConfig, decoupled_loss
 from accerl_lerobot.algorithms.gipo import GIPOConfig, gipo_loss
+from accerl_lerobot.algorithms.importance import ImportanceConfig, importance_loss
 from accerl_lerobot.algorithms.ppo import PPOConfig, ppo_loss
+from accerl_lerobot.algorithms.sapo import SAPOConfig, sapo_loss
 
 ALGORITHMS: dict[str, Callable[[LossInputs, Any], LossOutput]] = {
+    "awr": awr_loss,
+    "decoupled": decoupled_loss,
     "gipo": gipo_loss,
+    "is": importance_loss,
     "ppo": ppo_loss,
+    "sapo": sapo_loss,
 }
 """Name on the command line → loss; the second argument is the config registered under the same name."""
 
@@ -52,13 +60,22 @@ def compute_loss(inputs: LossInputs, config: AlgorithmConfig) -> LossOutput:
 
 __all__ = [
     "ALGORITHMS",
+    "AWRConfig",
     "AlgorithmConfig",
+    "DecoupledConfig",
     "GIPOConfig",
+    "ImportanceConfig",
     "Level",
     "LossInputs",
     "LossOutput",
     "PPOConfig",
+    "SAPOConfig",
+    "awr_loss",
+    "check_level",
     "compute_loss",
+    "decoupled_loss",
     "gipo_loss",
+    "importance_loss",
     "ppo_loss",
+    "sapo_loss",
 ]

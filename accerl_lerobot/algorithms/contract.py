@@ -13,7 +13,7 @@
 # limitations under the License.
 """What every objective receives and returns, and the settings all of them share.
 
-Shape letters: N decisions of a batch, L log-prob factors of one decision.
+Shape letters: N decisions of a batch, L log-prob factors of one decision, as its policy stores them.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from accerl_lerobot.errors import InputError
 if TYPE_CHECKING:
     from torch import Tensor
 
-Level = Literal["action", "chunk"]
+Level = Literal["token", "action", "chunk"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,12 +45,22 @@ class AlgorithmConfig(draccus.ChoiceRegistry):
     """Discount per decision (not per env step), in [0, 1]."""
     lam: float = 0.95
     """λ of GAE per decision, in [0, 1]: 0 trusts the critic, 1 the observed rewards."""
+    advantage: Literal["gae", "group"] = "gae"
+    """``gae``: from the critic. ``group``: relative to other episodes from the same start, stamped on
+    segments by the rollout worker; V is not used then, and `value_coef` may as well be 0."""
     level: Level = "action"
-    """What one importance ratio covers: each of the L factors, or their product over the whole ``chunk``."""
+    """What one importance ratio covers: each log-prob factor (``token``), those of one ``action`` of the
+    chunk, or the whole ``chunk``. A flow or Gaussian policy has one factor per action."""
     value_coef: float = 0.5
-    """Weight of the mean squared error of V against the returns, ≥ 0."""
+    """Weight of the critic's regression error, ≥ 0."""
     kl_coef: float = 0.0
     """Weight of KL(μ‖π), the distance from the behaviour policy, ≥ 0."""
+    reference_coef: float = 0.0
+    """Weight of KL(π‖π_ref), the distance from the policy that RL began with, ≥ 0.
+
+    Above 0 the trainer keeps a copy of those weights and re-scores every batch under it: one more forward
+    pass. Estimated from samples of μ corrected by ρ; `ratio.kl_to_reference` says what that leaves.
+    """
     entropy_coef: float = 0.0
     """Weight of the entropy bonus, ≥ 0."""
 
@@ -59,15 +69,37 @@ class AlgorithmConfig(draccus.ChoiceRegistry):
         """The registered name."""
         return str(self.get_choice_name(self.__class__))
 
+    @property
+    def proximal_updates(self) -> int:
+        """For how many updates the weights behind `LossInputs.log_prob_proximal` are kept; 0: not used."""
+        return 0
+
     def __post_init__(self) -> None:
         for name in ("gamma", "lam"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise InputError(f"algorithm.{name}", getattr(self, name), "use a number from 0 to 1")
-        for name in ("value_coef", "kl_coef", "entropy_coef"):
+        for name in ("value_coef", "kl_coef", "reference_coef", "entropy_coef"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise InputError(f"algorithm.{name}", getattr(self, name), "use a finite number, 0 or larger")
-        if self.level not in ("action", "chunk"):
-            raise InputError("algorithm.level", self.level, "use action or chunk")
+        if self.level not in ("token", "action", "chunk"):
+            raise InputError("algorithm.level", self.level, "use token, action or chunk")
+        if self.advantage not in ("gae", "group"):
+            raise InputError("algorithm.advantage", self.advantage, "use gae or group")
+
+
+def check_level(level: Level, actions: int | None) -> None:
+    """Refuses a ratio per action for a policy whose factors do not align with actions.
+
+    Args:
+        level: of the algorithm.
+        actions: see `LossInputs.actions`.
+
+    Raises:
+        InputError: as above.
+    """
+    if level == "action" and actions is None:
+        remedy = "use token or chunk; this policy's log-prob factors do not belong to single actions"
+        raise InputError("algorithm.level", level, remedy)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,30 +109,60 @@ class LossInputs:
     log_prob_new: Tensor
     """(N, L), log π of the stored latents under the current weights; carries gradient."""
     log_prob_old: Tensor
-    """(N, L), log μ as the behaviour policy stored it.
+    """(N, L), log μ as the behaviour policy stored it."""
+    actions: int | None
+    """Into how many equal groups of consecutive factors, one per action of the chunk, the L fall.
 
-    A factor that does not exist, such as a token after the terminator, is 0 in both.
+    L itself for a flow or Gaussian policy, K for a head with A tokens for each of K actions; None if they do
+    not align with actions, as with compressed tokens: level ``action`` is refused then.
     """
     advantage: Tensor
-    """(N,), normalised by the caller."""
+    """(N,), normalised over the batch by the caller, or relative to a group of episodes."""
     value: Tensor
-    """(N,), V of the current critic; carries gradient."""
+    """(N,), V of the current critic; measured, not trained."""
+    value_error: Tensor
+    """(N,), the critic's regression error against `returns`, e.g. (V − R)²; carries gradient."""
     returns: Tensor
     """(N,), what V is regressed to."""
     entropy: Tensor
     """(N,), entropy of π at each decision; carries gradient if it is to be used."""
     mask: Tensor | None = None
     """bool (N,), False for padding, whose content is never looked at (it may be NaN). None: all are valid."""
+    factors: Tensor | None = None
+    """bool (N, L), False for a factor that does not exist, such as a token after the terminator; its content
+    is never looked at. None: all exist."""
+    ratios_per_decision: float | None = None
+    """Mean number of ratios per decision, of the batch that this one is a micro-batch of.
+
+    With it the losses of micro-batches, weighted by their decisions, add up to that of the whole batch. None:
+    this is the whole batch.
+    """
+    log_prob_reference: Tensor | None = None
+    """(N, L), log π_ref; needed if `AlgorithmConfig.reference_coef` is above 0."""
+    log_prob_proximal: Tensor | None = None
+    """(N, L), log π_prox; needed if `AlgorithmConfig.proximal_updates` is above 0."""
 
     def __post_init__(self) -> None:
-        n = self.log_prob_new.shape[0]
         if self.log_prob_new.dim() != 2 or self.log_prob_new.shape != self.log_prob_old.shape:
             new, old = tuple(self.log_prob_new.shape), tuple(self.log_prob_old.shape)
             raise ValueError(f"log_prob_new {new} and log_prob_old {old}: both must be (N, L)")
-        for name in ("advantage", "value", "returns", "entropy", "mask"):
+        n, width = self.log_prob_new.shape
+        flat = ("advantage", "value", "value_error", "returns", "entropy", "mask")
+        for name in (*flat, "factors", "log_prob_reference", "log_prob_proximal"):
             tensor: Tensor | None = getattr(self, name)
-            if tensor is not None and tuple(tensor.shape) != (n,):
-                raise ValueError(f"{name} has shape {tuple(tensor.shape)}, not ({n},)")
+            shape = (n,) if name in flat else (n, width)
+            if tensor is not None and tuple(tensor.shape) != shape:
+                raise ValueError(f"{name} has shape {tuple(tensor.shape)}, not {shape}")
+        if self.actions is not None and (self.actions < 1 or width % self.actions):
+            raise ValueError(f"{width} factors do not fall into {self.actions} equal groups")
+
+    @property
+    def keep(self) -> Tensor | None:
+        """bool (N, L), the factors that count: of valid decisions, and existing. None: all."""
+        if self.mask is None:
+            return self.factors
+        valid = self.mask[:, None].expand_as(self.log_prob_new)
+        return valid if self.factors is None else valid & self.factors
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,6 +17,8 @@
     Mean of (ρ − 1) − log ρ: KL(μ‖π) in nats, by how much the policy has left the samples.
 ``kl``
     The penalty as it enters the loss; differs from the above only in being bounded for far samples.
+``kl_reference``
+    KL(π‖π_ref) as it enters the loss; there only if it does.
 ``ess``
     Effective sample size of ω·ρ as a share of the samples: 1 all count alike, 1/n one of them decides.
 ``low_weight``
@@ -94,23 +96,31 @@ def explained_variance(value: Tensor, returns: Tensor, mask: Tensor | None = Non
 
 
 def ratio_metrics(
-    log_ratio: Tensor, weight: Tensor, mask: Tensor | None = None, *, clip: tuple[float, float]
+    log_ratio: Tensor,
+    weight: Tensor,
+    mask: Tensor | None = None,
+    *,
+    clip: tuple[float, float],
+    clipped: Tensor | None = None,
+    pull: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """All that is said about ρ and ω; keys are explained at the top.
 
     Args:
         log_ratio: (N, F), 0 at padding.
-        weight: (N, F), ω in [0, 1].
-        mask: bool (N,) or None.
+        weight: (N, F), ω.
+        mask: bool (N, F) or (N,), or None.
         clip: (low, high) of the clip range.
+        clipped: (N, F), log of the ratios that are clipped; None: `log_ratio`.
+        pull: (N, F), what stands before Â∇log π; None: ω·ρ.
     """
     rho = ratio(log_ratio)
     points = {"log_ratio_p05": 0.05, "log_ratio_p50": 0.5, "log_ratio_p95": 0.95}
     return {
         "approx_kl": approx_kl(log_ratio, mask),
-        "ess": ess_share(weight * rho, mask),
+        "ess": ess_share(weight * rho if pull is None else pull, mask),
         "low_weight": share_below(weight, LOW_WEIGHT, mask),
-        "clip_fraction": clip_fraction(rho, *clip, mask),
+        "clip_fraction": clip_fraction(rho if clipped is None else ratio(clipped), *clip, mask),
         "ratio_max_dev": (rho - 1.0).abs().max(),
         **quantiles(log_ratio, points, mask),
     }

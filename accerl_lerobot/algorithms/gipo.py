@@ -34,15 +34,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput
-from accerl_lerobot.algorithms.objective import advantage_column, assemble
-from accerl_lerobot.algorithms.ratio import log_ratio, masked_mean, ratio
+from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
+from accerl_lerobot.algorithms.ratio import at_level, ratio
 from accerl_lerobot.errors import InputError
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-REFERENCE_CLIP = (0.2, 0.2)
-"""GIPO clips nothing; its clip fraction counts what PPO's usual range would, so that runs can be compared."""
 
 
 @AlgorithmConfig.register_subclass("gipo")
@@ -81,16 +78,14 @@ def trust_weight(log_ratio: Tensor, advantage: Tensor, config: GIPOConfig) -> Te
 
 
 def gipo_loss(inputs: LossInputs, config: GIPOConfig) -> LossOutput:
-    """See the top of the file. E is the mean over decisions, and over their factors at level ``action``.
+    """See the top of the file. E is the mean over all ratios of all decisions.
 
     Args:
         inputs: the batch; `LossInputs` states the shapes.
         config: widths and coefficients.
     """
     advantage = advantage_column(inputs)
-    logs = log_ratio(inputs.log_prob_new, inputs.log_prob_old.detach(), config.level, inputs.mask)
+    logs = at_level(inputs.log_prob_new - inputs.log_prob_old.detach(), inputs, config.level)
     weight = trust_weight(logs, advantage, config)
-    policy_loss = -masked_mean(weight * ratio(logs) * advantage, inputs.mask)
-    return assemble(
-        inputs, config, policy_loss=policy_loss, log_ratio=logs, weight=weight, clip=REFERENCE_CLIP
-    )
+    policy_loss = -mean_over_ratios(weight * ratio(logs) * advantage, inputs, config.level)
+    return assemble(inputs, config, policy_loss=policy_loss, log_ratio=logs, weight=weight)

@@ -11,21 +11,31 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What all objectives have in common: the critic, the KL penalty, the entropy bonus and the diagnostics.
+"""What all objectives have in common: the critic, the KL penalties, the entropy bonus and the diagnostics.
 
-L = L_policy + value_coef · mean (V − R)² + kl_coef · KL(μ‖π) − entropy_coef · H
+L = L_policy + value_coef · mean value error + kl_coef · KL(μ‖π) + reference_coef · KL(π‖π_ref)
+             − entropy_coef · H
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput
+from accerl_lerobot.algorithms.contract import AlgorithmConfig, Level, LossInputs, LossOutput
 from accerl_lerobot.algorithms.diagnostics import explained_variance, ratio_metrics
-from accerl_lerobot.algorithms.ratio import kl_from_behaviour, masked_mean
+from accerl_lerobot.algorithms.ratio import (
+    at_level,
+    kl_from_behaviour,
+    kl_to_reference,
+    masked_mean,
+    present_in,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+USUAL_CLIP = (0.2, 0.2)
+"""What the clip fraction counts for an algorithm that clips nothing, so that runs can be compared."""
 
 
 def advantage_column(inputs: LossInputs) -> Tensor:
@@ -36,6 +46,20 @@ def advantage_column(inputs: LossInputs) -> Tensor:
     return advantage[:, None]
 
 
+def mean_over_ratios(x: Tensor, inputs: LossInputs, level: Level) -> Tensor:
+    """Mean of (N, F) over all ratios that count, a scalar.
+
+    Where decisions have different numbers of factors all factors weigh the same. Averaging over each
+    decision's own first would weigh them by 1/F and bias the policy gradient towards decisions with few.
+    """
+    counts = present_in(inputs, level)
+    if inputs.ratios_per_decision is None:
+        return masked_mean(x, counts)
+    total = (x if counts is None else x.masked_fill(~counts, 0.0)).sum()
+    decisions = len(x) if inputs.mask is None else inputs.mask.sum().clamp(min=1)
+    return total / (decisions * inputs.ratios_per_decision)
+
+
 def assemble(
     inputs: LossInputs,
     config: AlgorithmConfig,
@@ -43,7 +67,9 @@ def assemble(
     policy_loss: Tensor,
     log_ratio: Tensor,
     weight: Tensor,
-    clip: tuple[float, float],
+    clip: tuple[float, float] = USUAL_CLIP,
+    clipped: Tensor | None = None,
+    pull: Tensor | None = None,
 ) -> LossOutput:
     """Adds the shared terms to a policy loss and measures the batch.
 
@@ -51,34 +77,45 @@ def assemble(
         inputs: the batch.
         config: the shared coefficients.
         policy_loss: (), with gradient.
-        log_ratio: (N, F), with gradient, from `ratio.log_ratio`.
-        weight: (N, F), how much of each sample's gradient the algorithm keeps, in [0, 1].
+        log_ratio: (N, F), log π/μ with gradient, from `ratio.at_level`.
+        weight: (N, F), how much of each sample's gradient the algorithm keeps, ω.
         clip: (low, high), the clip fraction counts ratios outside [1 − low, 1 + high].
+        clipped: (N, F), log of the ratios that are clipped; None: `log_ratio`.
+        pull: (N, F), what stands before Â∇log π; None: ω·ρ.
     """
     mask = inputs.mask
-    error = inputs.value - inputs.returns.detach()
-    entropy = inputs.entropy
-    if mask is not None:
-        error, entropy = error.masked_fill(~mask, 0.0), entropy.masked_fill(~mask, 0.0)
-    value_loss = masked_mean(error.square(), mask)
-    kl = masked_mean(kl_from_behaviour(log_ratio), mask)
-    mean_entropy = masked_mean(entropy, mask)
+    value_loss, mean_entropy = masked_mean(inputs.value_error, mask), masked_mean(inputs.entropy, mask)
+    kl = mean_over_ratios(kl_from_behaviour(log_ratio), inputs, config.level)
 
     loss = policy_loss + config.value_coef * value_loss
     if config.kl_coef:
         loss = loss + config.kl_coef * kl
     if config.entropy_coef:  # an entropy that is not used may be non-finite
         loss = loss - config.entropy_coef * mean_entropy
+    metrics = {"policy_loss": policy_loss, "value_loss": value_loss, "kl": kl, "entropy": mean_entropy}
+    if config.reference_coef:
+        metrics["kl_reference"] = _reference_kl(inputs, config, log_ratio)
+        loss = loss + config.reference_coef * metrics["kl_reference"]
 
     decisions = mask.sum() if mask is not None else loss.new_tensor(float(len(inputs.value)))
-    metrics = {
+    metrics |= {
         "loss": loss,
-        "policy_loss": policy_loss,
-        "value_loss": value_loss,
-        "kl": kl,
-        "entropy": mean_entropy,
         "decisions": decisions.to(loss.dtype),
         "explained_variance": explained_variance(inputs.value.detach(), inputs.returns, mask),
-        **ratio_metrics(log_ratio.detach(), weight.detach(), mask, clip=clip),
     }
+    metrics |= ratio_metrics(
+        log_ratio.detach(),
+        weight.detach(),
+        present_in(inputs, config.level),
+        clip=clip,
+        clipped=None if clipped is None else clipped.detach(),
+        pull=None if pull is None else pull.detach(),
+    )
     return LossOutput(loss=loss, metrics={k: v.detach() for k, v in metrics.items()})
+
+
+def _reference_kl(inputs: LossInputs, config: AlgorithmConfig, log_ratio: Tensor) -> Tensor:
+    if inputs.log_prob_reference is None:
+        raise ValueError("reference_coef is above 0: log_prob_reference is needed")
+    apart = at_level(inputs.log_prob_new - inputs.log_prob_reference.detach(), inputs, config.level)
+    return mean_over_ratios(kl_to_reference(log_ratio, apart), inputs, config.level)

@@ -22,11 +22,15 @@ budget: at a large lag most samples are outside and their gradient is gone. That
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput
-from accerl_lerobot.algorithms.objective import advantage_column, assemble
-from accerl_lerobot.algorithms.ratio import log_ratio, masked_mean, ratio
+from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
+from accerl_lerobot.algorithms.ratio import at_level, ratio
 from accerl_lerobot.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @AlgorithmConfig.register_subclass("ppo")
@@ -47,24 +51,33 @@ class PPOConfig(AlgorithmConfig):
             raise InputError("algorithm.clip_high", self.clip_high, "use a number above 0")
 
 
+def clipped_surrogate(rho: Tensor, advantage: Tensor, config: PPOConfig) -> tuple[Tensor, Tensor]:
+    """min(ρ Â, clip(ρ) Â) and where the clip removed the gradient, both (N, F).
+
+    Args:
+        rho: (N, F).
+        advantage: (N, 1).
+        config: the clip range.
+    """
+    low, high = 1.0 - config.clip_low, 1.0 + config.clip_high
+    dropped = ((advantage > 0.0) & (rho > high)) | ((advantage < 0.0) & (rho < low))
+    return (rho * advantage).minimum(rho.clamp(low, high) * advantage), dropped
+
+
 def ppo_loss(inputs: LossInputs, config: PPOConfig) -> LossOutput:
-    """See the top of the file. E is the mean over decisions, and over their factors at level ``action``.
+    """See the top of the file. E is the mean over all ratios of all decisions.
 
     Args:
         inputs: the batch; `LossInputs` states the shapes.
         config: clip range and coefficients.
     """
-    low, high = 1.0 - config.clip_low, 1.0 + config.clip_high
-    advantage = advantage_column(inputs)
-    logs = log_ratio(inputs.log_prob_new, inputs.log_prob_old.detach(), config.level, inputs.mask)
-    rho = ratio(logs)
-    surrogate = (rho * advantage).minimum(rho.clamp(low, high) * advantage)
-    dropped = ((advantage > 0.0) & (rho > high)) | ((advantage < 0.0) & (rho < low))
+    logs = at_level(inputs.log_prob_new - inputs.log_prob_old.detach(), inputs, config.level)
+    surrogate, dropped = clipped_surrogate(ratio(logs), advantage_column(inputs), config)
     return assemble(
         inputs,
         config,
-        policy_loss=-masked_mean(surrogate, inputs.mask),
+        policy_loss=-mean_over_ratios(surrogate, inputs, config.level),
         log_ratio=logs,
-        weight=(~dropped).to(rho.dtype),
+        weight=(~dropped).to(logs.dtype),
         clip=(config.clip_low, config.clip_high),
     )

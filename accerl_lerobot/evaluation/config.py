@@ -33,9 +33,9 @@ class EvaluationConfig:
     """Evaluate while training, every so many updates; 0 does not."""
     episodes_during: int = 20
     """Episodes of each evaluation while training."""
-    videos: int = 1
-    """Episodes filmed before and after."""
-    video_size: int = 240
+    videos: int = 4
+    """Episodes filmed, the same before and after."""
+    video_size: int = 200
     """Side of the video in pixels."""
     video_every: int = 2
     """Env steps per video frame."""

@@ -21,8 +21,12 @@ from typing import Any
 
 import numpy as np
 
+from accerl_lerobot.rollout.runner import EpisodeResult
+
 GAP = 4
-"""Columns of white between two clips."""
+"""Pixels of white between two clips."""
+BORDER = 5
+"""Width, in pixels, of the frame that tells how an episode ended."""
 
 
 def success_curve(
@@ -62,31 +66,74 @@ def success_curve(
     plt.close(figure)
 
 
-def write_video(path: Path, clips: Sequence[Sequence[np.ndarray]], fps: int) -> None:
-    """Writes clips side by side; one that ends early holds its last frame.
+def write_video(path: Path, rows: Sequence[Sequence[Sequence[np.ndarray]]], fps: int) -> None:
+    """Writes a grid of clips; one that ends early holds its last frame.
 
     Args:
         path: .mp4 to write.
-        clips: frames of each, uint8 (H, W, 3), all of one size.
+        rows: rows of clips, as many in each; frames of a clip are uint8 (H, W, 3), all of one size.
         fps: frames per second.
 
     Raises:
-        ValueError: no clip, or one without frames.
+        ValueError: no clip, one without frames, or rows of unequal length.
     """
     import imageio.v2 as imageio
 
+    clips = [clip for row in rows for clip in row]
     if not clips or not all(clips):
         raise ValueError("every clip needs a frame")
+    if len({len(row) for row in rows}) != 1:
+        raise ValueError("every row needs as many clips")
     length = max(len(clip) for clip in clips)
-    gap = np.full((clips[0][0].shape[0], GAP, 3), 255, np.uint8)
     # The pixel format every player knows, at the price of even sides: an odd last row or column is left out.
     writer: Any = imageio.get_writer(
         path, fps=fps, macro_block_size=1, codec="libx264", pixelformat="yuv420p"
     )
     with writer:
-        for i in range(length + fps // 2):
-            tiles: list[np.ndarray] = []
-            for clip in clips:
-                tiles += [clip[min(i, len(clip) - 1)], gap]
-            row = np.concatenate(tiles[:-1], axis=1)
-            writer.append_data(row[: row.shape[0] // 2 * 2, : row.shape[1] // 2 * 2])
+        for i in range(length + fps):
+            lines = [_joined([clip[min(i, len(clip) - 1)] for clip in row], axis=1) for row in rows]
+            picture = _joined(lines, axis=0)
+            writer.append_data(picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2])
+
+
+def before_after(
+    path: Path, before: Sequence[EpisodeResult], after: Sequence[EpisodeResult], fps: int
+) -> None:
+    """Films the same episodes twice: above before training, below after it; green is success, red failure.
+
+    Args:
+        path: .mp4 to write; nothing is written when no episode was filmed.
+        before: results, of which those with frames count.
+        after: results of the same plans.
+        fps: frames per second.
+    """
+    filmed = [{r.plan.index: r for r in results if r.frames} for results in (before, after)]
+    both = sorted(filmed[0].keys() & filmed[1].keys())
+    if both:
+        names = ("before", "after")
+        rows = [[_captioned(row[i], name) for i in both] for row, name in zip(filmed, names, strict=True)]
+        write_video(path, rows, fps)
+
+
+def _captioned(result: EpisodeResult, name: str) -> list[np.ndarray]:
+    """An episode's frames under its name, and one more that tells how it ended by the colour of its frame."""
+    from PIL import Image, ImageDraw
+
+    captioned = []
+    for i in range(len(result.frames) + 1):
+        image = Image.fromarray(result.frames[min(i, len(result.frames) - 1)])
+        draw = ImageDraw.Draw(image)
+        draw.text((6, 4), name, fill=(255, 255, 255), stroke_width=1, stroke_fill=(0, 0, 0))
+        if i == len(result.frames):
+            colour = (40, 160, 60) if result.success else (200, 40, 40)
+            draw.rectangle((0, 0, image.width - 1, image.height - 1), outline=colour, width=BORDER)
+        captioned.append(np.asarray(image))
+    return captioned
+
+
+def _joined(pictures: Sequence[np.ndarray], axis: int) -> np.ndarray:
+    """Pictures beside (axis 1) or below (axis 0) each other, white between them."""
+    shape = list(pictures[0].shape)
+    shape[axis] = GAP
+    gap = np.full(shape, 255, np.uint8)
+    return np.concatenate([part for picture in pictures for part in (picture, gap)][:-1], axis=axis)

@@ -61,6 +61,15 @@ class LeRobotAdapter(PolicyAdapter):
         self.precision = precision
         self.policy.eval()
 
+    @property
+    def actions(self) -> int | None:
+        """See the base class."""
+        return self.family.actions
+
+    def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
+        """See the base class."""
+        return self.family.factors(latent)
+
     @torch.no_grad()
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
         """See the base class; each decision's noise is its own request's, whatever batch it lands in."""
@@ -94,7 +103,6 @@ class LeRobotAdapter(PolicyAdapter):
             log_prob=score.log_prob,
             entropy=score.entropy,
             value=self._value(encoded),
-            factors=score.factors,
         )
 
     @torch.no_grad()
@@ -114,10 +122,6 @@ class LeRobotAdapter(PolicyAdapter):
             if parameter.requires_grad
         }
 
-    def actions(self) -> int | None:
-        """See the base class."""
-        return self.family.actions
-
     @torch.no_grad()
     def self_check(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> float:
         """Largest difference between our sampler without exploration and LeRobot's own on equal noise.
@@ -128,7 +132,7 @@ class LeRobotAdapter(PolicyAdapter):
         try:
             batch = self.processing.prepare(observations, tasks)
             difference = self.family.difference(batch, self.model.encode(batch))
-        except (AttributeError, ImportError, KeyError, TypeError) as error:
+        except (AttributeError, ImportError, KeyError, NotImplementedError, TypeError) as error:
             raise self._incompatible(f"cannot drive it ({type(error).__name__}: {error})") from error
         self.policy.reset()
         if not difference <= SELF_CHECK_TOLERANCE:

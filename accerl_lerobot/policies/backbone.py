@@ -50,10 +50,18 @@ class BackboneConfig:
     patch: int = 16
     """Side of an image patch in pixels."""
     image: int = 64
-    """Side of the image the encoder sees; a multiple of 2·patch."""
+    """Side of the image the encoder sees; a multiple of `patch` · `shuffle`."""
 
     vocabulary: int = 512
     """Most tokens the tokeniser has; 264 are bytes and special tokens."""
+    embeddings: int = 0
+    """Rows of the embedding table; 0: as many as the tokeniser has tokens."""
+    intermediate: int = 0
+    """Width inside the language model's MLPs; 0: twice `hidden`."""
+    vision_intermediate: int = 0
+    """Width inside the image encoder's; 0: twice `vision_hidden`."""
+    shuffle: int = 2
+    """Side of the square of image tokens that become one token of the language model."""
 
     def __post_init__(self) -> None:
         for name in (
@@ -69,8 +77,14 @@ class BackboneConfig:
                 raise InputError(f"sft.backbone.{name}", getattr(self, name), "use at least 1")
         if self.vocabulary < 264:
             raise InputError("sft.backbone.vocabulary", self.vocabulary, "use at least 264")
-        if self.patch < 1 or self.image < 1 or self.image % (2 * self.patch):
-            remedy = f"use a multiple of {2 * self.patch}, twice the patch"
+        for name in ("embeddings", "intermediate", "vision_intermediate"):
+            if getattr(self, name) < 0:
+                raise InputError(f"sft.backbone.{name}", getattr(self, name), "use 0 (by itself) or more")
+        if self.shuffle < 1:
+            raise InputError("sft.backbone.shuffle", self.shuffle, "use at least 1")
+        tile = self.patch * self.shuffle
+        if self.patch < 1 or self.image < 1 or self.image % tile:
+            remedy = f"use a multiple of {tile}, the patch times the shuffle"
             raise InputError("sft.backbone.image", self.image, remedy)
         for heads, width in (("heads", self.hidden), ("vision_heads", self.vision_hidden)):
             if width % getattr(self, heads):
@@ -82,6 +96,24 @@ class BackboneConfig:
         if self.heads % self.kv_heads:
             remedy = f"use a divisor of the {self.heads} heads"
             raise InputError("sft.backbone.kv_heads", self.kv_heads, remedy)
+
+
+SMOLVLM2_500M = BackboneConfig(
+    hidden=960,
+    layers=32,
+    heads=15,
+    kv_heads=5,
+    vision_hidden=768,
+    vision_layers=12,
+    vision_heads=12,
+    patch=16,
+    image=512,
+    embeddings=49280,
+    intermediate=2560,
+    vision_intermediate=3072,
+    shuffle=4,
+)
+"""The sizes of SmolVLM2-500M, the backbone of ``lerobot/smolvla_base``."""
 
 
 def write_backbone(directory: Path, config: BackboneConfig, texts: Sequence[str] = ()) -> Path:
@@ -132,10 +164,10 @@ def write_backbone(directory: Path, config: BackboneConfig, texts: Sequence[str]
     architecture = SmolVLMConfig(
         image_token_id=vocabulary["<image>"],
         pad_token_id=vocabulary["<|pad|>"],
-        scale_factor=2,
+        scale_factor=config.shuffle,
         vision_config={
             "hidden_size": config.vision_hidden,
-            "intermediate_size": 2 * config.vision_hidden,
+            "intermediate_size": config.vision_intermediate or 2 * config.vision_hidden,
             "num_hidden_layers": config.vision_layers,
             "num_attention_heads": config.vision_heads,
             "image_size": config.image,
@@ -144,12 +176,12 @@ def write_backbone(directory: Path, config: BackboneConfig, texts: Sequence[str]
         text_config={
             "model_type": "llama",
             "hidden_size": config.hidden,
-            "intermediate_size": 2 * config.hidden,
+            "intermediate_size": config.intermediate or 2 * config.hidden,
             "num_hidden_layers": config.layers,
             "num_attention_heads": config.heads,
             "num_key_value_heads": config.kv_heads,
             "head_dim": config.hidden // config.heads,
-            "vocab_size": len(vocabulary),
+            "vocab_size": max(config.embeddings, len(vocabulary)),
             "pad_token_id": vocabulary["<|pad|>"],
             "max_position_embeddings": 1024,
             "rms_norm_eps": 1e-5,
@@ -162,7 +194,7 @@ def write_backbone(directory: Path, config: BackboneConfig, texts: Sequence[str]
         image_processor=SmolVLMImageProcessor(),
         tokenizer=tokenizer,
         video_processor=SmolVLMVideoProcessor(),
-        image_seq_len=(config.image // config.patch // 2) ** 2,
+        image_seq_len=(config.image // config.patch // config.shuffle) ** 2,
         chat_template="{% for m in messages %}{{ m['content'] }}{% endfor %}",
     ).save_pretrained(directory)
     return directory

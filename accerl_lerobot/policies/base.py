@@ -48,8 +48,6 @@ class Evaluation:
     """(B,)."""
     value: Value
     """Of B observations."""
-    factors: Tensor | None = None
-    """bool (B, L), False where a factor does not exist, such as a token after the terminator."""
 
 
 class PolicyAdapter(nn.Module, ABC):
@@ -59,6 +57,23 @@ class PolicyAdapter(nn.Module, ABC):
     """
 
     device: torch.device
+
+    @property
+    @abstractmethod
+    def actions(self) -> int | None:
+        """Into how many equal groups of consecutive log-prob factors the L fall, one per action of the chunk.
+
+        None if they do not align with actions: ratios per action are refused then.
+        """
+
+    def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
+        """bool (B, L), False for log-prob factors that a latent does not have, such as tokens after the
+        terminator; None if all latents have all of them.
+
+        Args:
+            latent: each (B, ...), as `decide` returned them.
+        """
+        return None
 
     @abstractmethod
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
@@ -83,10 +98,6 @@ class PolicyAdapter(nn.Module, ABC):
     @abstractmethod
     def trainable(self) -> dict[str, nn.Parameter]:
         """What the trainer updates and publishes, by name; the critic's begin with ``value_head.``"""
-
-    def actions(self) -> int | None:
-        """Into how many actions the L factors of a log-prob fall, in order and equally; None: they do not."""
-        return None
 
     def load_trainable(self, tensors: dict[str, np.ndarray]) -> None:
         """Copies published weights in place: all of them, or none when they do not fit.

@@ -67,8 +67,6 @@ class Score:
     """(B, L), differentiable."""
     entropy: Tensor
     """(B,)."""
-    factors: Tensor | None = None
-    """See `base.Evaluation`."""
 
 
 class Model(ABC):
@@ -123,6 +121,10 @@ class Family(nn.Module, ABC):
     @abstractmethod
     def actions(self) -> int | None:
         """See `base.PolicyAdapter.actions`."""
+
+    def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
+        """See `base.PolicyAdapter.factors`."""
+        return None
 
 
 def normal(requests: Sequence[Request], *sizes: tuple[int, ...], device: torch.device) -> list[Tensor]:

@@ -159,7 +159,7 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
 
     lerobot_config = load_lerobot_config(config)
     folder = _checkpoint_folder(config)
-    model_class: type[Model] = _imported(POLICIES[lerobot_config.type][0])
+    model_class: type[Model] = imported(POLICIES[lerobot_config.type][0])
     try:
         with model_class.loading():
             policy = get_policy_class(lerobot_config.type).from_pretrained(folder, config=lerobot_config)
@@ -183,7 +183,7 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
         raise InputError("policy.path", config.path, remedy) from error
     processing = Processing(pre, post, device, config.rename_map)
     sampler = sampler_config(config, lerobot_config.type)
-    family = _imported(FAMILIES[sampler.type])(model, sampler)
+    family = imported(FAMILIES[sampler.type])(model, sampler)
     adapter = LeRobotAdapter(
         policy, processing, model, family, ValueHead(model.width, config.value_head), config.precision
     )
@@ -314,7 +314,8 @@ def _override(lerobot_config: Any, config: PolicyConfig) -> None:
         lerobot_config.n_action_steps = config.n_action_steps
 
 
-def _imported(path: str) -> Any:
+def imported(path: str) -> Any:
+    """What an entry of `POLICIES` or `FAMILIES` names."""
     module, _, name = path.partition(":")
     return getattr(importlib.import_module(module), name)
 

@@ -151,8 +151,12 @@ class TokenFamily(Family):
         return Score(
             log_prob=torch.where(factors, token_log_prob(logits, tokens, temperature), 0.0),
             entropy=torch.where(factors, token_entropy(logits, temperature), 0.0).sum(1),
-            factors=None if self.model.terminator is None else factors,
         )
+
+    def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
+        """See the base class."""
+        terminator = self.model.terminator
+        return None if terminator is None else existing(latent["tokens"], terminator)
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
         """See the base class; greedy chunks are compared, then the log-probs of the two passes.

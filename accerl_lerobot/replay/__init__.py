@@ -17,13 +17,21 @@ go."""
 from __future__ import annotations
 
 from accerl_lerobot.replay.buffer import Replay, ReplayCounters
-from accerl_lerobot.replay.pacing import Pace, ReplayConfig, lag_bound, may_insert, may_sample
+from accerl_lerobot.replay.pacing import (
+    Pace,
+    ReplayConfig,
+    decisions_under_way,
+    lag_bound,
+    may_insert,
+    may_sample,
+)
 
 __all__ = [
     "Pace",
     "Replay",
     "ReplayConfig",
     "ReplayCounters",
+    "decisions_under_way",
     "lag_bound",
     "may_insert",
     "may_sample",

@@ -270,4 +270,5 @@ def is_finite(segment: Segment) -> bool:
     """Whether no floating-point number of the segment is a NaN or an infinity."""
     arrays = [segment.log_prob, segment.value, segment.reward, *segment.latent.values()]
     arrays += segment.observations.values()
+    arrays += [] if segment.advantage is None else [segment.advantage]
     return all(bool(np.isfinite(a).all()) for a in arrays if np.issubdtype(a.dtype, np.inexact))

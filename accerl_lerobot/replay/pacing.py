@@ -133,6 +133,33 @@ def may_insert(config: ReplayConfig, pace: Pace) -> bool:
     return pace.stored < config.min_decisions or pace.available < config.ahead
 
 
+def decisions_under_way(
+    *, workers: int, worlds: int, segment_length: int, group_size: int = 0, episode_decisions: int = 0
+) -> int:
+    """What environments of equal speed decide while a segment is on its way to the door.
+
+        workers · worlds · segment_length                                          without groups
+        workers · worlds · episode_decisions · (1 + ⌈(group_size − 1) / worlds⌉)   with groups
+
+    A segment of a group is held back until the group's last episode has ended. Every world begins an episode
+    at least once in `episode_decisions` and completes the oldest group first; so the last episode begins at
+    most ⌈(group_size − 1)/worlds⌉ episodes after the first, and lasts one more. What is inserted in that time
+    was decided in it or was itself held back, for no longer than that: at most twice this number.
+
+    Args:
+        workers: rollout processes.
+        worlds: of each.
+        segment_length: decisions of the longest segment.
+        group_size: episodes that are held back for each other; 0 for none.
+        episode_decisions: of the longest episode; needed with groups only.
+    """
+    if not group_size:
+        return workers * worlds * segment_length
+    if episode_decisions < 1:
+        raise ValueError("groups are held back for whole episodes: give episode_decisions")
+    return workers * worlds * episode_decisions * (1 + math.ceil((group_size - 1) / worlds))
+
+
 def lag_bound(
     config: ReplayConfig,
     *,
@@ -164,10 +191,10 @@ def lag_bound(
         batch_decisions: decisions one update draws at least.
         in_flight: most decisions inserted, by all workers, from the first decision of a segment until it is
             inserted itself, its own included, and not less than what may be under way when the door shuts.
-            With environments of about equal speed: environments × segment length, twice that to be safe.
-            One worker that hangs breaks this assumption; `max_lag` then retires its segment.
+            With environments of about equal speed: `decisions_under_way`, twice that to be safe. One worker
+            that hangs breaks this assumption; `max_lag` then retires its segment.
         publish_every: updates from one publication of the weights to the next.
-        pickup: updates made while a publication travels to the inference service.
+        pickup: updates made while a publication travels to the inference service, or is held back.
         prefetch: batches drawn ahead of the update that uses them.
     """
     decisions = max(config.ahead, config.min_decisions) + 2 * in_flight + config.capacity

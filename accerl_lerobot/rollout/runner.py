@@ -15,20 +15,28 @@
 
 A slot is one world. `start` resets it and `advance` executes a decision in it; both return the request for
 the next decision, and whoever drives the runner decides when that is answered: the Ray worker goes on with
-other slots meanwhile, the single-process mode answers at once.
+other slots meanwhile, the single-process mode answers at once. Segments of an episode that belongs to a group
+are held back until the group has ended.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import get_args
 
 import numpy as np
 
 from accerl_lerobot.envs.base import ChunkResult, World
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Observation, Request, Segment
+from accerl_lerobot.rollout.groups import GroupAdvantage, GroupFilter, Groups, Outcome, Place
 from accerl_lerobot.rollout.segments import SegmentBuilder
+from accerl_lerobot.rollout.tasks import TaskSampling
+from accerl_lerobot.seeds import noise_seed
+
+LARGEST_GROUP = 256
+"""Episodes; a worker holds all of a group's segments until its last episode has ended."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +59,29 @@ class RolloutConfig:
     bootstraps from its own optimistic value and failures go unpunished. On door-open, success at update 100
     fell from 0.82 to 0.50 (n = 20) with truncate.
     """
+    group_size: int = 0
+    """Exploring episodes that start alike (same task and seed, other noise) and are compared with each other,
+    2 to 256, for ``algorithm.advantage=group``; 0: none are.
+    """
+    group_advantage: GroupAdvantage = "grpo"
+    """grpo: (R − mean)/std of the group. rloo: R − mean of the others. grpo_no_std: R − mean. R is the
+    undiscounted return of the episode.
+    """
+    group_filter: GroupFilter = "outcome"
+    """Which groups are thrown away, having nothing to compare. return: those whose returns are all equal.
+    outcome: also those in which all episodes succeeded or all failed. none: no group.
+
+    `decision_cost` makes the returns of two successes differ by how fast they were, and the division by std
+    would make that as loud as success itself; hence `outcome`, as in DAPO. Rewards that do not come from
+    success need `return`. Where all groups are thrown away, because the policy never fails or always does, no
+    update is made: watch ``groups_dropped``.
+    """
+    task_sampling: TaskSampling = "uniform"
+    """Which task an exploring episode, or group, is about. uniform: each in turn. failures: p(task) ∝ 1 +
+    failures among the task's last `task_window` exploring episodes of the same worker.
+    """
+    task_window: int = 100
+    """Exploring episodes of a task that `task_sampling` remembers, at least 1."""
     max_restarts: int = 3
     """How often each worker is started again after it died or hung; once more ends the run with its error.
 
@@ -58,11 +89,25 @@ class RolloutConfig:
     """
 
     def __post_init__(self) -> None:
-        for name in ("workers", "worlds", "segment_length"):
+        for name in ("workers", "worlds", "segment_length", "task_window"):
             if getattr(self, name) < 1:
                 raise InputError(f"rollout.{name}", getattr(self, name), "use at least 1")
         if self.time_limit not in ("truncate", "fail"):
             raise InputError("rollout.time_limit", self.time_limit, "use truncate or fail")
+        if self.group_size == 1:
+            raise InputError(
+                "rollout.group_size", 1, "groups of one have no comparison; use 0 (none) or 2 and more"
+            )
+        if not 0 <= self.group_size <= LARGEST_GROUP:
+            raise InputError("rollout.group_size", self.group_size, f"use 0 (none) or 2 to {LARGEST_GROUP}")
+        choices = {
+            "group_advantage": GroupAdvantage,
+            "group_filter": GroupFilter,
+            "task_sampling": TaskSampling,
+        }
+        for name, kind in choices.items():
+            if getattr(self, name) not in get_args(kind):
+                raise InputError(f"rollout.{name}", getattr(self, name), f"use {' or '.join(get_args(kind))}")
         for name in ("decision_cost", "max_restarts"):
             if getattr(self, name) < 0:
                 raise InputError(f"rollout.{name}", getattr(self, name), "use 0 or more")
@@ -80,6 +125,8 @@ class EpisodePlan:
     """Position in the evaluation it belongs to."""
     group: str = "train"
     """Which evaluation it belongs to."""
+    place: Place | None = None
+    """Its group of equal starts and which of them it is, where exploring episodes are compared."""
     film: bool = False
     """Record frames for people. Steps the world one action at a time, which changes nothing else."""
 
@@ -108,6 +155,12 @@ class Counters:
     episodes: int = 0
     dropped_nonfinite: int = 0
     """Decisions thrown away because the world returned NaN or infinity."""
+    groups_kept: int = 0
+    """Groups handed out with advantages."""
+    groups_dropped: int = 0
+    """Groups thrown away: nothing to compare, too few left, or unfinished when exploring ended."""
+    groups_dropped_decisions: int = 0
+    """Decisions that were held back and thrown away, with their group or with their own episode."""
 
 
 @dataclass
@@ -130,9 +183,10 @@ class RolloutRunner:
         next_plan: called for each new episode; None leaves the slot idle until `start` is called again.
         config: segment length and decision cost.
         name: unique per incarnation of a worker; the prefix of its segments' keys.
-        on_segment: receives finished segments of exploring episodes.
+        on_segment: receives finished segments of exploring episodes; those of a group all at its end.
         on_episode: receives every finished episode.
         film: (side in pixels, env steps per frame) of filmed episodes.
+        groups: those that plans with a `place` belong to.
     """
 
     def __init__(
@@ -144,9 +198,11 @@ class RolloutRunner:
         on_segment: Callable[[Segment], object],
         on_episode: Callable[[EpisodeResult], object],
         film: tuple[int, int] = (240, 2),
+        groups: Groups | None = None,
     ) -> None:
         self.config, self.name = config, name
         self.counters = Counters()
+        self._groups = groups
         self._slots = [_Slot(world) for world in worlds]
         self._next_plan, self._on_segment, self._on_episode = next_plan, on_segment, on_episode
         self._sequence = 0
@@ -180,6 +236,7 @@ class RolloutRunner:
             self.counters.dropped_nonfinite += len(builder.decisions) + 1
             if not plan.explore:  # an evaluation counts every episode it planned
                 self._finish(state, plan, success=False)
+            self._leave_group(plan, None)
             return self.start(slot)
         reward = float(result.rewards.sum()) - self.config.decision_cost
         state.episode_return += reward
@@ -195,6 +252,12 @@ class RolloutRunner:
             self._finish(state, plan, result.success)
             return self.start(slot)
         return self._request(state)
+
+    def abandon_groups(self) -> None:
+        """Throws unfinished groups away, because exploring has ended."""
+        if self._groups is not None:
+            self._groups.abandon()
+            self._count_groups()
 
     def close(self) -> None:
         """Closes the worlds."""
@@ -217,8 +280,7 @@ class RolloutRunner:
     def _request(self, state: _Slot) -> Request:
         plan, builder = state.plan, state.builder
         assert plan is not None and builder is not None
-        # One stream per (episode, decision), whichever slot runs it and however requests are batched.
-        seed = plan.seed * 1_000_003 + state.decisions
+        seed = noise_seed(plan.seed, plan.place.member if plan.place else 0, state.decisions)
         return Request(observation=builder.latest, noise_seed=seed, explore=plan.explore)
 
     def _emit(
@@ -241,7 +303,10 @@ class RolloutRunner:
             }
         key = f"{self.name}.{self._sequence}"
         segment = builder.cut(key, terminated, truncated, success, episode)
-        if plan.explore:
+        if plan.place is not None:
+            assert self._groups is not None
+            self._groups.add(plan.place, segment)
+        elif plan.explore:
             self._on_segment(segment)
 
     def _finish(self, state: _Slot, plan: EpisodePlan, success: bool) -> None:
@@ -258,6 +323,21 @@ class RolloutRunner:
                 frames=state.frames,
             )
         )
+        self._leave_group(plan, Outcome(state.episode_return, success))
+
+    def _leave_group(self, plan: EpisodePlan, outcome: Outcome | None) -> None:
+        if plan.place is None:
+            return
+        assert self._groups is not None
+        for segment in self._groups.end(plan.place, outcome):
+            self._on_segment(segment)
+        self._count_groups()
+
+    def _count_groups(self) -> None:
+        assert self._groups is not None
+        counted = self._groups.counters
+        self.counters.groups_kept, self.counters.groups_dropped = counted.kept, counted.dropped
+        self.counters.groups_dropped_decisions = counted.dropped_decisions
 
 
 def _finite(observation: Observation | None) -> bool:

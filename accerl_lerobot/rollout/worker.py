@@ -37,15 +37,13 @@ import ray
 
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.experience import Decision, Request, Segment
+from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig, RolloutRunner
-from accerl_lerobot.seeds import train_seed
 
-GROUPS = 2
-"""A worker's worlds are asked for in so many groups: one is stepped while the other's decisions are made."""
+PARTS = 2
+"""A worker's worlds are asked for in so many parts: one is stepped while the other's decisions are made."""
 AT_THE_DOOR = 2
 """Insert calls that may be waiting before exploring worlds pause."""
-EPISODES_PER_INCARNATION = 1000
-"""By how much a restarted worker skips ahead in its training seeds, so as not to repeat its episodes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +64,7 @@ class RolloutWorker:
     Args:
         env: the world's config; one instance per slot.
         config: sizes.
-        tasks: the training tasks, explored in turn.
+        tasks: the training tasks.
         seed: the run's.
         index: of this worker.
         incarnation: how often it has been restarted; part of the segments' keys, and of the seeds.
@@ -83,10 +81,10 @@ class RolloutWorker:
         incarnation: int,
         film: tuple[int, int],
     ) -> None:
-        self._tasks, self._seed, self._index = tasks, seed, index
-        self._episode = incarnation * EPISODES_PER_INCARNATION
+        self._plans = EpisodePlans(
+            config, tasks, seed=seed, worlds=config.worlds, worker=index, incarnation=incarnation
+        )
         # Shared by the two threads: appending to and popping from a deque is atomic.
-        self._planned: deque[EpisodePlan] = deque()
         self._results: deque[EpisodeResult] = deque()
         self._training = threading.Event()
         self._entered: float | None = None
@@ -94,7 +92,14 @@ class RolloutWorker:
         worlds = [make_world(env) for _ in range(config.worlds)]
         name = f"rollout{index}.{incarnation}"
         self._runner = RolloutRunner(
-            worlds, self._next_plan, config, name, self._outbox.append, self._results.append, film
+            worlds,
+            lambda: self._plans.next(exploring=self._training.is_set()),
+            config,
+            name,
+            self._outbox.append,
+            self._ended,
+            film,
+            self._plans.groups,
         )
 
     def ready(self) -> int:
@@ -108,7 +113,7 @@ class RolloutWorker:
             training: whether training episodes are run between planned ones, from now on.
             plans: evaluation episodes to queue; they are taken before any training episode.
         """
-        self._planned.extend(plans)
+        self._plans.queue(plans)
         (self._training.set if training else self._training.clear)()
         episodes = [self._results.popleft() for _ in range(len(self._results))]
         entered = self._entered
@@ -124,7 +129,7 @@ class RolloutWorker:
         due: dict[int, Request] = {}
         under_way: dict[Any, list[int]] = {}
         door: list[Any] = []
-        size = max(1, len(self._runner) // GROUPS)
+        size = max(1, len(self._runner) // PARTS)
         while True:
             door = _still_waiting(door)
             self._give_up(due, idle)
@@ -141,9 +146,10 @@ class RolloutWorker:
                 slots = under_way.pop(reference)
                 for slot, decision in zip(slots, ray.get(reference), strict=True):
                     self._advance(slot, decision, due, idle)
-                if self._outbox:
-                    door.append(replay.insert.remote(list(self._outbox)))
-                    self._outbox.clear()
+                # The segments of a whole group may come at once; replay's pace is for a few at a time.
+                for start in range(0, len(self._outbox), size):
+                    door.append(replay.insert.remote(self._outbox[start : start + size]))
+                self._outbox.clear()
 
     def _begin(self, slot: int, due: dict[int, Request]) -> bool:
         with self._in_world():
@@ -164,6 +170,7 @@ class RolloutWorker:
         """Abandons training episodes once training has ended, so that planned ones need not wait for them."""
         if self._training.is_set():
             return
+        self._runner.abandon_groups()
         for slot in [slot for slot, request in due.items() if request.explore]:
             del due[slot]
             idle.append(slot)
@@ -175,14 +182,9 @@ class RolloutWorker:
         yield
         self._entered = None
 
-    def _next_plan(self) -> EpisodePlan | None:
-        if self._planned:
-            return self._planned.popleft()
-        if not self._training.is_set():
-            return None
-        number, self._episode = self._episode, self._episode + 1
-        task = self._tasks[(number + self._index) % len(self._tasks)]
-        return EpisodePlan(task=task, seed=train_seed(self._seed, self._index, number), explore=True)
+    def _ended(self, result: EpisodeResult) -> None:
+        self._plans.report(result)
+        self._results.append(result)
 
 
 def _still_waiting(door: list[Any]) -> list[Any]:

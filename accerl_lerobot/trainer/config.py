@@ -44,13 +44,23 @@ class TrainerConfig:
     """constant, or cosine: falls to `final_lr_share` of the peak over `updates`."""
     final_lr_share: float = 0.1
     value_warmup_updates: int = 20
-    """First updates, in which only the critic head learns: advantages of an untrained one are noise."""
+    """First updates, in which only the critic head learns: advantages of an untrained one are noise.
+
+    None with ``algorithm.advantage=group``, which asks no critic.
+    """
     grad_clip: float = 1.0
     """Largest gradient norm; > 0."""
     weight_decay: float = 0.0
     betas: tuple[float, float] = (0.9, 0.95)
     publish_every: int = 1
     """Updates between two publications of the weights."""
+    hold_back: int = 0
+    """Updates by which published weights are held back: lag on purpose, to study it; 0: none."""
+    probe_every: int = 25
+    """Updates between two measurements of the mismatch between acting and learning; 0: none.
+
+    While it waits for one, the trainer holds a copy of the policy's weights.
+    """
     max_nonfinite: int = 5
     """Updates with a non-finite loss or gradient are skipped and counted; so many in a row are an error."""
     num_threads: int = 1
@@ -64,7 +74,7 @@ class TrainerConfig:
         for name in ("lr", "value_lr"):
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"trainer.{name}", getattr(self, name), "use a value in [0, 1), e.g. 1e-4")
-        for name in ("warmup_updates", "value_warmup_updates", "weight_decay"):
+        for name in ("warmup_updates", "value_warmup_updates", "weight_decay", "hold_back", "probe_every"):
             if getattr(self, name) < 0:
                 raise InputError(f"trainer.{name}", getattr(self, name), "use 0 or more")
         if self.schedule not in ("constant", "cosine"):
@@ -73,6 +83,10 @@ class TrainerConfig:
             raise InputError("trainer.grad_clip", self.grad_clip, "use a positive norm")
         if not 0 <= self.final_lr_share <= 1:
             raise InputError("trainer.final_lr_share", self.final_lr_share, "use a share in [0, 1]")
+
+    def publishes(self, version: int) -> bool:
+        """Whether the weights of `version` are handed over."""
+        return version % self.publish_every == 0 or version == self.updates
 
     def lr_share(self, update: int) -> float:
         """Factor on both learning rates at `update`, counted from 0."""

@@ -15,9 +15,12 @@
 
     values of the current critic (bootstraps too) → GAE → advantages normalised over the batch → loss → step
 
+With ``advantage=group`` the advantages are those that the rollout workers stamped on the segments. GAE then
+only makes the critic's targets; where ``value_coef`` is 0, not even those, and V is not computed beforehand.
+
 Values stored with the samples are stale by their lag, so they are recomputed; the stored log-probs are not,
-since they are what the ratio divides by. Knows no process: the Ray worker and the single-process mode both
-call `Update.step`.
+since they are what the ratio divides by. Log-probs under older weights come from `anchors`. Knows no process:
+the Ray worker and the single-process mode both call `Update.step`.
 
 Shapes: S segments, T decisions of the longest one, N decisions in all.
 """
@@ -25,60 +28,22 @@ Shapes: S segments, T decisions of the longest one, N decisions in all.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from accerl_lerobot.algorithms import AlgorithmConfig, LossInputs, compute_loss
+from accerl_lerobot.algorithms import AlgorithmConfig, LossInputs, check_level, compute_loss
 from accerl_lerobot.algorithms.diagnostics import lag_metrics
 from accerl_lerobot.algorithms.gae import decision_mask, gae
 from accerl_lerobot.algorithms.normalise import moments, normalise
+from accerl_lerobot.algorithms.ratio import present
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.base import PolicyAdapter
+from accerl_lerobot.trainer.anchors import CRITIC, Anchors
+from accerl_lerobot.trainer.batch import Batch, Part, collate, pick, split
 from accerl_lerobot.trainer.config import TrainerConfig
-
-
-@dataclass(frozen=True, kw_only=True)
-class Batch:
-    """Segments laid end to end: N rows of decisions, plus one bootstrap observation per segment."""
-
-    observations: dict[str, np.ndarray]
-    """Each (N, ...)."""
-    tasks: list[str]
-    latent: dict[str, Tensor]
-    """Each (N, ...)."""
-    log_prob: Tensor
-    """(N, L) of the behaviour policy."""
-    reward: Tensor
-    """(N,)."""
-    version: np.ndarray
-    """int64 (N,)."""
-    lengths: Tensor
-    """int64 (S,)."""
-    terminated: Tensor
-    """bool (S,)."""
-    last_observations: dict[str, np.ndarray]
-    """Each (S, ...)."""
-    segment_tasks: list[str]
-
-
-def collate(segments: Sequence[Segment]) -> Batch:
-    """Lays segments end to end."""
-    keys, names = segments[0].observations.keys(), segments[0].latent.keys()
-    return Batch(
-        observations={k: np.concatenate([s.observations[k][:-1] for s in segments]) for k in keys},
-        tasks=[s.task for s in segments for _ in range(len(s))],
-        latent={k: torch.from_numpy(np.concatenate([s.latent[k] for s in segments])) for k in names},
-        log_prob=torch.from_numpy(np.concatenate([s.log_prob for s in segments])),
-        reward=torch.from_numpy(np.concatenate([s.reward for s in segments])),
-        version=np.concatenate([s.version for s in segments]),
-        lengths=torch.tensor([len(s) for s in segments]),
-        terminated=torch.tensor([s.terminated for s in segments]),
-        last_observations={k: np.stack([s.observations[k][-1] for s in segments]) for k in keys},
-        segment_tasks=[s.task for s in segments],
-    )
+from accerl_lerobot.trainer.probe import Probe
 
 
 class NonFiniteError(RuntimeError):
@@ -95,13 +60,20 @@ class Update:
     """
 
     def __init__(self, adapter: PolicyAdapter, algorithm: AlgorithmConfig, config: TrainerConfig) -> None:
+        check_level(algorithm.level, adapter.actions)
         self.adapter, self.algorithm, self.config = adapter, algorithm, config
+        self._grouped = algorithm.advantage == "group"
+        self._critic = not self._grouped or algorithm.value_coef > 0
         self.version = 0
         self.skipped = 0
         self._skipped_in_a_row = 0
+        self.anchors = Anchors(adapter)
+        if algorithm.reference_coef:
+            self.anchors.take("reference", self.version)
+        self._probe = Probe(self.anchors, config)
         named = adapter.trainable()
-        critic = [p for k, p in named.items() if k.startswith("value_head.")]
-        self._policy_parameters = [p for k, p in named.items() if not k.startswith("value_head.")]
+        critic = [p for k, p in named.items() if k.startswith(CRITIC)]
+        self._policy_parameters = [p for k, p in named.items() if not k.startswith(CRITIC)]
         self._parameters = self._policy_parameters + critic
         groups = [
             {"params": self._policy_parameters, "lr": config.lr},
@@ -116,8 +88,11 @@ class Update:
             NonFiniteError: `TrainerConfig.max_nonfinite` updates in a row were not finite.
         """
         batch = collate(segments)
+        mismatch = self._probe.read(batch)
+        if self._is_proximal and self.algorithm.proximal_updates > 1:
+            self.anchors.take("proximal", self.version)
         share = self.config.lr_share(self.version)
-        critic_only = self.version < self.config.value_warmup_updates
+        critic_only = self.version < self.config.value_warmup_updates and not self._grouped
         policy_group, critic_group = self.optimizer.param_groups
         policy_group["lr"] = 0.0 if critic_only else self.config.lr * share
         critic_group["lr"] = self.config.value_lr * share
@@ -135,13 +110,20 @@ class Update:
             self._skip()
         lag = lag_metrics(torch.from_numpy(batch.version), self.version)
         self.version += 1
-        metrics |= {name: float(value) for name, value in lag.items()}
+        self._probe.renew(self.version)
+        metrics |= mismatch | {name: float(value) for name, value in lag.items()}
         return metrics | {
             "grad_norm": float(norm),
             "lr": float(policy_group["lr"]),
             "value_lr": float(critic_group["lr"]),
             "skipped": float(self.skipped),
         }
+
+    @property
+    def _is_proximal(self) -> bool:
+        """Whether the weights of now are the proximal ones."""
+        every = self.algorithm.proximal_updates
+        return every > 0 and self.version % every == 0
 
     def _skip(self) -> None:
         self.skipped += 1
@@ -154,41 +136,58 @@ class Update:
 
     def _backward(self, batch: Batch) -> dict[str, float]:
         """Accumulates gradients over micro-batches; returns metrics weighted by their decisions."""
-        n = len(batch.reward)
-        chunks = np.split(np.arange(n), range(self.config.micro_batch, n, self.config.micro_batch))
+        parts = split(np.arange(len(batch)), self.config.micro_batch)
         bootstrap = self._values(batch.last_observations, batch.segment_tasks)
         targets: tuple[Tensor, Tensor] | None = None
-        if len(chunks) > 1:  # a single micro-batch supplies the values that GAE needs by its own forward pass
+        if len(parts) > 1:  # a single micro-batch supplies the values that GAE needs by its own forward pass
             targets = self._targets(batch, self._values(batch.observations, batch.tasks), bootstrap)
+        factors = self.adapter.factors(batch.latent)
         total: dict[str, float] = {}
-        for rows in chunks:
-            latent = {k: v[rows] for k, v in batch.latent.items()}
-            observations, tasks = _rows(batch.observations, batch.tasks, rows)
-            evaluation = self.adapter.evaluate(observations, tasks, latent)
+        for rows in parts:
+            part = batch.part(rows)
+            reference = self._under("reference", part)
+            proximal = None if self._is_proximal else self._under("proximal", part)
+            evaluation = self.adapter.evaluate(*part)
+            if self._is_proximal:
+                proximal = evaluation.log_prob.detach()
             if targets is None:
                 targets = self._targets(batch, evaluation.value.mean.detach().cpu(), bootstrap)
             device = evaluation.log_prob.device
-            output = compute_loss(
-                LossInputs(
-                    log_prob_new=evaluation.log_prob,
-                    log_prob_old=batch.log_prob[rows].to(device),
-                    advantage=targets[0][rows].to(device),
-                    value=evaluation.value.mean,
-                    returns=targets[1][rows].to(device),
-                    entropy=evaluation.entropy,
-                ),
-                self.algorithm,
+            returns = targets[1][rows].to(device)
+            inputs = LossInputs(
+                log_prob_new=evaluation.log_prob,
+                log_prob_old=batch.log_prob[rows].to(device),
+                actions=self.adapter.actions,
+                advantage=targets[0][rows].to(device),
+                value=evaluation.value.mean,
+                value_error=evaluation.value.error(returns),
+                returns=returns,
+                entropy=evaluation.entropy,
+                factors=None if factors is None else factors[rows].to(device),
+                ratios_per_decision=None if factors is None else self._ratios_per_decision(factors),
+                log_prob_reference=reference,
+                log_prob_proximal=proximal,
             )
-            share = len(rows) / n
+            output = compute_loss(inputs, self.algorithm)
+            share = len(rows) / len(batch)
             (output.loss * share).backward()
             _merge(total, {k: float(v) for k, v in output.metrics.items()}, share)
         assert targets is not None
         return total | {"return_mean": float(targets[1].mean()), "reward_mean": float(batch.reward.mean())}
 
+    def _under(self, name: str, part: Part) -> Tensor | None:
+        """log-probs (rows, L) under a copy; None if there is none."""
+        return self.anchors.log_prob(name, *part) if name in self.anchors else None
+
+    def _ratios_per_decision(self, factors: Tensor) -> float:
+        return float(present(factors, self.algorithm.level, self.adapter.actions).sum()) / len(factors)
+
     def _targets(self, batch: Batch, values: Tensor, bootstrap: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalised advantages and returns, each (N,)."""
+        """Advantages, normalised unless they come from groups, and returns, each (N,)."""
         mask = decision_mask(batch.lengths, int(batch.lengths.max()))
         padded = torch.zeros(mask.shape)
+        if not self._critic:
+            values = torch.zeros_like(values)
         reward, value = (padded.masked_scatter(mask, x.float()) for x in (batch.reward, values))
         advantages, returns = gae(
             reward,
@@ -199,20 +198,21 @@ class Update:
             gamma=self.algorithm.gamma,
             lam=self.algorithm.lam,
         )
+        if self._grouped:
+            if batch.advantage is None:
+                raise ValueError(
+                    "algorithm.advantage=group, but a segment carries none: set rollout.group_size"
+                )
+            return batch.advantage, returns[mask]
         advantages = normalise(advantages, moments(advantages, mask), mask)
         return advantages[mask], returns[mask]
 
     def _values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
         """V of each row, (rows,), without gradient, at most `micro_batch` rows at a time."""
-        size, n = self.config.micro_batch, len(tasks)
-        rows = np.split(np.arange(n), range(size, n, size))
-        return torch.cat([self.adapter.values(*_rows(observations, tasks, r)).cpu().float() for r in rows])
-
-
-def _rows(
-    observations: dict[str, np.ndarray], tasks: Sequence[str], rows: np.ndarray
-) -> tuple[dict[str, np.ndarray], list[str]]:
-    return {k: v[rows] for k, v in observations.items()}, [tasks[i] for i in rows]
+        if not self._critic:  # V is neither used nor learnt
+            return torch.zeros(len(tasks))
+        parts = split(np.arange(len(tasks)), self.config.micro_batch)
+        return torch.cat([self.adapter.values(*pick(observations, tasks, r)).cpu().float() for r in parts])
 
 
 def _merge(total: dict[str, float], metrics: dict[str, float], share: float) -> None:

@@ -33,6 +33,7 @@ import ray
 from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.weights.held_back import HeldBack
 from accerl_lerobot.weights.ray_channel import RayPublisher
 
 
@@ -67,7 +68,7 @@ class TrainerWorker:
 
     def run(self, replay: Any, readers: list[Any]) -> int:
         """Trains; returns the number of updates made."""
-        publisher = RayPublisher(readers)
+        publisher, held = RayPublisher(readers), HeldBack(self._config.hold_back)
         n, config = self._config.batch_decisions, self._config
         publisher.publish(0, self._export())  # a checkpoint need not hold a critic: all start from this one
         upcoming = replay.sample.remote(n, self._update.version)
@@ -83,9 +84,10 @@ class TrainerWorker:
             with self._lock:
                 metrics = self._update.step(segments)
             updated = time.monotonic()
-            last = self._update.version == config.updates
-            if self._update.version % config.publish_every == 0 or last:
-                publisher.publish(self._update.version, self._export())
+            version = self._update.version
+            if config.publishes(version):
+                for due in held.push(version, self._export(), last=version == config.updates):
+                    publisher.publish(*due)
             metrics |= {
                 "update": float(self._update.version),
                 "wait_s": waited,

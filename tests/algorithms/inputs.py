@@ -25,7 +25,10 @@ from accerl_lerobot.algorithms import LossInputs
 def make_inputs(
     n: int = 12, factors: int = 3, spread: float = 0.4, seed: int = 0, **replace: Any
 ) -> LossInputs:
-    """Random float64 batch; `spread` is the standard deviation of log ρ per factor."""
+    """Random float64 batch; `spread` is the standard deviation of log ρ per factor.
+
+    Every factor is an action, π_prox lies between μ and π, and the critic's error is squared.
+    """
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -35,25 +38,32 @@ def make_inputs(
     fields: dict[str, Any] = {
         "log_prob_old": old,
         "log_prob_new": (old + spread * normal(n, factors)).requires_grad_(),
+        "actions": factors,
         "advantage": normal(n),
-        "value": normal(n).requires_grad_(),
+        "value": normal(n),
         "returns": normal(n),
         "entropy": normal(n).abs().requires_grad_(),
     }
+    fields["value_error"] = (fields["value"] - fields["returns"]).square().requires_grad_()
+    fields["log_prob_reference"] = old + spread * normal(n, factors)
+    fields["log_prob_proximal"] = old + spread * normal(n, factors)
     return LossInputs(**{**fields, **replace})
 
 
-def one(log_ratio: float, advantage: float) -> LossInputs:
-    """A single decision with one factor."""
+def one(log_ratio: float, advantage: float, log_proximal: float | None = None) -> LossInputs:
+    """A single decision with one factor; log-probs are relative to μ's."""
     zero = torch.zeros(1, dtype=torch.float64)
     new = torch.tensor([[log_ratio]], dtype=torch.float64, requires_grad=True)
     return LossInputs(
         log_prob_new=new,
         log_prob_old=torch.zeros(1, 1, dtype=torch.float64),
+        actions=1,
         advantage=torch.tensor([advantage], dtype=torch.float64),
         value=zero,
+        value_error=zero,
         returns=zero,
         entropy=zero,
+        log_prob_proximal=torch.full_like(new, log_ratio if log_proximal is None else log_proximal),
     )
 
 

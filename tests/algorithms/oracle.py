@@ -44,39 +44,106 @@ def gae(
     return advantages, returns
 
 
-def log_ratios(new: np.ndarray, old: np.ndarray, level: str) -> np.ndarray:
-    """(N, L) or (N, 1)."""
-    if level == "action":
-        return new - old
-    return np.array([[sum(new[i, j] - old[i, j] for j in range(new.shape[1]))] for i in range(len(new))])
+Ragged = list[list[float]]
+"""One list per decision, with an entry for each of its ratios."""
 
 
-def gipo(logs: np.ndarray, advantage: np.ndarray, sigma: float, sigma_negative: float) -> float:
+def grouped(
+    x: np.ndarray, level: str, actions: int | None = None, factors: np.ndarray | None = None
+) -> Ragged:
+    """Sums of (N, L) log-probs over what one ratio covers, without factors and groups that do not exist."""
+    found: Ragged = []
+    n, width = x.shape
+    size = {"token": 1, "action": width // (actions or width), "chunk": width}[level]
+    for i in range(n):
+        row = []
+        for start in range(0, width, size):
+            there = [j for j in range(start, start + size) if factors is None or factors[i, j]]
+            if there:
+                row.append(sum(float(x[i, j]) for j in there))
+        found.append(row)
+    return found
+
+
+def mean(terms: list[float]) -> float:
+    return sum(terms) / len(terms)
+
+
+def gipo(logs: Ragged, advantage: np.ndarray, sigma: float, sigma_negative: float) -> float:
     """−E[ω ρ Â]."""
     terms = []
-    for i in range(logs.shape[0]):
-        width = sigma if advantage[i] > 0 else sigma_negative
-        for j in range(logs.shape[1]):
-            weight = math.exp(-0.5 * (logs[i, j] / width) ** 2)
-            terms.append(weight * math.exp(logs[i, j]) * advantage[i])
-    return -sum(terms) / len(terms)
+    for row, a in zip(logs, advantage, strict=True):
+        width = sigma if a > 0 else sigma_negative
+        for x in row:
+            weight = math.exp(-0.5 * (x / width) ** 2)
+            terms.append(weight * math.exp(x) * a)
+    return -mean(terms)
 
 
-def ppo(logs: np.ndarray, advantage: np.ndarray, low: float, high: float) -> float:
+def ppo(logs: Ragged, advantage: np.ndarray, low: float, high: float) -> float:
     """−E[min(ρ Â, clip(ρ, 1 − low, 1 + high) Â)]."""
     terms = []
-    for i in range(logs.shape[0]):
-        for j in range(logs.shape[1]):
-            rho = math.exp(logs[i, j])
+    for row, a in zip(logs, advantage, strict=True):
+        for x in row:
+            rho = math.exp(x)
             clipped = min(max(rho, 1 - low), 1 + high)
-            terms.append(min(rho * advantage[i], clipped * advantage[i]))
-    return -sum(terms) / len(terms)
+            terms.append(min(rho * a, clipped * a))
+    return -mean(terms)
+
+
+def decoupled(
+    moved: Ragged, behaviour: Ragged, advantage: np.ndarray, low: float, high: float, cap: float
+) -> float:
+    """−E[w · min(r Â, clip(r, 1 − low, 1 + high) Â)], w = 0 above the cap.
+
+    Args:
+        moved: log π/π_prox.
+        behaviour: log π_prox/μ.
+    """
+    terms = []
+    for row, other, a in zip(moved, behaviour, advantage, strict=True):
+        for x, y in zip(row, other, strict=True):
+            weight, r = math.exp(y), math.exp(x)
+            clipped = min(max(r, 1 - low), 1 + high)
+            terms.append(0.0 if weight > cap else weight * min(r * a, clipped * a))
+    return -mean(terms)
+
+
+def sapo(logs: Ragged, advantage: np.ndarray, tau_positive: float, tau_negative: float) -> float:
+    """−E[(4/τ) σ(τ(ρ − 1)) Â]."""
+    terms = []
+    for row, a in zip(logs, advantage, strict=True):
+        tau = tau_positive if a > 0 else tau_negative
+        for x in row:
+            terms.append(4 / tau / (1 + math.exp(-tau * (math.exp(x) - 1))) * a)
+    return -mean(terms)
+
+
+def importance(logs: Ragged, advantage: np.ndarray, cap: float) -> float:
+    """−E[min(ρ, cap) Â]."""
+    return -mean([min(math.exp(x), cap) * a for row, a in zip(logs, advantage, strict=True) for x in row])
+
+
+def awr(log_prob: Ragged, advantage: np.ndarray, beta: float, cap: float) -> float:
+    """−E[min(exp(Â/β), cap) log π]."""
+    terms = []
+    for row, a in zip(log_prob, advantage, strict=True):
+        for x in row:
+            terms.append(min(math.exp(a / beta), cap) * x)
+    return -mean(terms)
 
 
 def shared(
-    value: np.ndarray, returns: np.ndarray, logs: np.ndarray, entropy: np.ndarray, config: AlgorithmConfig
+    error: np.ndarray, logs: Ragged, apart: Ragged, entropy: np.ndarray, config: AlgorithmConfig
 ) -> float:
-    """value_coef · MSE + kl_coef · KL − entropy_coef · H."""
-    mse = sum((v - r) ** 2 for v, r in zip(value, returns, strict=True)) / len(value)
-    kl = float(np.mean([math.exp(x) - 1 - x for x in logs.flatten()]))
-    return float(config.value_coef * mse + config.kl_coef * kl - config.entropy_coef * entropy.mean())
+    """value_coef · error + kl_coef · KL(μ‖π) + reference_coef · KL(π‖π_ref) − entropy_coef · H.
+
+    Args:
+        logs: log π/μ.
+        apart: log π/π_ref.
+    """
+    kl = mean([math.exp(x) - 1 - x for row in logs for x in row])
+    pairs = [p for row, other in zip(logs, apart, strict=True) for p in zip(row, other, strict=True)]
+    reference = mean([math.exp(x) * (math.exp(-y) - 1 + y) for x, y in pairs])
+    total = config.value_coef * mean(list(error)) + config.kl_coef * kl + config.reference_coef * reference
+    return float(total - config.entropy_coef * mean(list(entropy)))

@@ -11,11 +11,12 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""GIPO and PPO against slow oracles, by hand, and by the sign and size of their gradients."""
+"""What holds for every algorithm, and GIPO and PPO by hand; `test_peers` has the others by hand."""
 
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from typing import Any
 
 import draccus
@@ -26,49 +27,102 @@ import torch
 from accerl_lerobot.algorithms import (
     ALGORITHMS,
     AlgorithmConfig,
+    AWRConfig,
+    DecoupledConfig,
     GIPOConfig,
+    ImportanceConfig,
     LossInputs,
     PPOConfig,
+    SAPOConfig,
     compute_loss,
     gipo_loss,
     ppo_loss,
 )
-from accerl_lerobot.algorithms.ratio import KL_LINEAR_ABOVE, LOG_RATIO_CLAMP, kl_from_behaviour
+from accerl_lerobot.algorithms.ratio import LOG_RATIO_CLAMP
 from accerl_lerobot.errors import InputError
 from tests.algorithms import oracle
 from tests.algorithms.inputs import gradient, make_inputs, one
 
 CONFIGS: list[AlgorithmConfig] = [
     GIPOConfig(level="action", sigma=0.5, sigma_negative=0.25, entropy_coef=0.01),
-    GIPOConfig(level="chunk"),
-    PPOConfig(level="action", kl_coef=0.2),
+    GIPOConfig(level="chunk", reference_coef=0.3),
+    PPOConfig(level="action", kl_coef=0.2, reference_coef=0.1),
     PPOConfig(level="chunk", clip_low=0.1, clip_high=0.4, entropy_coef=0.01),
+    DecoupledConfig(level="token", kl_coef=0.1, behaviour_cap=1.2, clip_high=0.3),
+    DecoupledConfig(level="chunk", reference_coef=0.2, behaviour_cap=math.inf),
+    SAPOConfig(level="token", entropy_coef=0.02),
+    SAPOConfig(level="chunk", tau_positive=0.5, tau_negative=3.0, kl_coef=0.1),
+    ImportanceConfig(level="action", cap=1.1, reference_coef=0.1),
+    ImportanceConfig(level="chunk"),
+    AWRConfig(level="action", beta=0.5, cap=3.0, kl_coef=0.1),
+    AWRConfig(level="chunk", beta=math.inf, reference_coef=0.1),
 ]
 each_config = pytest.mark.parametrize("config", CONFIGS, ids=lambda c: f"{c.type}-{c.level}")
 each_algorithm = pytest.mark.parametrize(
-    "config", [GIPOConfig(kl_coef=0.0), PPOConfig()], ids=lambda c: c.type
+    "config",
+    [GIPOConfig(kl_coef=0.0), PPOConfig(), DecoupledConfig(), SAPOConfig(), ImportanceConfig()],
+    ids=lambda c: c.type,
 )
 
 
-def logs_of(inputs: LossInputs, level: str) -> np.ndarray:
-    return oracle.log_ratios(inputs.log_prob_new.detach().numpy(), inputs.log_prob_old.numpy(), level)
+def logs_of(inputs: LossInputs, level: str, under: torch.Tensor | None = None) -> oracle.Ragged:
+    """log of π over μ, or over `under`."""
+    new, old = inputs.log_prob_new.detach(), inputs.log_prob_old if under is None else under
+    factors = None if inputs.factors is None else inputs.factors.numpy()
+    return oracle.grouped((new - old).numpy(), level, inputs.actions, factors)
+
+
+def policy_loss_of(inputs: LossInputs, config: AlgorithmConfig) -> float:
+    """The algorithm's own term by its oracle."""
+    logs, advantage = logs_of(inputs, config.level), inputs.advantage.numpy()
+    match config:
+        case GIPOConfig():
+            return oracle.gipo(logs, advantage, config.sigma, config.sigma_negative or config.sigma)
+        case DecoupledConfig():
+            moved = logs_of(inputs, config.level, inputs.log_prob_proximal)
+            pairs = [zip(row, other, strict=True) for row, other in zip(logs, moved, strict=True)]
+            behaviour = [[all_ - near for all_, near in row] for row in pairs]
+            clip = (config.clip_low, config.clip_high)
+            return oracle.decoupled(moved, behaviour, advantage, *clip, config.behaviour_cap)
+        case PPOConfig():
+            return oracle.ppo(logs, advantage, config.clip_low, config.clip_high)
+        case SAPOConfig():
+            return oracle.sapo(logs, advantage, config.tau_positive, config.tau_negative)
+        case ImportanceConfig():
+            return oracle.importance(logs, advantage, math.inf if config.cap is None else config.cap)
+    assert isinstance(config, AWRConfig)
+    zero = torch.zeros_like(inputs.log_prob_old)
+    return oracle.awr(logs_of(inputs, config.level, zero), advantage, config.beta, config.cap)
+
+
+def loss_of(inputs: LossInputs, config: AlgorithmConfig) -> float:
+    """All of it."""
+    error, entropy = inputs.value_error.detach().numpy(), inputs.entropy.detach().numpy()
+    logs, apart = (logs_of(inputs, config.level, under) for under in (None, inputs.log_prob_reference))
+    return policy_loss_of(inputs, config) + oracle.shared(error, logs, apart, entropy, config)
+
+
+def ragged_factors(n: int, width: int) -> torch.Tensor:
+    """bool (n, width), decision i has its first 1 + i % width factors."""
+    return torch.arange(width) <= torch.arange(n)[:, None] % width
 
 
 @each_config
 def test_equals_the_oracle(config: AlgorithmConfig) -> None:
     inputs = make_inputs()
-    logs = logs_of(inputs, config.level)
-    advantage = inputs.advantage.numpy()
-    if isinstance(config, GIPOConfig):
-        expected = oracle.gipo(logs, advantage, config.sigma, config.sigma_negative or config.sigma)
-    else:
-        assert isinstance(config, PPOConfig)
-        expected = oracle.ppo(logs, advantage, config.clip_low, config.clip_high)
     output = compute_loss(inputs, config)
-    assert output.metrics["policy_loss"].item() == pytest.approx(expected, abs=1e-12)
-    value, entropy = inputs.value.detach().numpy(), inputs.entropy.detach().numpy()
-    expected += oracle.shared(value, inputs.returns.numpy(), logs, entropy, config)
-    assert output.loss.item() == pytest.approx(expected, abs=1e-12)
+    assert output.metrics["policy_loss"].item() == pytest.approx(policy_loss_of(inputs, config), abs=1e-12)
+    assert output.loss.item() == pytest.approx(loss_of(inputs, config), abs=1e-12)
+
+
+@each_config
+@pytest.mark.parametrize("level", ["token", "action", "chunk"])
+def test_equals_the_oracle_for_tokens_of_which_some_do_not_exist(config: AlgorithmConfig, level: Any) -> None:
+    """Two actions of three tokens."""
+    inputs = make_inputs(factors=6, actions=2)
+    inputs = replace(inputs, factors=ragged_factors(12, 6))
+    config = replace(config, level=level)
+    assert compute_loss(inputs, config).loss.item() == pytest.approx(loss_of(inputs, config), abs=1e-12)
 
 
 def test_gipo_by_hand() -> None:
@@ -119,11 +173,11 @@ def test_gipo_gradient_is_that_of_importance_sampling_with_the_weight_held_still
     width = np.where(advantage > 0, 0.7, 0.4)
 
     def surrogate(new: np.ndarray, weight: np.ndarray) -> float:
-        logs = oracle.log_ratios(new, inputs.log_prob_old.numpy(), level)
+        logs = np.array(oracle.grouped(new - inputs.log_prob_old.numpy(), level))
         return float(-np.mean(weight * np.exp(logs) * advantage))
 
     new = inputs.log_prob_new.detach().numpy()
-    logs = oracle.log_ratios(new, inputs.log_prob_old.numpy(), level)
+    logs = np.array(oracle.grouped(new - inputs.log_prob_old.numpy(), level))
     weight = np.exp(-0.5 * (logs / width) ** 2)
     formula = np.broadcast_to(-weight * np.exp(logs) * advantage / logs.size, new.shape)
     np.testing.assert_allclose(got.numpy(), formula, atol=1e-12)
@@ -136,10 +190,10 @@ def test_gipo_gradient_is_that_of_importance_sampling_with_the_weight_held_still
 
 @each_algorithm
 @pytest.mark.parametrize("level", ["action", "chunk"])
-def test_on_policy_both_are_the_plain_policy_gradient(config: AlgorithmConfig, level: Any) -> None:
+def test_on_policy_all_are_the_plain_policy_gradient(config: AlgorithmConfig, level: Any) -> None:
     """At ρ = 1 the gradient is −E[Â ∇log π]: of the chunk, or of its factors one by one (1/L of it)."""
-    inputs = make_inputs(spread=0.0)
-    config = type(config)(level=level, kl_coef=0.3)  # the KL has no gradient there
+    inputs = make_inputs(spread=0.0)  # π_prox is μ as well
+    config = replace(config, level=level, kl_coef=0.3)  # the KL has no gradient there
     terms = inputs.log_prob_new.mean(1) if level == "action" else inputs.log_prob_new.sum(1)
     expected = gradient(inputs, -(terms * inputs.advantage).mean())
     torch.testing.assert_close(gradient(inputs, compute_loss(inputs, config).loss), expected)
@@ -184,15 +238,13 @@ def test_chunk_level_sees_only_the_product() -> None:
 def test_padding_changes_neither_loss_nor_metrics_nor_gradient(config: AlgorithmConfig) -> None:
     inputs = make_inputs(n=8)
     expected = compute_loss(inputs, config)
-    names = ("log_prob_new", "log_prob_old", "advantage", "value", "returns", "entropy")
-    padded = {}
-    for name in names:
-        tensor: torch.Tensor = getattr(inputs, name).detach()
-        tail = torch.full((3, *tensor.shape[1:]), torch.nan, dtype=tensor.dtype)
-        padded[name] = torch.cat([tensor, tail])
-    leaves = {k: padded[k].requires_grad_() for k in ("log_prob_new", "value", "entropy")}
-    mask = torch.arange(11) < 8
-    got = compute_loss(LossInputs(**padded, mask=mask), config)
+    padded: dict[str, Any] = {"actions": inputs.actions, "mask": torch.arange(11) < 8}
+    for name, tensor in vars(inputs).items():
+        if isinstance(tensor, torch.Tensor):
+            tail = torch.full((3, *tensor.shape[1:]), torch.nan, dtype=tensor.dtype)
+            padded[name] = torch.cat([tensor.detach(), tail])
+    leaves = {k: padded[k].requires_grad_() for k in ("log_prob_new", "value_error", "entropy")}
+    got = compute_loss(LossInputs(**padded), config)
     assert got.metrics.keys() == expected.metrics.keys()
     for name, metric in expected.metrics.items():
         torch.testing.assert_close(got.metrics[name], metric, msg=name)
@@ -207,11 +259,12 @@ def test_padding_changes_neither_loss_nor_metrics_nor_gradient(config: Algorithm
         assert (leaf.grad[8:] == 0).all()
 
 
-def test_only_the_value_term_moves_the_critic() -> None:
+@each_config
+def test_only_the_value_term_moves_the_critic(config: AlgorithmConfig) -> None:
     inputs = make_inputs()
-    loss = gipo_loss(inputs, GIPOConfig(value_coef=0.5)).loss
-    (slope,) = torch.autograd.grad(loss, inputs.value)
-    torch.testing.assert_close(slope, 0.5 * 2 * (inputs.value - inputs.returns).detach() / 12)
+    loss = compute_loss(inputs, replace(config, value_coef=0.3)).loss
+    (slope,) = torch.autograd.grad(loss, inputs.value_error)
+    torch.testing.assert_close(slope, torch.full_like(slope, 0.3 / 12))
 
 
 def test_the_entropy_bonus_raises_entropy() -> None:
@@ -225,29 +278,6 @@ def test_an_unused_entropy_may_be_undefined() -> None:
     assert gipo_loss(inputs, GIPOConfig()).loss.isfinite()
 
 
-def test_kl_estimates_behaviour_to_policy_in_value_and_gradient() -> None:
-    """μ = N(0, 1), π = N(m, s): samples of μ, KL(μ‖π) = log s + (1 + m²)/(2s²) − ½ and its slope m/s² in
-    m."""
-    noise = torch.randn(200_000, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    mean = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
-    s = 1.2
-    policy = torch.distributions.Normal(mean, s)
-    logs = policy.log_prob(noise) - torch.distributions.Normal(0.0, 1.0).log_prob(noise)
-    kl = kl_from_behaviour(logs).mean()
-    assert kl.item() == pytest.approx(math.log(s) + (1 + 0.09) / (2 * s * s) - 0.5, rel=0.02)
-    (slope,) = torch.autograd.grad(kl, mean)
-    assert slope.item() == pytest.approx(0.3 / (s * s), rel=0.02)
-
-
-def test_kl_pulls_back_from_both_sides_with_a_bounded_slope() -> None:
-    far = [-50.0, -1.0, 0.0, 1.0, KL_LINEAR_ABOVE, 50.0]
-    logs = torch.tensor(far, dtype=torch.float64, requires_grad=True)
-    (slope,) = torch.autograd.grad(kl_from_behaviour(logs).sum(), logs)
-    edge = math.expm1(KL_LINEAR_ABOVE)
-    expected = [-1.0, math.expm1(-1.0), 0.0, math.expm1(1.0), edge, edge]
-    np.testing.assert_allclose(slope.numpy(), expected, atol=1e-12)
-
-
 @each_config
 def test_absurd_ratios_stay_finite_in_float32(config: AlgorithmConfig) -> None:
     new = torch.tensor([[300.0], [-300.0], [LOG_RATIO_CLAMP], [0.0]], requires_grad=True)
@@ -255,10 +285,14 @@ def test_absurd_ratios_stay_finite_in_float32(config: AlgorithmConfig) -> None:
     inputs = LossInputs(
         log_prob_new=new,
         log_prob_old=torch.zeros(4, 1),
+        actions=1,
         advantage=torch.tensor([1.0, -1.0, 1.0, 1.0]),
         value=ones,
+        value_error=ones,
         returns=ones,
         entropy=ones,
+        log_prob_reference=torch.tensor([[-300.0], [300.0], [0.0], [300.0]]),
+        log_prob_proximal=torch.tensor([[-300.0], [300.0], [0.0], [300.0]]),
     )
     output = compute_loss(inputs, config)
     assert output.loss.isfinite() and all(m.isfinite() for m in output.metrics.values())
@@ -267,7 +301,9 @@ def test_absurd_ratios_stay_finite_in_float32(config: AlgorithmConfig) -> None:
 
 def test_metrics_are_detached_scalars_under_the_same_names() -> None:
     outputs = [compute_loss(make_inputs(), config) for config in CONFIGS]
-    assert len({tuple(sorted(o.metrics)) for o in outputs}) == 1
+    assert len({tuple(sorted(o.metrics.keys() - {"kl_reference"})) for o in outputs}) == 1
+    for config, output in zip(CONFIGS, outputs, strict=True):
+        assert ("kl_reference" in output.metrics) is (config.reference_coef > 0)
     for output in outputs:
         assert output.loss.requires_grad
         for metric in output.metrics.values():
@@ -276,9 +312,12 @@ def test_metrics_are_detached_scalars_under_the_same_names() -> None:
 
 def test_inputs_are_left_as_they_were() -> None:
     inputs = make_inputs(mask=torch.arange(12) < 9)
-    before = {k: v.detach().clone() for k, v in vars(inputs).items()}
-    compute_loss(inputs, GIPOConfig()).loss.backward()
-    assert all(torch.equal(before[k], v) for k, v in vars(inputs).items())
+    inputs = replace(inputs, factors=ragged_factors(12, 3))
+    tensors = {k: v for k, v in vars(inputs).items() if isinstance(v, torch.Tensor)}
+    before = {k: v.detach().clone() for k, v in tensors.items()}
+    for config in CONFIGS:
+        compute_loss(inputs, config).loss.backward()
+    assert all(torch.equal(before[k], v) for k, v in tensors.items())
 
 
 def test_every_registered_config_has_a_loss() -> None:
@@ -298,10 +337,25 @@ def test_every_registered_config_has_a_loss() -> None:
         (GIPOConfig, {"gamma": 1.01}),
         (GIPOConfig, {"lam": -0.1}),
         (GIPOConfig, {"kl_coef": math.inf}),
-        (GIPOConfig, {"level": "token"}),
+        (GIPOConfig, {"level": "row"}),
+        (GIPOConfig, {"advantage": "td"}),
+        (GIPOConfig, {"reference_coef": -0.1}),
+        (GIPOConfig, {"reference_coef": math.nan}),
         (PPOConfig, {"clip_low": 1.0}),
         (PPOConfig, {"clip_high": 0.0}),
         (PPOConfig, {"value_coef": -0.5}),
+        (DecoupledConfig, {"clip_low": 0.0}),
+        (DecoupledConfig, {"behaviour_cap": 0.9}),
+        (DecoupledConfig, {"behaviour_cap": math.nan}),
+        (DecoupledConfig, {"proximal_every": 0}),
+        (SAPOConfig, {"tau_positive": 0.0}),
+        (SAPOConfig, {"tau_negative": math.inf}),
+        (ImportanceConfig, {"cap": 0.5}),
+        (ImportanceConfig, {"cap": math.inf}),
+        (AWRConfig, {"beta": 0.0}),
+        (AWRConfig, {"beta": math.nan}),
+        (AWRConfig, {"cap": 0.9}),
+        (AWRConfig, {"cap": math.inf}),
     ],
 )
 def test_impossible_settings_are_refused(config: type[AlgorithmConfig], settings: dict[str, Any]) -> None:
@@ -315,6 +369,10 @@ def test_mismatched_shapes_are_refused() -> None:
         make_inputs(log_prob_old=torch.zeros(12, 2))
     with pytest.raises(ValueError, match="advantage has shape"):
         make_inputs(advantage=torch.zeros(12, 1))
+    with pytest.raises(ValueError, match=r"log_prob_proximal has shape \(12,\), not \(12, 3\)"):
+        make_inputs(log_prob_proximal=torch.zeros(12))
+    with pytest.raises(ValueError, match="3 factors do not fall into 2 equal groups"):
+        make_inputs(actions=2)
 
 
 def test_parsing_a_config_does_not_import_torch() -> None:

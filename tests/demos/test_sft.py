@@ -162,11 +162,8 @@ def test_two_steps_of_lerobot_s_trainer_give_a_checkpoint(tmp_path: Path):
     assert path == tmp_path / "sft" / "checkpoints" / "last" / "pretrained_model"
     assert "End of training" in (tmp_path / "sft.log").read_text()
     adapter = adapter_at(path)
-    assert (
-        adapter.family.shape.executed,
-        adapter.family.shape.action_dim,
-        adapter.family.shape.padded_dim,
-    ) == (4, 4, 4)
+    shape = adapter.family.shape
+    assert (shape.executed, shape.action_dim, shape.padded_dim) == (4, 4, 4)
     assert list(adapter.policy.config.image_features) == [CAMERA]
     item = stock_dataset()[100]
     observation = {

@@ -22,7 +22,8 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 
-from accerl_lerobot.evaluation.pictures import GAP, success_curve, write_video
+from accerl_lerobot.evaluation.pictures import GAP, before_after, success_curve, write_video
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 
 
 def evaluation(env_steps: float, successes: int, n: int) -> dict[str, Any]:
@@ -76,22 +77,54 @@ class TestVideo:
 
     def test_clips_stand_side_by_side_and_hold_their_last_frame(self, tmp_path: Path) -> None:
         path = tmp_path / "film.mp4"
-        write_video(path, [clip(3, (200, 0, 0)), clip(6, (0, 0, 200))], fps=10)
+        write_video(path, [[clip(3, (200, 0, 0)), clip(6, (0, 0, 200))]], fps=10)
         film = read(path)
-        assert film.shape == (6 + 5, 32, 32 + GAP + 32, 3)
+        assert film.shape == (6 + 10, 32, 32 + GAP + 32, 3)
         left, right = film[:, 8:24, 8:24].mean((1, 2)), film[:, 8:24, -24:-8].mean((1, 2))
         assert (abs(left - (200, 0, 0)) < 25).all() and (abs(right - (0, 0, 200)) < 25).all()
         assert (film[:, :, 33 : 32 + GAP - 1] > 150).all()
 
     def test_odd_sides(self, tmp_path: Path) -> None:
-        write_video(tmp_path / "film.mp4", [clip(2, (9, 9, 9), side=33)], fps=4)
+        write_video(tmp_path / "film.mp4", [[clip(2, (9, 9, 9), side=33)]], fps=4)
         assert read(tmp_path / "film.mp4").shape[1:3] == (32, 32)
 
     def test_pixel_format(self, tmp_path: Path) -> None:
-        write_video(tmp_path / "film.mp4", [clip(2, (9, 9, 9))], fps=4)
+        write_video(tmp_path / "film.mp4", [[clip(2, (9, 9, 9))]], fps=4)
         assert imageio.get_reader(tmp_path / "film.mp4").get_meta_data()["pix_fmt"].startswith("yuv420p")
 
-    @pytest.mark.parametrize("clips", [[], [[]]])
-    def test_nothing_to_write(self, tmp_path: Path, clips: list[list[np.ndarray]]) -> None:
+    @pytest.mark.parametrize("clips", [[], [[]], [[[]]]])
+    def test_nothing_to_write(self, tmp_path: Path, clips: list[list[list[np.ndarray]]]) -> None:
         with pytest.raises(ValueError, match="every clip needs a frame"):
             write_video(tmp_path / "film.mp4", clips, fps=4)
+
+    def test_rows_of_unequal_length(self, tmp_path: Path) -> None:
+        grid = [[clip(2, (9, 9, 9))], [clip(2, (9, 9, 9))] * 2]
+        with pytest.raises(ValueError, match="every row needs as many clips"):
+            write_video(tmp_path / "film.mp4", grid, fps=4)
+
+    def test_before_above_after_with_the_outcome_around(self, tmp_path: Path) -> None:
+        def result(index: int, success: bool, frames: list[np.ndarray]) -> EpisodeResult:
+            plan = EpisodePlan(task="t", seed=index, explore=False, index=index)
+            return EpisodeResult(
+                plan=plan, success=success, episode_return=0.0, steps=1, decisions=1, versions=(0, 0),
+                frames=frames,
+            )  # fmt: skip
+
+        grey = clip(3, (120, 120, 120), side=64)
+        before = [result(1, False, grey), result(0, True, grey), result(2, True, [])]
+        after = [result(0, True, grey), result(1, True, grey), result(2, True, grey)]
+        before_after(tmp_path / "film.mp4", before, after, fps=4)
+        film = read(tmp_path / "film.mp4").astype(int)
+        assert film.shape[1:] == (2 * 64 + GAP, 2 * 64 + GAP, 3)
+
+        def edge(frame: int, row: int, column: int) -> str:
+            top, left = row * (64 + GAP), column * (64 + GAP)
+            red, green, _ = film[frame, top + 61, left + 20 : left + 44].mean(0)
+            return "red" if red > green + 60 else "green" if green > red + 60 else "none"
+
+        assert [edge(0, r, c) for r in (0, 1) for c in (0, 1)] == ["none"] * 4
+        assert [edge(-1, r, c) for r in (0, 1) for c in (0, 1)] == ["green", "red", "green", "green"]
+
+    def test_without_frames_there_is_no_video(self, tmp_path: Path) -> None:
+        before_after(tmp_path / "film.mp4", [], [], fps=4)
+        assert list(tmp_path.iterdir()) == []

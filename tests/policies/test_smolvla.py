@@ -345,3 +345,25 @@ def test_the_shape_is_the_policy_s(adapter: LeRobotAdapter):
     assert adapter.family.shape == flow.FlowShape(
         num_steps=3, chunk_size=5, executed=3, padded_dim=4, action_dim=2
     )
+
+
+def test_half_precision_is_a_little_off_and_log_probs_stay_in_full(path: Path):
+    full, half, asked = adapter_at(path), adapter_at(path, precision="bf16"), requests(6)
+    decisions, other = full.decide(asked, 0), half.decide(asked, 0)
+    gap = np.abs(np.stack([d.chunk for d in decisions]) - np.stack([d.chunk for d in other])).max()
+    assert 1e-5 < gap < 0.1, "the network runs in bfloat16"
+    latent, old = stored(other)
+    evaluation = half.evaluate(*stack_observations(asked), latent)
+    assert old.dtype == evaluation.log_prob.dtype == evaluation.value.mean.dtype == torch.float32
+    assert (evaluation.log_prob - old).sum(1).abs().max() < 0.5
+    evaluation.log_prob.sum().backward()
+    assert all(p.dtype == torch.float32 for p in half.trainable().values())
+    assert any(p.grad is not None and p.grad.abs().max() > 0 for p in half.trainable().values())
+
+
+@pytest.mark.parametrize("config", SAMPLERS, ids=name)
+def test_each_factor_is_an_action_and_all_of_them_exist(adapter: LeRobotAdapter, config: FlowSamplerConfig):
+    adapter = exploring(adapter, config)
+    decision = adapter.decide(requests(1), 0)[0]
+    assert decision.log_prob.shape == (adapter.actions,)
+    assert adapter.factors(stored([decision])[0]) is None

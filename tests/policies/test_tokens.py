@@ -184,18 +184,18 @@ def test_scores_are_the_oracle_s_for_all_that_can_be_said(kind: Any, temperature
     model = kind()
     said = sequences(model)
     start = observations(1)
-    score = family(model, temperature).score(
-        encoded(model, start.expand(len(said), -1)), {"tokens": torch.tensor(said)}
-    )
+    tokens_family, latent = family(model, temperature), {"tokens": torch.tensor(said)}
+    score = tokens_family.score(encoded(model, start.expand(len(said), -1)), latent)
+    factors = tokens_family.factors(latent)
     expected = [oracle(model, start[0].double().numpy(), s, temperature) for s in said]
     assert np.allclose(score.log_prob, [e[0] for e in expected], atol=1e-5)
     assert np.allclose(score.entropy, [e[1] for e in expected], atol=1e-5)
     assert score.log_prob.sum(1).exp().sum() == pytest.approx(1.0, abs=1e-5), "a density over them"
     if kind is Recurrent:
-        assert score.factors is not None and score.factors.tolist() == [e[2] for e in expected]
-        assert not score.factors.all()
+        assert factors is not None and factors.tolist() == [e[2] for e in expected]
+        assert not factors.all()
     else:
-        assert score.factors is None
+        assert factors is None
 
 
 @pytest.mark.parametrize("temperature", [1.0, 0.5])
@@ -279,7 +279,8 @@ def test_nothing_after_the_terminator_counts():
     assert after.any() and not after.all()
     assert (said[after] == END).all() and not action.log_prob[after].any()
     score = tokens_family.score(read, action.latent)
-    assert score.factors is not None and torch.equal(score.factors, ~after)
+    factors = tokens_family.factors(action.latent)
+    assert factors is not None and torch.equal(factors, ~after)
     assert not score.log_prob[after].any() and (score.log_prob[~after] < 0).all()
     # The terminator itself counts, and a different sequel to it changes nothing.
     ends = (said == END) & ~after

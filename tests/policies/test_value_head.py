@@ -15,12 +15,14 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 import torch
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import ValueHeadConfig
-from accerl_lerobot.policies.value_head import ValueHead
+from accerl_lerobot.policies.value_head import ValueHead, two_hot
 
 
 def head(**options: object) -> ValueHead:
@@ -80,7 +82,57 @@ def test_half_precision_features_are_read_in_full():
     assert head()(features.bfloat16(), mask).mean.dtype == torch.float32
 
 
-@pytest.mark.parametrize(("name", "value"), [("pooling", "max"), ("hidden", 0)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("pooling", "max"), ("hidden", 0), ("bins", 1), ("value_range", (1.0, 1.0))]
+)
 def test_bad_options_name_their_field(name: str, value: object):
-    with pytest.raises(InputError, match=f"^policy.value_head.{name}={value!r}: use"):
+    with pytest.raises(InputError, match=rf"^policy\.value_head\.{name}={re.escape(repr(value))}: use"):
         ValueHeadConfig(**{name: value})
+
+
+def test_two_hot_by_hand():
+    support = torch.linspace(-1.0, 1.0, 5)
+    rows = two_hot(torch.tensor([-1.0, -0.625, 0.0, 1.0, 7.0, -9.0]), support)
+    assert torch.allclose(
+        rows,
+        torch.tensor(
+            [
+                [1.0, 0, 0, 0, 0],
+                [0.25, 0.75, 0, 0, 0],
+                [0, 0, 1.0, 0, 0],
+                [0, 0, 0, 0, 1.0],
+                [0, 0, 0, 0, 1.0],
+                [1.0, 0, 0, 0, 0],
+            ]
+        ),
+    )
+    x = torch.rand(100, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    assert torch.allclose(two_hot(x, support) @ support, x, atol=1e-6), "the mean is kept"
+
+
+def test_a_distribution_over_returns_by_hand():
+    critic, (features, mask) = head(bins=3, value_range=(-2.0, 4.0)), inputs()
+    value = critic(features, mask)
+    assert value.logits is not None and value.logits.shape == (2, 3)
+    p = torch.softmax(value.logits, -1)
+    assert torch.allclose(value.mean, -2 * p[:, 0] + 1 * p[:, 1] + 4 * p[:, 2], atol=1e-6)
+    error = value.error(torch.tensor([0.0, 4.0]))  # 0 lies two thirds of the way from −2 to 1
+    expected = torch.stack([-(p[0, 0].log() / 3 + 2 * p[0, 1].log() / 3), -p[1, 2].log()])
+    assert torch.allclose(error, expected, atol=1e-5)
+
+
+def test_the_distribution_is_learnt_and_its_mean_with_it():
+    critic, (features, mask) = ValueHead(6, ValueHeadConfig(bins=11)), inputs()
+    wanted = torch.tensor([0.33, -0.71])
+    optimizer = torch.optim.Adam(critic.parameters(), lr=0.01)
+    for _ in range(400):
+        optimizer.zero_grad()
+        critic(features, mask).error(wanted).mean().backward()
+        optimizer.step()
+    assert torch.allclose(critic(features, mask).mean, wanted, atol=0.02)
+
+
+def test_the_scalar_s_error_is_squared():
+    value = head()(*inputs())
+    returns = torch.tensor([1.0, -2.0])
+    assert torch.equal(value.error(returns), (value.mean - returns) ** 2)

@@ -88,10 +88,10 @@ def test_key_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("field", ["log_prob", "value", "reward", "latent", "observations"])
+@pytest.mark.parametrize("field", ["log_prob", "value", "reward", "advantage", "latent", "observations"])
 def test_nonfinite_segments_are_dropped_and_counted(field: str, bad: float) -> None:
     replay = make_replay()
-    segment = make_segment("a")
+    segment = make_segment("a", advantage=np.zeros(4, np.float32))
     target = getattr(segment, field)
     array = next(iter(target.values())) if isinstance(target, dict) else target
     array.flat[1] = bad

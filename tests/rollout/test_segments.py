@@ -15,6 +15,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -75,6 +77,12 @@ def test_the_next_segment_begins_where_this_one_was_cut():
 def test_after_a_termination_the_bootstrap_row_repeats_the_observation_before():
     segment = collected(2, terminated=True).cut("k", terminated=True, success=True)
     assert states(segment) == [0, 1, 1] and segment.terminated and segment.success
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_an_advantage_is_one_of_each_decision(size: int):
+    with pytest.raises(ValueError, match=f"2 rewards but {{'advantage': {size}}}"):
+        replace(collected(2).cut("k"), advantage=np.zeros(size, np.float32))
 
 
 def test_full_at_its_length():

@@ -177,6 +177,65 @@ def test_the_end_of_training_abandons_its_episodes_and_frees_their_slots(stage):
     one.until(lambda: len(one.evaluated) == 6, training=False)
 
 
+def test_a_group_reaches_replay_whole_stamped_and_in_small_parts(stage):
+    calls: list[list[Segment]] = []
+    one = stage(lambda segments: calls.append(segments) or True, group_size=3, group_filter="none")
+    one.until(lambda: one.order(True).counters["groups_kept"] >= 4)
+    one.order(False, planned(1))
+    one.until(lambda: len(one.evaluated) == 1, training=False)
+    assert max(len(call) for call in calls) == 2, "no more than half the worlds can finish at once"
+    inserted = [segment for call in calls for segment in call]
+    kept = one.order(False).counters["groups_kept"]
+    assert len({s.key for s in inserted}) == len(inserted) == 3 * kept, "one segment an episode"
+    assert all(s.advantage is not None and s.advantage.shape == (len(s),) for s in inserted)
+    seeds: dict[int, list[int]] = {}
+    for episode in one.episodes[: 3 * 4]:
+        assert episode.plan.place is not None
+        seeds.setdefault(episode.plan.seed, []).append(episode.plan.place.member)
+    assert [0, 1, 2] in map(sorted, seeds.values())
+    assert all(len(set(members)) == len(members) <= 3 for members in seeds.values())
+
+
+def test_the_plans_hear_of_every_finished_episode(stage, monkeypatch: pytest.MonkeyPatch):
+    one = stage(lambda segments: True)
+    heard: list[EpisodeResult] = []
+    monkeypatch.setattr(one.worker._plans, "report", heard.append)
+    one.order(True, planned(2))
+    one.until(lambda: len(one.episodes) >= 8)
+    assert heard[: len(one.episodes)] == one.episodes
+
+
+def test_exploring_pauses_while_a_group_stands_at_the_door(stage):
+    door: list[Future[bool]] = []
+    arguments: dict[str, Any] = {"group_size": 3, "group_filter": "none", "segment_length": 1}
+    one = stage(lambda segments: door.append(Future()) or door[-1], **arguments)
+    one.until(lambda: len(door) >= AT_THE_DOOR)  # six segments, two at a time
+    time.sleep(0.1)
+    explored = one.explored
+    time.sleep(0.1)
+    assert one.explored == explored
+    while one.explored == explored:
+        for future in door:
+            if not future.done():
+                future.set_result(True)
+        one.order(True)
+        time.sleep(0.005)
+
+
+def test_the_end_of_training_drops_unfinished_groups(stage):
+    inserted: list[Segment] = []
+    one = stage(lambda segments: inserted.extend(segments) or True, group_size=200, group_filter="none")
+    one.until(lambda: len(one.episodes) >= 20)
+    assert inserted == [] and one.order(True).counters["groups_dropped"] == 0
+    one.order(False, planned(6))
+    one.until(lambda: len(one.evaluated) == 6, training=False)
+    counters = one.order(False).counters
+    assert inserted == [] and (counters["groups_kept"], counters["groups_dropped"]) == (0, 1)
+    assert counters["groups_dropped_decisions"] >= 2 * 20
+    one.until(lambda: one.order(True).counters["episodes"] > 40)  # were training to go on: a new group
+    assert {e.plan.place.start for e in one.episodes if e.plan.place is not None} == {0, 1}
+
+
 def test_an_insert_that_fails_ends_the_worker(stage):
     def insert(segments: list[Segment]) -> bool:
         raise OSError("replay is gone")
@@ -192,7 +251,7 @@ def test_a_restarted_worker_uses_other_keys_and_other_seeds(monkeypatch: pytest.
     for incarnation in (0, 1):
         worker = RolloutWorker(WORLD, RolloutConfig(), ("match",), 0, 0, incarnation, (8, 2))
         worker.report(True, [])
-        plans.append([worker._next_plan() for _ in range(20)])
+        plans.append([worker._plans.next(exploring=True) for _ in range(20)])
     seeds = [{plan.seed for plan in some} for some in plans]
     assert len(seeds[0]) == 20 and not seeds[0] & seeds[1]
 

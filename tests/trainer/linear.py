@@ -31,7 +31,10 @@ STD = 0.5
 
 
 class LinearAdapter(PolicyAdapter):
-    """Latent ~ N(W·state, STD²), two factors, one per latent entry; V = v·state + b."""
+    """Latent ~ N(W·state, STD²), two factors, one per latent entry; V = v·state + b.
+
+    A latent with a ``count`` has only that many factors.
+    """
 
     def __init__(self, seed: int = 0) -> None:
         super().__init__()
@@ -42,6 +45,13 @@ class LinearAdapter(PolicyAdapter):
             self.value_head.weight.copy_(torch.randn(1, 3, generator=generator))
             self.value_head.bias.fill_(0.3)
         self.device = torch.device("cpu")
+
+    @property
+    def actions(self) -> int | None:
+        return 2
+
+    def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
+        return torch.arange(2) < latent["count"][:, None] if "count" in latent else None
 
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
         raise NotImplementedError
@@ -68,6 +78,17 @@ class LinearAdapter(PolicyAdapter):
     def copy(self) -> dict[str, Tensor]:
         """The weights as they are now."""
         return {k: p.detach().clone() for k, p in self.trainable().items()}
+
+
+def decided_by(adapter: LinearAdapter, segments: Sequence[Segment], version: int) -> list[Segment]:
+    """Stamps segments as decisions of these weights, log-probs included."""
+    for segment in segments:
+        observations = {k: v[:-1] for k, v in segment.observations.items()}
+        latent = {k: torch.from_numpy(v) for k, v in segment.latent.items()}
+        with torch.no_grad():
+            scored = adapter.evaluate(observations, [segment.task] * len(segment), latent)
+        segment.log_prob, segment.version = scored.log_prob.numpy(), np.full(len(segment), version)
+    return list(segments)
 
 
 def make_segments(lengths: Sequence[int], version: int = 0, seed: int = 0, **replace: Any) -> list[Segment]:

@@ -108,6 +108,23 @@ def test_it_publishes_the_first_weights_every_so_many_and_the_last(every: int, v
     assert any(not np.array_equal(first[name], last_sent[name]) for name in first)
 
 
+def test_weights_held_back_are_published_late_and_the_last_at_once():
+    stage = Stage(updates=6, hold_back=2)
+    weights: list[dict[str, Any]] = []
+    step = stage.worker._update.step
+
+    def watched(segments: list[Segment]) -> dict[str, float]:
+        metrics = step(segments)
+        weights.append(stage.worker._update.adapter.export_trainable())
+        return metrics
+
+    stage.worker._update.step = watched  # type: ignore[method-assign]
+    stage.run()
+    assert [version for version, _ in stage.received] == [0, 1, 2, 3, 6]
+    for version, tensors in stage.received[1:]:
+        assert all(np.array_equal(tensors[k], weights[version - 1][k]) for k in tensors)
+
+
 def test_a_closed_replay_ends_it_early():
     stage = Stage(batches=2, updates=6)
     assert stage.run() == 2 and len(stage.worker.metrics()) == 2

@@ -45,7 +45,7 @@ class SmolVLABinsConfig(PreTrainedConfig):
     )
     """Actions must come to [-1, 1]: MIN_MAX, or QUANTILES, which spends no bins on outliers and cannot
     reproduce them. MIN_MAX, because LeRobot takes a dataset's quantile to be the mean of its episodes'
-    quantiles, and so may cut off far more than the 2 % it says."""
+    quantiles: a movement that few episodes need would be cut off in all of them."""
 
     vlm_model_name: str = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
     """Hub id or folder of a SmolVLM."""

@@ -1,0 +1,111 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Which episode a free world runs next: planned evaluations first, then exploring ones.
+
+An exploring episode is a task (`tasks.py`), a seed of this worker's own (`seeds.py`) and, where episodes are
+compared with each other, a place in a group (`groups.py`): the episodes of a group share task and seed, so
+they start alike, and their exploration noise differs.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+
+from accerl_lerobot.rollout.groups import Groups
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
+from accerl_lerobot.rollout.tasks import TaskSampler
+from accerl_lerobot.seeds import train_seed
+
+STARTS_PER_INCARNATION = 1000
+"""By how much a restarted worker skips ahead in its training seeds, so as not to repeat its episodes."""
+
+
+class EpisodePlans:
+    """The episodes of one worker, in order.
+
+    Example:
+        >>> plans = EpisodePlans(config, tasks, seed=0, worlds=8)
+        >>> runner = RolloutRunner(worlds, lambda: plans.next(exploring=True), ..., groups=plans.groups)
+        >>> plans.report(result)      # of each finished episode
+
+    Args:
+        config: groups and tasks.
+        tasks: the training tasks.
+        seed: the run's.
+        worlds: how many the worker steps.
+        worker: its index.
+        incarnation: how often it has been restarted.
+    """
+
+    def __init__(
+        self,
+        config: RolloutConfig,
+        tasks: tuple[str, ...],
+        *,
+        seed: int,
+        worlds: int,
+        worker: int = 0,
+        incarnation: int = 0,
+    ) -> None:
+        self.groups: Groups | None = None
+        if config.group_size:
+            self.groups = Groups(config.group_size, worlds, config.group_advantage, config.group_filter)
+        self._seed, self._worker = seed, worker
+        self._starts = incarnation * STARTS_PER_INCARNATION
+        self._tasks = TaskSampler(
+            tasks,
+            config.task_sampling,
+            config.task_window,
+            (seed, worker, incarnation),
+            self._starts + worker,
+        )
+        self._start = ("", 0)
+        # Filled and emptied on different threads: appending to and popping from a deque is atomic.
+        self._queued: deque[EpisodePlan] = deque()
+
+    def queue(self, plans: Iterable[EpisodePlan]) -> None:
+        """Plans evaluation episodes."""
+        self._queued.extend(plans)
+
+    def next(self, exploring: bool) -> EpisodePlan | None:
+        """The episode that a free world is to run; None: it has to wait.
+
+        Args:
+            exploring: whether exploring episodes are wanted at all.
+        """
+        if self._queued:
+            return self._queued.popleft()
+        if not exploring:
+            return None
+        if self.groups is None:
+            task, seed = self._new_start()
+            return EpisodePlan(task=task, seed=seed, explore=True)
+        place = self.groups.claim()
+        if place is None:
+            return None
+        if place.member == 0:
+            self._start = self._new_start()
+        task, seed = self._start
+        return EpisodePlan(task=task, seed=seed, explore=True, place=place)
+
+    def report(self, result: EpisodeResult) -> None:
+        """Takes note of a finished episode."""
+        if result.plan.explore:
+            self._tasks.report(result.plan.task, result.success)
+
+    def _new_start(self) -> tuple[str, int]:
+        """A task, and a seed that no episode of this worker has had."""
+        number, self._starts = self._starts, self._starts + 1
+        return self._tasks.next(), train_seed(self._seed, self._worker, number)

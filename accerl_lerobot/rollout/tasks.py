@@ -1,0 +1,72 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Which task an exploring episode is about.
+
+    uniform    each in turn
+    failures   p(task) ∝ 1 + failures among its last `window` exploring episodes
+
+The second is the dynamic weighted resampling of AcceRL, arXiv 2603.18464: a task that always succeeds is
+still explored now and then, and what the policy forgets counts again.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+TaskSampling = Literal["uniform", "failures"]
+
+
+class TaskSampler:
+    """The tasks of one rollout worker's exploring episodes, the same for equal seeds and reports.
+
+    Example:
+        >>> sampler = TaskSampler(("door-open-v3", "drawer-open-v3"), "failures", window=100, seed=(0, 0, 0))
+        >>> task = sampler.next()
+        >>> sampler.report(task, success=False)
+
+    Args:
+        tasks: names, each once.
+        sampling: see the top of this file.
+        window: episodes of each task that are remembered.
+        seed: of the draws.
+        first: which task is the first in turn, counted on beyond the last.
+    """
+
+    def __init__(
+        self, tasks: Sequence[str], sampling: TaskSampling, window: int, seed: Sequence[int], first: int = 0
+    ) -> None:
+        self._tasks, self._turn = tuple(tasks), first
+        self._sampling: TaskSampling = sampling
+        self._rng = np.random.default_rng(list(seed))
+        self._failed: dict[str, deque[bool]] = {task: deque(maxlen=window) for task in tasks}
+
+    def probabilities(self) -> np.ndarray:
+        """float64 (tasks,), what `failures` draws the next task by."""
+        weights = np.array([1 + sum(self._failed[task]) for task in self._tasks], np.float64)
+        return np.asarray(weights / weights.sum())
+
+    def next(self) -> str:
+        """The task of the next episode, or of the next group of episodes."""
+        if self._sampling == "uniform":
+            self._turn += 1
+            return self._tasks[(self._turn - 1) % len(self._tasks)]
+        return self._tasks[int(self._rng.choice(len(self._tasks), p=self.probabilities()))]
+
+    def report(self, task: str, success: bool) -> None:
+        """Counts one finished exploring episode."""
+        self._failed[task].append(not success)

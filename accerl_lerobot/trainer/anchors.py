@@ -1,0 +1,100 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Frozen copies of the policy's weights, and log-probs under them.
+
+``reference``  the weights that RL began with, for KL(π‖π_ref)
+``proximal``   those of a few updates ago, for decoupled PPO
+``probe``      those of one published version, see `probe`
+
+A copy holds the policy's trainable weights, not the critic's, on the same device. Nobody pays for a copy that
+nobody takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from accerl_lerobot.policies.base import PolicyAdapter
+
+CRITIC = "value_head."
+"""How names of the critic's weights begin."""
+
+
+class Anchors:
+    """Copies by name.
+
+    Args:
+        adapter: the policy that is being trained.
+
+    Example:
+        >>> anchors = Anchors(adapter)
+        >>> anchors.take("reference", version=0)
+        >>> anchors.log_prob("reference", *batch.part(rows))  # (rows, L), of version 0 for ever
+    """
+
+    def __init__(self, adapter: PolicyAdapter) -> None:
+        self.adapter = adapter
+        self._live = [p for name, p in adapter.trainable().items() if not name.startswith(CRITIC)]
+        self._copies: dict[str, tuple[int, list[Tensor]]] = {}
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._copies
+
+    def take(self, name: str, version: int) -> None:
+        """Keeps the weights of now, in place of an older copy of that name.
+
+        Args:
+            name: of the copy.
+            version: of the weights; copies of the same version share their memory.
+        """
+        same = [tensors for number, tensors in self._copies.values() if number == version]
+        self._copies.pop(name, None)  # before its successor is made, not after
+        self._copies[name] = version, same[0] if same else [p.detach().clone() for p in self._live]
+
+    def drop(self, name: str) -> None:
+        """Frees a copy."""
+        del self._copies[name]
+
+    @torch.no_grad()
+    def log_prob(
+        self, name: str, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
+    ) -> Tensor:
+        """log-probs (B, L) of stored latents under a copy, without gradient.
+
+        Args:
+            name: of the copy.
+            observations: each (B, ...).
+            tasks: B instruction texts.
+            latent: each (B, ...).
+        """
+        with self._swapped_in(name):
+            return self.adapter.evaluate(observations, tasks, latent).log_prob
+
+    @contextmanager
+    def _swapped_in(self, name: str) -> Iterator[None]:
+        """Parameters point to the copy inside, and to their own memory again afterwards, whatever happens."""
+        _, tensors = self._copies[name]
+        own = [p.data for p in self._live]
+        try:
+            for parameter, tensor in zip(self._live, tensors, strict=True):
+                parameter.data = tensor
+            yield
+        finally:
+            for parameter, tensor in zip(self._live, own, strict=True):
+                parameter.data = tensor

@@ -1,0 +1,96 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Segments laid end to end, as one update sees them.
+
+Shapes: S segments, N decisions in all, L log-prob factors of one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from accerl_lerobot.experience import Segment
+
+Part = tuple[dict[str, np.ndarray], list[str], dict[str, Tensor]]
+"""Observations, tasks and latents of some decisions, as `PolicyAdapter.evaluate` takes them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Batch:
+    """Segments laid end to end: N rows of decisions, plus one bootstrap observation per segment."""
+
+    observations: dict[str, np.ndarray]
+    """Each (N, ...)."""
+    tasks: list[str]
+    latent: dict[str, Tensor]
+    """Each (N, ...)."""
+    log_prob: Tensor
+    """(N, L) of the behaviour policy."""
+    reward: Tensor
+    """(N,)."""
+    version: np.ndarray
+    """int64 (N,)."""
+    lengths: Tensor
+    """int64 (S,)."""
+    terminated: Tensor
+    """bool (S,)."""
+    last_observations: dict[str, np.ndarray]
+    """Each (S, ...)."""
+    segment_tasks: list[str]
+    advantage: Tensor | None = None
+    """(N,), stamped by the rollout workers; None: not on all segments."""
+
+    def __len__(self) -> int:
+        return len(self.tasks)
+
+    def part(self, rows: np.ndarray) -> Part:
+        """Some of the rows."""
+        observations, tasks = pick(self.observations, self.tasks, rows)
+        return observations, tasks, {k: v[rows] for k, v in self.latent.items()}
+
+
+def collate(segments: Sequence[Segment]) -> Batch:
+    """Lays segments end to end."""
+    keys, names = segments[0].observations.keys(), segments[0].latent.keys()
+    stamped = [s.advantage for s in segments if s.advantage is not None]
+    return Batch(
+        observations={k: np.concatenate([s.observations[k][:-1] for s in segments]) for k in keys},
+        tasks=[s.task for s in segments for _ in range(len(s))],
+        latent={k: torch.from_numpy(np.concatenate([s.latent[k] for s in segments])) for k in names},
+        log_prob=torch.from_numpy(np.concatenate([s.log_prob for s in segments])),
+        reward=torch.from_numpy(np.concatenate([s.reward for s in segments])),
+        version=np.concatenate([s.version for s in segments]),
+        lengths=torch.tensor([len(s) for s in segments]),
+        terminated=torch.tensor([s.terminated for s in segments]),
+        last_observations={k: np.stack([s.observations[k][-1] for s in segments]) for k in keys},
+        segment_tasks=[s.task for s in segments],
+        advantage=torch.from_numpy(np.concatenate(stamped)) if len(stamped) == len(segments) else None,
+    )
+
+
+def pick(
+    observations: dict[str, np.ndarray], tasks: Sequence[str], rows: np.ndarray
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Some rows of observations and of the tasks beside them."""
+    return {k: v[rows] for k, v in observations.items()}, [tasks[i] for i in rows]
+
+
+def split(rows: np.ndarray, size: int) -> list[np.ndarray]:
+    """Rows in parts of at most `size`."""
+    return np.split(rows, range(size, len(rows), size))

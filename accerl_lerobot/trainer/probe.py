@@ -1,0 +1,101 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Do the process that acts and the one that learns agree on log-probs? Measured while both run.
+
+At equal weights log π = log μ is what everything else relies on. The two are never at equal weights when it
+could be compared, because samples are always a few versions old. So the trainer keeps a copy of one published
+version, waits for a batch with decisions of that version, scores those under the copy, and reports
+
+    logprob/mismatch_mean    mean of |Σ log π − Σ log μ| over these decisions, in nats
+    logprob/mismatch_max     the largest
+    logprob/mismatch_clip    share of them whose ratio is outside 1 ± 0.2
+
+which is rounding, or a mistake. Version 0 is equal everywhere at the start and is the first to be probed. A
+version may never have acted, because inference skipped it for a newer one: once most of a batch is newer,
+another one is taken. That is after `replay.max_lag` updates at the latest.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from accerl_lerobot.trainer.anchors import Anchors
+from accerl_lerobot.trainer.batch import Batch, split
+from accerl_lerobot.trainer.config import TrainerConfig
+
+PROBE = "probe"
+CLIP = 0.2
+"""PPO's usual range: a mismatch outside it would be clipped as if the policy had moved."""
+
+
+class Probe:
+    """One copy after the other.
+
+    Args:
+        anchors: where the copy is kept.
+        config: how often, and which versions are published.
+    """
+
+    def __init__(self, anchors: Anchors, config: TrainerConfig) -> None:
+        self._anchors, self._config = anchors, config
+        self._version: int | None = None
+        self._next = 0
+        self.renew(0)
+
+    def renew(self, version: int) -> None:
+        """Takes a copy if it is time for one.
+
+        Args:
+            version: of the weights, which have just been made.
+        """
+        config = self._config
+        due = config.probe_every and self._version is None and version >= self._next
+        if due and config.publishes(version) and version < config.updates:
+            self._anchors.take(PROBE, version)
+            self._version, self._next = version, version + config.probe_every
+
+    def read(self, batch: Batch) -> dict[str, float]:
+        """The mismatch, if the batch holds decisions of the probed version; else nothing."""
+        if self._version is None:
+            return {}
+        rows = np.flatnonzero(batch.version == self._version)
+        if len(rows):
+            metrics = self._measure(batch, rows)
+        elif np.median(batch.version) > self._version:
+            metrics, self._next = {}, 0
+        else:
+            return {}
+        self._anchors.drop(PROBE)
+        self._version = None
+        return metrics
+
+    def _measure(self, batch: Batch, rows: np.ndarray) -> dict[str, float]:
+        parts = split(rows, self._config.micro_batch)
+        apart = torch.cat([self._apart(batch, part) for part in parts])
+        return {
+            "logprob/mismatch_mean": float(apart.abs().mean()),
+            "logprob/mismatch_max": float(apart.abs().max()),
+            "logprob/mismatch_clip": float((apart.expm1().abs() > CLIP).double().mean()),
+        }
+
+    def _apart(self, batch: Batch, rows: np.ndarray) -> Tensor:
+        """Σ log π − Σ log μ of each row, float64."""
+        part = batch.part(rows)
+        difference = self._anchors.log_prob(PROBE, *part).cpu() - batch.log_prob[rows]
+        factors = self._anchors.adapter.factors(part[2])
+        if factors is not None:
+            difference = difference.masked_fill(~factors.cpu(), 0.0)
+        return difference.double().sum(dim=-1)

@@ -1,0 +1,82 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The bench of full-size policies, on one small enough for a test."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from accerl_lerobot.bench import policy as bench
+from accerl_lerobot.bench.policy import BenchPolicyConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies import backbone
+from accerl_lerobot.policies.config import TuningConfig
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    build = bench.BUILDERS["smolvla"]
+    sizes = backbone.BackboneConfig(
+        hidden=32, heads=2, kv_heads=1, vision_hidden=16, vision_layers=1, patch=32
+    )
+    monkeypatch.setattr(backbone, "SMOLVLM2_500M", sizes)
+
+    def shrunk(config: BenchPolicyConfig, directory: Path) -> Any:
+        made = build(config, directory)
+        made.num_vlm_layers, made.chunk_size, made.n_action_steps = 2, 4, 4
+        made.resize_imgs_with_padding = (64, 64)
+        return made
+
+    monkeypatch.setitem(bench.BUILDERS, "smolvla", shrunk)
+
+
+@pytest.mark.parametrize(("precision", "low", "high"), [("fp32", 0.0, 1e-4), ("bf16", 0.0, 30.0)])
+def test_it_measures(small: None, precision: str, low: float, high: float) -> None:
+    result = bench.bench_policy(
+        BenchPolicyConfig(batch=3, precision=precision, device="cpu", repeats=1, cameras=1, num_steps=2)
+    )
+    assert 0 < result["parameters"]["trained"] < result["parameters"]["all"]
+    assert list(result["memory_gb"]) == ["built", "decided", "updated"]
+    assert all(result["seconds"][k]["median"] > 0 for k in ("decide_one", "decide", "score", "update"))
+    assert low <= result["mismatch"]["mean"] <= result["mismatch"]["max"] <= high
+    assert "memory, updated" in list(bench.table(result).columns[0].cells)
+
+
+def test_low_rank_adapters_train_less(small: None) -> None:
+    def trained(mode: str) -> int:
+        config = BenchPolicyConfig(
+            batch=1, device="cpu", repeats=1, cameras=1, num_steps=2, tuning=TuningConfig(mode=mode, rank=1)
+        )
+        return int(bench.bench_policy(config)["parameters"]["trained"])
+
+    assert trained("lora") < trained("expert") < trained("full")
+
+
+def test_the_published_backbone_has_the_published_size(tmp_path: Path) -> None:
+    import json
+
+    backbone.write_backbone(tmp_path / "b", backbone.SMOLVLM2_500M)
+    text = json.loads((tmp_path / "b" / "config.json").read_text())["text_config"]
+    assert (text["hidden_size"], text["intermediate_size"], text["vocab_size"]) == (960, 2560, 49280)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("type", "act"), ("batch", 0), ("cameras", 0), ("repeats", 0), ("precision", "fp8")]
+)
+def test_bad_values_name_their_field(name: str, value: object) -> None:
+    with pytest.raises(InputError, match=rf"^bench\.{name}={value!r}: use"):
+        BenchPolicyConfig(**{name: value})

@@ -1,0 +1,109 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Which episode a free world is given."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from accerl_lerobot.rollout.groups import Outcome, Place
+from accerl_lerobot.rollout.plans import STARTS_PER_INCARNATION, EpisodePlans
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
+from accerl_lerobot.seeds import train_seed
+from tests.rollout.worlds import evaluate
+
+TASKS = ("push", "pull", "lift")
+
+
+def make(worlds: int = 4, worker: int = 0, incarnation: int = 0, **config) -> EpisodePlans:
+    return EpisodePlans(
+        RolloutConfig(**config), TASKS, seed=3, worlds=worlds, worker=worker, incarnation=incarnation
+    )
+
+
+def take(plans: EpisodePlans, count: int) -> list[EpisodePlan]:
+    found = [plans.next(exploring=True) for _ in range(count)]
+    return [plan for plan in found if plan is not None]
+
+
+def ended(plan: EpisodePlan, success: bool) -> EpisodeResult:
+    return EpisodeResult(
+        plan=plan, success=success, episode_return=0.0, steps=1, decisions=1, versions=(0, 0)
+    )
+
+
+def test_without_groups_every_episode_has_its_own_seed_and_tasks_take_turns():
+    plans = take(make(worker=1), 5)
+    assert [p.task for p in plans] == ["pull", "lift", "push", "pull", "lift"]
+    assert [p.seed for p in plans] == [train_seed(3, 1, number) for number in range(5)]
+    assert all(p.explore and p.place is None for p in plans)
+
+
+def test_evaluations_go_first_and_nothing_is_explored_before_it_is_time():
+    plans = make(group_size=2)
+    plans.queue([evaluate(index=0), evaluate(index=1)])
+    assert [p.index for p in take(plans, 1)] == [0]
+    assert plans.next(exploring=False) == evaluate(index=1)
+    assert plans.next(exploring=False) is None
+    assert take(plans, 1)[0].place == Place(0, 0)
+    plans.queue([evaluate(index=2)])
+    following = take(plans, 2)  # the group goes on where it was
+    assert not following[0].explore and following[1].place == Place(0, 1)
+
+
+def test_a_group_shares_its_start_and_the_next_group_has_another():
+    plans = take(make(group_size=4, worlds=8), 12)
+    assert [p.place for p in plans] == [Place(start, member) for start in range(3) for member in range(4)]
+    starts = [{(p.task, p.seed) for p in group} for _, group in itertools.groupby(plans, _start)]
+    assert starts == [{(task, train_seed(3, 0, i))} for i, task in enumerate(TASKS)]
+
+
+def _start(plan: EpisodePlan) -> int:
+    assert plan.place is not None
+    return plan.place.start
+
+
+def test_a_world_waits_when_too_many_groups_are_unfinished():
+    plans = make(group_size=4, worlds=4)
+    assert plans.groups is not None
+    unfinished = take(plans, 30)
+    assert len(unfinished) == 4 * plans.groups.limit
+    for plan in unfinished[:4]:
+        assert plan.place is not None
+        plans.groups.end(plan.place, Outcome(0.0, False))
+    assert take(plans, 1)[0].place == Place(plans.groups.limit, 0)
+
+
+@pytest.mark.parametrize("group_size", [0, 4])
+def test_another_incarnation_repeats_no_seed(group_size):
+    seeds = []
+    for incarnation in range(3):
+        plans = make(incarnation=incarnation, group_size=group_size, worlds=400)
+        seeds.append({p.seed for p in take(plans, 400)})
+        assert min(seeds[-1]) == train_seed(3, 0, incarnation * STARTS_PER_INCARNATION)
+    assert not set.intersection(*seeds) and len(set.union(*seeds)) == 3 * (100 if group_size else 400)
+
+
+@pytest.mark.parametrize("group_size", [0, 2])
+def test_tasks_that_fail_are_explored_more(group_size):
+    plans = make(task_sampling="failures", task_window=50, group_size=group_size, worlds=4000)
+    for _ in range(50):
+        plans.report(ended(EpisodePlan(task="lift", seed=0, explore=True), success=False))
+        plans.report(ended(EpisodePlan(task="push", seed=0, explore=True), success=True))
+        plans.report(ended(evaluate(task="push"), success=False))  # an evaluation is no exploring episode
+    starts = take(plans, 4000)[:: group_size or 1]
+    share = sum(p.task == "lift" for p in starts) / len(starts)
+    assert share == pytest.approx(51 / 53, abs=0.02)

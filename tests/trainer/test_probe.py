@@ -1,0 +1,179 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The mismatch between acting and learning, with mismatches that were planted."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.experience import Segment
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.update import Update
+from tests.trainer.linear import LinearAdapter, decided_by, make_segments
+
+CONFIG = TrainerConfig(
+    updates=100, lr=5e-2, value_lr=1e-2, warmup_updates=0, value_warmup_updates=0, probe_every=3
+)
+NAMES = ["logprob/mismatch_mean", "logprob/mismatch_max", "logprob/mismatch_clip"]
+LENGTHS = (3, 5, 1, 4)
+
+
+def make_update(config: TrainerConfig = CONFIG, **algorithm: Any) -> Update:
+    return Update(LinearAdapter(), GIPOConfig(**algorithm), config)
+
+
+def fresh(update: Update, seed: int = 0) -> list[Segment]:
+    """Decisions of the weights of now."""
+    return decided_by(update.adapter, make_segments(LENGTHS, seed=seed), update.version)
+
+
+def read(metrics: dict[str, float]) -> list[float] | None:
+    """Mean, maximum and clipped share, if there is a reading."""
+    found = [metrics[name] for name in NAMES if name in metrics]
+    assert len(found) in (0, 3)
+    return found or None
+
+
+def readings(update: Update, updates: int) -> list[int]:
+    """Updates, counted from 1, at which fresh decisions gave a reading, all of them 0."""
+    found = []
+    for i in range(updates):
+        metrics = update.step(fresh(update, i))
+        if "logprob/mismatch_max" in metrics:
+            assert metrics["logprob/mismatch_max"] <= 1e-6
+            found.append(i + 1)
+    return found
+
+
+def shifted(segments: list[Segment], by: float) -> list[Segment]:
+    """log μ of each decision off by `by`, half of it in each factor."""
+    for segment in segments:
+        segment.log_prob = segment.log_prob - np.float32(by / 2)
+    return segments
+
+
+def test_policies_that_agree_have_no_mismatch():
+    found = read(make_update().step(fresh(make_update())))
+    assert found is not None and max(found) <= 1e-6
+
+
+@pytest.mark.parametrize(
+    ("by", "clipped"), [(0.15, 0.0), (-0.15, 0.0), (0.19, 1.0), (-0.22, 0.0), (-0.23, 1.0), (3.0, 1.0)]
+)
+@pytest.mark.parametrize("level", ["action", "chunk"])
+def test_a_planted_mismatch_is_found(by: float, clipped: float, level: str):
+    """The whole decision's ratio, at whatever level the algorithm works: exp(0.19) is outside 1 ± 0.2,
+    exp(−0.22) is not."""
+    update = make_update(level=level)
+    found = read(update.step(shifted(fresh(update), by)))
+    assert found == pytest.approx([abs(by), abs(by), clipped], abs=1e-5)
+
+
+def test_mean_maximum_and_share_are_of_decisions():
+    """5 decisions of 13 are off by 0.5 and 4 by −0.1, which do not cancel."""
+    update = make_update()
+    segments = fresh(update)
+    shifted(segments[1:2], 0.5)
+    shifted(segments[3:], -0.1)
+    found = read(update.step(segments))
+    assert found == pytest.approx([(5 * 0.5 + 4 * 0.1) / 13, 0.5, 5 / 13], abs=1e-5)
+
+
+@pytest.mark.parametrize("micro_batch", [1, 4, 1000])
+def test_only_decisions_of_the_probed_version_count(micro_batch: int):
+    update = make_update(replace(CONFIG, micro_batch=micro_batch))
+    segments = shifted(fresh(update), 0.1)
+    segments[1].version[2:] = 1  # from the future, for this test
+    segments[1].log_prob[2:] += 7.0
+    segments[2].version[:] = 5
+    segments[2].log_prob[:] = 100.0
+    assert read(update.step(segments)) == pytest.approx([0.1, 0.1, 0.0], abs=1e-5)
+
+
+def test_decisions_are_scored_under_the_weights_that_made_them():
+    """They come four updates late, when the policy has left them far behind."""
+    update = make_update()
+    late = shifted(fresh(update, seed=9), 0.1)
+    for i in range(4):
+        assert read(update.step(decided_by(update.adapter, make_segments(LENGTHS, seed=i), -1))) is None
+    metrics = update.step(late)
+    assert read(metrics) == pytest.approx([0.1, 0.1, 0.0], abs=1e-5)
+    assert metrics["ratio_max_dev"] > 0.3
+
+
+def test_readings_come_every_so_many_updates():
+    assert readings(make_update(), 10) == [1, 4, 7, 10]
+    assert readings(make_update(replace(CONFIG, probe_every=1)), 4) == [1, 2, 3, 4]
+
+
+def test_only_published_versions_are_probed():
+    """Versions 0, 4 and 8: the first of the even ones that are three updates apart or more."""
+    assert readings(make_update(replace(CONFIG, publish_every=2)), 10) == [1, 5, 9]
+    assert readings(make_update(replace(CONFIG, publish_every=50)), 10) == [1]
+
+
+def test_nothing_is_probed_when_it_is_off_nor_after_the_last_update():
+    update = make_update(replace(CONFIG, probe_every=0))
+    assert readings(update, 4) == [] and "probe" not in update.anchors
+    update = make_update(replace(CONFIG, updates=3))
+    assert readings(update, 3) == [1] and "probe" not in update.anchors
+
+
+def test_the_copy_is_freed_when_it_has_been_read():
+    update = make_update()
+    assert "probe" in update.anchors
+    update.step(fresh(update))
+    assert "probe" not in update.anchors
+    update.step(fresh(update))
+    update.step(fresh(update))
+    assert "probe" in update.anchors
+
+
+def test_a_version_that_never_acted_is_given_up_for_the_newest():
+    update = make_update()
+    later = [decided_by(update.adapter, make_segments((4, 4, 4), seed=i), 0) for i in range(2)]
+    for segments in later:
+        segments[0].version[:], segments[1].version[:], segments[2].version[:] = -3, -2, 1
+    assert read(update.step(later[0])) is None and update._probe._version == 0
+    later[1][1].version[:] = 1  # now most of the batch is newer than version 0
+    assert read(update.step(later[1])) is None and update._probe._version == 2
+    assert read(update.step(fresh(update))) == pytest.approx([0.0] * 3, abs=1e-6)
+
+
+def test_factors_that_a_latent_does_not_have_are_left_out():
+    update = make_update()
+    segments = make_segments(LENGTHS)
+    for segment in segments:
+        segment.latent["count"] = np.ones(len(segment), np.int64)
+    decided_by(update.adapter, segments, 0)
+    for segment in segments:
+        segment.log_prob[:, 0] -= 0.1
+        segment.log_prob[:, 1] = math.nan
+    assert read(update.step(segments)) == pytest.approx([0.1, 0.1, 0.0], abs=1e-5)
+
+
+def test_measuring_changes_nothing_that_is_learnt():
+    with_, without = make_update(replace(CONFIG, probe_every=1)), make_update(replace(CONFIG, probe_every=0))
+    for i in range(5):
+        metrics = with_.step(fresh(with_, i))
+        expected = without.step(fresh(without, i))
+        assert {k: v for k, v in metrics.items() if k not in NAMES} == expected
+    assert all(torch.equal(p, without.adapter.copy()[k]) for k, p in with_.adapter.copy().items())

@@ -1,0 +1,49 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Weights that are handed on late."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.weights.held_back import HeldBack
+
+
+def handed_on(updates: int, every: int, until: int) -> dict[int, list[int]]:
+    """Update → versions handed on then."""
+    held = HeldBack(updates)
+    found = {}
+    for version in range(0, until + 1, every):
+        due = held.push(version, {"w": np.full(1, version)}, last=version == until)
+        assert all(int(tensors["w"][0]) == number for number, tensors in due)
+        found[version] = [number for number, _ in due]
+    return found
+
+
+def test_nothing_is_held_back_by_default():
+    assert handed_on(0, 1, 3) == {0: [0], 1: [1], 2: [2], 3: [3]}
+
+
+def test_each_version_comes_so_many_updates_late_and_the_last_at_once():
+    assert handed_on(2, 1, 6) == {0: [0], 1: [], 2: [], 3: [1], 4: [2], 5: [3], 6: [6]}
+
+
+@pytest.mark.parametrize(("updates", "every"), [(3, 2), (4, 3), (1, 5)])
+def test_a_version_is_handed_on_with_the_first_publication_that_finds_it_old_enough(updates: int, every: int):
+    acting = 0
+    for version, due in list(handed_on(updates, every, 10 * every).items())[:-1]:
+        assert all(number <= max(0, version - updates) for number in due)
+        acting = due[-1] if due else acting
+        assert acting == max(0, (version - updates) // every * every)
