@@ -47,7 +47,7 @@ def tune(policy: Any, model: Model, family: Family, config: TuningConfig) -> Non
     elif config.mode == "lora":
         _inject(policy, config)
     for name, parameter in policy.named_parameters():
-        if name.startswith((*model.unread, *model.idle)):
+        if name.startswith(model.idle):
             parameter.requires_grad_(False)
 
 

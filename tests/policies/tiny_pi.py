@@ -202,6 +202,10 @@ def write_pi(
         for name, parameter in policy.named_parameters():
             if ".dense." in name:  # adaptive norms start at zero, where the time has no effect
                 parameter.normal_(std=0.1)
+        if kind == "pi0_fast":  # else every token is as likely as any, and few are actions
+            head = policy.model.paligemma_with_expert.paligemma.lm_head.weight
+            head.normal_(std=0.4)
+            head[: VOCABULARY - SKIP - CHARACTERS - 2] *= 0.1
     for part in (policy, *processors):
         part.save_pretrained(directory)
     if whole:

@@ -63,7 +63,7 @@ class Pi05(FlowModel):
         # The expert reads the last layer's keys and values; what that layer makes of them is for the critic.
         last = f"{LANGUAGE_MODEL}layers.{len(language_model.layers) - 1}."
         parts = ("self_attn.q_proj.", "self_attn.o_proj.", "mlp.", "post_attention_layernorm.")
-        self.idle = (f"{LANGUAGE_MODEL}norm.", *(last + part for part in parts))
+        self.idle = (*self.unread, f"{LANGUAGE_MODEL}norm.", *(last + part for part in parts))
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
         """See the base class; the features are the prefix's: images and prompt."""

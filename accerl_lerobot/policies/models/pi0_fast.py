@@ -150,6 +150,18 @@ class Pi0Fast(TokenModel):
             chunk: Tensor = self.policy.predict_action_chunk(batch)
         return chunk
 
+    def stock_tokens(self, batch: dict[str, Tensor]) -> Tensor:
+        """See the base class."""
+        from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
+
+        tokens: Tensor = self.policy.model.sample_actions_fast_kv_cache(
+            *self.policy._preprocess_images(batch),
+            batch[OBS_LANGUAGE_TOKENS],
+            batch[OBS_LANGUAGE_ATTENTION_MASK],
+            max_decoding_steps=self.length,
+        )
+        return tokens
+
 
 def _refuse(config: Any) -> None:
     """Refuses settings under which LeRobot's own sampler is not what evaluation and the self-check need.
