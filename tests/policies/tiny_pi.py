@@ -38,6 +38,7 @@ PALIGEMMA = "google/paligemma-3b-pt-224"
 """The tokeniser that LeRobot's processors ask the Hub for."""
 ACTIONS = "lerobot/fast-action-tokenizer"
 """The tokeniser of actions that π0-FAST asks for."""
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
 KINDS = ("pi0", "pi05")
 """Of the flow family."""
 VOCABULARY = 400
@@ -139,10 +140,10 @@ def hub(cache: Path) -> Iterator[None]:
     for name, write in ((PALIGEMMA, write_tokenizer), (ACTIONS, write_fast)):
         repository = cache / f"models--{name.replace('/', '--')}"
         if not repository.exists():
-            snapshot = write(repository / "snapshots" / "abc")
+            snapshot = write(repository / "snapshots" / COMMIT)
             (snapshot / "config.json").write_text('{"model_type": "paligemma"}')
             (repository / "refs").mkdir()
-            (repository / "refs" / "main").write_text("abc")
+            (repository / "refs" / "main").write_text(COMMIT)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(constants, "HF_HUB_CACHE", str(cache))
         yield
