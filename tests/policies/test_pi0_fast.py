@@ -263,6 +263,19 @@ def test_what_follows_the_terminator_does_not_count(adapter: LeRobotAdapter):
     assert torch.equal(adapter.model.chunk(garbled), adapter.model.chunk(tokens))
 
 
+def test_one_reading_of_the_observations_serves_again_and_again(adapter: LeRobotAdapter):
+    asked = requests(6)
+    tokens = said(adapter.decide(asked, 0))
+    encoded = adapter._encode(*stack_observations(asked))
+    with torch.no_grad():
+        first = encoded.context.logits(tokens)
+        again = adapter.family.act(encoded, asked)
+        assert torch.equal(again.latent["tokens"], tokens)
+        assert torch.equal(encoded.context.logits(tokens), first)
+        some = encoded.context.logits(tokens[:, :3])
+    assert some.shape == (6, 3, VOCABULARY) and torch.allclose(some, first[:, :3], atol=1e-5)
+
+
 def test_the_layout_of_training_is_another_policy_s(adapter: LeRobotAdapter, monkeypatch: pytest.MonkeyPatch):
     """BOS as the first causal token, as LeRobot's loss has it: the self-check refuses to score like that."""
     asked = requests(4)

@@ -81,6 +81,9 @@ def test_gradients_reach_every_trainable_parameter(adapter: LeRobotAdapter):
     assert [k for k, p in parameters.items() if p.grad is None or not p.grad.abs().max() > 0] == []
     for part in ("vision_tower", "multi_modal_projector", "embed_tokens", "lm_head"):
         assert any(part in k for k in parameters), part
+    embedding = adapter.policy.model.paligemma_with_expert.paligemma.model.language_model.embed_tokens
+    fed = latent["tokens"][:, :-1][adapter.factors(latent)[:, 1:]].unique()
+    assert len(fed) > 10 and (embedding.weight.grad[fed].abs().amax(1) > 0).all(), "what was said is read"
 
 
 @pytest.mark.parametrize("temperature", [1.0, 0.6])
