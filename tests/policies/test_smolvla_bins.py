@@ -234,7 +234,7 @@ def test_values_are_those_of_evaluate_and_read_the_action_queries(adapter: LeRob
     encoded = adapter.model.encode(batch)
     assert torch.equal(encoded.features, adapter.policy.hidden(batch))
     assert encoded.features.shape == (6, 5 * DIMS, 32) and encoded.mask.all()
-    assert adapter.actions() == ROWS
+    assert adapter.actions == ROWS
 
 
 def test_gradients_reach_every_trainable_parameter(adapter: LeRobotAdapter):
