@@ -28,7 +28,18 @@ from typing import Any
 
 PRETRAINED = "pretrained_model"
 BACKBONE = "backbone"
-"""Folder beside the weights with the vision-language backbone's config and tokeniser, when they are local."""
+"""Folder beside the weights with the vision-language backbone's config and tokenisers."""
+FAST = f"{BACKBONE}/fast"
+"""Folder with the tokeniser of actions, where a policy has one."""
+CONFIG_FOLDERS = {"vlm_model_name": BACKBONE, "text_tokenizer_name": BACKBONE, "action_tokenizer_name": FAST}
+"""Field of a LeRobot policy config that names files → where ours have them."""
+STEP_FOLDERS = {
+    "tokenizer_processor": ("tokenizer_name", BACKBONE),
+    "action_tokenizer_processor": ("action_tokenizer_name", FAST),
+}
+"""LeRobot processor step → its option that names files, and where ours have them."""
+PREPROCESSOR = "policy_preprocessor.json"
+"""LeRobot's file of the processor steps before the policy."""
 
 
 def save_checkpoint(checkpoints: Path, write: Callable[[Path], int], state: dict[str, Any]) -> Path:
@@ -68,9 +79,9 @@ def save_checkpoint(checkpoints: Path, write: Callable[[Path], int], state: dict
 
 
 def relocate(directory: Path, home: Path) -> None:
-    """Points a checkpoint's config and tokeniser at the backbone files in its own folder.
+    """Points a checkpoint's config and processors at the files in its own folder.
 
-    LeRobot 0.6.1 stores a local backbone by absolute path.
+    LeRobot 0.6.1 stores a local backbone by absolute path. Names on the Hub are left as they are.
 
     Args:
         directory: where the files are now.
@@ -78,12 +89,29 @@ def relocate(directory: Path, home: Path) -> None:
     """
     if not (directory / BACKBONE).is_dir():
         return
-    name = str((home / BACKBONE).absolute())
-    config = json.loads((directory / "config.json").read_text())
-    config["vlm_model_name"] = name
+    config, processor = _named(directory)
+    for fields, key, folder in _local_names(config, processor):
+        fields[key] = str((home / folder).absolute())
     (directory / "config.json").write_text(json.dumps(config, indent=4) + "\n")
-    processor = json.loads((directory / "policy_preprocessor.json").read_text())
+    (directory / PREPROCESSOR).write_text(json.dumps(processor, indent=4) + "\n")
+
+
+def displaced(directory: Path) -> bool:
+    """Whether a checkpoint has a backbone folder of its own and its files name one that is not there."""
+    if not (directory / BACKBONE).is_dir():
+        return False
+    return any(not Path(fields[key]).is_dir() for fields, key, _ in _local_names(*_named(directory)))
+
+
+def _named(directory: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    config = json.loads((directory / "config.json").read_text())
+    return config, json.loads((directory / PREPROCESSOR).read_text())
+
+
+def _local_names(config: dict[str, Any], processor: dict[str, Any]) -> list[tuple[dict[str, Any], str, str]]:
+    """Where a checkpoint's files name a folder of this machine: (mapping, key, our folder for it)."""
+    places = [(config, key, folder) for key, folder in CONFIG_FOLDERS.items()]
     for step in processor["steps"]:
-        if step.get("registry_name") == "tokenizer_processor":
-            step["config"]["tokenizer_name"] = name
-    (directory / "policy_preprocessor.json").write_text(json.dumps(processor, indent=4) + "\n")
+        if (option := STEP_FOLDERS.get(step.get("registry_name"))) is not None:
+            places.append((step["config"], *option))
+    return [place for place in places if Path(place[0].get(place[1]) or "").is_absolute()]

@@ -31,7 +31,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.checkpoint import BACKBONE, relocate
+from accerl_lerobot.checkpoint import displaced, relocate
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.backbone import BackboneConfig, write_backbone
 from accerl_lerobot.policies.plugins import discovery, register_policies
@@ -206,10 +206,7 @@ def run_sft(
 def _with_backbone_in_place(config: SFTConfig, copy: Path) -> SFTConfig:
     """Starts from a copy where the checkpoint's own backbone is no longer where its files say it is."""
     start = Path(config.init_path or "").expanduser()
-    if config.init_path is None or not (start / BACKBONE).is_dir():
-        return config
-    stored = _stored_config(config.init_path).get("vlm_model_name")
-    if stored is not None and Path(stored).is_dir():
+    if config.init_path is None or not displaced(start):
         return config
     shutil.copytree(start, copy)
     relocate(copy, copy)

@@ -86,7 +86,9 @@ class PolicyConfig:
     device: str = "auto"
     """cpu, cuda, or auto."""
     precision: str = "fp32"
-    """fp32, or bf16: the network runs in bfloat16 under autocast, weights and log-probs stay in fp32."""
+    """fp32, or bf16: the network runs in bfloat16 under autocast, weights and log-probs stay in fp32. A
+    ``dtype`` in the checkpoint's LeRobot config is taken as float32, and saved so: updates of RL are smaller
+    than bfloat16 resolves."""
     sampler: SamplerConfig | None = None
     """How it explores. None: the first family of its policy type, with that family's defaults."""
     value_head: ValueHeadConfig = field(default_factory=ValueHeadConfig)

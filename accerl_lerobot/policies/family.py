@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -77,6 +78,8 @@ class Model(ABC):
 
     backbone: ClassVar[str | None] = None
     """Prefix of the parameters that ``policy.tuning.mode=expert`` freezes; None: it has no expert."""
+    unread: ClassVar[tuple[str, ...]] = ()
+    """Names of tensors that nothing is computed with; savers drop them where they are tied."""
     processor_overrides: ClassVar[dict[str, dict[str, Any]]] = {}
     """LeRobot processor step → options that its inference needs and its training does not."""
 
@@ -85,6 +88,11 @@ class Model(ABC):
     """Prefixes of the parameters that no action depends on; never trained, nor published."""
     width: int
     """Of the features."""
+
+    @staticmethod
+    def loading() -> AbstractContextManager[None]:
+        """Holds while LeRobot builds policy and processors."""
+        return nullcontext()
 
     @abstractmethod
     def encode(self, batch: dict[str, Tensor]) -> Encoded:

@@ -23,7 +23,6 @@ from __future__ import annotations
 import importlib
 import json
 import logging
-import shutil
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -42,10 +41,12 @@ from accerl_lerobot.policies.base import OBS_STATE
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Model
 from accerl_lerobot.policies.plugins import register_policies
+from accerl_lerobot.policies.portable import keep_names, save_backbone, tokenizer_overrides, use_backbone
 from accerl_lerobot.policies.processing import IMAGES, Processing
 from accerl_lerobot.policies.samplers import SamplerConfig
 from accerl_lerobot.policies.tuning import merged_state_dict, tune
 from accerl_lerobot.policies.value_head import ValueHead
+from accerl_lerobot.policies.verify import verify_weights
 
 logger = logging.getLogger(__name__)
 
@@ -62,6 +63,9 @@ POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "act": (f"{MODELS}.act:ACT", ("gaussian",)),
     "gaussian_actor": (f"{MODELS}.gaussian_actor:GaussianActor", ("gaussian",)),
     "diffusion": (f"{MODELS}.diffusion:Diffusion", ("diffusion",)),
+    "pi0": (f"{MODELS}.pi0:Pi0", ("flow", "noise_space")),
+    "pi05": (f"{MODELS}.pi0:Pi05", ("flow", "noise_space")),
+    "pi0_fast": (f"{MODELS}.pi0_fast:Pi0Fast", ("tokens",)),
     "smolvla_bins": (f"{MODELS}.smolvla_bins:SmolVLABins", ("tokens",)),
 }
 """LeRobot policy type → its model, and the families that suit it, the default one first."""
@@ -159,14 +163,7 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     _override(lerobot_config, config)
     sampler.override(lerobot_config)
     check_observations(lerobot_config, "policy.n_obs_steps")
-    if (folder / BACKBONE).is_dir() and hasattr(lerobot_config, "vlm_model_name"):
-        lerobot_config.vlm_model_name = str((folder / BACKBONE).resolve())
-    backbone = Path(getattr(lerobot_config, "vlm_model_name", ""))
-    if backbone.is_absolute() and not backbone.is_dir():
-        remedy = (
-            f"its backbone was in {backbone}, which is gone; put a copy into {BACKBONE}/ beside config.json"
-        )
-        raise InputError("policy.path", config.path, remedy)
+    use_backbone(lerobot_config, folder, config.path)
     return lerobot_config
 
 
@@ -181,24 +178,28 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
 
     lerobot_config = load_lerobot_config(config)
     folder = _checkpoint_folder(config)
+    model_class: type[Model] = imported(POLICIES[lerobot_config.type][0])
     try:
-        policy = get_policy_class(lerobot_config.type).from_pretrained(folder, config=lerobot_config)
+        with model_class.loading():
+            policy = get_policy_class(lerobot_config.type).from_pretrained(folder, config=lerobot_config)
     except Exception as error:
         raise InputError("policy.path", config.path, f"the weights did not load ({_brief(error)})") from error
-    _verify_weights(policy, folder, config)
-    model: Model = imported(POLICIES[lerobot_config.type][0])(policy)
+    verify_weights(policy, model_class, folder / WEIGHTS, config.path)
+    model = model_class(policy)  # type: ignore[call-arg]
     device = torch.device(lerobot_config.device)
     overrides = {"device_processor": {"device": str(device)}, **model.processor_overrides}
-    if (folder / BACKBONE).is_dir():
-        overrides["tokenizer_processor"] = {"tokenizer_name": str((folder / BACKBONE).resolve())}
     try:
-        pre, post = make_pre_post_processors(
-            lerobot_config, pretrained_path=str(folder), preprocessor_overrides=overrides
-        )
+        overrides |= tokenizer_overrides(lerobot_config, folder)
+        with model.loading():
+            pre, post = make_pre_post_processors(
+                lerobot_config, pretrained_path=str(folder), preprocessor_overrides=overrides
+            )
+        keep_names(lerobot_config, pre, folder)
     except Exception as error:
-        raise InputError(
-            "policy.path", config.path, f"its LeRobot processors did not load ({_brief(error)})"
-        ) from error
+        remedy = f"its LeRobot processors did not load ({_brief(error)})"
+        if "tokenizer_processor" in str(error) and not (folder / BACKBONE).is_dir():
+            remedy += f"; a tokeniser that cannot be had from the Hub goes into {BACKBONE}/ beside {CONFIG}"
+        raise InputError("policy.path", config.path, remedy) from error
     processing = Processing(pre, post, device, config.rename_map)
     sampler = sampler_config(config, lerobot_config.type)
     family = imported(FAMILIES[sampler.type])(model, sampler)
@@ -215,13 +216,7 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
 def save_pretrained(adapter: LeRobotAdapter, directory: Path, config: PolicyConfig) -> None:
     """Writes LeRobot's ``pretrained_model`` layout, and what is ours beside it, into `directory`."""
     directory.mkdir(parents=True, exist_ok=True)
-    lerobot_config = adapter.policy.config
-    source = Path(getattr(lerobot_config, "vlm_model_name", ""))
-    if source.is_absolute() and source.resolve() != (directory / BACKBONE).resolve():
-        # The policy's own file holds the backbone's weights, unless LeRobot builds it from the backbone's.
-        weights = () if lerobot_config.load_vlm_weights else ("*.safetensors", "*.bin", "*.pt", "*.pth")
-        ignore = shutil.ignore_patterns(*weights)
-        shutil.copytree(source, directory / BACKBONE, ignore=ignore, dirs_exist_ok=True)
+    save_backbone(adapter.policy.config, adapter.processing.preprocessor, directory)
     adapter.policy.save_pretrained(directory, state_dict=merged_state_dict(adapter.policy))
     adapter.processing.preprocessor.save_pretrained(directory)
     adapter.processing.postprocessor.save_pretrained(directory)
@@ -281,31 +276,6 @@ def _checkpoint_folder(config: PolicyConfig) -> Path:
     return folder
 
 
-def _verify_weights(policy: Any, folder: Path, config: PolicyConfig) -> None:
-    """Compares all tensors with the file: LeRobot loads non-strictly, some policies swallow load errors."""
-    stored, loaded = load_file(folder / WEIGHTS), policy.state_dict()
-    # No action is computed with the language model's output layer, and savers drop it where it is tied.
-    # Nor is a tensor missing that a policy holds under several names: savers keep one of them.
-    held = {loaded[k].data_ptr() for k in stored.keys() & loaded.keys()}
-    missing = sorted(
-        k
-        for k in loaded.keys() - stored.keys()
-        if not k.endswith("vlm_with_expert.vlm.lm_head.weight") and loaded[k].data_ptr() not in held
-    )
-    unexpected = sorted(stored.keys() - loaded.keys())
-    if missing or unexpected:
-        counts = (
-            f"{len(missing)} tensors missing {missing[:2]}, {len(unexpected)} unexpected {unexpected[:2]}"
-        )
-        remedy = f"the weights did not load: {counts}; {CONFIG} and {WEIGHTS} disagree"
-        raise InputError("policy.path", config.path, remedy)
-    for name, tensor in stored.items():
-        mine = loaded[name].cpu()
-        if mine.shape != tensor.shape or not torch.equal(mine, tensor.to(mine.dtype)):
-            remedy = f"the weights did not load: {name} differs from the file, or holds a NaN"
-            raise InputError("policy.path", config.path, remedy)
-
-
 def _load_ours(adapter: LeRobotAdapter, folder: Path) -> None:
     """Loads critic and family, and says where this run's options differ from those they were made with."""
     ours = json.loads((folder / OURS).read_text())
@@ -346,7 +316,7 @@ def _load_module(module: nn.Module, path: Path, what: str, otherwise: str) -> No
 
 
 def _override(lerobot_config: Any, config: PolicyConfig) -> None:
-    """Puts a run's choices of denoising steps and executed rows into the LeRobot config."""
+    """Puts a run's choices of denoising steps, executed rows and precision into the LeRobot config."""
     if hasattr(lerobot_config, "pretrained_backbone_weights"):
         # The checkpoint has them; LeRobot would download torchvision's first, even when told to stay offline.
         lerobot_config.pretrained_backbone_weights = None
@@ -356,6 +326,8 @@ def _override(lerobot_config: Any, config: PolicyConfig) -> None:
             remedy = f"a {lerobot_config.type} policy does not denoise; leave the field out"
             raise InputError("policy.num_steps", config.num_steps, remedy)
         setattr(lerobot_config, names[0], config.num_steps)
+    if hasattr(lerobot_config, "dtype"):
+        lerobot_config.dtype = "float32"  # see `PolicyConfig.precision`
     if config.n_action_steps is not None:
         chunk = int(getattr(lerobot_config, "chunk_size", 0) or getattr(lerobot_config, "horizon", 1))
         if config.n_action_steps > chunk:

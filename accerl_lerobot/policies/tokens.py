@@ -38,7 +38,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.family import Action, Encoded, Family, Model, Score, exploring
@@ -57,7 +57,7 @@ class TokenContext:
 
     logits: Callable[[Tensor], Tensor]
     """tokens (B, L) → logits (B, L, V), differentiable; position l depends on ``tokens[:, :l]`` only, and in
-    a parallel model on no token at all."""
+    a parallel model on no token at all. With a terminator, any number of positions from the first on."""
     generate: Callable[[Choose], None] | None = None
     """Autoregressive models, None in parallel ones. Calls `Choose` for positions 0, 1, … and feeds the model
     with what it answers; ends after L positions, or once the answer is the terminator in every row (a row
@@ -83,6 +83,10 @@ class TokenModel(Model):
     @abstractmethod
     def stock(self, batch: dict[str, Tensor]) -> Tensor:
         """LeRobot's own greedy chunk (B, K, A) in normalised units, executed rows only."""
+
+    def stock_tokens(self, batch: dict[str, Tensor]) -> Tensor | None:
+        """The tokens (B, L) behind `stock`, where many of them decode to one chunk."""
+        return None
 
 
 def draw(logits: Tensor, uniform: Tensor, temperature: float) -> Tensor:
@@ -145,12 +149,17 @@ class TokenFamily(Family):
 
     def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
         """See the base class; the entropy is that of the distributions the factors were drawn from."""
-        tokens, temperature = latent["tokens"], self.sampler.temperature
-        logits = encoded.context.logits(tokens)
+        tokens = latent["tokens"]
         factors = existing(tokens, self.model.terminator)
+        # Positions at which every row has ended are not computed: a logit for each of V tokens is a lot.
+        used = int(factors.any(0).sum())
+        logits, temperature = encoded.context.logits(tokens[:, :used]), self.sampler.temperature
+        log_prob = token_log_prob(logits, tokens[:, :used], temperature)
+        entropy = token_entropy(logits, temperature)
+        missing = (0, tokens.shape[1] - used)
         return Score(
-            log_prob=torch.where(factors, token_log_prob(logits, tokens, temperature), 0.0),
-            entropy=torch.where(factors, token_entropy(logits, temperature), 0.0).sum(1),
+            log_prob=torch.where(factors, nn.functional.pad(log_prob, missing), 0.0),
+            entropy=torch.where(factors[:, :used], entropy, 0.0).sum(1),
         )
 
     def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
@@ -159,7 +168,7 @@ class TokenFamily(Family):
         return None if terminator is None else existing(latent["tokens"], terminator)
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
-        """See the base class; greedy chunks are compared, then the log-probs of the two passes.
+        """See the base class; greedy chunks and tokens are compared, then the log-probs of the two passes.
 
         An autoregressive model has two ways to its logits, and a policy may be trained in another layout than
         it acts in. That changes log-probs by far more than rounding does, which is what is let pass here.
@@ -169,9 +178,14 @@ class TokenFamily(Family):
         greedy = torch.zeros(size[0], dtype=torch.bool, device=device)
         tokens, acted = self._decide(encoded, greedy, torch.zeros(size, device=device))
         difference = float((self.model.chunk(tokens) - self.model.stock(batch)).abs().max())
+        factors = existing(tokens, self.model.terminator)
+        if (stock := self.model.stock_tokens(batch)) is not None:
+            difference += float((tokens != stock)[factors].sum())
+        used = int(factors.any(0).sum())
+        tokens, acted, factors = tokens[:, :used], acted[:, :used], factors[:, :used]
         logits = encoded.context.logits(tokens)
         scored = token_log_prob(logits, tokens, self.sampler.temperature)
-        gap = (scored - acted)[existing(tokens, self.model.terminator)].abs().max()
+        gap = (scored - acted)[factors].abs().max()
         # A NaN is not below: argmax finds a token among NaNs too.
         return difference if gap <= torch.finfo(logits.dtype).eps ** 0.5 else difference + float(gap)
 

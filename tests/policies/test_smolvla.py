@@ -16,7 +16,6 @@
 from __future__ import annotations
 
 import copy
-import itertools
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -25,34 +24,16 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.experience import Request, Segment
+from accerl_lerobot.experience import Request
 from accerl_lerobot.policies import flow
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import stack_observations
 from accerl_lerobot.policies.config import PolicyConfig, ValueHeadConfig
-from accerl_lerobot.policies.flow import FlowFamily
 from accerl_lerobot.policies.loading import save_pretrained
 from accerl_lerobot.policies.samplers import FlowSamplerConfig
-from accerl_lerobot.rollout.segments import SegmentBuilder
 from tests.conftest import write_smolvla
-from tests.policies import oracle
+from tests.policies.flow_contract import SAMPLERS, TOLERANCE, as_segment, exploring, name, slow_log_prob
 from tests.policies.tiny import adapter_at, log_ratio, perturb, requests, stored
-
-TOLERANCE = 1e-5
-"""The contract: |ρ − 1| of a whole chunk at equal weights, in fp32."""
-SAMPLERS = [
-    FlowSamplerConfig(
-        stochastic=stochastic, noise=noise, noise_level=0.5 if noise == "flow_sde" else 0.2, padded=padded
-    )
-    for stochastic, noise, padded in itertools.product(
-        ("last", "all", "one"), ("euler", "flow_sde"), ("joint", "analytic")
-    )
-    if (stochastic, padded) != ("last", "analytic")  # the same sampler as joint
-]
-
-
-def name(config: FlowSamplerConfig) -> str:
-    return f"{config.stochastic}-{config.noise}-{config.padded}"
 
 
 @pytest.fixture(scope="module")
@@ -71,19 +52,6 @@ def loaded(path: Path) -> LeRobotAdapter:
 def adapter(loaded: LeRobotAdapter) -> LeRobotAdapter:
     """One of its own for each test."""
     return copy.deepcopy(loaded)
-
-
-def exploring(adapter: LeRobotAdapter, config: FlowSamplerConfig) -> LeRobotAdapter:
-    family = FlowFamily(adapter.model, config)
-    return LeRobotAdapter(adapter.policy, adapter.processing, adapter.model, family, adapter.value_head)
-
-
-def as_segment(asked: list[Request], adapter: LeRobotAdapter, length: int) -> Segment:
-    """Plays requests as one episode, in which each decision is made alone."""
-    builder = SegmentBuilder(asked[0].observation, length)
-    for i in range(length):
-        builder.add(adapter.decide([asked[i]], 3)[0], 0.0, 3, asked[i + 1].observation)
-    return pickle.loads(pickle.dumps(builder.cut("test")))
 
 
 @pytest.mark.parametrize("config", SAMPLERS, ids=name)
@@ -105,28 +73,7 @@ def test_other_weights_give_the_oracle_s_ratio(adapter: LeRobotAdapter, config: 
     decisions = adapter.decide(asked, 0)
     latent, old = stored(decisions)
     perturb(adapter, 0.3)
-    observations, tasks = stack_observations(asked)
-    fields = [
-        adapter._encode({k: v[i : i + 1] for k, v in observations.items()}, [tasks[i]]).context.velocity
-        for i in range(4)
-    ]
-
-    def slow(x: np.ndarray, t: float, sample: int) -> np.ndarray:
-        with torch.no_grad():
-            v = fields[sample](torch.from_numpy(x).float()[None], torch.tensor([t], dtype=torch.float32))
-        return v[0].numpy().astype(np.float64)
-
-    shape = adapter.family.shape
-    index = np.asarray(latent["index"]) if "index" in latent else np.zeros(4, int)
-    path_ = np.full((4, shape.num_steps + 1, shape.chunk_size, shape.padded_dim), np.nan)
-    if config.stochastic == "all":
-        path_[:] = latent["path"]
-    for b in range(4):
-        if config.stochastic == "last":
-            path_[b, 0], path_[b, -1] = latent["path"][b]
-        if config.stochastic == "one":
-            path_[b, index[b]], path_[b, index[b] + 1] = latent["path"][b]
-    expected = oracle.log_prob(slow, path_, index, shape, config)[:, : old.shape[1]]
+    expected = slow_log_prob(adapter, asked, latent)
     change = log_ratio(adapter, asked, decisions).numpy()
     assert np.allclose(change, (expected - old.numpy()).sum(1), atol=2e-4)
     assert np.abs(change).max() > 0.05, "the weights must have moved the policy"

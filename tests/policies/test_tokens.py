@@ -56,7 +56,8 @@ class Recurrent(TokenModel):
 
         def logits(tokens: Tensor) -> Tensor:
             h, rows = start, []
-            for position in range(LENGTH):
+            self.scored = tokens.shape[1]
+            for position in range(tokens.shape[1]):
                 rows.append(h @ self.out.T)
                 fed = tokens[:, max(0, position - self.late)]  # `late`: as if trained in another layout
                 h = torch.tanh(h + self.embedding[fed])
@@ -290,6 +291,17 @@ def test_nothing_after_the_terminator_counts():
     assert torch.equal(again.log_prob, score.log_prob) and torch.equal(again.entropy, score.entropy)
 
 
+def test_positions_at_which_all_have_ended_are_not_computed():
+    model = Recurrent()
+    tokens_family, read = family(model), encoded(model, observations(2))
+    score = tokens_family.score(read, {"tokens": torch.tensor([[END, END, END], [1, END, END]])})
+    assert model.scored == 2 and score.log_prob.shape == (2, LENGTH) and not score.log_prob[:, 2].any()
+    other = tokens_family.score(read, {"tokens": torch.tensor([[END, END, END], [1, 0, 2]])})
+    assert model.scored == LENGTH
+    assert torch.equal(score.log_prob[0], other.log_prob[0]) and score.entropy[0] == other.entropy[0]
+    assert torch.equal(score.log_prob[1, :1], other.log_prob[1, :1])
+
+
 def test_generation_ends_when_all_have_ended():
     model = Recurrent()
     model.out[END] = 0.0
@@ -364,6 +376,16 @@ def test_the_self_check_catches_another_layout_a_changed_sampler_and_nan():
         model = kind()
         model.stock = lambda batch, model=model: model.chunk(torch.zeros(2, LENGTH, dtype=torch.int64))  # type: ignore[method-assign]
         assert math.isnan(family(model).difference(broken, model.encode(broken)))
+
+
+def test_other_tokens_behind_the_same_chunk_are_caught():
+    model, batch = Recurrent(), {"observation": observations(6)}
+    model.chunk = lambda tokens: torch.zeros(len(tokens), 1, 2)  # type: ignore[method-assign]
+    said = torch.tensor([_greedy(model, s.double().numpy()) for s in batch["observation"]])
+    model.stock_tokens = lambda batch: said  # type: ignore[method-assign]
+    assert family(model).difference(batch, model.encode(batch)) == 0.0
+    said[2, 0] = (said[2, 0] + 1) % VOCABULARY
+    assert family(model).difference(batch, model.encode(batch)) >= 1.0
 
 
 def test_nan_logits_are_visible_in_the_log_prob_and_break_nothing():

@@ -26,7 +26,8 @@ from torch import Tensor
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.family import Encoded
-from accerl_lerobot.policies.flow import FlowContext, FlowModel, FlowShape
+from accerl_lerobot.policies.flow import FlowContext, FlowModel
+from accerl_lerobot.policies.models.options import flow_shape, refuse_options
 
 
 class SmolVLA(FlowModel):
@@ -37,10 +38,11 @@ class SmolVLA(FlowModel):
     """
 
     backbone = "model.vlm_with_expert.vlm."
+    unread = ("model.vlm_with_expert.vlm.lm_head.weight",)
 
     def __init__(self, policy: Any) -> None:
         config = policy.config
-        refuse_flow_options(config)
+        refuse_options(config)
         if config.adapt_to_pi_aloha:
             raise InputError(
                 "policy.adapt_to_pi_aloha", True, "not supported in RL; train a policy without it"
@@ -80,39 +82,3 @@ class SmolVLA(FlowModel):
         """See the base class."""
         chunk: Tensor = self.policy.predict_action_chunk(batch, noise=noise)
         return chunk
-
-
-def flow_shape(config: Any, num_steps: int) -> FlowShape:
-    """The sizes in a LeRobot flow policy's config.
-
-    Args:
-        config: LeRobot's.
-        num_steps: what this policy type calls its number of denoising steps.
-    """
-    return FlowShape(
-        num_steps=num_steps,
-        chunk_size=config.chunk_size,
-        executed=config.n_action_steps,
-        padded_dim=config.max_action_dim,
-        action_dim=config.action_feature.shape[0],
-    )
-
-
-def refuse_flow_options(config: Any) -> None:
-    """Refuses what would change the sampler's density behind our back.
-
-    Raises:
-        InputError: real-time chunking or compilation is on.
-    """
-    if config.rtc_config is not None and config.rtc_config.enabled:
-        raise InputError(
-            "policy.rtc_config.enabled",
-            True,
-            "real-time chunking changes the sampler's density; turn it off",
-        )
-    if config.compile_model:
-        raise InputError(
-            "policy.compile_model",
-            True,
-            "a compiled sampler rounds unlike the re-scoring pass; set it to false in config.json",
-        )

@@ -1,0 +1,202 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""π0-FAST: PaliGemma writes a chunk of actions as tokens, one after the other.
+
+LeRobot's `sample_actions_fast_kv_cache` runs without gradient and throws tokens and logits away, so its parts
+are driven here. Both ways to the logits start from one pass over the prefix: images, prompt (which holds the
+state), BOS, all attending to each other. `generate` goes on token by token with the key-value cache;
+`logits` shows the cache all tokens at once, each attending to those before it.
+
+*Layout.* LeRobot trains with BOS as the first of the causal tokens and samples with BOS inside the
+bidirectional prefix. Scored in the layout of training, log-probs would be those of another policy: here it is
+the layout of sampling, at both ends.
+
+*Decoding* is LeRobot's `detokenize_actions` on the tokens before the terminator ``|``. Tokens that mean
+nothing to FAST's tokeniser are skipped, missing coefficients are zeros, too many are cut off, and where
+decoding fails the chunk is zeros. Only the check that the text begins with ``Action:``, an assertion, is
+switched off in what is loaded and saved: a policy that explores will begin otherwise at times.
+
+Float32 weights as for π0, see `pi0`. Scoring takes a logit for each of the 257152 tokens of PaliGemma at each
+position: about 1 MB a token in float32, several times over for the gradient.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.family import Encoded
+from accerl_lerobot.policies.fast import data_only
+from accerl_lerobot.policies.models.options import refuse_options
+from accerl_lerobot.policies.tokens import Choose, TokenContext, TokenModel
+
+logger = logging.getLogger(__name__)
+
+END = "|"
+
+
+class Pi0Fast(TokenModel):
+    """Drives LeRobot's `PI0FastPolicy`.
+
+    Args:
+        policy: a loaded one.
+    """
+
+    parallel = False
+    rows = None
+    loading = staticmethod(data_only)
+
+    def __init__(self, policy: Any) -> None:
+        config, tokenizer = policy.config, policy._paligemma_tokenizer
+        refuse_options(config)
+        _refuse(config)
+        config.validate_action_token_prefix = False
+        self.policy = policy
+        self.length = config.max_decoding_steps
+        self.terminator = tokenizer.convert_tokens_to_ids(END)
+        paligemma = policy.model.paligemma_with_expert.paligemma
+        self.width = paligemma.model.language_model.config.hidden_size
+        if len(tokenizer) < paligemma.lm_head.out_features:
+            known = f"{len(tokenizer)} of the {paligemma.lm_head.out_features} tokens the policy writes"
+            raise InputError("policy.text_tokenizer_name", config.text_tokenizer_name, f"knows only {known}")
+
+    def encode(self, batch: dict[str, Tensor]) -> Encoded:
+        """See the base class; the features are the prefix's: images, prompt, BOS."""
+        from lerobot.policies.common.vla_utils import clone_past_key_values, prepare_attention_masks_4d
+        from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
+
+        model, network = self.policy.model, self.policy.model.paligemma_with_expert
+        images, image_masks = self.policy._preprocess_images(batch)
+        prompt, known = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
+        bos = torch.full_like(prompt[:, :1], self.policy._paligemma_tokenizer.bos_token_id)
+        embedded, pad, att, _, _ = model.embed_prefix_fast(
+            images,
+            image_masks,
+            torch.cat([prompt, bos], 1),
+            torch.cat([known, torch.ones_like(known[:, :1])], 1),
+        )
+        (features, _), cache = network.forward(
+            attention_mask=prepare_attention_masks_4d(att, dtype=embedded.dtype),
+            position_ids=torch.cumsum(pad, dim=1) - 1,
+            past_key_values=None,
+            inputs_embeds=[embedded, None],
+            use_cache=True,
+        )
+
+        def follow(tokens: Tensor, cache: Any, first: int) -> Tensor:
+            """Hidden states (B, n, width) at the n positions from `first` on, whose tokens are (B, n)."""
+            last = first + tokens.shape[1]
+            places = torch.arange(first, last, device=tokens.device)
+            seen = torch.arange(last, device=tokens.device) <= places[:, None]
+            whole = pad[:, None].expand(-1, len(places), -1)
+            attends = torch.cat([whole, seen.expand(len(pad), -1, -1)], 2)
+            embedded = network.embed_language_tokens(tokens)
+            (hidden, _), _ = network.forward(
+                attention_mask=prepare_attention_masks_4d(attends, dtype=embedded.dtype),
+                position_ids=pad.sum(1, keepdim=True) + places,
+                past_key_values=cache,
+                inputs_embeds=[embedded, None],
+                use_cache=True,
+            )
+            states: Tensor = hidden
+            return states
+
+        def logits(tokens: Tensor) -> Tensor:
+            states = features[:, -1:]
+            if tokens.shape[1] > 1:
+                states = torch.cat([states, follow(tokens[:, :-1], clone_past_key_values(cache), 0)], 1)
+            scores: Tensor = network.paligemma.lm_head(states)
+            return scores
+
+        def generate(choose: Choose) -> None:
+            own, state = clone_past_key_values(cache), features[:, -1]
+            for position in range(self.length):
+                tokens = choose(network.paligemma.lm_head(state), position)
+                if position == self.length - 1 or bool((tokens == self.terminator).all()):
+                    return
+                state = follow(tokens[:, None], own, position)[:, 0]
+
+        return Encoded(features=features, mask=pad, context=TokenContext(logits=logits, generate=generate))
+
+    def chunk(self, tokens: Tensor) -> Tensor:
+        """See the base class."""
+        config = self.policy.config
+        with _undecodable_once():
+            chunk: Tensor = self.policy.detokenize_actions(
+                tokens, action_horizon=config.n_action_steps, action_dim=config.action_feature.shape[0]
+            )
+        return chunk
+
+    def stock(self, batch: dict[str, Tensor]) -> Tensor:
+        """See the base class."""
+        with _undecodable_once():
+            chunk: Tensor = self.policy.predict_action_chunk(batch)
+        return chunk
+
+    def stock_tokens(self, batch: dict[str, Tensor]) -> Tensor:
+        """See the base class."""
+        from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
+
+        tokens: Tensor = self.policy.model.sample_actions_fast_kv_cache(
+            *self.policy._preprocess_images(batch),
+            batch[OBS_LANGUAGE_TOKENS],
+            batch[OBS_LANGUAGE_ATTENTION_MASK],
+            max_decoding_steps=self.length,
+        )
+        return tokens
+
+
+def _refuse(config: Any) -> None:
+    """Refuses settings under which LeRobot's own sampler is not what evaluation and the self-check need.
+
+    Raises:
+        InputError: it samples at rest, or decodes fewer rows than were encoded.
+    """
+    if config.temperature != 0:
+        remedy = "LeRobot's sampler has to be greedy here: set it to 0 in config.json; exploration has a "
+        raise InputError("policy.temperature", config.temperature, f"{remedy}policy.sampler.temperature")
+    if config.n_action_steps != config.chunk_size:
+        # The coefficients of K rows, read as those of fewer, are another, faster and larger movement.
+        remedy = f"LeRobot decodes so many rows from the coefficients of {config.chunk_size}; use all of them"
+        raise InputError("policy.n_action_steps", config.n_action_steps, remedy)
+
+
+class _Undecodable(logging.Filter):
+    """Passes LeRobot's complaint about a sequence it cannot decode once, in our words."""
+
+    said = False
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        message = str(record.msg)
+        if message.startswith("Error decoding tokens") and not _Undecodable.said:
+            _Undecodable.said = True
+            logger.warning("tokens that FAST cannot decode were drawn; such a chunk is all zeros")
+        return not message.startswith(("Error decoding tokens", "Tokens: "))
+
+
+@contextlib.contextmanager
+def _undecodable_once() -> Iterator[None]:
+    """LeRobot writes two lines for each such sequence, and a policy that explores draws many."""
+    quiet = _Undecodable()
+    logging.root.addFilter(quiet)
+    try:
+        yield
+    finally:
+        logging.root.removeFilter(quiet)

@@ -1,0 +1,96 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What the tests of every flow policy share: the samplers, and the slow oracle on a policy's own velocity."""
+
+from __future__ import annotations
+
+import itertools
+import pickle
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from accerl_lerobot.experience import Request, Segment
+from accerl_lerobot.policies.adapter import LeRobotAdapter
+from accerl_lerobot.policies.base import stack_observations
+from accerl_lerobot.policies.flow import FlowFamily
+from accerl_lerobot.policies.samplers import FlowSamplerConfig
+from accerl_lerobot.rollout.segments import SegmentBuilder
+from tests.policies import oracle
+
+TOLERANCE = 1e-5
+"""The contract: |ρ − 1| of a whole chunk at equal weights, in fp32."""
+SAMPLERS = [
+    FlowSamplerConfig(
+        stochastic=stochastic, noise=noise, noise_level=0.5 if noise == "flow_sde" else 0.2, padded=padded
+    )
+    for stochastic, noise, padded in itertools.product(
+        ("last", "all", "one"), ("euler", "flow_sde"), ("joint", "analytic")
+    )
+    if (stochastic, padded) != ("last", "analytic")  # the same sampler as joint
+]
+
+
+def name(config: FlowSamplerConfig) -> str:
+    return f"{config.stochastic}-{config.noise}-{config.padded}"
+
+
+def exploring(adapter: LeRobotAdapter, config: FlowSamplerConfig) -> LeRobotAdapter:
+    """The same policy, exploring in another way."""
+    family = FlowFamily(adapter.model, config)
+    return LeRobotAdapter(
+        adapter.policy, adapter.processing, adapter.model, family, adapter.value_head, adapter.precision
+    )
+
+
+def as_segment(asked: Sequence[Request], adapter: LeRobotAdapter, length: int) -> Segment:
+    """Plays requests as one episode, in which each decision is made alone."""
+    builder = SegmentBuilder(asked[0].observation, length)
+    for i in range(length):
+        builder.add(adapter.decide([asked[i]], 3)[0], 0.0, 3, asked[i + 1].observation)
+    return pickle.loads(pickle.dumps(builder.cut("test")))
+
+
+def slow_log_prob(
+    adapter: LeRobotAdapter,
+    asked: Sequence[Request],
+    latent: dict[str, Tensor],
+    velocity: oracle.SlowVelocity | None = None,
+) -> np.ndarray:
+    """The oracle's log-prob (B, L) of stored latents; without `velocity`, each observation is read alone."""
+    observations, tasks = stack_observations(asked)
+    fields = [
+        adapter._encode({k: v[i : i + 1] for k, v in observations.items()}, [tasks[i]]).context.velocity
+        for i in range(len(asked))
+    ]
+
+    def slow(x: np.ndarray, t: float, sample: int) -> np.ndarray:
+        with torch.no_grad():
+            v = fields[sample](torch.from_numpy(x).float()[None], torch.tensor([t], dtype=torch.float32))
+        return v[0].numpy().astype(np.float64)
+
+    shape, config = adapter.family.shape, adapter.family.sampler
+    index = np.asarray(latent["index"]) if "index" in latent else np.zeros(len(asked), int)
+    path = np.full((len(asked), shape.num_steps + 1, shape.chunk_size, shape.padded_dim), np.nan)
+    if config.stochastic == "all":
+        path[:] = latent["path"]
+    for b in range(len(asked)):
+        if config.stochastic == "last":
+            path[b, 0], path[b, -1] = latent["path"][b]
+        if config.stochastic == "one":
+            path[b, index[b]], path[b, index[b] + 1] = latent["path"][b]
+    rows = shape.executed if config.stochastic == "last" else shape.chunk_size
+    return oracle.log_prob(velocity or slow, path, index, shape, config)[:, :rows]

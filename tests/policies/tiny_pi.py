@@ -1,0 +1,231 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""π0 and its kin at a twentieth of a million parameters, offline.
+
+LeRobot's configs know two sizes of Gemma, 0.3 and 2 billion parameters, and write PaliGemma's vocabulary and
+widths over whatever else they are given. `small` puts other sizes in where LeRobot's modules look theirs up;
+everything else is LeRobot's own code. A policy is built from its config whenever it is loaded, so it must be
+active then, too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from accerl_lerobot.checkpoint import BACKBONE, FAST
+from accerl_lerobot.policies.fast import data_only
+
+PALIGEMMA = "google/paligemma-3b-pt-224"
+"""The tokeniser that LeRobot's processors ask the Hub for."""
+ACTIONS = "lerobot/fast-action-tokenizer"
+"""The tokeniser of actions that π0-FAST asks for."""
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+KINDS = ("pi0", "pi05")
+"""Of the flow family."""
+VOCABULARY = 400
+SKIP = 8
+"""PaliGemma's last tokens, which are none of FAST's; LeRobot's `fast_skip_tokens`."""
+SCALE, LOWEST, CHARACTERS = 8.0, -32, 64
+"""FAST rounds coefficients times the first to one of so many integers from the second on."""
+IMAGE = 32
+TEXTS = ("Match the target", "Mirror the target", "Task: , State: 0 1 2 3;\nAction: |")
+
+
+@contextlib.contextmanager
+def small() -> Iterator[None]:
+    """Two narrow Gemmas in place of both of LeRobot's, and a SigLIP of one layer."""
+    with pytest.MonkeyPatch.context() as patch:
+        for kind in (*KINDS, "pi0_fast"):
+            module = importlib.import_module(f"lerobot.policies.{kind}.modeling_{kind}")
+            patch.setattr(module, "get_gemma_config", _sizes(module.GemmaConfig))
+            name = "PaliGemmaForConditionalGenerationWithPiGemma"
+            patch.setattr(module, name, _shrunk(getattr(module, name)))
+            if kind in KINDS:
+                patch.setattr(module, "PiGemmaForCausalLM", _shrunk(module.PiGemmaForCausalLM))
+        yield
+
+
+def _sizes(gemma_config: Any) -> Any:
+    def get_gemma_config(variant: str) -> Any:
+        width = {"gemma_2b": 32, "gemma_300m": 24}[variant]
+        return gemma_config(width=width, depth=2, mlp_dim=2 * width, num_heads=8, num_kv_heads=1, head_dim=8)
+
+    return get_gemma_config
+
+
+def _shrunk(real: Any) -> Any:
+    def build(config: Any) -> Any:
+        text = getattr(config, "text_config", config)
+        text.vocab_size = VOCABULARY
+        if text is not config:
+            config._vocab_size, config.image_token_index = VOCABULARY, VOCABULARY - 1
+            vision = config.vision_config
+            vision.hidden_size, vision.intermediate_size, vision.num_attention_heads = 16, 32, 2
+            vision.num_hidden_layers, vision.image_size, vision.patch_size = 1, IMAGE, 16
+            vision.projection_dim = config.projection_dim = text.hidden_size
+        return real(config=config)
+
+    return build
+
+
+def write_fast(directory: Path) -> Path:
+    """A tokeniser of actions in the files that FAST's has: characters, two zeros in one, half a letter."""
+    from tokenizers import Tokenizer, decoders, models, pre_tokenizers
+    from transformers import PreTrainedTokenizerFast
+
+    byte_level = pre_tokenizers.ByteLevel(add_prefix_space=False)
+    letters = [byte_level.pre_tokenize_str(chr(i))[0][0] for i in range(CHARACTERS)]
+    half = byte_level.pre_tokenize_str("é")[0][0][0]  # decodes to U+FFFD
+    zeros = letters[-LOWEST] * 2
+    vocabulary = {token: i for i, token in enumerate([*letters, half, zeros])}
+    raw = Tokenizer(models.BPE(vocab=vocabulary, merges=[(letters[-LOWEST], letters[-LOWEST])]))
+    raw.pre_tokenizer, raw.decoder = byte_level, decoders.ByteLevel()
+    PreTrainedTokenizerFast(tokenizer_object=raw).save_pretrained(directory)
+    config = {"processor_class": "UniversalActionProcessor", "scale": SCALE, "min_token": LOWEST}
+    config["auto_map"] = {"AutoProcessor": "processing_action_tokenizer.UniversalActionProcessor"}
+    (directory / "processor_config.json").write_text(json.dumps(config))
+    return directory
+
+
+def write_tokenizer(directory: Path) -> Path:
+    """Bytes, some words, and at the end fillers, which is where PaliGemma has tokens that are no text."""
+    from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
+    from transformers import PreTrainedTokenizerFast
+
+    raw = Tokenizer(models.BPE())
+    raw.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
+    trainer = trainers.BpeTrainer(
+        vocab_size=300,
+        special_tokens=["<pad>", "<eos>", "<bos>", "<unk>"],
+        initial_alphabet=sorted(pre_tokenizers.ByteLevel.alphabet()),
+        show_progress=False,
+    )
+    raw.train_from_iterator(TEXTS, trainer)
+    learnt = json.loads(raw.to_str())["model"]
+    vocabulary: dict[str, int] = learnt["vocab"]
+    for i in range(len(vocabulary), VOCABULARY):
+        vocabulary[f"<loc{i:04d}>"] = i
+    full = Tokenizer(models.BPE(vocab=vocabulary, merges=[tuple(pair) for pair in learnt["merges"]]))
+    full.pre_tokenizer, full.decoder = raw.pre_tokenizer, decoders.ByteLevel()
+    PreTrainedTokenizerFast(
+        tokenizer_object=full, pad_token="<pad>", eos_token="<eos>", bos_token="<bos>", unk_token="<unk>"
+    ).save_pretrained(directory)
+    return directory
+
+
+@contextlib.contextmanager
+def hub(cache: Path) -> Iterator[None]:
+    """A Hub cache that holds both tokenisers, as after a download; nothing else reaches the Hub."""
+    from huggingface_hub import constants
+
+    for name, write in ((PALIGEMMA, write_tokenizer), (ACTIONS, write_fast)):
+        repository = cache / f"models--{name.replace('/', '--')}"
+        if not repository.exists():
+            snapshot = write(repository / "snapshots" / COMMIT)
+            (snapshot / "config.json").write_text('{"model_type": "paligemma"}')
+            (repository / "refs").mkdir()
+            (repository / "refs" / "main").write_text(COMMIT)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(constants, "HF_HUB_CACHE", str(cache))
+        yield
+
+
+def write_pi(
+    directory: Path,
+    kind: str,
+    *,
+    state_dim: int = 4,
+    action_dim: int = 2,
+    padded_dim: int = 2,
+    chunk: int = 4,
+    executed: int = 4,
+    num_steps: int = 3,
+    prompt: int = 48,
+    seed: int = 1,
+    whole: bool = True,
+    **fields: Any,
+) -> Path:
+    """Saves a random policy with identity-like normalisation as LeRobot does; call it within `small`.
+
+    Args:
+        kind: of `KINDS`, or pi0_fast, whose `num_steps` are its most tokens.
+        prompt: tokens; the longest of `tiny.TEXTS` takes 20, and π0.5 adds 20 or so with the state.
+        whole: with the tokeniser beside it, as our checkpoints have it; LeRobot's need the Hub for that.
+    """
+    import torch
+    from lerobot.configs.types import FeatureType, PolicyFeature
+    from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
+
+    fast = {"max_decoding_steps": num_steps, "max_action_tokens": 32, "fast_skip_tokens": SKIP}
+    config = make_policy_config(
+        kind,
+        input_features={
+            "observation.images.front": PolicyFeature(type=FeatureType.VISUAL, shape=(3, IMAGE, IMAGE)),
+            "observation.state": PolicyFeature(type=FeatureType.STATE, shape=(state_dim,)),
+        },
+        output_features={"action": PolicyFeature(type=FeatureType.ACTION, shape=(action_dim,))},
+        device="cpu",
+        push_to_hub=False,
+        chunk_size=chunk,
+        n_action_steps=executed,
+        max_state_dim=state_dim,
+        max_action_dim=padded_dim,
+        image_resolution=(IMAGE, IMAGE),
+        tokenizer_max_length=prompt,
+        **({"num_inference_steps": num_steps} if kind in KINDS else fast),
+        **fields,
+    )
+    torch.manual_seed(seed)
+    cache = directory.parent / f"{directory.name}-hub"
+    with hub(cache), data_only():
+        policy = get_policy_class(kind)(config)
+        processors = make_pre_post_processors(config, dataset_stats=_stats(state_dim, action_dim))
+    with torch.no_grad():
+        for name, parameter in policy.named_parameters():
+            if ".dense." in name:  # adaptive norms start at zero, where the time has no effect
+                parameter.normal_(std=0.1)
+        if kind == "pi0_fast":  # else every token is as likely as any, and few are actions
+            head = policy.model.paligemma_with_expert.paligemma.lm_head.weight
+            head.normal_(std=0.4)
+            head[: VOCABULARY - SKIP - CHARACTERS - 2] *= 0.1
+    for part in (policy, *processors):
+        part.save_pretrained(directory)
+    if whole:
+        write_tokenizer(directory / BACKBONE)
+        shutil.rmtree(cache)
+        if kind == "pi0_fast":
+            write_fast(directory / FAST)
+    return directory
+
+
+def _stats(state_dim: int, action_dim: int) -> dict[str, Any]:
+    import torch
+
+    return {
+        name: {
+            "mean": torch.zeros(size),
+            "std": torch.full((size,), 0.5),
+            "q01": torch.full((size,), -0.5),
+            "q99": torch.full((size,), 0.5),
+        }
+        for name, size in (("observation.state", state_dim), ("action", action_dim))
+    }
