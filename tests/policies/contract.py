@@ -114,7 +114,7 @@ class PolicyContract:
                 assert all(np.abs(v - a.latent[k]).max() <= TOLERANCE for k, v in one.latent.items())
                 assert abs(one.value - a.value) <= TOLERANCE
             assert one.chunk.shape == self.shape and one.chunk.dtype == np.float32 and one.version == 7
-            assert one.log_prob.shape == (adapter.actions(),) and one.log_prob.dtype == np.float32
+            assert one.log_prob.shape == (adapter.actions,) and one.log_prob.dtype == np.float32
         torch.manual_seed(1)
         state = torch.get_rng_state()
         assert pickle.dumps(adapter.decide(asked, 7)) == pickle.dumps(together), "no global generator is read"
