@@ -63,9 +63,9 @@ class TuningConfig:
     alpha: int = 16
     """lora: the adapters' output is scaled by alpha / rank; ≥ 1."""
     targets: str | None = None
-    """lora: regular expression that must match the whole name of a linear layer inside the policy; those that
-    PyTorch's attention reads without calling them are passed over. None: what LeRobot's own PEFT training
-    adapts in this policy."""
+    """lora: regular expression that must match the whole name of a linear layer inside the policy; those
+    inside PyTorch's own attention are passed over, as it reads their weights without calling them. None: what
+    LeRobot's own PEFT training adapts in this policy."""
 
     def __post_init__(self) -> None:
         if self.mode not in ("checkpoint", "full", "expert", "lora"):
