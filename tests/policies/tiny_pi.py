@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""π0 and its kin at a twentieth of a million parameters, offline.
+"""π0 and its kin at a tenth of a million parameters, offline.
 
 LeRobot's configs know two sizes of Gemma, 0.3 and 2 billion parameters, and write PaliGemma's vocabulary and
 widths over whatever else they are given. `small` puts other sizes in where LeRobot's modules look theirs up;
