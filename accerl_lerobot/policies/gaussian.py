@@ -43,7 +43,7 @@ from accerl_lerobot.policies.flow import LOG_SQRT_2PI
 from accerl_lerobot.policies.samplers import GaussianSamplerConfig
 
 QUADRATURE_NODES = 32
-"""For the tanh term of an entropy; exact to 1e-6 up to a std of 1, to 1 % at 3."""
+"""For the tanh term of an entropy; off by 6e-8 at a std of 1, 2e-4 at 2, 0.003 at 3 and 0.16 (1 %) at 10."""
 
 
 @dataclass(frozen=True, kw_only=True)

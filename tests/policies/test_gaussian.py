@@ -132,7 +132,7 @@ def test_the_slope_of_tanh_near_and_far():
     assert not torch.isfinite(naive), "which is why it is not computed so"
 
 
-@pytest.mark.parametrize(("std", "tolerance"), [(0.05, 1e-5), (0.5, 1e-5), (1.0, 1e-5), (3.0, 0.03)])
+@pytest.mark.parametrize(("std", "tolerance"), [(0.05, 1e-5), (0.5, 1e-5), (1.0, 1e-5), (3.0, 1e-3)])
 def test_a_squashed_action_s_entropy_against_numerical_integration(std: float, tolerance: float):
     for mean in (-2.0, 0.0, 0.7):
         u = np.linspace(mean - 12 * std, mean + 12 * std, 400_001)
