@@ -18,7 +18,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 from typing import TYPE_CHECKING, Any
 
@@ -50,36 +49,38 @@ def check_start(config: RunConfig) -> None:
 
         open_metadata(config.dataset)
     if config.sft.init_path is None:
-        from accerl_lerobot.policies.loading import check_type, sampler_config
+        from accerl_lerobot.policies.loading import check_observations, check_type, sampler_config
 
-        check_sft_policy(config.sft)
+        policy_config = check_sft_policy(config.sft)
         kind = check_type(config.sft.policy["type"], "sft.policy.type", "RL needs a likelihood: ")
         sampler_config(config.policy, kind)
+        check_observations(policy_config, "sft.policy.n_obs_steps")
 
 
-def check_sft_policy(config: SFTConfig) -> None:
-    """Lets LeRobot build the policy config that the SFT would ask for.
+def check_sft_policy(config: SFTConfig) -> Any:
+    """Lets LeRobot build the policy config that the SFT would ask for, and returns it.
 
     Raises:
-        InputError: LeRobot has no such policy, no such field, or refuses a value.
+        InputError: LeRobot has no such policy, no such field, or refuses a value; or cannot fine-tune it.
     """
     from lerobot.configs.policies import PreTrainedConfig
 
-    from accerl_lerobot.policies.plugins import register_policies
+    from accerl_lerobot.demos.sft import policy_fields
 
-    register_policies()
     fields: dict[str, Any] = {k: v for k, v in config.policy.items() if k != "type"}
-    kind, choices = config.policy["type"], PreTrainedConfig.get_known_choices()
-    if kind not in choices:
-        raise InputError("sft.policy.type", kind, f"LeRobot has {', '.join(sorted(choices))}")
-    names = [field.name for field in dataclasses.fields(choices[kind])]
+    kind = config.policy["type"]
+    names = policy_fields(kind, "sft.policy.type")
+    if config.backbone is not None and "vlm_model_name" not in names:
+        remedy = f"{kind} has no vision-language backbone; leave the section out"
+        raise InputError("sft.backbone", config.backbone, remedy)
     for key, value in fields.items():
         if key not in names:
             near = " or ".join(difflib.get_close_matches(key, names, n=3))
             remedy = f"LeRobot's {kind} has no such field{f'; did you mean {near}?' if near else ''}"
             raise InputError(f"sft.policy.{key}", value, remedy)
     try:
-        draccus.decode(choices[kind], {"device": "cpu"} | fields)  # without a device LeRobot looks for one
+        # Without a device LeRobot looks for one.
+        return draccus.decode(PreTrainedConfig.get_choice_class(kind), {"device": "cpu"} | fields)
     except draccus.utils.DraccusException as error:
         raise _as_input_error(error, fields) from error
 

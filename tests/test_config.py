@@ -28,6 +28,7 @@ from accerl_lerobot.config import DatasetConfig, RunConfig, check_chunk, encode,
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.envs import LeRobotEnvConfig, MetaWorldConfig, SimulatedConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.backbone import BackboneConfig
 from accerl_lerobot.preflight import check_sft_policy, check_start
 from accerl_lerobot.verbs import DemosRun, EvalRun, SFTRun
 
@@ -255,6 +256,7 @@ class TestPreflight:
         ("policy", "message"),
         [
             ({"type": "smol"}, "sft.policy.type='smol': LeRobot has act, "),
+            ({"type": "gaussian_actor"}, "sft.policy.type='gaussian_actor': only LeRobot's SAC trains it"),
             (
                 {"type": "smolvla", "chunks": 3},
                 "sft.policy.chunks=3: LeRobot's smolvla has no such field; did you",
@@ -271,6 +273,17 @@ class TestPreflight:
             check_sft_policy(SFTConfig(steps=1, policy=policy))
         assert str(caught.value).startswith(message)
 
+    def test_refuses_a_backbone_where_there_is_none(self) -> None:
+        with pytest.raises(InputError, match="^sft.backbone=.*: act has no vision-language backbone"):
+            check_sft_policy(SFTConfig(steps=1, policy={"type": "act"}, backbone=BackboneConfig()))
+
+    def test_refuses_what_looks_back_before_training_it(self) -> None:
+        policy: dict[str, Any] = {"type": "diffusion"}
+        check_sft_policy(SFTConfig(steps=1, policy=policy))  # SFT alone could
+        with pytest.raises(InputError, match="^sft.policy.n_obs_steps=2: RL shows a policy one observation"):
+            check_start(RunConfig(sft=SFTConfig(steps=1, policy=policy)))
+        check_start(RunConfig(sft=SFTConfig(steps=1, policy=policy | {"n_obs_steps": 1})))
+
     def test_refuses_a_policy_without_a_likelihood_before_training_it(self) -> None:
         with pytest.raises(InputError, match="sft.policy.type='vqbet': RL needs a likelihood"):
             check_start(RunConfig(sft=SFTConfig(steps=1, policy={"type": "vqbet"})))
@@ -278,6 +291,7 @@ class TestPreflight:
     def test_accepts(self, tiny_checkpoint: Path) -> None:
         policy = {"type": "smolvla", "chunk_size": 10, "n_action_steps": 10}
         check_start(RunConfig(sft=SFTConfig(steps=1, policy=policy)))
+        check_start(RunConfig(sft=SFTConfig(steps=1, policy=policy | {"type": "act"})))
         check_start(parse(RunConfig, [f"--policy.path={tiny_checkpoint}"]))
         dataset = DatasetConfig(
             repo_id="accerl/metaworld_tiny", root=str(ROOT / "datasets" / "metaworld_tiny")

@@ -27,19 +27,23 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 from accerl_lerobot.checkpoint import displaced, relocate
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.backbone import BackboneConfig, write_backbone
-from accerl_lerobot.policies.plugins import discovery
+from accerl_lerobot.policies.plugins import discovery, register_policies
 
 logger = logging.getLogger(__name__)
 
 LOG_EVERY = 25
 """Optimiser steps between two lines of progress."""
+NO_SFT = {
+    "gaussian_actor": "only LeRobot's SAC trains it, lerobot-train does not; give a checkpoint as policy.path"
+}
+"""LeRobot policy types that ``lerobot-train`` cannot fine-tune → why, and what to do."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +55,9 @@ class SFTConfig:
     batch_size: int = 64
     """Frames per step."""
     lr: float = 1e-3
-    """Peak learning rate; LeRobot's preset warms up and decays it over `steps`."""
+    """Peak learning rate; LeRobot's preset warms up and decays it over `steps`, if the policy type's does."""
     warmup_steps: int = 20
+    """Without effect on a policy type whose preset has no warm-up, such as act."""
     cache: bool = True
     """Keep the dataset's items in memory, see `cached_train`; not above 4 GiB nor with image transforms."""
     num_workers: int = 0
@@ -60,8 +65,7 @@ class SFTConfig:
     num_threads: int = 2
     """CPU threads of the trainer."""
     init_path: str | None = None
-    """LeRobot checkpoint to start from; None starts a new policy from `policy`. One on the Hub of a type of
-    ours (`policies/plugins.py`) needs its ``--policy.discover_packages_path`` in `extra_args`."""
+    """LeRobot checkpoint to start from; None starts a new policy from `policy`."""
     policy: dict[str, Any] = field(default_factory=lambda: {"type": "smolvla"})
     """Fields of LeRobot's own policy config for a new policy, ``type`` among them."""
     backbone: BackboneConfig | None = None
@@ -91,20 +95,28 @@ def sft_command(
     revision: str | None = None,
 ) -> list[str]:
     """The ``lerobot-train`` command line of this warm start."""
-    fields: dict[str, Any]
+    policy: dict[str, Any]
     if config.init_path is not None:
-        fields, policy_type = {"path": config.init_path}, _stored_config(config.init_path).get("type")
+        policy, kind = {"path": config.init_path}, str(_stored_config(config.init_path).get("type"))
     else:
-        fields, policy_type = dict(config.policy), config.policy["type"]
+        policy, kind = dict(config.policy), str(config.policy["type"])
         if config.backbone is not None:
-            fields["vlm_model_name"] = str((output_dir.parent / "backbone").resolve())
-            fields["load_vlm_weights"] = False
-    fields |= {"device": device, "push_to_hub": False, "optimizer_lr": config.lr}
-    fields |= {"scheduler_warmup_steps": config.warmup_steps, "scheduler_decay_steps": config.steps}
+            policy["vlm_model_name"] = str((output_dir.parent / "backbone").resolve())
+            policy["load_vlm_weights"] = False
+    known = policy_fields(kind, "sft.init_path" if config.init_path is not None else "sft.policy.type")
+    policy |= {"device": device, "push_to_hub": False}
+    preset = {
+        "optimizer_lr": config.lr,
+        "scheduler_warmup_steps": config.warmup_steps,
+        "scheduler_decay_steps": config.steps,
+    }
+    policy |= {name: value for name, value in preset.items() if name in known}
+    if config.init_path is not None and "pretrained_backbone_weights" in known:
+        policy["pretrained_backbone_weights"] = None  # the checkpoint's replace them; spares their download
     module = "accerl_lerobot.demos.cached_train" if config.cache else "lerobot.scripts.lerobot_train"
     command = [sys.executable, "-m", module]
-    command += [f"--policy.{key}={_as_argument(value)}" for key, value in fields.items()]
-    command += discovery(policy_type)
+    command += [f"--policy.{key}={_as_argument(value)}" for key, value in policy.items()]
+    command += discovery(kind)
     command += [f"--dataset.repo_id={repo_id}"] + ([f"--dataset.root={root}"] if root else [])
     command += [f"--dataset.revision={revision}"] if revision else []
     command += [
@@ -201,10 +213,39 @@ def _with_backbone_in_place(config: SFTConfig, copy: Path) -> SFTConfig:
     return replace(config, init_path=str(copy))
 
 
+def policy_fields(kind: str, field: str) -> set[str]:
+    """Names of the fields of LeRobot's config of a policy type.
+
+    Raises:
+        InputError: LeRobot has no such type, or cannot fine-tune it; blames `field`.
+    """
+    from lerobot.configs.policies import PreTrainedConfig
+
+    register_policies()
+    choices = PreTrainedConfig.get_known_choices()
+    if kind not in choices:
+        raise InputError(field, kind, f"LeRobot has {', '.join(sorted(choices))}")
+    if kind in NO_SFT:
+        raise InputError(field, kind, NO_SFT[kind])
+    return {f.name for f in fields(choices[kind])}
+
+
 def _stored_config(path: str) -> dict[str, Any]:
-    """The ``config.json`` of a checkpoint on this machine; empty where there is none."""
+    """The ``config.json`` of a checkpoint, on this machine or on the Hub.
+
+    Raises:
+        InputError: there is none.
+    """
+    from huggingface_hub import hf_hub_download
+
     file = Path(path).expanduser() / "config.json"
-    config: dict[str, Any] = json.loads(file.read_text()) if file.is_file() else {}
+    if not file.is_file():
+        try:
+            file = Path(hf_hub_download(path, "config.json"))
+        except (OSError, ValueError) as error:
+            remedy = "no config.json in a folder of that name, and not loadable from the Hub"
+            raise InputError("sft.init_path", path, remedy) from error
+    config: dict[str, Any] = json.loads(file.read_text())
     return config
 
 

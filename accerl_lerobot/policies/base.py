@@ -151,6 +151,9 @@ def check_fit(policy_config: Any, spec: WorldSpec, rename_map: dict[str, str]) -
             f"the policy wants this camera but the world offers {', '.join(offered) or 'none'}; choose "
             "env.camera accordingly or map the world's name to the policy's with policy.rename_map",
         )
+    if policy_config.env_state_feature is not None:
+        remedy = "the policy reads it, and worlds offer images and observation.state only"
+        raise InputError("policy.path", "observation.environment_state", remedy)
     remedy = "choose a policy trained in this world, or the world it was trained in"
     state = policy_config.robot_state_feature
     if state is not None and tuple(state.shape) != (spec.state_dim,):

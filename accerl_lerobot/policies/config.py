@@ -63,7 +63,8 @@ class TuningConfig:
     alpha: int = 16
     """lora: the adapters' output is scaled by alpha / rank; ≥ 1."""
     targets: str | None = None
-    """lora: regular expression that must match the whole name of a module inside the policy. None: what
+    """lora: regular expression that must match the whole name of a linear layer inside the policy; those
+    inside PyTorch's own attention are passed over, as it reads their weights without calling them. None: what
     LeRobot's own PEFT training adapts in this policy."""
 
     def __post_init__(self) -> None:

@@ -60,6 +60,9 @@ FILES = ("*.json", WEIGHTS, "policy_*.safetensors", VALUE_HEAD, FAMILY, f"{BACKB
 MODELS = "accerl_lerobot.policies.models"
 POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "smolvla": (f"{MODELS}.smolvla:SmolVLA", ("flow", "noise_space")),
+    "act": (f"{MODELS}.act:ACT", ("gaussian",)),
+    "gaussian_actor": (f"{MODELS}.gaussian_actor:GaussianActor", ("gaussian",)),
+    "diffusion": (f"{MODELS}.diffusion:Diffusion", ("diffusion",)),
     "pi0": (f"{MODELS}.pi0:Pi0", ("flow", "noise_space")),
     "pi05": (f"{MODELS}.pi0:Pi05", ("flow", "noise_space")),
     "pi0_fast": (f"{MODELS}.pi0_fast:Pi0Fast", ("tokens",)),
@@ -69,6 +72,8 @@ POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
 FAMILIES = {
     "flow": "accerl_lerobot.policies.flow:FlowFamily",
     "noise_space": "accerl_lerobot.policies.noise_space:NoiseSpaceFamily",
+    "gaussian": "accerl_lerobot.policies.gaussian:GaussianFamily",
+    "diffusion": "accerl_lerobot.policies.diffusion:DiffusionFamily",
     "tokens": "accerl_lerobot.policies.tokens:TokenFamily",
 }
 """Family → class; its config is registered under the same name in `samplers`."""
@@ -107,6 +112,17 @@ def check_type(policy_type: Any, field: str, prefix: str = "") -> str:
     return str(policy_type)
 
 
+def check_observations(policy_config: Any, field: str) -> None:
+    """Refuses a policy that looks back; what worlds observe between two decisions is not kept.
+
+    Raises:
+        InputError: it reads more than one observation.
+    """
+    if policy_config.n_obs_steps != 1:
+        remedy = "RL shows a policy one observation at a time; use one trained with n_obs_steps=1"
+        raise InputError(field, policy_config.n_obs_steps, remedy)
+
+
 def sampler_config(config: PolicyConfig, policy_type: str) -> SamplerConfig:
     """How a policy of this type explores in this run.
 
@@ -135,7 +151,8 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     folder = _checkpoint_folder(config)
     try:
         name = json.loads((folder / CONFIG).read_text()).get("type")
-        sampler_config(config, check_type(name, "policy.type", f"{config.path} is of this type: "))
+        kind = check_type(name, "policy.type", f"{config.path} is of this type: ")
+        sampler = sampler_config(config, kind)
         lerobot_config = PreTrainedConfig.from_pretrained(folder)
     except InputError:
         raise
@@ -144,6 +161,8 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
         raise InputError("policy.path", config.path, remedy) from error
     lerobot_config.device = str(resolve_device(config.device))
     _override(lerobot_config, config)
+    sampler.override(lerobot_config)
+    check_observations(lerobot_config, "policy.n_obs_steps")
     use_backbone(lerobot_config, folder, config.path)
     return lerobot_config
 
@@ -298,6 +317,9 @@ def _load_module(module: nn.Module, path: Path, what: str, otherwise: str) -> No
 
 def _override(lerobot_config: Any, config: PolicyConfig) -> None:
     """Puts a run's choices of denoising steps, executed rows and precision into the LeRobot config."""
+    if hasattr(lerobot_config, "pretrained_backbone_weights"):
+        # The checkpoint has them; LeRobot would download torchvision's first, even when told to stay offline.
+        lerobot_config.pretrained_backbone_weights = None
     if config.num_steps is not None:
         names = [n for n in ("num_steps", "num_inference_steps") if hasattr(lerobot_config, n)]
         if not names:

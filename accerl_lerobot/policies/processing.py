@@ -22,7 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-IMAGES = "observation.images."
+IMAGES = "observation.image"
+"""How images' names begin: ``observation.images.<camera>``, or LeRobot's name for a lone camera."""
 
 
 class Processing:

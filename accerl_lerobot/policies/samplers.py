@@ -20,6 +20,7 @@ means nothing without it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import draccus
 
@@ -34,6 +35,9 @@ class SamplerConfig(draccus.ChoiceRegistry):
     def type(self) -> str:
         """The registered name, that of the family."""
         return str(self.get_choice_name(self.__class__))
+
+    def override(self, policy_config: Any) -> None:
+        """Puts what it asks of the policy itself into LeRobot's config, which is saved with the policy."""
 
 
 @SamplerConfig.register_subclass("flow")
@@ -133,3 +137,75 @@ class TokenSamplerConfig(SamplerConfig):
         if not 0 < self.temperature <= 10:
             remedy = "use a value in (0, 10]; 1 samples what was trained"
             raise InputError("policy.sampler.temperature", self.temperature, remedy)
+
+
+@SamplerConfig.register_subclass("gaussian")
+@dataclass(frozen=True, kw_only=True)
+class GaussianSamplerConfig(SamplerConfig):
+    """Policies that predict one chunk, with a Gaussian around it; see `gaussian.py`.
+
+    Only `at_rest` concerns a policy that has a std of its own, as gaussian_actor does.
+    """
+
+    std: float = 0.2
+    """Std of every action at the start, in normalised units, (0, 2]."""
+    std_min: float = 0.05
+    """With `learn_std`: lower bound of the std, > 0 and below `std`."""
+    std_max: float = 0.5
+    """With `learn_std`: upper bound of the std, above `std`."""
+    learn_std: bool = True
+    """True: the std is learnt, per observation, row and action dim. False: it stays `std`."""
+    detach: bool = True
+    """True: the learnt std reads the policy's features without shaping them."""
+    at_rest: str = "stock"
+    """How it acts when it does not explore: stock, as LeRobot's policy does, which for gaussian_actor means
+    to sample; or mean. For act both are the same."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.std <= 2:
+            raise InputError("policy.sampler.std", self.std, "use a value in (0, 2]; 0.2 is usual")
+        if self.learn_std and not 0 < self.std_min < self.std:
+            remedy = f"use a value between 0 and policy.sampler.std, {self.std}"
+            raise InputError("policy.sampler.std_min", self.std_min, remedy)
+        if self.learn_std and not self.std < self.std_max:
+            raise InputError("policy.sampler.std_max", self.std_max, f"use a value above {self.std}")
+        if self.at_rest not in ("stock", "mean"):
+            raise InputError("policy.sampler.at_rest", self.at_rest, "use stock or mean")
+
+
+@SamplerConfig.register_subclass("diffusion")
+@dataclass(frozen=True, kw_only=True)
+class DiffusionSamplerConfig(SamplerConfig):
+    """Diffusion policies, each denoising step a Gaussian (DPPO); see `diffusion.py`.
+
+    How many steps there are is ``policy.num_steps``.
+    """
+
+    std_min: float = 0.1
+    """Lower bound of a step's std while exploring, in normalised units, (0, 1]. The last step has no noise
+    of its own, so this is the executed action's std around what the chain arrives at."""
+    last_steps: int | None = None
+    """Explore in, and learn from, so many steps at the end of the chain; those before act as LeRobot's and
+    are left out of the ratio, which then is an approximation off-policy. None: all steps, which is exact."""
+    eta: float = 1.0
+    """DDIM: noise of the exploring steps, from 0 (none but `std_min`) to 1 (as much as DDPM). LeRobot's own
+    DDIM sampler has 0."""
+    scheduler: str | None = None
+    """DDPM or DDIM, whatever the policy was trained with: both reverse the same noising. None keeps the
+    checkpoint's. Written into what is saved."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.std_min <= 1:
+            raise InputError("policy.sampler.std_min", self.std_min, "use a value in (0, 1]; 0.1 is usual")
+        if self.last_steps is not None and self.last_steps < 1:
+            raise InputError("policy.sampler.last_steps", self.last_steps, "use at least 1, or null for all")
+        if not 0 <= self.eta <= 1:
+            raise InputError("policy.sampler.eta", self.eta, "use a value in [0, 1]")
+        if self.scheduler not in (None, "DDPM", "DDIM"):
+            remedy = "use DDPM, DDIM, or null to keep the checkpoint's"
+            raise InputError("policy.sampler.scheduler", self.scheduler, remedy)
+
+    def override(self, policy_config: Any) -> None:
+        """See the base class."""
+        if self.scheduler is not None:
+            policy_config.noise_scheduler_type = self.scheduler

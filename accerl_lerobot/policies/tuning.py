@@ -57,7 +57,9 @@ def merged_state_dict(policy: nn.Module) -> dict[str, Tensor] | None:
         return None
     from peft.tuners.lora import Linear
 
-    layers = {name: m for name, m in policy.named_modules() if isinstance(m, Linear)}
+    # Under every name: a module that a policy holds twice is in its state twice.
+    modules = policy.named_modules(remove_duplicate=False)
+    layers = {name: m for name, m in modules if isinstance(m, Linear)}
     state = {k: v for k, v in policy.state_dict().items() if ".lora_" not in k}
     for name, layer in layers.items():
         weight = state[f"{name}.base_layer.weight"]
@@ -72,7 +74,8 @@ def _inject(policy: Any, config: TuningConfig) -> None:
     if targets is None:
         remedy = f"LeRobot names no default for {policy.name}; give a regular expression of module names"
         raise InputError("policy.tuning.targets", None, remedy)
-    linear = [name for name, module in policy.named_modules() if isinstance(module, nn.Linear)]
+    # Not its subclasses: attention reads the weight of its own without calling it, past any adapter.
+    linear = [name for name, module in policy.named_modules() if type(module) is nn.Linear]
     try:
         matching = [name for name in linear if re.fullmatch(targets, name)]
     except re.error as error:

@@ -52,7 +52,10 @@ def verify_weights(policy: Any, model: type[Model], file: Path, path: str | None
         remedy = f"the weights did not load ({' '.join(str(error).split())})"
         raise InputError("policy.path", path, remedy) from error
     loaded = policy.state_dict()
-    missing = sorted(loaded.keys() - stored.keys() - set(model.unread))
+    # Nor is a tensor missing that a policy holds under several names: savers keep one of them.
+    held = {loaded[k].data_ptr() for k in stored.keys() & loaded.keys()}
+    absent = loaded.keys() - stored.keys() - set(model.unread)
+    missing = sorted(k for k in absent if loaded[k].data_ptr() not in held)
     unexpected = sorted(stored.keys() - loaded.keys())
     if missing or unexpected:
         counts = f"{len(missing)} tensors missing {missing[:NAMED]}, {len(unexpected)} unexpected "

@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pickle
 import shutil
@@ -176,6 +177,20 @@ def test_two_steps_of_lerobot_s_trainer_give_a_checkpoint(tmp_path: Path):
     assert np.allclose(batch["observation.state"], expected, atol=1e-4), "the dataset's normalisation"
 
 
+def test_act_is_trained_as_well(tmp_path: Path):
+    small = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "n_encoder_layers": 1, "latent_dim": 4}
+    policy = {
+        "type": "act",
+        "chunk_size": 4,
+        "n_action_steps": 4,
+        "pretrained_backbone_weights": None,
+    } | small
+    config = SFTConfig(steps=2, batch_size=4, num_threads=1, policy=policy)
+    adapter = adapter_at(run_sft(config, "accerl/metaworld_tiny", str(ROOT), tmp_path / "sft", seed=0))
+    assert adapter.policy.name == "act" and adapter.family.actions == 4
+    assert adapter.policy.config.optimizer_lr == config.lr
+
+
 def command_that(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
     monkeypatch.setattr(sft, "sft_command", lambda *arguments: [sys.executable, "-u", "-c", program])
 
@@ -248,11 +263,46 @@ def test_the_command_line(tmp_path: Path):
         "--seed=3",
     ):
         assert argument in command
-    start = SFTConfig(steps=2, init_path="org/policy", cache=False, extra_args=["--log_freq=1"])
-    command = sft_command(start, "a/b", None, tmp_path / "sft", 0, "cuda")
-    assert command[2] == "lerobot.scripts.lerobot_train" and "--policy.path=org/policy" in command
+    start = tmp_path / "start"
+    start.mkdir()
+    (start / "config.json").write_text('{"type": "smolvla"}')
+    config = SFTConfig(steps=2, init_path=str(start), cache=False, extra_args=["--log_freq=1"])
+    command = sft_command(config, "a/b", None, tmp_path / "sft", 0, "cuda")
+    assert command[2] == "lerobot.scripts.lerobot_train" and f"--policy.path={start}" in command
     assert command[-1] == "--log_freq=1"
     assert not [a for a in command if a.startswith(("--policy.type", "--dataset.root", "--dataset.revision"))]
+
+
+@pytest.mark.parametrize(
+    ("kind", "schedule"),
+    [("act", set()), ("diffusion", {"--policy.scheduler_warmup_steps=20"})],
+)
+def test_a_preset_gets_only_what_it_has(tmp_path: Path, kind: str, schedule: set[str]):
+    start = SFTConfig(steps=9, policy={"type": kind})
+    command = sft_command(start, "a/b", None, tmp_path / "sft", 0, "cpu")
+    assert "--policy.optimizer_lr=0.001" in command
+    assert {a for a in command if "scheduler" in a} == schedule
+    assert not [a for a in command if "pretrained_backbone_weights" in a], "a new policy's own choice"
+    (tmp_path / "config.json").write_text(json.dumps({"type": kind}))
+    command = sft_command(
+        SFTConfig(steps=9, init_path=str(tmp_path)), "a/b", None, tmp_path / "sft", 0, "cpu"
+    )
+    assert "--policy.pretrained_backbone_weights=null" in command, "the checkpoint replaces them"
+
+
+@pytest.mark.parametrize(
+    ("stored", "sentence"),
+    [
+        (None, "sft.init_path=.*: no config.json in a folder of that name, and not loadable from the Hub"),
+        ({"type": "gaussian_actor"}, "sft.init_path='gaussian_actor': only LeRobot's SAC trains it"),
+        ({"type": "mine"}, "sft.init_path='mine': LeRobot has act, "),
+    ],
+)
+def test_a_start_that_cannot_be_fine_tuned(tmp_path: Path, stored: dict | None, sentence: str):
+    if stored is not None:
+        (tmp_path / "config.json").write_text(json.dumps(stored))
+    with pytest.raises(InputError, match=f"^{sentence}"):
+        sft_command(SFTConfig(steps=1, init_path=str(tmp_path)), "a/b", None, tmp_path / "sft", 0, "cpu")
 
 
 def test_a_moved_checkpoint_is_started_from_a_copy(

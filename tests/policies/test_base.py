@@ -62,6 +62,15 @@ def test_a_camera_the_world_does_not_have(config: Any, spec: WorldSpec):
     check_fit(config, spec, {"observation.images.front": "observation.images.top"})
 
 
+def test_an_observation_that_no_world_makes(config: Any, spec: WorldSpec):
+    from lerobot.configs.types import FeatureType, PolicyFeature
+
+    privileged = PolicyFeature(type=FeatureType.ENV, shape=(6,))
+    config.input_features["observation.environment_state"] = privileged
+    with pytest.raises(InputError, match="^policy.path='observation.environment_state': the policy reads it"):
+        check_fit(config, spec, {})
+
+
 def test_a_rename_of_nothing(config: Any, spec: WorldSpec):
     with pytest.raises(InputError) as caught:
         check_fit(config, spec, {"observation.images.frnt": "observation.images.front"})

@@ -337,8 +337,7 @@ def test_where_lerobot_finds_the_type(path: Path, tmp_path: Path):
     assert flag in new and "--policy.type=smolvla_bins" in new
     further = SFTConfig(steps=1, init_path=str(path))
     assert flag in sft_command(further, "a/b", None, tmp_path / "sft", 0, "cpu")
-    for other in (SFTConfig(steps=1), SFTConfig(steps=1, init_path="org/policy")):
-        assert flag not in sft_command(other, "a/b", None, tmp_path / "sft", 0, "cpu")
+    assert flag not in sft_command(SFTConfig(steps=1), "a/b", None, tmp_path / "sft", 0, "cpu")
 
 
 @pytest.fixture(scope="module")

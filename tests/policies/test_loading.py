@@ -87,11 +87,10 @@ def test_the_folder_above_the_checkpoint(copied: Path):
 @pytest.mark.parametrize(
     ("kind", "why"),
     [
-        ("act", "no likelihood for it here; use one of smolvla"),
-        ("gaussian_actor", "no likelihood for it here; use one of smolvla"),
+        ("multi_task_dit", "no likelihood for it here; use one of smolvla, "),
         ("tdmpc", "it plans by sampling and has no action density"),
         ("vqbet", "LeRobot does not return its code log-probs"),
-        ("my_policy", "no likelihood for it here; use one of smolvla"),
+        ("my_policy", "no likelihood for it here; use one of smolvla, "),
     ],
 )
 def test_a_policy_without_a_likelihood(copied: Path, kind: str, why: str):

@@ -22,6 +22,7 @@ import torch
 
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import stack_observations
+from tests.policies.checkpoints import write_act
 from tests.policies.tiny import TEXTS, adapter_at, requests
 
 
@@ -38,6 +39,17 @@ def test_images_are_scaled_and_states_normalised(tiny_checkpoint: Path):
         image[1, 2, 5, 7].numpy(), np.float32(raw["observation.images.front"][1, 5, 7, 2]) / 255
     )
     assert np.allclose(batch["observation.state"], raw["observation.state"] / 0.5, rtol=1e-6)
+
+
+def test_a_lone_camera_may_be_called_as_in_lerobot_s_pusht(tmp_path: Path):
+    # What `env.camera=""` names it, and what policies trained on LeRobot's PushT dataset expect.
+    adapter = adapter_at(write_act(tmp_path / "one", camera="observation.image"))  # compared with LeRobot's
+    request = requests(1, image=16)[0]
+    image = request.observation["observation.images.front"]
+    observations = {"observation.image": image[None], "observation.state": np.zeros((1, 4), np.float32)}
+    batch = adapter.processing.prepare(observations, ["Push"])
+    assert batch["observation.image"].shape == (1, 3, 16, 16)
+    assert np.array_equal(batch["observation.image"][0, 2, 5, 7].numpy(), np.float32(image[5, 7, 2]) / 255)
 
 
 def test_instructions_get_lerobot_s_newline_and_padding(tiny_checkpoint: Path):

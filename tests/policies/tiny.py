@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Observations for the tiny SmolVLA of `write_smolvla`, and stored decisions as the trainer sees them."""
+"""Observations for tiny policies, and stored decisions as the trainer sees them."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ TEXTS = ("Match the target", "Go", "Mirror the target slowly, then stay")
 """Of different lengths, so that a batch pads some of them."""
 
 
-def requests(count: int, *, explore: bool = True, seed: int = 0) -> list[Request]:
+def requests(count: int, *, explore: bool = True, seed: int = 0, image: int = 32) -> list[Request]:
     rng = np.random.default_rng(seed)
     return [
         Request(
             observation={
-                "observation.images.front": rng.integers(0, 256, (32, 32, 3), dtype=np.uint8),
+                "observation.images.front": rng.integers(0, 256, (image, image, 3), dtype=np.uint8),
                 "observation.state": rng.standard_normal(4, dtype=np.float32),
                 TASK: TEXTS[i % len(TEXTS)],
             },

@@ -1,0 +1,276 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The diffusion family's likelihood: the denoising chain is a sequence of Gaussian steps, as in DPPO.
+
+A diffusion policy goes from x_N (noise) to x_0 (actions), and each of its steps is a Gaussian whose mean the
+network decides (Ren et al., arXiv 2409.00588):
+
+    x̂ = clip((x − √(1−ᾱ)·ε(x)) / √ᾱ)
+    DDPM   m = (√ᾱ′·β/(1−ᾱ))·x̂ + (√(1−β)·(1−ᾱ′)/(1−ᾱ))·x      s² = β·(1−ᾱ′)/(1−ᾱ),   β = 1 − ᾱ/ᾱ′
+    DDIM   m = √ᾱ′·x̂ + √(1−ᾱ′−s²)·ε(x)                          s² = η²·(the same)
+
+with ᾱ at the step and ᾱ′ at the one after it (arXiv 2006.11239, eq. 7; arXiv 2010.02502, eq. 12). These are
+the operations of LeRobot's scheduler, in its order. While exploring, a step's std is max(s, std_min) and its
+log-density counts; the chain is what is stored, and re-scoring takes a network pass per counted step. x_N's
+density does not depend on the weights and is left out. In every step but the last all rows feed back through
+the network, so all count; after the last nothing feeds back, and rows that are not executed are left out.
+
+`DiffusionSamplerConfig.last_steps` limits exploration to the end of the chain, as DPPO does to save passes.
+Where the chain is by then moves with the weights too but is taken as given, so weighting with ρ gives the
+policy in which only the last steps are new. DPPO keeps a frozen copy of the network for the steps before,
+which LeRobot's checkpoint could not hold. DPPO's other liberties are not taken: it may score with a wider std
+than it sampled with, clips its noise, and gives each denoising step a ratio of its own with a discount.
+
+Shapes: B batch, H horizon, A action dims, N steps, C counted steps, L factors: one per row.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import Request
+from accerl_lerobot.policies.family import Action, Encoded, Family, Model, Score, exploring, normal
+from accerl_lerobot.policies.flow import LOG_SQRT_2PI, gaussian_log_prob
+from accerl_lerobot.policies.samplers import DiffusionSamplerConfig
+
+Network = Callable[[Tensor, int], Tensor]
+"""(x (B, H, A), timestep) → what the network predicts, (B, H, A)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiffusionShape:
+    """The sizes a chunk is sampled in."""
+
+    horizon: int
+    """H rows that are denoised."""
+    executed: int
+    """Rows that are sent to the world, the first ones (LeRobot's n_action_steps)."""
+    action_dim: int
+    """A."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Schedule:
+    """The steps of LeRobot's scheduler, in the order in which they are taken."""
+
+    timesteps: tuple[int, ...]
+    """N, falling to 0."""
+    alphas: Tensor
+    """(N,) ᾱ at each step, fp32 on the CPU."""
+    following: Tensor
+    """(N,) ᾱ at the step after it; 1 after the last."""
+    scheduler: str
+    """DDPM or DDIM."""
+    prediction: str
+    """What the network predicts: epsilon (the noise) or sample (the actions)."""
+    clip: float | None
+    """Bound of x̂, if it is clipped."""
+
+    def __len__(self) -> int:
+        return len(self.timesteps)
+
+    def step(self, k: int, x: Tensor, output: Tensor, eta: float = 0.0) -> tuple[Tensor, Tensor]:
+        """Mean (B, H, A) and std, a scalar, of step k; with the default `eta` LeRobot's own.
+
+        Args:
+            k: counted from the noise, 0 to N − 1.
+            x: (B, H, A) before the step.
+            output: (B, H, A), the network's at x.
+            eta: of DDIM; DDPM has none.
+        """
+        alpha, following = self.alphas[k], self.following[k]
+        noise_share = 1 - alpha
+        estimate = output
+        if self.prediction == "epsilon":
+            estimate = (x - noise_share**0.5 * output) / alpha**0.5
+        clean = estimate if self.clip is None else estimate.clamp(-self.clip, self.clip)
+        remaining = alpha / following
+        beta = 1 - remaining
+        variance = (1 - following) / noise_share * beta
+        if self.scheduler == "DDIM":
+            noise = output
+            if self.prediction == "sample":
+                noise = (x - alpha**0.5 * output) / noise_share**0.5
+            std = eta * variance**0.5
+            return following**0.5 * clean + (1 - following - std**2) ** 0.5 * noise, std
+        of_clean = (following**0.5 * beta) / noise_share
+        of_noisy = remaining**0.5 * (1 - following) / noise_share
+        return of_clean * clean + of_noisy * x, variance**0.5
+
+    def exploring_step(
+        self, k: int, x: Tensor, output: Tensor, config: DiffusionSamplerConfig
+    ) -> tuple[Tensor, Tensor]:
+        """Mean (B, H, A) and std (1, 1, 1) of step k while exploring; see `step`."""
+        mean, std = self.step(k, x, output, config.eta)
+        return mean, std.clamp(min=config.std_min).to(x).view(1, 1, 1)
+
+
+def counted_steps(schedule: Schedule, config: DiffusionSamplerConfig) -> int:
+    """C, how many steps at the end of the chain are explored in."""
+    return len(schedule) if config.last_steps is None else config.last_steps
+
+
+def factors(shape: DiffusionShape, counted: int) -> int:
+    """L. Rows without a density are left out: as constant factors they would dilute means over factors."""
+    return shape.executed if counted == 1 else shape.horizon
+
+
+def sample(
+    network: Network,
+    x: Tensor,
+    eps: Tensor,
+    explore: Tensor,
+    shape: DiffusionShape,
+    schedule: Schedule,
+    config: DiffusionSamplerConfig,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Denoises a batch, some samples exploring and the others by LeRobot's own steps.
+
+    Args:
+        x: (B, H, A) initial noise.
+        eps: (B, N, H, A) standard normal, the step noise.
+        explore: (B,) bool.
+
+    Returns:
+        x_0 (B, H, A); the end of the chain (B, C + 1, H, A); its log-prob (B, L), zero where not exploring.
+    """
+    first = len(schedule) - counted_steps(schedule, config)
+    path = []
+    logp = x.new_zeros(x.shape[:2])
+    for k, timestep in enumerate(schedule.timesteps):
+        if k >= first:
+            path.append(x)
+        output = network(x, timestep)
+        mean, std = schedule.step(k, x, output)
+        step = mean + std * eps[:, k]
+        if k >= first:
+            mean, width = schedule.exploring_step(k, x, output, config)
+            step = torch.where(explore[:, None, None], mean + width * eps[:, k], step)
+            counted = gaussian_log_prob(step, mean, width, _mask(k, shape, schedule, x.device))
+            logp = logp + torch.where(explore[:, None], counted, 0.0)
+        x = step
+    path.append(x)
+    return x, torch.stack(path, 1), logp[:, : factors(shape, len(path) - 1)]
+
+
+def log_prob(
+    network: Network,
+    path: Tensor,
+    shape: DiffusionShape,
+    schedule: Schedule,
+    config: DiffusionSamplerConfig,
+) -> Tensor:
+    """Log-density of stored chains (B, C + 1, H, A) under the current network, (B, L), differentiable."""
+    counted = counted_steps(schedule, config)
+    logp = path.new_zeros(len(path), shape.horizon)
+    for i, k in enumerate(range(len(schedule) - counted, len(schedule))):
+        x = path[:, i]
+        mean, std = schedule.exploring_step(k, x, network(x, schedule.timesteps[k]), config)
+        logp = logp + gaussian_log_prob(path[:, i + 1], mean, std, _mask(k, shape, schedule, x.device))
+    return logp[:, : factors(shape, counted)]
+
+
+def entropy(shape: DiffusionShape, schedule: Schedule, config: DiffusionSamplerConfig) -> float:
+    """Differential entropy of the counted steps; no weight changes it."""
+    zero = torch.zeros(1, 1, 1)
+    total = 0.0
+    for k in range(len(schedule) - counted_steps(schedule, config), len(schedule)):
+        _, std = schedule.exploring_step(k, zero, zero, config)
+        entries = int(_mask(k, shape, schedule, zero.device).sum()) * shape.action_dim
+        total += entries * (float(torch.log(std)) + LOG_SQRT_2PI + 0.5)
+    return total
+
+
+def _mask(k: int, shape: DiffusionShape, schedule: Schedule, device: torch.device) -> Tensor:
+    """bool (H, 1): rows of step k's outcome that belong to the density."""
+    mask = torch.ones(shape.horizon, 1, dtype=torch.bool, device=device)
+    if k == len(schedule) - 1:
+        mask[shape.executed :] = False
+    return mask
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiffusionContext:
+    """`Encoded.context` of a diffusion model."""
+
+    network: Network
+    """Conditioned on the observations; output in fp32."""
+
+
+class DiffusionModel(Model):
+    """A LeRobot policy that denoises a chunk step by step; `Encoded.context` is a `DiffusionContext`."""
+
+    shape: DiffusionShape
+    schedule: Schedule
+
+    @abstractmethod
+    def stock(self, batch: dict[str, Tensor], noise: Tensor) -> tuple[Tensor, Tensor]:
+        """LeRobot's own chunk from noise (B, H, A), and the step noise (B, N, H, A) that it drew."""
+
+
+class DiffusionFamily(Family):
+    """Diffusion policies explored by the noise of their denoising steps; the functions above do the work.
+
+    Args:
+        model: the policy.
+        sampler: how it explores.
+    """
+
+    def __init__(self, model: DiffusionModel, sampler: DiffusionSamplerConfig) -> None:
+        super().__init__()
+        self.model, self.sampler = model, sampler
+        self.shape, self.schedule = model.shape, model.schedule
+        if sampler.last_steps is not None and sampler.last_steps > len(self.schedule):
+            remedy = f"use at most {len(self.schedule)}, the policy's denoising steps, or null for all"
+            raise InputError("policy.sampler.last_steps", sampler.last_steps, remedy)
+
+    def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
+        """See the base class; at rest a DDPM policy still samples, as LeRobot's does."""
+        size = (self.shape.horizon, self.shape.action_dim)
+        device = encoded.features.device
+        x, eps = normal(requests, size, (len(self.schedule), *size), device=device)
+        explore = exploring(requests, device)
+        x, path, logp = sample(
+            encoded.context.network, x, eps, explore, self.shape, self.schedule, self.sampler
+        )
+        return Action(chunk=x[:, : self.shape.executed], latent={"path": path}, log_prob=logp)
+
+    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
+        """See the base class."""
+        logp = log_prob(encoded.context.network, latent["path"], self.shape, self.schedule, self.sampler)
+        constant = entropy(self.shape, self.schedule, self.sampler)
+        return Score(log_prob=logp, entropy=logp.new_full((len(logp),), constant))
+
+    def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
+        """See the base class."""
+        size = (len(encoded.features), self.shape.horizon, self.shape.action_dim)
+        device = encoded.features.device
+        noise = torch.randn(size, generator=torch.Generator().manual_seed(0)).to(device)
+        stock, eps = self.model.stock(batch, noise)
+        at_rest = torch.zeros(len(noise), dtype=torch.bool, device=device)
+        x, _, _ = sample(
+            encoded.context.network, noise, eps, at_rest, self.shape, self.schedule, self.sampler
+        )
+        return float((x[:, : self.shape.executed] - stock).abs().max())
+
+    @property
+    def actions(self) -> int:
+        """Every factor is one row of the chunk."""
+        return factors(self.shape, counted_steps(self.schedule, self.sampler))

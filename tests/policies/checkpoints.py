@@ -1,0 +1,156 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Checkpoints of LeRobot's small policies, written offline with random weights."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from accerl_lerobot.experience import Request
+
+
+def write_policy(
+    directory: Path,
+    kind: str,
+    *,
+    image: int = 16,
+    camera: str = "observation.images.front",
+    state_dim: int = 4,
+    action_dim: int = 2,
+    stats: dict[str, Any] | None = None,
+    seed: int = 0,
+    **fields: Any,
+) -> Path:
+    """Saves a new policy and its processors as a LeRobot ``pretrained_model`` folder.
+
+    Args:
+        directory: where to.
+        kind: LeRobot's policy type.
+        image: its side in pixels; 0: the policy reads none.
+        camera: what the image is called.
+        state_dim: of ``observation.state``.
+        action_dim: of the action.
+        stats: normalisation; None: states and actions of std 0.5 around 0, or within ±2.
+        seed: of the weights.
+        fields: of LeRobot's policy config.
+    """
+    import torch
+    from lerobot.configs.types import FeatureType, PolicyFeature
+    from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
+
+    inputs = {"observation.state": PolicyFeature(type=FeatureType.STATE, shape=(state_dim,))}
+    if image:
+        inputs = {camera: PolicyFeature(type=FeatureType.VISUAL, shape=(3, image, image))} | inputs
+    config = make_policy_config(
+        kind,
+        input_features=inputs,
+        output_features={"action": PolicyFeature(type=FeatureType.ACTION, shape=(action_dim,))},
+        device="cpu",
+        push_to_hub=False,
+        **fields,
+    )
+    torch.manual_seed(seed)
+    policy = get_policy_class(kind)(config)
+    if stats is None:
+        sizes = {"observation.state": state_dim, "action": action_dim}
+        stats = {
+            key: {
+                "mean": torch.zeros(size),
+                "std": torch.full((size,), 0.5),
+                "min": torch.full((size,), -2.0),
+                "max": torch.full((size,), 2.0),
+            }
+            for key, size in sizes.items()
+        }
+    for part in (policy, *make_pre_post_processors(config, dataset_stats=stats)):
+        part.save_pretrained(directory)
+    return directory
+
+
+def write_act(directory: Path, *, chunk: int = 5, executed: int = 3, **options: Any) -> Path:
+    """An ACT of 11 M parameters, nearly all of them in the smallest ResNet that LeRobot allows."""
+    small = {
+        "chunk_size": chunk,
+        "n_action_steps": executed,
+        "dim_model": 32,
+        "n_heads": 2,
+        "dim_feedforward": 64,
+        "n_encoder_layers": 2,
+        "n_vae_encoder_layers": 1,
+        "latent_dim": 4,
+        "pretrained_backbone_weights": None,
+    }
+    return write_policy(directory, "act", **(small | options))
+
+
+def write_gaussian_actor(directory: Path, **options: Any) -> Path:
+    """A gaussian_actor of a few thousand parameters that reads the state only, unless told otherwise."""
+    from lerobot.policies.gaussian_actor.configuration_gaussian_actor import ActorNetworkConfig
+
+    network = ActorNetworkConfig(hidden_dims=[32, 32])
+    small = {"image": 0, "latent_dim": 16, "actor_network_kwargs": network}
+    return write_policy(directory, "gaussian_actor", **(small | options))
+
+
+def write_diffusion(directory: Path, *, horizon: int = 8, executed: int = 3, **options: Any) -> Path:
+    """A diffusion policy with a U-Net of 0.07 M parameters beside the smallest ResNet that LeRobot allows."""
+    small = {
+        "n_obs_steps": 1,
+        "horizon": horizon,
+        "n_action_steps": executed,
+        "down_dims": (16, 32),
+        "n_groups": 4,
+        "diffusion_step_embed_dim": 16,
+        "num_train_timesteps": 20,
+        "num_inference_steps": 4,
+        "spatial_softmax_num_keypoints": 4,
+        "use_group_norm": True,  # batch norm wants images above 32 pixels when LeRobot builds it
+        "pretrained_backbone_weights": None,
+    }
+    return write_policy(directory, "diffusion", **(small | options))
+
+
+def edit_config(path: Path, **changes: Any) -> None:
+    """Puts other values into a checkpoint's ``config.json``."""
+    config = json.loads((path / "config.json").read_text())
+    (path / "config.json").write_text(json.dumps(config | changes))
+
+
+def stock_chunk(path: Path, request: Request, **options: Any) -> np.ndarray:
+    """What stock LeRobot makes of a checkpoint and one observation: (1, K, A) in the world's units.
+
+    Args:
+        path: the checkpoint.
+        request: what is observed.
+        options: of LeRobot's `predict_action_chunk`.
+    """
+    import torch
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+
+    kind = PreTrainedConfig.from_pretrained(path).type
+    policy = get_policy_class(kind).from_pretrained(path)
+    pre, post = make_pre_post_processors(policy.config, pretrained_path=str(path))
+    batch = {"task": request.observation["task"]}
+    for key in policy.config.input_features:
+        value = torch.from_numpy(np.asarray(request.observation[key]))
+        batch[key] = value.permute(2, 0, 1) / 255.0 if value.dtype == torch.uint8 else value
+    batch = pre(batch)
+    if kind == "diffusion":  # its sampler wants a time dimension
+        batch["observation.state"] = batch["observation.state"][:, None]
+    return post(policy.predict_action_chunk(batch, **options)).numpy()
