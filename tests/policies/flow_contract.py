@@ -35,7 +35,7 @@ TOLERANCE = 1e-5
 """The contract: |ρ − 1| of a whole chunk at equal weights, in fp32."""
 SAMPLERS = [
     FlowSamplerConfig(
-        stochastic=stochastic, noise=noise, noise_level=0.5 if noise == "flow_sde" else 0.2, padded=padded
+        stochastic=stochastic, noise=noise, noise_level=0.5 if noise == "flow_sde" else 0.4, padded=padded
     )
     for stochastic, noise, padded in itertools.product(
         ("last", "all", "one"), ("euler", "flow_sde"), ("joint", "analytic")
