@@ -48,6 +48,13 @@ class TrainerConfig:
 
     None with ``algorithm.advantage=group``, which asks no critic.
     """
+    advantage_memory: float = 0.0
+    """[0, 1). Advantages are normalised by the moments of this batch and of those before it, of which each
+    earlier one is weighted by this factor once more; 0: this batch alone.
+
+    A small batch may hold nothing but failures. Its advantages are then the critic's noise, which its own
+    standard deviation would make as loud as any.
+    """
     grad_clip: float = 1.0
     """Largest gradient norm; > 0."""
     weight_decay: float = 0.0
@@ -81,6 +88,8 @@ class TrainerConfig:
             raise InputError("trainer.schedule", self.schedule, "use constant or cosine")
         if not self.grad_clip > 0:
             raise InputError("trainer.grad_clip", self.grad_clip, "use a positive norm")
+        if not 0 <= self.advantage_memory < 1:
+            raise InputError("trainer.advantage_memory", self.advantage_memory, "use a value in [0, 1)")
         if not 0 <= self.final_lr_share <= 1:
             raise InputError("trainer.final_lr_share", self.final_lr_share, "use a share in [0, 1]")
 

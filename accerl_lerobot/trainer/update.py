@@ -67,6 +67,7 @@ class Update:
         self.version = 0
         self.skipped = 0
         self._skipped_in_a_row = 0
+        self._moments = torch.zeros(3, dtype=torch.float64)
         self.anchors = Anchors(adapter)
         if algorithm.reference_coef:
             self.anchors.take("reference", self.version)
@@ -204,8 +205,10 @@ class Update:
                     "algorithm.advantage=group, but a segment carries none: set rollout.group_size"
                 )
             return batch.advantage, returns[mask]
-        advantages = normalise(advantages, moments(advantages, mask), mask)
-        return advantages[mask], returns[mask]
+        total = self.config.advantage_memory * self._moments + moments(advantages, mask)
+        if bool(torch.isfinite(total).all()):  # a batch that is not finite is skipped, and must be forgotten
+            self._moments = total
+        return normalise(advantages, total, mask)[mask], returns[mask]
 
     def _values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
         """V of each row, (rows,), without gradient, at most `micro_batch` rows at a time."""

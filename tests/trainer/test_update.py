@@ -435,3 +435,45 @@ def test_the_version_counts_updates_and_the_lag_is_measured_before_the_step():
         metrics = update.step(make_segments((2, 2), version=0))
         assert metrics["lag_mean"] == metrics["lag_max"] == version
     assert update.version == 3
+
+
+def test_advantages_are_normalised_by_earlier_batches_too():
+    """A batch of nothing but failures must not be as loud as any other."""
+    loud, quiet = make_segments(LENGTHS, seed=1), make_segments(LENGTHS, seed=2)
+    for segment in quiet:
+        segment.reward[:] = 0.0
+        segment.reward += 1e-3 * np.arange(len(segment), dtype=np.float32)
+
+    def scales(memory: float) -> list[float]:
+        config = replace(PLAIN, lr=0.0, value_lr=0.0, advantage_memory=memory)
+        update = make_update(config, gamma=0.0, lam=0.0)
+        with torch.no_grad():
+            update.adapter.value_head.weight.zero_()
+        found, targets = [], update._targets
+
+        def watched(*arguments: Any) -> tuple[Any, Any]:
+            result = targets(*arguments)
+            found.append(float(result[0].std(unbiased=False)))
+            return result
+
+        update._targets = watched  # type: ignore[method-assign]
+        for batch in (loud, quiet):
+            update.step(batch)
+        return found
+
+    assert scales(0.0) == pytest.approx([1.0, 1.0], abs=1e-2)
+    first, second = scales(0.9)
+    assert first == pytest.approx(1.0, abs=1e-3) and second < 0.01
+
+
+def test_the_memory_of_advantages_by_hand():
+    update = make_update(replace(PLAIN, lr=0.0, value_lr=0.0, advantage_memory=0.5), gamma=0.0, lam=0.0)
+    with torch.no_grad():
+        update.adapter.value_head.weight.zero_()
+    batches = [make_segments((3,), seed=s) for s in (1, 2)]
+    for batch in batches:
+        update.step(batch)
+    bias = float(update.adapter.value_head.bias.detach())
+    one, two = (np.asarray(b[0].reward, np.float64) - bias for b in batches)
+    expected = [0.5 * one.sum() + two.sum(), 0.5 * (one**2).sum() + (two**2).sum(), 0.5 * 3 + 3]
+    assert np.allclose(update._moments.numpy(), expected, rtol=1e-5)
