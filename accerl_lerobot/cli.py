@@ -34,7 +34,7 @@ VERBS = {
     "sft": ("verbs:sft", "fine-tune on a LeRobotDataset with LeRobot's own trainer"),
     "eval": ("verbs:evaluate", "success of a checkpoint, with its confidence interval"),
     "doctor": ("doctor:main", "resolve a recipe and check this machine"),
-    "bench": ("verbs:bench", "measure: accerl bench world, accerl bench policy"),
+    "bench": ("verbs:bench", "measure: accerl bench world, policy, lag"),
 }
 
 

@@ -27,7 +27,9 @@ Observation = dict[str, np.ndarray | str]
 """One observation under LeRobot's feature names.
 
 ``observation.images.<camera>`` uint8 (H, W, 3), ``observation.state`` float32 (S,), ``task`` the instruction
-text. Values are raw: scaling and normalisation belong to the policy's own LeRobot processors.
+text. Values are raw: scaling and normalisation belong to the policy's own LeRobot processors. Where a policy
+looks back (LeRobot's ``n_obs_steps`` above 1), arrays hold so many env steps, oldest first, in a dimension in
+front.
 """
 
 TASK = "task"

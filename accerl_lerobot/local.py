@@ -70,7 +70,8 @@ class LocalEngine(Engine):
         self._episodes: list[EpisodeResult] = []
         self._training = False
         self._outbox: deque[Segment] = deque()
-        worlds = [make_world(config.env) for _ in range(config.rollout.worlds * config.rollout.workers)]
+        count, history = config.rollout.worlds * config.rollout.workers, config.rollout.history or 1
+        worlds = [make_world(config.env, history) for _ in range(count)]
         self._plans = EpisodePlans(config.rollout, tasks, seed=config.seed, worlds=len(worlds))
         self._runner = RolloutRunner(
             worlds,

@@ -135,7 +135,7 @@ def train(config: RunConfig, directory: Path, console: Console) -> dict[str, Any
     tasks = check_world(config)
     config = warm_start(config, directory, console)
     warm_s = time.monotonic() - started
-    check_policy(config)
+    config = check_policy(config)
     with contextlib.ExitStack() as stack:  # ends the workers and flushes the log, whatever fails
         log = stack.enter_context(contextlib.closing(MetricsLog(directory, config.wandb, encode(config))))
         with console.stage("starting workers"):
@@ -143,16 +143,21 @@ def train(config: RunConfig, directory: Path, console: Console) -> dict[str, Any
         return _Loop(config, directory, console, engine, log, tasks).run(started, warm_s)
 
 
-def check_policy(config: RunConfig) -> None:
-    """Refuses a policy that does not fit the world, before any worker is started."""
+def check_policy(config: RunConfig) -> RunConfig:
+    """Refuses a policy that does not fit the world, before workers are started; sets ``rollout.history``."""
     from accerl_lerobot.policies.base import check_fit
     from accerl_lerobot.policies.loading import load_lerobot_config
 
     world = make_world(config.env)
     try:
-        check_fit(load_lerobot_config(config.policy), world.spec, config.policy.rename_map)
+        policy = load_lerobot_config(config.policy)
+        check_fit(policy, world.spec, config.policy.rename_map)
     finally:
         world.close()
+    if config.rollout.history not in (None, policy.n_obs_steps):
+        remedy = f"the policy's n_obs_steps is {policy.n_obs_steps}; leave the field out"
+        raise InputError("rollout.history", config.rollout.history, remedy)
+    return replace(config, rollout=replace(config.rollout, history=policy.n_obs_steps))
 
 
 def run_plans(
@@ -200,7 +205,7 @@ class _Loop:
 
     def run(self, started: float, warm_s: float) -> dict[str, Any]:
         evaluation = self.config.evaluation
-        before = self._evaluate("before", evaluation.episodes, 0.0)
+        before = self._evaluate("before", evaluation.episodes, 0.0) if evaluation.before else None
         self.base = self.engine.poll().rollout
         rl_started = time.monotonic()
         last = self._train()
@@ -208,30 +213,32 @@ class _Loop:
         self.steps = self._steps(last)
         self._save(last.version)
         after = self._evaluate("after", evaluation.episodes, self.steps)
-        before_after(self.directory / "before_after.mp4", before[1], after[1], fps=20)
+        if before is not None:
+            before_after(self.directory / "before_after.mp4", before[1], after[1], fps=20)
         success_curve(self.directory / "success_curve.png", self.evaluations, self.curve)
         times = (time.monotonic() - started, warm_s, rl_s)
-        summary = self._summary(before[0], after[0], last, times)
+        summary = self._summary(None if before is None else before[0], after[0], last, times)
         (self.directory / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
         return summary
 
     def _summary(
         self,
-        before: dict[str, Any],
+        before: dict[str, Any] | None,
         after: dict[str, Any],
         last: Progress,
         times: tuple[float, float, float],
     ) -> dict[str, Any]:
+        before = before or {}
         summary = {
-            "success_before": before["success"],
+            "success_before": before.get("success"),
             "success_after": after["success"],
             "n": after["n"],
-            "ci95": {"before": before["ci95"], "after": after["ci95"]},
-            "n_before": before["n"],
+            "ci95": {"before": before.get("ci95"), "after": after["ci95"]},
+            "n_before": before.get("n"),
             "n_after": after["n"],
-            "ci95_before": before["ci95"],
+            "ci95_before": before.get("ci95"),
             "ci95_after": after["ci95"],
-            "tasks_before": before["tasks"],
+            "tasks_before": before.get("tasks"),
             "tasks_after": after["tasks"],
             "env_steps": int(self.steps),
             "decisions": int(self._since(last, "decisions")),

@@ -28,6 +28,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from accerl_lerobot.bench.lag import BenchLagConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
 from accerl_lerobot.config import DatasetConfig, LaunchConfig, RunConfig, check_chunk, parse
@@ -104,8 +105,9 @@ def train(arguments: list[str]) -> int:
     except InputError:
         _discard_unused(directory)
         raise
+    before = summary["success_before"]
     console.say(
-        f"success {summary['success_before']:.1%} → {summary['success_after']:.1%} "
+        f"success {'' if before is None else f'{before:.1%} → '}{summary['success_after']:.1%} "
         f"in {summary['wall_s']:.0f} s; see {directory / 'success_curve.png'}"
     )
     sys.stdout.write(json.dumps(summary, indent=2) + "\n")
@@ -176,7 +178,7 @@ def evaluate(arguments: list[str]) -> int:
     film = config.evaluation.videos if out else 0
     console = Console()
     with redirect_stdout(sys.stderr):
-        run.check_policy(whole)
+        whole = run.check_policy(whole)
         tasks = run.check_world(whole)
         engine = run.make_engine(whole, tasks)
         try:
@@ -194,11 +196,11 @@ def evaluate(arguments: list[str]) -> int:
 
 
 def bench(arguments: list[str]) -> int:
-    """``accerl bench world`` and ``accerl bench policy``."""
+    """``accerl bench world``, ``policy`` and ``lag``."""
     name = arguments[0] if arguments else ""
     if f"bench {name}" not in CONFIGS:
-        benches = [verb for verb in CONFIGS if verb.startswith("bench ")]
-        raise InputError("bench", name, f"use: accerl {' or accerl '.join(benches)}")
+        names = [verb.split()[1] for verb in CONFIGS if verb.startswith("bench ")]
+        raise InputError("bench", name, f"name what is measured: {', '.join(names)}")
     config = parse(CONFIGS[f"bench {name}"], arguments[1:])
     module: Any = importlib.import_module(f"accerl_lerobot.bench.{name}")
     with redirect_stdout(sys.stderr):
@@ -216,6 +218,7 @@ CONFIGS: dict[str, type[Any]] = {
     "doctor": RunConfig,
     "bench world": BenchWorldConfig,
     "bench policy": BenchPolicyConfig,
+    "bench lag": BenchLagConfig,
 }
 """Verb → what its command line is parsed into."""
 

@@ -277,12 +277,12 @@ class TestPreflight:
         with pytest.raises(InputError, match="^sft.backbone=.*: act has no vision-language backbone"):
             check_sft_policy(SFTConfig(steps=1, policy={"type": "act"}, backbone=BackboneConfig()))
 
-    def test_refuses_what_looks_back_before_training_it(self) -> None:
-        policy: dict[str, Any] = {"type": "diffusion"}
+    def test_refuses_to_look_back_where_lerobot_does_not_before_training_it(self) -> None:
+        policy: dict[str, Any] = {"type": "smolvla", "n_obs_steps": 2}
         check_sft_policy(SFTConfig(steps=1, policy=policy))  # SFT alone could
-        with pytest.raises(InputError, match="^sft.policy.n_obs_steps=2: RL shows a policy one observation"):
+        with pytest.raises(InputError, match="^sft.policy.n_obs_steps=2: only diffusion looks back"):
             check_start(RunConfig(sft=SFTConfig(steps=1, policy=policy)))
-        check_start(RunConfig(sft=SFTConfig(steps=1, policy=policy | {"n_obs_steps": 1})))
+        check_start(RunConfig(sft=SFTConfig(steps=1, policy={"type": "diffusion"})))
 
     def test_refuses_a_policy_without_a_likelihood_before_training_it(self) -> None:
         with pytest.raises(InputError, match="sft.policy.type='vqbet': RL needs a likelihood"):

@@ -171,9 +171,9 @@ def _adapter(config: BenchPolicyConfig, device: Any, directory: Path) -> Any:
     from lerobot.policies.factory import get_policy_class
 
     from accerl_lerobot.policies.adapter import LeRobotAdapter
-    from accerl_lerobot.policies.config import PolicyConfig, ValueHeadConfig
+    from accerl_lerobot.policies.config import ValueHeadConfig
     from accerl_lerobot.policies.flow import FlowFamily
-    from accerl_lerobot.policies.loading import POLICIES, imported
+    from accerl_lerobot.policies.loading import POLICIES, imported, steps_field
     from accerl_lerobot.policies.samplers import FlowSamplerConfig
     from accerl_lerobot.policies.tuning import tune
     from accerl_lerobot.policies.value_head import ValueHead
@@ -182,7 +182,7 @@ def _adapter(config: BenchPolicyConfig, device: Any, directory: Path) -> Any:
     lerobot_config = BUILDERS[config.type](config, directory)
     lerobot_config.device = str(device)
     if config.num_steps is not None:
-        lerobot_config = replace(lerobot_config, **{_steps_field(lerobot_config): config.num_steps})
+        lerobot_config = replace(lerobot_config, **{str(steps_field(lerobot_config)): config.num_steps})
     policy = get_policy_class(config.type)(lerobot_config).to(device)
     model = imported(POLICIES[config.type][0])(policy)
     family = FlowFamily(model, FlowSamplerConfig(stochastic=config.stochastic, noise_level=0.2))
@@ -190,7 +190,7 @@ def _adapter(config: BenchPolicyConfig, device: Any, directory: Path) -> Any:
     adapter = LeRobotAdapter(
         policy, processing, model, family, ValueHead(model.width, ValueHeadConfig()), config.precision
     )
-    tune(policy, model, family, PolicyConfig(tuning=config.tuning).tuning)
+    tune(policy, model, family, config.tuning)
     return adapter
 
 
@@ -307,7 +307,3 @@ def _device_name(device: Any) -> str:
     import torch
 
     return torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
-
-
-def _steps_field(lerobot_config: Any) -> str:
-    return "num_steps" if hasattr(lerobot_config, "num_steps") else "num_inference_steps"

@@ -75,7 +75,8 @@ def main() -> None:
     def cached(cfg: Any) -> tuple[Any, Any]:
         train, evaluation = stock(cfg)
         fixed = not cfg.dataset.image_transforms.enable and not cfg.dataset.streaming
-        if fixed and len(train) * item_bytes(train.meta) <= MAX_BYTES:
+        size = item_bytes(train.meta) * cfg.policy.n_obs_steps
+        if fixed and len(train) * size <= MAX_BYTES:
             train = CachedDataset(train)
         return train, evaluation
 

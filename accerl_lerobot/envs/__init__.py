@@ -23,6 +23,7 @@ from typing import Any
 
 from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec
 from accerl_lerobot.envs.config import EnvConfig
+from accerl_lerobot.envs.history import HistoryWorld
 from accerl_lerobot.envs.lerobot_env import LeRobotEnvConfig, LeRobotWorld
 from accerl_lerobot.envs.metaworld import MetaWorld, MetaWorldConfig
 from accerl_lerobot.envs.simulated import SimulatedConfig, SimulatedWorld
@@ -30,6 +31,7 @@ from accerl_lerobot.envs.simulated import SimulatedConfig, SimulatedWorld
 __all__ = [
     "ChunkResult",
     "EnvConfig",
+    "HistoryWorld",
     "LeRobotEnvConfig",
     "LeRobotWorld",
     "MetaWorld",
@@ -48,6 +50,12 @@ _WORLDS: dict[type[EnvConfig], Callable[[Any], World]] = {
 }
 
 
-def make_world(config: EnvConfig) -> World:
-    """Builds the world that `config` describes."""
-    return _WORLDS[type(config)](config)
+def make_world(config: EnvConfig, history: int = 1) -> World:
+    """Builds the world that `config` describes.
+
+    Args:
+        config: of one of the kinds of world.
+        history: how many env steps an observation holds; above 1, arrays begin with that dimension.
+    """
+    world = _WORLDS[type(config)](config)
+    return world if history == 1 else HistoryWorld(world, history)

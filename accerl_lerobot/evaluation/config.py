@@ -29,6 +29,8 @@ class EvaluationConfig:
 
     episodes: int = 100
     """Episodes before and after training, over all tasks; the same seeds both times, never trained on."""
+    before: bool = True
+    """Evaluate before training too; without it there is no video of before and after."""
     every_updates: int = 0
     """Evaluate while training, every so many updates; 0 does not."""
     episodes_during: int = 20

@@ -46,8 +46,9 @@ from torch import Tensor
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
+from accerl_lerobot.policies.density import normal_entropy
 from accerl_lerobot.policies.family import Action, Encoded, Family, Model, Score, exploring, normal
-from accerl_lerobot.policies.flow import LOG_SQRT_2PI, gaussian_log_prob
+from accerl_lerobot.policies.flow import gaussian_log_prob
 from accerl_lerobot.policies.samplers import DiffusionSamplerConfig
 
 Network = Callable[[Tensor, int], Tensor]
@@ -61,9 +62,16 @@ class DiffusionShape:
     horizon: int
     """H rows that are denoised."""
     executed: int
-    """Rows that are sent to the world, the first ones (LeRobot's n_action_steps)."""
+    """Rows that are sent to the world (LeRobot's n_action_steps)."""
+    first: int = 0
+    """The first of them; those before it stand for the past (LeRobot's n_obs_steps − 1)."""
     action_dim: int
     """A."""
+
+    @property
+    def rows(self) -> slice:
+        """The executed ones."""
+        return slice(self.first, self.first + self.executed)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,9 +135,9 @@ def counted_steps(schedule: Schedule, config: DiffusionSamplerConfig) -> int:
     return len(schedule) if config.last_steps is None else config.last_steps
 
 
-def factors(shape: DiffusionShape, counted: int) -> int:
-    """L. Rows without a density are left out: as constant factors they would dilute means over factors."""
-    return shape.executed if counted == 1 else shape.horizon
+def factors(shape: DiffusionShape, counted: int) -> slice:
+    """L rows. Those without a density are left out: as constant factors they would dilute means."""
+    return shape.rows if counted == 1 else slice(0, shape.horizon)
 
 
 def sample(
@@ -167,7 +175,7 @@ def sample(
             logp = logp + torch.where(explore[:, None], counted, 0.0)
         x = step
     path.append(x)
-    return x, torch.stack(path, 1), logp[:, : factors(shape, len(path) - 1)]
+    return x, torch.stack(path, 1), logp[:, factors(shape, len(path) - 1)]
 
 
 def log_prob(
@@ -184,7 +192,7 @@ def log_prob(
         x = path[:, i]
         mean, std = schedule.exploring_step(k, x, network(x, schedule.timesteps[k]), config)
         logp = logp + gaussian_log_prob(path[:, i + 1], mean, std, _mask(k, shape, schedule, x.device))
-    return logp[:, : factors(shape, counted)]
+    return logp[:, factors(shape, counted)]
 
 
 def entropy(shape: DiffusionShape, schedule: Schedule, config: DiffusionSamplerConfig) -> float:
@@ -194,15 +202,15 @@ def entropy(shape: DiffusionShape, schedule: Schedule, config: DiffusionSamplerC
     for k in range(len(schedule) - counted_steps(schedule, config), len(schedule)):
         _, std = schedule.exploring_step(k, zero, zero, config)
         entries = int(_mask(k, shape, schedule, zero.device).sum()) * shape.action_dim
-        total += entries * (float(torch.log(std)) + LOG_SQRT_2PI + 0.5)
+        total += entries * float(normal_entropy(std))
     return total
 
 
 def _mask(k: int, shape: DiffusionShape, schedule: Schedule, device: torch.device) -> Tensor:
     """bool (H, 1): rows of step k's outcome that belong to the density."""
-    mask = torch.ones(shape.horizon, 1, dtype=torch.bool, device=device)
-    if k == len(schedule) - 1:
-        mask[shape.executed :] = False
+    last = k == len(schedule) - 1
+    mask = torch.full((shape.horizon, 1), not last, dtype=torch.bool, device=device)
+    mask[shape.rows] = True
     return mask
 
 
@@ -250,7 +258,7 @@ class DiffusionFamily(Family):
         x, path, logp = sample(
             encoded.context.network, x, eps, explore, self.shape, self.schedule, self.sampler
         )
-        return Action(chunk=x[:, : self.shape.executed], latent={"path": path}, log_prob=logp)
+        return Action(chunk=x[:, self.shape.rows], latent={"path": path}, log_prob=logp)
 
     def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
         """See the base class."""
@@ -268,9 +276,10 @@ class DiffusionFamily(Family):
         x, _, _ = sample(
             encoded.context.network, noise, eps, at_rest, self.shape, self.schedule, self.sampler
         )
-        return float((x[:, : self.shape.executed] - stock).abs().max())
+        return float((x[:, self.shape.rows] - stock).abs().max())
 
     @property
     def actions(self) -> int:
         """Every factor is one row of the chunk."""
-        return factors(self.shape, counted_steps(self.schedule, self.sampler))
+        rows = factors(self.shape, counted_steps(self.schedule, self.sampler))
+        return rows.stop - rows.start

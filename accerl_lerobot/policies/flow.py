@@ -54,6 +54,7 @@ import torch
 from torch import Tensor, nn
 
 from accerl_lerobot.experience import Request
+from accerl_lerobot.policies.density import BoundedStd, normal_entropy, normal_log_prob, pooled
 from accerl_lerobot.policies.family import Action, Encoded, Family, Model, Score, exploring, normal
 from accerl_lerobot.policies.samplers import FlowSamplerConfig
 
@@ -61,8 +62,6 @@ Velocity = Callable[[Tensor, Tensor], Tensor]
 """(x (B, K, D), t (B,)) → v (B, K, D)."""
 Std = Callable[[Tensor], Tensor]
 """t (B,) → std (B, 1, D) of a step that begins there."""
-
-LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,8 +137,7 @@ def transition(
 
 def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor, mask: Tensor) -> Tensor:
     """Per-row log-density, summed over the dims `mask` (K, D) keeps. Returns (B, K)."""
-    z = (x - mean) / std
-    return torch.where(mask, -0.5 * z * z - torch.log(std) - LOG_SQRT_2PI, 0.0).sum(-1)
+    return torch.where(mask, normal_log_prob(x, mean, std), 0.0).sum(-1)
 
 
 def sample(
@@ -231,7 +229,7 @@ def entropy(
     for k in range(n):
         t = path.new_full((b,), step_time(k, n))
         _, width = transition(zero, zero, t, shape, config, std)
-        each = (torch.log(width) + LOG_SQRT_2PI + 0.5).expand(b, *mask.shape)
+        each = normal_entropy(width).expand(b, *mask.shape)
         per_step.append(torch.where(_counted(k, mask, shape, config), each, 0.0).sum((1, 2)))
     steps = torch.stack(per_step, 1)
     if config.stochastic == "all":
@@ -308,18 +306,14 @@ class NoiseHead(nn.Module):
     def __init__(self, width: int, shape: FlowShape, config: FlowSamplerConfig) -> None:
         super().__init__()
         self.steps, self.dims = shape.num_steps, shape.padded_dim
-        self.low, self.high = math.log(config.noise_min), math.log(config.noise_max)
         self.norm, self.out = nn.LayerNorm(width), nn.Linear(width, self.steps * self.dims)
-        share = (math.log(config.noise_level) - self.low) / (self.high - self.low)
-        nn.init.zeros_(self.out.weight)
-        nn.init.constant_(self.out.bias, math.log(share / (1 - share)))
+        self.bounded = BoundedStd(config.noise_min, config.noise_max)
+        self.bounded.start(self.out, config.noise_level)
 
     def forward(self, encoded: Encoded) -> Std:
         """The std of each step, given the observations."""
-        weights = encoded.mask / encoded.mask.sum(-1, keepdim=True)
-        pooled = (weights[..., None] * encoded.features.detach().float()).sum(1)
-        raw = self.out(self.norm(pooled)).float().view(-1, self.steps, self.dims)
-        widths = torch.exp(self.low + (self.high - self.low) * torch.sigmoid(raw))
+        raw = self.out(self.norm(pooled(encoded.features.detach(), encoded.mask)))
+        widths = self.bounded(raw).view(-1, self.steps, self.dims)
 
         def std(t: Tensor) -> Tensor:
             k = ((1 - t) * self.steps).round().long()

@@ -38,8 +38,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from accerl_lerobot.experience import Request
+from accerl_lerobot.policies.density import BoundedStd, normal_entropy, normal_log_prob
 from accerl_lerobot.policies.family import Action, Encoded, Family, Model, Score, exploring, normal
-from accerl_lerobot.policies.flow import LOG_SQRT_2PI
 from accerl_lerobot.policies.samplers import GaussianSamplerConfig
 
 QUADRATURE_NODES = 32
@@ -86,17 +86,14 @@ class StdHead(nn.Module):
     def __init__(self, width: int, action_dim: int, sampler: GaussianSamplerConfig) -> None:
         super().__init__()
         self.detach = sampler.detach
-        self.low, self.high = math.log(sampler.std_min), math.log(sampler.std_max)
         self.norm, self.out = nn.LayerNorm(width), nn.Linear(width, action_dim)
-        share = (math.log(sampler.std) - self.low) / (self.high - self.low)
-        nn.init.zeros_(self.out.weight)
-        nn.init.constant_(self.out.bias, math.log(share / (1 - share)))
+        self.bounded = BoundedStd(sampler.std_min, sampler.std_max)
+        self.bounded.start(self.out, sampler.std)
 
     def forward(self, rows: Tensor) -> Tensor:
         """(B, K, W) to (B, K, A)."""
         rows = rows.detach() if self.detach else rows
-        raw = self.out(self.norm(rows.float())).float()
-        return torch.exp(self.low + (self.high - self.low) * torch.sigmoid(raw))
+        return self.bounded(self.out(self.norm(rows.float())))
 
 
 class GaussianFamily(Family):
@@ -132,7 +129,7 @@ class GaussianFamily(Family):
     def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
         """See the base class."""
         mean, std = self._gaussian(encoded)
-        entropy = torch.log(std) + LOG_SQRT_2PI + 0.5
+        entropy = normal_entropy(std)
         if self.model.squashed:
             entropy = entropy + expected_log_slope(mean, std)
         return Score(log_prob=self._log_prob(latent["u"], mean, std), entropy=entropy.sum((1, 2)))
@@ -167,8 +164,7 @@ class GaussianFamily(Family):
 
     def _log_prob(self, u: Tensor, mean: Tensor, std: Tensor) -> Tensor:
         """(B, L), summed over action dims."""
-        z = (u - mean) / std
-        density = -0.5 * z * z - torch.log(std) - LOG_SQRT_2PI
+        density = normal_log_prob(u, mean, std)
         if self.model.squashed:
             density = density - log_slope(u)
         return density.sum(-1)

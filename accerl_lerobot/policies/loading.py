@@ -78,6 +78,8 @@ FAMILIES = {
 }
 """Family → class; its config is registered under the same name in `samplers`."""
 
+LOOK_BACK = ("diffusion",)
+"""Types that read the observations of ``n_obs_steps`` env steps; the others read one."""
 NO_DENSITY = {
     "tdmpc": "it plans by sampling and has no action density; LeRobot trains it with its own RL objective",
     "vqbet": "LeRobot does not return its code log-probs; use smolvla",
@@ -113,13 +115,13 @@ def check_type(policy_type: Any, field: str, prefix: str = "") -> str:
 
 
 def check_observations(policy_config: Any, field: str) -> None:
-    """Refuses a policy that looks back; what worlds observe between two decisions is not kept.
+    """Refuses a history that LeRobot's policy of this type does not read.
 
     Raises:
-        InputError: it reads more than one observation.
+        InputError: it is to look back and cannot.
     """
-    if policy_config.n_obs_steps != 1:
-        remedy = "RL shows a policy one observation at a time; use one trained with n_obs_steps=1"
+    if policy_config.n_obs_steps != 1 and policy_config.type not in LOOK_BACK:
+        remedy = f"only {', '.join(LOOK_BACK)} looks back; a {policy_config.type} policy takes 1"
         raise InputError(field, policy_config.n_obs_steps, remedy)
 
 
@@ -245,11 +247,12 @@ def example_observations(
     observations: dict[str, np.ndarray] = {}
     for key, feature in policy_config.input_features.items():
         shape = tuple(feature.shape)
+        batch = (2,) if policy_config.n_obs_steps == 1 else (2, policy_config.n_obs_steps)
         if key.startswith(IMAGES) and ".empty_camera_" not in key:
-            size = (2, *shape[1:], shape[0])
+            size = (*batch, *shape[1:], shape[0])
             observations[world_name.get(key, key)] = rng.integers(0, 256, size, dtype=np.uint8)
         elif key == OBS_STATE:
-            observations[world_name.get(key, key)] = rng.standard_normal((2, *shape), dtype=np.float32)
+            observations[world_name.get(key, key)] = rng.standard_normal((*batch, *shape), dtype=np.float32)
     return observations, ("Go", "Put the red cube on the plate")
 
 
@@ -321,19 +324,26 @@ def _override(lerobot_config: Any, config: PolicyConfig) -> None:
         # The checkpoint has them; LeRobot would download torchvision's first, even when told to stay offline.
         lerobot_config.pretrained_backbone_weights = None
     if config.num_steps is not None:
-        names = [n for n in ("num_steps", "num_inference_steps") if hasattr(lerobot_config, n)]
-        if not names:
+        name = steps_field(lerobot_config)
+        if name is None:
             remedy = f"a {lerobot_config.type} policy does not denoise; leave the field out"
             raise InputError("policy.num_steps", config.num_steps, remedy)
-        setattr(lerobot_config, names[0], config.num_steps)
+        setattr(lerobot_config, name, config.num_steps)
     if hasattr(lerobot_config, "dtype"):
         lerobot_config.dtype = "float32"  # see `PolicyConfig.precision`
     if config.n_action_steps is not None:
         chunk = int(getattr(lerobot_config, "chunk_size", 0) or getattr(lerobot_config, "horizon", 1))
+        if lerobot_config.type in LOOK_BACK:
+            chunk -= lerobot_config.n_obs_steps - 1  # rows that stand for the past
         if config.n_action_steps > chunk:
             remedy = f"use 1 to {chunk}, the chunk the policy predicts"
             raise InputError("policy.n_action_steps", config.n_action_steps, remedy)
         lerobot_config.n_action_steps = config.n_action_steps
+
+
+def steps_field(lerobot_config: Any) -> str | None:
+    """Where a policy type's config has its denoising steps; None if it does not denoise."""
+    return next((n for n in ("num_steps", "num_inference_steps") if hasattr(lerobot_config, n)), None)
 
 
 def imported(path: str) -> Any:

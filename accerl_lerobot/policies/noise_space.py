@@ -23,7 +23,6 @@ without it.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -31,6 +30,7 @@ from torch import Tensor, nn
 
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies import flow
+from accerl_lerobot.policies.density import BoundedStd, normal_entropy, normal_log_prob, pooled
 from accerl_lerobot.policies.family import Action, Encoded, Family, Score, exploring, normal
 from accerl_lerobot.policies.samplers import NoiseSpaceSamplerConfig
 
@@ -54,12 +54,10 @@ class NoiseSpaceFamily(Family):
         self.hidden = nn.Linear(model.width, sampler.hidden)
         self.mean = nn.Linear(sampler.hidden, size)
         self.width = nn.Linear(sampler.hidden, size)
-        for layer in (self.mean, self.width):
-            nn.init.zeros_(layer.weight)
-            nn.init.zeros_(layer.bias)
-        self.low, self.high = math.log(sampler.std_min), math.log(sampler.std_max)
-        share = (math.log(sampler.std) - self.low) / (self.high - self.low)
-        nn.init.constant_(self.width.bias, math.log(share / (1 - share)))
+        nn.init.zeros_(self.mean.weight)
+        nn.init.zeros_(self.mean.bias)
+        self.bounded = BoundedStd(sampler.std_min, sampler.std_max)
+        self.bounded.start(self.width, sampler.std)
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         """See the base class; at rest it starts from the mean, see `NoiseSpaceSamplerConfig.at_rest`."""
@@ -79,7 +77,7 @@ class NoiseSpaceFamily(Family):
     def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
         """See the base class."""
         mean, std = self._gaussian(encoded)
-        entropy = (torch.log(std) + flow.LOG_SQRT_2PI + 0.5).sum((1, 2))
+        entropy = normal_entropy(std).sum((1, 2))
         return Score(log_prob=_log_prob(latent["z"], mean, std), entropy=entropy)
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
@@ -93,17 +91,13 @@ class NoiseSpaceFamily(Family):
 
     def _gaussian(self, encoded: Encoded) -> tuple[Tensor, Tensor]:
         """Mean and std of z, each (B, rows, D)."""
-        weights = encoded.mask / encoded.mask.sum(-1, keepdim=True)
-        pooled = (weights[..., None] * encoded.features.float()).sum(1)
-        hidden = torch.relu(self.hidden(self.norm(pooled)))
+        hidden = torch.relu(self.hidden(self.norm(pooled(encoded.features, encoded.mask))))
         size = (-1, self.rows, self.shape.padded_dim)
         bound = self.sampler.bound
         mean = bound * torch.tanh(self.mean(hidden).float() / bound)
-        width = self.low + (self.high - self.low) * torch.sigmoid(self.width(hidden).float())
-        return mean.view(size), torch.exp(width).view(size)
+        return mean.view(size), self.bounded(self.width(hidden)).view(size)
 
 
 def _log_prob(z: Tensor, mean: Tensor, std: Tensor) -> Tensor:
     """(B, rows), summed over dims; padded ones act on the others, so they are part of the choice."""
-    unit = (z - mean) / std
-    return (-0.5 * unit * unit - torch.log(std) - flow.LOG_SQRT_2PI).sum(-1)
+    return normal_log_prob(z, mean, std).sum(-1)

@@ -51,12 +51,12 @@ class Processing:
         self.rename_map = rename_map or {}
 
     def prepare(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> dict[str, Tensor]:
-        """Normalises and tokenises. Images go from uint8 (B, H, W, 3) to float (B, 3, H, W) in [0, 1]."""
+        """Normalises and tokenises. Images go from uint8 (..., H, W, 3) to float (..., 3, H, W) in [0, 1]."""
         batch: dict[str, Any] = {"task": list(tasks)}
         for key, array in observations.items():
             tensor = torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
             if key.startswith(IMAGES):
-                tensor = tensor.permute(0, 3, 1, 2).contiguous().float() / 255.0
+                tensor = tensor.movedim(-1, -3).contiguous().float() / 255.0
             batch[self.rename_map.get(key, key)] = tensor
         return self.preprocessor(batch)
 

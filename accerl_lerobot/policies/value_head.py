@@ -21,6 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from accerl_lerobot.policies.config import ValueHeadConfig
+from accerl_lerobot.policies.density import pooled
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,13 +79,11 @@ class ValueHead(nn.Module):
         features = features.detach() if self.config.detach else features
         features = features.float()
         if self.query is None:
-            weights = mask.float()
+            weights = mask
         else:
             scores = (features @ self.query) / features.shape[-1] ** 0.5
             weights = torch.softmax(scores.masked_fill(~mask, float("-inf")), -1)
-        weights = weights / weights.sum(-1, keepdim=True)
-        pooled = (weights[..., None] * features).sum(1)
-        out = self.out(torch.relu(self.hidden(self.norm(pooled)))).float()
+        out = self.out(torch.relu(self.hidden(self.norm(pooled(features, weights))))).float()
         if self.support is None:
             return Value(mean=out[:, 0])
         return Value(mean=torch.softmax(out, -1) @ self.support, logits=out, support=self.support)

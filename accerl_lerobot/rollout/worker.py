@@ -89,7 +89,7 @@ class RolloutWorker:
         self._training = threading.Event()
         self._entered: float | None = None
         self._outbox: list[Segment] = []
-        worlds = [make_world(env) for _ in range(config.worlds)]
+        worlds = [make_world(env, config.history or 1) for _ in range(config.worlds)]
         name = f"rollout{index}.{incarnation}"
         self._runner = RolloutRunner(
             worlds,

@@ -29,7 +29,7 @@ class TrainerConfig:
     """
 
     updates: int = 1000
-    """Optimiser steps of the run; the trainer is the run's clock."""
+    """Optimiser steps of the run; the trainer is the run's clock. 0: the warm start, and what it is worth."""
     batch_decisions: int = 128
     """Decisions of one update; whole segments are drawn until there are at least as many."""
     micro_batch: int = 1024
@@ -74,14 +74,16 @@ class TrainerConfig:
     """CPU threads."""
 
     def __post_init__(self) -> None:
-        sizes = ("updates", "batch_decisions", "micro_batch", "publish_every", "max_nonfinite", "num_threads")
+        sizes = ("batch_decisions", "micro_batch", "publish_every", "max_nonfinite", "num_threads")
         for name in sizes:
             if getattr(self, name) < 1:
                 raise InputError(f"trainer.{name}", getattr(self, name), "use at least 1")
         for name in ("lr", "value_lr"):
             if not 0 <= getattr(self, name) < 1:
                 raise InputError(f"trainer.{name}", getattr(self, name), "use a value in [0, 1), e.g. 1e-4")
-        for name in ("warmup_updates", "value_warmup_updates", "weight_decay", "hold_back", "probe_every"):
+        for name in (
+            "updates", "warmup_updates", "value_warmup_updates", "weight_decay", "hold_back", "probe_every",
+        ):  # fmt: skip
             if getattr(self, name) < 0:
                 raise InputError(f"trainer.{name}", getattr(self, name), "use 0 or more")
         if self.schedule not in ("constant", "cosine"):

@@ -143,6 +143,7 @@ class Update:
         if len(parts) > 1:  # a single micro-batch supplies the values that GAE needs by its own forward pass
             targets = self._targets(batch, self._values(batch.observations, batch.tasks), bootstrap)
         factors = self.adapter.factors(batch.latent)
+        ratios = None if factors is None else self._ratios_per_decision(factors)
         total: dict[str, float] = {}
         for rows in parts:
             part = batch.part(rows)
@@ -165,7 +166,7 @@ class Update:
                 returns=returns,
                 entropy=evaluation.entropy,
                 factors=None if factors is None else factors[rows].to(device),
-                ratios_per_decision=None if factors is None else self._ratios_per_decision(factors),
+                ratios_per_decision=ratios,
                 log_prob_reference=reference,
                 log_prob_proximal=proximal,
             )

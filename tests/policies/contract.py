@@ -24,25 +24,16 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.experience import Request, Segment
+from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import stack_observations
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import save_pretrained
 from accerl_lerobot.policies.samplers import SamplerConfig
-from accerl_lerobot.rollout.segments import SegmentBuilder
-from tests.policies.tiny import adapter_at, log_ratio, perturb, requests, stored
+from tests.policies.tiny import adapter_at, as_segment, check_gradient, log_ratio, perturb, requests, stored
 
 TOLERANCE = 1e-5
 """|ρ − 1| of a whole chunk at equal weights, in fp32."""
-
-
-def as_segment(asked: list[Request], adapter: LeRobotAdapter, length: int) -> Segment:
-    """Plays requests as one episode, in which each decision is made alone."""
-    builder = SegmentBuilder(asked[0].observation, length)
-    for i in range(length):
-        builder.add(adapter.decide([asked[i]], 3)[0], 0.0, 3, asked[i + 1].observation)
-    return pickle.loads(pickle.dumps(builder.cut("test")))
 
 
 def label(config: SamplerConfig) -> str:
@@ -166,27 +157,11 @@ class PolicyContract:
         assert all(any(part in k for k in parameters) for part in self.parts)
 
     def test_log_prob_s_gradient_against_finite_differences(self, adapter: LeRobotAdapter, config: Any):
-        # fp32: along the gradient itself, where the change is large against rounding.
         adapter, asked = self.exploring(adapter, config), self.ask(8)
         perturb(adapter, 0.1)
         decisions = adapter.decide(asked, 0)
-        latent, _ = stored(decisions)
         perturb(adapter, 0.02, seed=1)
-        adapter.evaluate(*stack_observations(asked), latent).log_prob.sum().backward()
-        named = {k: p for k, p in adapter.trainable().items() if not k.startswith("value_head.")}
-        for part in self.parts:
-            gradients = {k: p.grad.clone() for k, p in named.items() if part in k}
-            norm = float(torch.cat([g.flatten() for g in gradients.values()]).norm())
-            home, scores, step = {k: named[k].detach().clone() for k in gradients}, [], 0.005 / norm
-            for sign in (1, -1):
-                with torch.no_grad():
-                    for key, gradient in gradients.items():
-                        named[key].copy_(home[key] + sign * step * gradient / norm)
-                scores.append(float(log_ratio(adapter, asked, decisions).double().sum()))
-            with torch.no_grad():
-                for key, value in home.items():
-                    named[key].copy_(value)
-            assert (scores[0] - scores[1]) / (2 * step) == pytest.approx(norm, rel=self.slack), part
+        check_gradient(adapter, asked, decisions, self.parts, step=0.005, slack=self.slack)
 
     def test_published_weights_make_the_same_policy(self, loaded: LeRobotAdapter):
         trainer, reader, asked = copy.deepcopy(loaded), copy.deepcopy(loaded), self.ask(4)

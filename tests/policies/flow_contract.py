@@ -16,32 +16,36 @@
 from __future__ import annotations
 
 import itertools
-import pickle
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from accerl_lerobot.experience import Request, Segment
+from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import stack_observations
 from accerl_lerobot.policies.flow import FlowFamily
 from accerl_lerobot.policies.samplers import FlowSamplerConfig
-from accerl_lerobot.rollout.segments import SegmentBuilder
 from tests.policies import oracle
 
 TOLERANCE = 1e-5
 """The contract: |ρ − 1| of a whole chunk at equal weights, in fp32."""
-SAMPLERS = [
-    FlowSamplerConfig(
-        stochastic=stochastic, noise=noise, noise_level=0.5 if noise == "flow_sde" else 0.4, padded=padded
-    )
-    for stochastic, noise, padded in itertools.product(
-        ("last", "all", "one"), ("euler", "flow_sde"), ("joint", "analytic")
-    )
-    if (stochastic, padded) != ("last", "analytic")  # the same sampler as joint
-]
+
+
+def samplers(euler: float) -> list[FlowSamplerConfig]:
+    """All that flow policies share; `euler` is the noise level of that law, rounding is over it."""
+    kinds = itertools.product(("last", "all", "one"), ("euler", "flow_sde"), ("joint", "analytic"))
+    return [
+        FlowSamplerConfig(
+            stochastic=stochastic,
+            noise=noise,
+            noise_level=0.5 if noise == "flow_sde" else euler,
+            padded=padded,
+        )
+        for stochastic, noise, padded in kinds
+        if (stochastic, padded) != ("last", "analytic")  # the same sampler as joint
+    ]
 
 
 def name(config: FlowSamplerConfig) -> str:
@@ -54,14 +58,6 @@ def exploring(adapter: LeRobotAdapter, config: FlowSamplerConfig) -> LeRobotAdap
     return LeRobotAdapter(
         adapter.policy, adapter.processing, adapter.model, family, adapter.value_head, adapter.precision
     )
-
-
-def as_segment(asked: Sequence[Request], adapter: LeRobotAdapter, length: int) -> Segment:
-    """Plays requests as one episode, in which each decision is made alone."""
-    builder = SegmentBuilder(asked[0].observation, length)
-    for i in range(length):
-        builder.add(adapter.decide([asked[i]], 3)[0], 0.0, 3, asked[i + 1].observation)
-    return pickle.loads(pickle.dumps(builder.cut("test")))
 
 
 def slow_log_prob(

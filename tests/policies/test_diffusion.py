@@ -379,7 +379,6 @@ def test_torchvision_s_weights_are_not_asked_for(path: Path, tmp_path: Path, mon
 @pytest.mark.parametrize(
     ("changes", "options", "sentence"),
     [
-        ({"n_obs_steps": 2}, {}, "policy.n_obs_steps=2: RL shows a policy one observation at a time"),
         (
             {},
             {"num_steps": 21},
@@ -394,6 +393,11 @@ def test_torchvision_s_weights_are_not_asked_for(path: Path, tmp_path: Path, mon
             {},
             {"n_action_steps": 9},
             "policy.n_action_steps=9: use 1 to 8, the chunk the policy predicts",
+        ),
+        (
+            {"n_obs_steps": 2},
+            {"n_action_steps": 8},
+            "policy.n_action_steps=8: use 1 to 7, the chunk the policy predicts",
         ),
     ],
 )

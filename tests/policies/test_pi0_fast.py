@@ -37,8 +37,8 @@ from accerl_lerobot.policies.loading import save_pretrained
 from accerl_lerobot.policies.models import pi0_fast
 from accerl_lerobot.policies.samplers import TokenSamplerConfig
 from accerl_lerobot.policies.tokens import TokenContext, TokenFamily
-from tests.policies.flow_contract import TOLERANCE, as_segment
-from tests.policies.tiny import adapter_at, log_ratio, perturb, requests, stored
+from tests.policies.flow_contract import TOLERANCE
+from tests.policies.tiny import adapter_at, as_segment, log_ratio, perturb, requests, stored
 from tests.policies.tiny_pi import CHARACTERS, LOWEST, SCALE, SKIP, VOCABULARY, small, write_pi
 
 LENGTH = 10

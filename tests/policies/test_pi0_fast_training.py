@@ -42,7 +42,7 @@ from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.policies.flow_contract import TOLERANCE
-from tests.policies.tiny import adapter_at, log_ratio, perturb, requests, stored
+from tests.policies.tiny import adapter_at, check_gradient, log_ratio, perturb, requests, stored
 from tests.policies.tiny_pi import LOWEST, SKIP, VOCABULARY, small, write_pi
 from tests.runs import collect, drive, tiny_run
 
@@ -88,27 +88,12 @@ def test_gradients_reach_every_trainable_parameter(adapter: LeRobotAdapter):
 
 @pytest.mark.parametrize("temperature", [1.0, 0.6])
 def test_log_prob_s_gradient_against_finite_differences(path: Path, temperature: float):
-    # fp32: along the gradient itself, where the change is large against rounding.
     adapter = adapter_at(path, TokenSamplerConfig(temperature=temperature))
     asked = requests(8)
     decisions = adapter.decide(asked, 0)
-    latent, _ = stored(decisions)
     perturb(adapter, 0.05)
-    adapter.evaluate(*stack_observations(asked), latent).log_prob.sum().backward()
-    named = {k: p for k, p in adapter.trainable().items() if not k.startswith("value_head.")}
-    for part in ("vision_tower", "embed_tokens", "language_model.layers", "lm_head"):
-        gradients = {k: p.grad.clone() for k, p in named.items() if part in k}
-        norm = float(torch.cat([g.flatten() for g in gradients.values()]).norm())
-        home, scores, step = {k: named[k].detach().clone() for k in gradients}, [], 0.02 / max(norm, 1)
-        for sign in (1, -1):
-            with torch.no_grad():
-                for key, gradient in gradients.items():
-                    named[key].copy_(home[key] + sign * step * gradient / norm)
-            scores.append(float(log_ratio(adapter, asked, decisions).sum()))
-        with torch.no_grad():
-            for key, value in home.items():
-                named[key].copy_(value)
-        assert (scores[0] - scores[1]) / (2 * step) == pytest.approx(norm, rel=0.02), part
+    parts = ("vision_tower", "embed_tokens", "language_model.layers", "lm_head")
+    check_gradient(adapter, asked, decisions, parts, step=0.02)
 
 
 def deviation(one: Tensor, other: Tensor) -> float:

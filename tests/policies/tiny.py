@@ -15,20 +15,23 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from torch import Tensor
 
-from accerl_lerobot.experience import TASK, Decision, Request
+from accerl_lerobot.experience import TASK, Decision, Request, Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import PolicyAdapter, stack_observations
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.samplers import SamplerConfig
+from accerl_lerobot.rollout.segments import SegmentBuilder
 
 TEXTS = ("Match the target", "Go", "Mirror the target slowly, then stay")
 """Of different lengths, so that a batch pads some of them."""
@@ -54,6 +57,14 @@ def adapter_at(path: Path, sampler: SamplerConfig | None = None, **options: Any)
     return load_adapter(PolicyConfig(path=str(path), device="cpu", sampler=sampler, **options))
 
 
+def as_segment(asked: Sequence[Request], adapter: LeRobotAdapter, length: int) -> Segment:
+    """Plays requests as one episode, in which each decision is made alone; it has been through a pickle."""
+    builder = SegmentBuilder(asked[0].observation, length)
+    for i in range(length):
+        builder.add(adapter.decide([asked[i]], 3)[0], 0.0, 3, asked[i + 1].observation)
+    return pickle.loads(pickle.dumps(builder.cut("test")))
+
+
 def stored(decisions: Sequence[Decision]) -> tuple[dict[str, Tensor], Tensor]:
     """(latents, log-probs (B, L)) of decisions, as a batch."""
     latent = {k: torch.from_numpy(np.stack([d.latent[k] for d in decisions])) for k in decisions[0].latent}
@@ -76,3 +87,40 @@ def perturb(adapter: PolicyAdapter, scale: float, seed: int = 0) -> None:
         for parameter in adapter.trainable().values():
             size = parameter.abs().mean() + 1e-3
             parameter += scale * size * torch.randn(parameter.shape, generator=generator)
+
+
+def check_gradient(
+    adapter: LeRobotAdapter,
+    asked: Sequence[Request],
+    decisions: Sequence[Decision],
+    parts: Sequence[str],
+    *,
+    step: float,
+    slack: float = 0.02,
+) -> None:
+    """Σ log-prob's gradient against finite differences, for the parameters of each part.
+
+    In fp32: along the gradient itself, where the change is large against rounding.
+
+    Args:
+        adapter: of weights other than those that made the decisions.
+        parts: parts of parameter names.
+        step: how far to go, over the norm of the part's gradient where that is above 1.
+        slack: relative error.
+    """
+    latent, _ = stored(decisions)
+    adapter.evaluate(*stack_observations(asked), latent).log_prob.sum().backward()
+    named = {k: p for k, p in adapter.trainable().items() if not k.startswith("value_head.")}
+    for part in parts:
+        gradients = {k: p.grad.clone() for k, p in named.items() if part in k}
+        norm = float(torch.cat([g.flatten() for g in gradients.values()]).norm())
+        home, scores, width = {k: named[k].detach().clone() for k in gradients}, [], step / max(norm, 1)
+        for sign in (1, -1):
+            with torch.no_grad():
+                for key, gradient in gradients.items():
+                    named[key].copy_(home[key] + sign * width * gradient / norm)
+            scores.append(float(log_ratio(adapter, asked, decisions).double().sum()))
+        with torch.no_grad():
+            for key, value in home.items():
+                named[key].copy_(value)
+        assert (scores[0] - scores[1]) / (2 * width) == pytest.approx(norm, rel=slack), part

@@ -51,12 +51,13 @@ class Diffusion(DiffusionModel):
         self.policy = policy
         self.shape = DiffusionShape(
             horizon=config.horizon,
-            executed=min(config.n_action_steps, config.horizon),
+            executed=min(config.n_action_steps, config.horizon - config.n_obs_steps + 1),
+            first=config.n_obs_steps - 1,
             action_dim=config.action_feature.shape[0],
         )
         self.schedule = _schedule(policy.diffusion.noise_scheduler, steps, config)
         of_images = 2 * config.spatial_softmax_num_keypoints * len(config.image_features)
-        self.width = config.robot_state_feature.shape[0] + of_images
+        self.width = config.n_obs_steps * (config.robot_state_feature.shape[0] + of_images)
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
         """See the base class; the features, one token, are the U-Net's condition: state, image keypoints."""
@@ -88,12 +89,14 @@ class Diffusion(DiffusionModel):
         return chunk, eps.transpose(0, 1)
 
     def _with_time(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """As LeRobot's sampler wants it: state (B, 1, S), images stacked (B, 1, cameras, 3, H, W)."""
+        """As LeRobot's sampler wants it: state (B, O, S), images stacked (B, O, cameras, 3, H, W)."""
         from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 
-        images = [batch[key][:, None] for key in self.policy.config.image_features]
-        inputs = {OBS_STATE: batch[OBS_STATE][:, None]}
-        inputs |= dict(zip(self.policy.config.image_features, images, strict=True))
+        config = self.policy.config
+        inputs = {key: batch[key] for key in (OBS_STATE, *config.image_features)}
+        if config.n_obs_steps == 1:
+            inputs = {key: value[:, None] for key, value in inputs.items()}
+        images = [inputs[key] for key in config.image_features]
         return inputs | {OBS_IMAGES: torch.stack(images, dim=-4)}
 
 

@@ -1,0 +1,151 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The lag study: what it compares, and a small one that is really run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from accerl_lerobot.bench import lag as bench
+from accerl_lerobot.bench.lag import BenchLagConfig, Cell
+from accerl_lerobot.config import RunConfig, encode, parse
+from accerl_lerobot.errors import InputError
+from tests.runs import tiny_run
+
+
+def recipe(tmp_path: Path, checkpoint: Path) -> str:
+    path = tmp_path / f"{checkpoint.name}.yaml"
+    path.write_text(yaml.safe_dump(encode(tiny_run(checkpoint))))
+    return str(path)
+
+
+def small(tmp_path: Path, checkpoint: Path, **options: Any) -> BenchLagConfig:
+    defaults = {
+        "recipe": recipe(tmp_path, checkpoint),
+        "output_dir": str(tmp_path / "study"),
+        "algorithms": ("gipo", "ppo"),
+        "lags": (0, 2),
+        "seeds": (3, 4),
+        "updates": 4,
+        "episodes": 4,
+    }
+    return BenchLagConfig(**{**defaults, **options})
+
+
+def a_summary(success: float, *, env_steps: int = 100, lag: float = 1.0) -> dict[str, Any]:
+    return {
+        "success_after": success, "n_after": 10, "env_steps": env_steps, "decisions": 10, "updates": 4,
+        "lag_mean": lag, "lag_max": 5.0, "rl_s": 1.0,
+    }  # fmt: skip
+
+
+@pytest.fixture
+def result(tmp_path: Path, tiny_checkpoint: Path) -> dict[str, Any]:
+    config = small(tmp_path, tiny_checkpoint)
+    success = {
+        "gipo": {0: (0.9, 1.0), 2: (0.5, 0.6)},
+        "ppo": {0: (0.8, 0.7), 2: (0.0, 0.1)},
+    }
+    runs = [
+        (Cell(algorithm=a, lag=lag, seed=seed), a_summary(share, env_steps=97 + seed, lag=lag + seed - 3))
+        for a, by_lag in success.items()
+        for lag, shares in by_lag.items()
+        for seed, share in zip((3, 4), shares, strict=True)
+    ]
+    return bench.compare(config, {3: a_summary(0.4), 4: a_summary(0.5)}, runs)
+
+
+def test_seeds_are_counted_together(result: dict[str, Any]):
+    gipo = result["groups"][0]
+    assert (gipo["algorithm"], gipo["lag"], gipo["successes"], gipo["n"]) == ("gipo", 0, 19, 20)
+    assert gipo["by_seed"] == [0.9, 1.0] and gipo["env_steps"] == 100.5 and gipo["lag_mean"] == 0.5
+    assert [(g["successes"]) for g in result["groups"]] == [19, 11, 15, 1]
+    assert result["starts"] == {"3": 0.4, "4": 0.5} and len(result["cells"]) == 8
+    json.dumps(result)
+
+
+def test_the_table_says_rate_interval_and_each_seed(result: dict[str, Any]):
+    lines = bench.markdown(result).splitlines()
+    assert lines[0] == "| algorithm | held back 0 (lag 0) | held back 2 (lag 2) |"
+    assert lines[2].startswith("| gipo | 95.0 % [76.4, 99.1] n=20 (90 100) | 55.0 % [")
+    shown = bench.table(result)
+    assert shown.row_count == 2 and "40%, 50%" in str(shown.title)
+
+
+def test_the_picture_is_drawn(result: dict[str, Any], tmp_path: Path):
+    bench.draw(tmp_path / "lag.png", result)
+    assert (tmp_path / "lag.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_study_is_run_and_goes_on_where_it_was_stopped(
+    tmp_path: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+):
+    config = small(tmp_path, tiny_checkpoint, algorithms=("gipo",), lags=(2,), seeds=(3,))
+    first = bench.bench_lag(config)
+    (cell,) = first["cells"]
+    assert (cell["algorithm"], cell["lag"], cell["seed"], cell["updates"], cell["n"]) == ("gipo", 2, 3, 4, 4)
+    assert 0 < cell["lag_mean"] <= cell["lag_max"]
+    study = tmp_path / "study"
+    assert json.loads((study / "lag.json").read_text()) == json.loads(json.dumps(first))
+    made = {"start-seed3", "start-seed3.log", "gipo-lag2-seed3", "gipo-lag2-seed3.log"}
+    assert {p.name for p in study.iterdir()} == made | {"lag.json", "lag.md", "lag.png"}
+
+    ran: list[str] = []
+
+    def fake(root: Path, folder: str, arguments: list[str]) -> None:
+        ran.append(folder)
+        (root / folder).mkdir()
+        (root / folder / "summary.json").write_text(json.dumps(a_summary(0.5)))
+
+    monkeypatch.setattr(bench, "_run", fake)
+    again = bench.bench_lag(small(tmp_path, tiny_checkpoint, lags=(2,), seeds=(3,)))
+    assert ran == ["ppo-lag2-seed3"] and again["cells"][0] == cell
+    with pytest.raises(InputError, match="gipo-lag2-seed3 in it was run with other settings; choose another"):
+        bench.bench_lag(small(tmp_path, tiny_checkpoint, lags=(2,), seeds=(3,), updates=5))
+
+
+def test_cells_differ_from_the_recipe_in_what_is_studied(tmp_path: Path, tiny_checkpoint: Path):
+    config = small(tmp_path, tiny_checkpoint)
+    made = parse(RunConfig, Cell(algorithm="ppo", lag=2, seed=4).arguments(config, tmp_path))
+    assert (made.algorithm.type, made.trainer.hold_back, made.seed) == ("ppo", 2, 4)
+    assert (made.trainer.updates, made.launch.engine, made.sft.steps) == (4, "local", 0)
+    assert made.policy.path == str(tmp_path)
+    assert (made.evaluation.episodes, made.evaluation.before) == (4, False)
+    assert made.replay == tiny_run(tiny_checkpoint).replay
+
+
+def test_settings_are_checked_before_anything_runs(tmp_path: Path, tiny_checkpoint: Path):
+    config = small(tmp_path, tiny_checkpoint, algorithms=("gipo", "pppo"))
+    with pytest.raises(InputError, match="algorithm.type"):
+        bench.bench_lag(config)
+    assert not (tmp_path / "study").exists()
+
+
+def test_a_run_that_fails_ends_the_study_with_its_last_lines(tmp_path: Path, tiny_checkpoint: Path):
+    config = small(tmp_path, tiny_checkpoint, recipe=recipe(tmp_path, tmp_path / "nowhere"))
+    with pytest.raises(RuntimeError, match="the run start-seed. failed.*\n.*policy.path"):
+        bench.bench_lag(config)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("algorithms", ()), ("lags", (0, 0)), ("seeds", ()), ("episodes", 0), ("jobs", 0)]
+)
+def test_bad_values_name_their_field(name: str, value: object):
+    with pytest.raises(InputError, match=f"bench.{name}="):
+        BenchLagConfig(**{name: value})

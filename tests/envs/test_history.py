@@ -1,0 +1,143 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A world that looks back, against the same world stepped one action at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.envs import HistoryWorld, MetaWorldConfig, SimulatedConfig, World, make_world
+from accerl_lerobot.envs.base import ChunkResult
+from accerl_lerobot.experience import TASK, Observation
+
+STATE, IMAGE = "observation.state", "observation.images.front"
+WORLD = SimulatedConfig(max_steps=11, tolerance=0.4, terminate_on_success=False, image_size=8)
+
+
+def chunks(count: int, rows: int, dims: int = 2, seed: int = 0) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return [rng.uniform(-1, 1, (rows, dims)).astype(np.float32) for _ in range(count)]
+
+
+def one_by_one(world: World, task: str, actions: np.ndarray) -> tuple[list[Observation], list[ChunkResult]]:
+    """Every observation of an episode, and every result."""
+    seen, results = [world.reset(5, task)], []
+    for action in actions:
+        results.append(world.step_chunk(action[None]))
+        if results[-1].observation is not None:
+            seen.append(results[-1].observation)
+        if results[-1].done:
+            break
+    return seen, results
+
+
+def same(observation: Observation, states: list[Observation]) -> None:
+    """Whether it holds these states, oldest first."""
+    for key, value in observation.items():
+        if key == TASK:
+            assert value == states[-1][key]
+        else:
+            assert np.array_equal(value, np.stack([s[key] for s in states])), key
+
+
+@pytest.mark.parametrize("length", [2, 3])
+@pytest.mark.parametrize("rows", [1, 2, 4])
+def test_the_last_states_are_seen_and_nothing_else_changes(rows: int, length: int):
+    played = chunks(12, rows)
+    seen, results = one_by_one(make_world(WORLD), "match", np.concatenate(played))
+    world, steps = make_world(WORLD, length), 0
+    same(world.reset(5, "match"), [seen[0]] * length)
+    for actions in played:
+        result = world.step_chunk(actions)
+        expected = results[steps : steps + result.steps]
+        steps += result.steps
+        assert np.array_equal(result.rewards, np.concatenate([r.rewards for r in expected]))
+        assert (result.done, result.truncated) == (expected[-1].done, expected[-1].truncated)
+        assert result.success == expected[-1].success
+        assert result.observation is not None
+        padded = [seen[0]] * (length - 1) + seen
+        same(result.observation, padded[steps : steps + length])
+        if result.done:
+            break
+    assert steps == 11 and result.truncated
+    with pytest.raises(RuntimeError, match="reset"):
+        world.step_chunk(played[0])
+    same(world.reset(5, "match"), [seen[0]] * length)
+    world.close()
+
+
+def test_a_termination_inside_a_chunk_ends_it():
+    config = SimulatedConfig(max_steps=50, tolerance=3.0, image_size=8)
+    _, results = one_by_one(make_world(config), "match", np.zeros((5, 2), np.float32))
+    assert 1 <= len(results) < 5
+    world = make_world(config, 2)
+    world.reset(5, "match")
+    result = world.step_chunk(np.zeros((5, 2), np.float32))
+    assert result.terminated and result.observation is None and result.success
+    assert result.steps == len(results)
+
+
+def test_bad_actions_are_refused_before_any_is_executed():
+    world = make_world(WORLD, 2)
+    first = world.reset(5, "match")
+    bad = np.zeros((4, 2), np.float32)
+    bad[-1] = np.nan
+    with pytest.raises(ValueError, match="non-finite"):
+        world.step_chunk(bad)
+    result = world.step_chunk(np.zeros((1, 2), np.float32))
+    assert result.observation is not None
+    assert np.array_equal(result.observation[STATE][0], first[STATE][-1])
+
+
+def test_a_world_that_ends_early_shows_its_last_state_for_those_it_did_not_show():
+    inner = make_world(WORLD)
+
+    class Early(World):
+        spec = inner.spec
+
+        def reset(self, seed: int, task: str) -> Observation:
+            return inner.reset(seed, task)
+
+        def step_chunk(self, actions: np.ndarray) -> ChunkResult:
+            result = inner.step_chunk(actions[:2])
+            return ChunkResult(
+                observation=result.observation, rewards=result.rewards, terminated=False, truncated=True,
+                success=False,
+            )  # fmt: skip
+
+        def render(self, height: int, width: int) -> np.ndarray:
+            return inner.render(height, width)
+
+    world = HistoryWorld(Early(), 2)
+    first = world.reset(5, "match")
+    result = world.step_chunk(np.full((6, 2), 0.3, np.float32))
+    assert result.truncated and result.steps == 2 and result.observation is not None
+    assert np.array_equal(result.observation[STATE][0], result.observation[STATE][1])
+    assert not np.array_equal(result.observation[IMAGE][0], first[IMAGE][0])
+
+
+def test_metaworld_too():
+    config = MetaWorldConfig(task="reach-v3", max_steps=20, image_size=64)
+    actions = chunks(1, 6, dims=4)[0]
+    bare = make_world(config)
+    seen, _ = one_by_one(bare, "reach-v3", actions)
+    world = make_world(config, 2)
+    world.reset(5, "reach-v3")
+    result = world.step_chunk(actions)
+    assert result.observation is not None
+    same(result.observation, seen[-2:])
+    assert np.array_equal(world.render(32, 32), bare.render(32, 32))
+    for one in (bare, world):
+        one.close()
