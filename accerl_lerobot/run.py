@@ -53,6 +53,8 @@ from accerl_lerobot.rollout.runner import EpisodeResult
 
 logger = logging.getLogger(__name__)
 
+FRUITLESS_GROUPS = 50
+"""So many groups thrown away in a row are said aloud: no update is made of them."""
 RECENT = 100
 """Exploring episodes over which the training success of the curve is averaged."""
 
@@ -200,6 +202,8 @@ class _Loop:
         self.mismatch_max = 0.0
         self.during: dict[str, list[EpisodeResult]] = {}
         self.base: dict[str, float] = {}
+        self.groups = (0.0, 0.0)
+        """Kept so far, and thrown away when that was last said or one was kept."""
         self.steps = math.inf
         """Env steps of the training, once it has ended."""
 
@@ -296,12 +300,26 @@ class _Loop:
             values |= {f"replay_{k}": v for k, v in progress.replay.items()}
             values |= {f"inference_{k}": v for k, v in progress.inference.items()}
             self.log.write("rollout", progress.version, values)
+            self._heed_groups(progress.rollout)
         for episode in progress.episodes:
             results = self.during.get(episode.plan.group)
             if results is not None:
                 results.append(episode)
                 if len(results) == self.config.evaluation.episodes_during:
                     self._report(episode.plan.group, results, self._steps(progress), progress.version)
+
+    def _heed_groups(self, counters: dict[str, float]) -> None:
+        """Says so when groups of equal starts have nothing to compare, or the run would seem to hang."""
+        kept, dropped = counters.get("groups_kept", 0.0), counters.get("groups_dropped", 0.0)
+        if kept > self.groups[0]:
+            self.groups = (kept, dropped)
+        elif dropped - self.groups[1] >= FRUITLESS_GROUPS:
+            self.groups = (kept, dropped)
+            always = "always" if np.mean(self.recent) > 0.5 else "never"
+            self.console.say(
+                f"{FRUITLESS_GROUPS} groups were thrown away, nothing is learnt: the policy {always} succeeds "
+                "from their starts; stop the run, or choose another task or rollout.group_filter"
+            )
 
     def _plan_during(self, number: int) -> None:
         group = f"during-{number}"

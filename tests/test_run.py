@@ -235,7 +235,7 @@ def _succeeded(plan: EpisodePlan) -> EpisodeResult:
 def scripted(monkeypatch: pytest.MonkeyPatch, config: RunConfig) -> Scripted:
     engine = Scripted(config)
     monkeypatch.setattr(run, "make_engine", lambda *_: engine)
-    monkeypatch.setattr(run, "check_policy", lambda *_: None)
+    monkeypatch.setattr(run, "check_policy", lambda config: config)
     return engine
 
 
@@ -251,6 +251,26 @@ def test_an_evaluation_that_ends_after_training_is_not_lost(
     # What is stepped to evaluate after training is no experience that was learned from.
     assert summary["env_steps"] == found[-1]["env_steps"] == found[-2]["env_steps"] == 12 * 10
     assert engine.closed and (tmp_path / "checkpoints" / "last").is_symlink()
+
+
+def test_groups_with_nothing_to_compare_are_said_aloud(
+    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """In a real run no update would be made then; here, one is made for every 20 groups, 240 in all."""
+    engine = scripted(monkeypatch, local_run(tiny_checkpoint, tmp_path))
+    poll = engine.poll
+
+    def fruitless() -> Progress:
+        explored = _succeeded(EpisodePlan(task="match", seed=1, explore=True))
+        progress = poll()
+        counters = {"groups_kept": float(engine.version > 6), "groups_dropped": 20.0 * engine.version}
+        return replace(progress, episodes=[*progress.episodes, explored], rollout=progress.rollout | counters)
+
+    monkeypatch.setattr(engine, "poll", fruitless)
+    run.train(engine.config, tmp_path, Console())
+    said = " ".join(capsys.readouterr().err.split())
+    # At 60 and 120; one is kept at 140, from where it is counted again: at 200.
+    assert said.count("50 groups were thrown away, nothing is learnt: the policy always") == 3
 
 
 @pytest.mark.parametrize("error", [RuntimeError("inference worker failed for good"), KeyboardInterrupt()])
