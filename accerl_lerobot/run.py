@@ -317,8 +317,8 @@ class _Loop:
             self.groups = (kept, dropped)
             always = "always" if np.mean(self.recent) > 0.5 else "never"
             self.console.say(
-                f"{FRUITLESS_GROUPS} groups were thrown away, nothing is learnt: the policy {always} succeeds "
-                "from their starts; stop the run, or choose another task or rollout.group_filter"
+                f"{FRUITLESS_GROUPS} groups were thrown away, nothing is learnt: the policy {always} "
+                "succeeds from their starts; stop the run, or choose another task or rollout.group_filter"
             )
 
     def _plan_during(self, number: int) -> None:
