@@ -85,12 +85,12 @@ class Check:
 
 def main(arguments: list[str]) -> int:
     """``accerl doctor``; 0 if everything needed is there, otherwise 1."""
-    config, checks = _resolve(arguments) if arguments else (None, [])
+    config, history, checks = _resolve(arguments) if arguments else (None, 1, [])
     if config is not None:
         from accerl_lerobot.config import encode
 
         sys.stdout.write(yaml.safe_dump(encode(config), sort_keys=False, allow_unicode=True) + "\n")
-    checks += list(machine(config))
+    checks += list(machine(config, history))
     if config is not None:
         checks += list(pace(config))
     for check in checks:
@@ -100,15 +100,15 @@ def main(arguments: list[str]) -> int:
     return 1 if failed else 0
 
 
-def machine(config: RunConfig | None) -> Iterator[Check]:
-    """What any run needs, and what `config` asks for beyond that."""
+def machine(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
+    """What any run needs, and what `config` asks for beyond; `history` is the policy's ``n_obs_steps``."""
     yield python_version()
     yield packages()
     yield hugging_face_datasets()
     yield ray_imports()
     yield cuda(config)
     yield rendering(needed=config is None or config.env.type == "metaworld")
-    yield from resources(config)
+    yield from resources(config, history)
 
 
 def python_version() -> Check:
@@ -245,7 +245,7 @@ def rendering(*, needed: bool, script: str = DRAW) -> Check:
     return Check(name="rendering", status=bad, text=last.removeprefix("accerl_lerobot.errors.InputError: "))
 
 
-def resources(config: RunConfig | None) -> Iterator[Check]:
+def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
     """Cores, memory and disk, against what the recipe will take."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     text, status = f"{cores} cores", OK
@@ -261,7 +261,7 @@ def resources(config: RunConfig | None) -> Iterator[Check]:
     if free is not None:
         text, status = f"{free:.1f} GiB free", OK
         if config is not None:
-            need = memory_estimate_gib(config)
+            need = memory_estimate_gib(config, history)
             text += f", about {need:.1f} GiB needed"
             if need > free:
                 status, text = WARN, f"{text}: lower rollout.workers, rollout.worlds or replay.capacity"
@@ -272,12 +272,13 @@ def resources(config: RunConfig | None) -> Iterator[Check]:
     yield Check(name="disk", status=WARN if short else OK, text=text)
 
 
-def memory_estimate_gib(config: RunConfig) -> float:
+def memory_estimate_gib(config: RunConfig, history: int = 1) -> float:
     """Rough: processes with their libraries, simulators, and replay."""
     tasks = len(getattr(config.env, "tasks", ("one",)))
     worlds = config.rollout.workers * config.rollout.worlds
     simulators = worlds * tasks * SIMULATOR_GIB if config.env.type == "metaworld" else 0.0
-    pictures = (config.replay.capacity + _under_way(config)) * observation_bytes(config) / GIB
+    decisions = config.replay.capacity + _under_way(config)
+    pictures = decisions * history * observation_bytes(config) / GIB
     if config.launch.engine == "local":
         return POLICY_PROCESS_GIB + simulators + pictures
     # The driver, inference and the trainer each load torch.
@@ -286,7 +287,7 @@ def memory_estimate_gib(config: RunConfig) -> float:
 
 
 def observation_bytes(config: RunConfig) -> int:
-    """Bytes of one decision's images; what else a decision holds is small beside them."""
+    """Bytes of one env step's images; what else a decision holds is small beside them."""
     env: Any = config.env
     side = getattr(
         env, "image_size", 96
@@ -341,20 +342,20 @@ def _under_way(config: RunConfig) -> int:
     )
 
 
-def _resolve(arguments: list[str]) -> tuple[RunConfig | None, list[Check]]:
+def _resolve(arguments: list[str]) -> tuple[RunConfig | None, int, list[Check]]:
     from accerl_lerobot.config import RunConfig, parse
     from accerl_lerobot.preflight import check_start
 
     try:
         config: RunConfig = parse(RunConfig, arguments)
-        check_start(config)
+        history = check_start(config)
         if config.output_dir is not None and Path(config.output_dir).expanduser().exists():
             raise InputError(
                 "output_dir", config.output_dir, "the folder exists; choose another or remove it"
             )
     except InputError as error:
-        return None, [Check(name="recipe", status=FAIL, text=str(error))]
-    return config, [Check(name="recipe", status=OK, text="resolves")]
+        return None, 1, [Check(name="recipe", status=FAIL, text=str(error))]
+    return config, history, [Check(name="recipe", status=OK, text="resolves")]
 
 
 def _memory_gib() -> float | None:

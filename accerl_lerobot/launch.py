@@ -83,13 +83,14 @@ class RayEngine(Engine):
     Args:
         config: the run; its ``policy.path`` must be set.
         tasks: the training tasks.
+        history: env steps that an observation holds, the policy's ``n_obs_steps``.
 
     Raises:
         RuntimeError: a worker did not start; carries its own traceback.
     """
 
-    def __init__(self, config: RunConfig, tasks: tuple[str, ...]) -> None:
-        self._config, self._tasks = config, tasks
+    def __init__(self, config: RunConfig, tasks: tuple[str, ...], history: int = 1) -> None:
+        self._config, self._tasks, self._history = config, tasks, history
         self._services: list[Watched] = []
         self._seats: list[_Seat] = []
         self._past: dict[str, float] = {"restarts": 0.0}
@@ -211,7 +212,7 @@ class RayEngine(Engine):
         actor = ray.remote(RolloutWorker).options(num_cpus=0, num_gpus=0, max_concurrency=4)
         return Watched(
             f"rollout {index}",
-            actor.remote(c.env, c.rollout, self._tasks, c.seed, index, incarnation, film),
+            actor.remote(c.env, c.rollout, self._tasks, c.seed, index, incarnation, film, self._history),
         )
 
     def _set_to_work(self, seat: _Seat) -> None:

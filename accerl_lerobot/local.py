@@ -47,9 +47,10 @@ class LocalEngine(Engine):
     Args:
         config: the run; its ``policy.path`` must be set.
         tasks: the training tasks.
+        history: env steps that an observation holds, the policy's ``n_obs_steps``.
     """
 
-    def __init__(self, config: RunConfig, tasks: tuple[str, ...]) -> None:
+    def __init__(self, config: RunConfig, tasks: tuple[str, ...], history: int = 1) -> None:
         import torch
 
         from accerl_lerobot.policies.loading import load_adapter
@@ -70,7 +71,7 @@ class LocalEngine(Engine):
         self._episodes: list[EpisodeResult] = []
         self._training = False
         self._outbox: deque[Segment] = deque()
-        count, history = config.rollout.worlds * config.rollout.workers, config.rollout.history or 1
+        count = config.rollout.worlds * config.rollout.workers
         worlds = [make_world(config.env, history) for _ in range(count)]
         self._plans = EpisodePlans(config.rollout, tasks, seed=config.seed, worlds=len(worlds))
         self._runner = RolloutRunner(

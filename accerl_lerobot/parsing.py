@@ -230,8 +230,8 @@ def _checked(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...], whole:
             raise InputError(".".join(here), value, _unknown(str(key), path, list(by_name), whole))
         hint, room = hints[key], room_of(hints[key])
         if room is None:
+            out[key] = value = _as_list(hint, value)
             _check_leaf(hint, value, here)
-            out[key] = value
         elif value is None:
             if _is_optional(hint):
                 out[key] = None  # otherwise an empty room: all defaults
@@ -257,14 +257,33 @@ def _checked_room(
     return {TYPE: kind} | _checked(choices[kind], rest, here, whole)
 
 
+def _as_list(hint: Any, value: Any) -> Any:
+    """``a,b`` and a lone value as the list that the field holds; draccus would take text letter by letter."""
+    lists = [kind for kind in _kinds(hint) if typing.get_origin(kind) in (list, tuple)]
+    if len(lists) != 1:
+        return value
+    if isinstance(value, str):
+        entries = [entry.strip() for entry in value.split(",")]
+        return entries if typing.get_args(lists[0])[0] is str else [_value(entry) for entry in entries]
+    return [value] if isinstance(value, (bool, int, float)) else value
+
+
+def _kinds(hint: Any) -> set[Any]:
+    return set(typing.get_args(hint)) if _is_union(hint) else {hint}
+
+
 def _check_leaf(hint: Any, value: Any, here: tuple[str, ...]) -> None:
     """Refuses what draccus would quietly turn into something else."""
-    kinds = set(typing.get_args(hint)) if _is_union(hint) else {hint}
+    kinds = _kinds(hint)
     wrong = (
         (value is None and hint is not Any and not _is_optional(hint))
         or (isinstance(value, bool) and not kinds & {bool, Any})
         or (isinstance(value, (list, dict)) and kinds <= {str, int, float, bool, type(None)})
     )
+    lists = [kind for kind in kinds if typing.get_origin(kind) in (list, tuple)]
+    if isinstance(value, list) and len(lists) == 1:
+        (entry, *_) = typing.get_args(lists[0])
+        wrong = wrong or any(isinstance(v, bool) and entry not in (bool, Any) for v in value)
     if wrong:
         raise InputError(".".join(here), value, f"use {wanted(hint)}")
 
@@ -280,9 +299,9 @@ def wanted(hint: Any) -> str:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Literal:
         return f"one of {', '.join(map(str, arguments))}"
-    if origin is tuple:
+    if origin is tuple and Ellipsis not in arguments:
         return f"a list of {len(arguments)}, each {wanted(arguments[0])}"
-    if origin is list:
+    if origin in (list, tuple):
         return f"a list such as [a, b], each {wanted(arguments[0])}"
     if origin is dict:
         return "a mapping such as {key: value}"

@@ -30,8 +30,11 @@ if TYPE_CHECKING:
     from accerl_lerobot.demos.sft import SFTConfig
 
 
-def check_start(config: RunConfig) -> None:
+def check_start(config: RunConfig) -> int:
     """Refuses a run that could not begin: no policy, no dataset, or an SFT whose outcome RL could not use.
+
+    Returns:
+        The policy's ``n_obs_steps``; 1 where LeRobot's trainer will tell.
 
     Raises:
         InputError: see above; also what `check_sft_policy` raises.
@@ -42,19 +45,20 @@ def check_start(config: RunConfig) -> None:
     if config.policy.path is not None:
         from accerl_lerobot.policies.loading import load_lerobot_config
 
-        load_lerobot_config(config.policy)
-        return
+        return int(load_lerobot_config(config.policy).n_obs_steps)
     if config.dataset.repo_id is not None:
         from accerl_lerobot.demos.windows import open_metadata
 
         open_metadata(config.dataset)
-    if config.sft.init_path is None:
-        from accerl_lerobot.policies.loading import check_observations, check_type, sampler_config
+    if config.sft.init_path is not None:
+        return 1
+    from accerl_lerobot.policies.loading import check_observations, check_type, sampler_config
 
-        policy_config = check_sft_policy(config.sft)
-        kind = check_type(config.sft.policy["type"], "sft.policy.type", "RL needs a likelihood: ")
-        sampler_config(config.policy, kind)
-        check_observations(policy_config, "sft.policy.n_obs_steps")
+    policy_config = check_sft_policy(config.sft)
+    kind = check_type(config.sft.policy["type"], "sft.policy.type", "RL needs a likelihood: ")
+    sampler_config(config.policy, kind)
+    check_observations(policy_config, "sft.policy.n_obs_steps")
+    return int(policy_config.n_obs_steps)
 
 
 def check_sft_policy(config: SFTConfig) -> Any:

@@ -19,7 +19,7 @@ outputs/<run>/
   sft/                   LeRobot's own training output, sft.log beside it
   checkpoints/NNNNNN/    LeRobot's layout; `last` is the newest
   metrics.jsonl          and tensorboard/
-  success_curve.png, before_after.mp4, summary.json
+  success_curve.png, summary.json, and before_after.mp4 unless evaluation.before=false
 """
 
 from __future__ import annotations
@@ -76,16 +76,16 @@ def make_output_dir(config: RunConfig) -> Path:
     return path
 
 
-def make_engine(config: RunConfig, tasks: tuple[str, ...]) -> Engine:
-    """The engine that ``launch.engine`` names."""
+def make_engine(config: RunConfig, tasks: tuple[str, ...], history: int) -> Engine:
+    """The engine that ``launch.engine`` names, for a policy that sees `history` env steps at a time."""
     if config.launch.engine == "local":
         from accerl_lerobot.local import LocalEngine
 
-        return LocalEngine(config, tasks)
+        return LocalEngine(config, tasks, history)
     ray_environment.prepare()
     from accerl_lerobot.launch import RayEngine
 
-    return RayEngine(config, tasks)
+    return RayEngine(config, tasks, history)
 
 
 def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfig:
@@ -137,16 +137,16 @@ def train(config: RunConfig, directory: Path, console: Console) -> dict[str, Any
     tasks = check_world(config)
     config = warm_start(config, directory, console)
     warm_s = time.monotonic() - started
-    config = check_policy(config)
+    history = check_policy(config)
     with contextlib.ExitStack() as stack:  # ends the workers and flushes the log, whatever fails
         log = stack.enter_context(contextlib.closing(MetricsLog(directory, config.wandb, encode(config))))
         with console.stage("starting workers"):
-            engine = stack.enter_context(contextlib.closing(make_engine(config, tasks)))
+            engine = stack.enter_context(contextlib.closing(make_engine(config, tasks, history)))
         return _Loop(config, directory, console, engine, log, tasks).run(started, warm_s)
 
 
-def check_policy(config: RunConfig) -> RunConfig:
-    """Refuses a policy that does not fit the world, before workers are started; sets ``rollout.history``."""
+def check_policy(config: RunConfig) -> int:
+    """Refuses a policy that does not fit the world, before workers are started; gives its ``n_obs_steps``."""
     from accerl_lerobot.policies.base import check_fit
     from accerl_lerobot.policies.loading import load_lerobot_config
 
@@ -156,10 +156,7 @@ def check_policy(config: RunConfig) -> RunConfig:
         check_fit(policy, world.spec, config.policy.rename_map)
     finally:
         world.close()
-    if config.rollout.history not in (None, policy.n_obs_steps):
-        remedy = f"the policy's n_obs_steps is {policy.n_obs_steps}; leave the field out"
-        raise InputError("rollout.history", config.rollout.history, remedy)
-    return replace(config, rollout=replace(config.rollout, history=policy.n_obs_steps))
+    return int(policy.n_obs_steps)
 
 
 def run_plans(
@@ -275,6 +272,7 @@ class _Loop:
                 stage.update(progress.version, self._status(progress))
                 if progress.done:
                     return progress
+                self._heed_groups(progress.rollout)
                 every = config.evaluation.every_updates
                 if every and progress.version // every > evaluated:
                     evaluated = progress.version // every
@@ -300,7 +298,6 @@ class _Loop:
             values |= {f"replay_{k}": v for k, v in progress.replay.items()}
             values |= {f"inference_{k}": v for k, v in progress.inference.items()}
             self.log.write("rollout", progress.version, values)
-            self._heed_groups(progress.rollout)
         for episode in progress.episodes:
             results = self.during.get(episode.plan.group)
             if results is not None:
@@ -315,10 +312,11 @@ class _Loop:
             self.groups = (kept, dropped)
         elif dropped - self.groups[1] >= FRUITLESS_GROUPS:
             self.groups = (kept, dropped)
-            always = "always" if np.mean(self.recent) > 0.5 else "never"
+            success = f"{np.mean(self.recent):.0%}" if self.recent else "unknown"
             self.console.say(
-                f"{FRUITLESS_GROUPS} groups were thrown away, nothing is learnt: the policy {always} "
-                "succeeds from their starts; stop the run, or choose another task or rollout.group_filter"
+                f"{FRUITLESS_GROUPS} groups in a row were thrown away, and nothing is learnt from them: they "
+                f"had nothing to compare under rollout.group_filter={self.config.rollout.group_filter} "
+                f"(success while exploring {success}); stop the run, or choose tasks that succeed sometimes"
             )
 
     def _plan_during(self, number: int) -> None:

@@ -178,9 +178,9 @@ def evaluate(arguments: list[str]) -> int:
     film = config.evaluation.videos if out else 0
     console = Console()
     with redirect_stdout(sys.stderr):
-        whole = run.check_policy(whole)
+        history = run.check_policy(whole)
         tasks = run.check_world(whole)
-        engine = run.make_engine(whole, tasks)
+        engine = run.make_engine(whole, tasks, history)
         try:
             engine.plan(evaluation_plans(tasks, config.evaluation.episodes, "eval", film))
             results = run.run_plans(engine, config.evaluation.episodes, "eval", console)

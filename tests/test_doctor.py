@@ -36,7 +36,8 @@ QUICKSTART = Path(__file__).parents[1] / "recipes" / "quickstart.yaml"
 @pytest.fixture
 def healthy(monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine on which all is well, whatever this one is like."""
-    monkeypatch.setattr(doctor, "machine", lambda config: [Check(name="python", status=OK, text="3.12")])
+    fine = [Check(name="python", status=OK, text="3.12")]
+    monkeypatch.setattr(doctor, "machine", lambda config, history: fine)
 
 
 def checks(config: RunConfig) -> dict[str, Check]:
@@ -206,6 +207,13 @@ class TestResources:
         big = {"image_size": 480}
         memory = checks(self.recipe(env=big, replay={"capacity": 100_000}))["memory"]
         assert memory.status == WARN and "GiB needed: lower" in memory.text
+
+    def test_a_policy_that_looks_back_keeps_more_pictures(self) -> None:
+        config = self.recipe(replay={"capacity": 10_000})
+        pictures = [doctor.memory_estimate_gib(config, history) for history in (1, 2, 3)]
+        each = 10_000 * doctor.observation_bytes(config) / 2**30
+        assert pictures[1] - pictures[0] == pytest.approx(pictures[2] - pictures[1])
+        assert each <= pictures[1] - pictures[0] < 1.1 * each
 
     def test_too_little_disk(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: SimpleNamespace(free=2**28))

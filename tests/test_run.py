@@ -235,7 +235,7 @@ def _succeeded(plan: EpisodePlan) -> EpisodeResult:
 def scripted(monkeypatch: pytest.MonkeyPatch, config: RunConfig) -> Scripted:
     engine = Scripted(config)
     monkeypatch.setattr(run, "make_engine", lambda *_: engine)
-    monkeypatch.setattr(run, "check_policy", lambda config: config)
+    monkeypatch.setattr(run, "check_policy", lambda config: 1)
     return engine
 
 
@@ -270,7 +270,8 @@ def test_groups_with_nothing_to_compare_are_said_aloud(
     run.train(engine.config, tmp_path, Console())
     said = " ".join(capsys.readouterr().err.split())
     # At 60 and 120; one is kept at 140, from where it is counted again: at 200.
-    assert said.count("50 groups were thrown away, nothing is learnt: the policy always") == 3
+    assert said.count("50 groups in a row were thrown away, and nothing is learnt from them") == 3
+    assert "rollout.group_filter=outcome (success while exploring 100%)" in said
 
 
 @pytest.mark.parametrize("error", [RuntimeError("inference worker failed for good"), KeyboardInterrupt()])
@@ -291,6 +292,6 @@ def test_the_engine_is_the_one_that_was_asked_for(tiny_checkpoint: Path):
     from accerl_lerobot.local import LocalEngine
 
     config = local_run(tiny_checkpoint, None)
-    engine = run.make_engine(replace(config, seed=1), ("match",))
+    engine = run.make_engine(replace(config, seed=1), ("match",), 1)
     assert isinstance(engine, LocalEngine)
     engine.close()

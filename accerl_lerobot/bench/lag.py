@@ -22,26 +22,29 @@ is doing. Cells that are finished are kept: the same command goes on where it wa
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import yaml
 from rich.table import Table
 
 from accerl_lerobot.checkpoint import PRETRAINED
-from accerl_lerobot.config import RunConfig, parse
+from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.stats import Rate
 
-CONFIG, SUMMARY = "config.yaml", "summary.json"
+CONFIG, SUMMARY, LOCK = "config.yaml", "summary.json", ".lock"
 LOG_LINES = 12
 """Of a run that failed, shown in the error."""
 
@@ -51,7 +54,7 @@ class BenchLagConfig:
     """What is compared."""
 
     recipe: str = "recipes/quickstart.yaml"
-    """The run that every cell is a variation of."""
+    """The run that every cell is a variation of; read once, when the study starts."""
     output_dir: str = "outputs/lag"
     """Folder of the runs and of lag.json, lag.md and lag.png; finished cells in it are kept."""
     algorithms: tuple[str, ...] = ("gipo", "ppo", "decoupled", "sapo")
@@ -90,13 +93,63 @@ class Cell:
         """Of its folder."""
         return f"{self.algorithm}-lag{self.lag}-seed{self.seed}"
 
-    def arguments(self, config: BenchLagConfig, checkpoint: Path | None) -> list[str]:
-        """Of ``accerl train``; without a checkpoint, as they are before the warm start, to be checked."""
-        chosen = [f"--algorithm.type={self.algorithm}", f"--trainer.hold_back={self.lag}"]
-        if config.updates is not None:
-            chosen.append(f"--trainer.updates={config.updates}")
-        start = [] if checkpoint is None else ["--sft.steps=0", f"--policy.path={checkpoint}"]
-        return _common(config, self.seed) + start + chosen
+
+class Study:
+    """The runs of a study, all of them settled before the first one starts.
+
+    Raises:
+        InputError: the recipe, or a cell's settings, are wrong.
+    """
+
+    def __init__(self, config: BenchLagConfig) -> None:
+        self.config, self.root = config, Path(config.output_dir).expanduser().resolve()
+        # Seeds outermost: a study that is stopped has compared everything on the first ones.
+        self.cells = [
+            Cell(algorithm=algorithm, lag=lag, seed=seed)
+            for seed in config.seeds
+            for lag in config.lags
+            for algorithm in config.algorithms
+        ]
+        self.starts = {
+            seed: self._parse(seed, ["--trainer.updates=0"], self.start(seed)) for seed in config.seeds
+        }
+        self.runs = {cell: self._of(cell) for cell in self.cells}
+
+    def start(self, seed: int) -> Path:
+        """The folder of a seed's warm start."""
+        return self.root / f"start-seed{seed}"
+
+    def folder(self, cell: Cell) -> Path:
+        """The folder of a cell's run."""
+        return self.root / cell.name
+
+    def _of(self, cell: Cell) -> RunConfig:
+        chosen = [f"--algorithm.type={cell.algorithm}", f"--trainer.hold_back={cell.lag}"]
+        if self.config.updates is not None:
+            chosen.append(f"--trainer.updates={self.config.updates}")
+        if self.starts[cell.seed].policy.path is None:
+            checkpoint = self.start(cell.seed) / "checkpoints" / "last" / PRETRAINED
+            chosen += ["--sft.steps=0", f"--policy.path={checkpoint}"]
+        return self._parse(cell.seed, chosen, self.folder(cell))
+
+    def _parse(self, seed: int, chosen: list[str], folder: Path) -> RunConfig:
+        config: RunConfig = parse(
+            RunConfig,
+            [
+                f"--config_path={self.config.recipe}",
+                f"--seed={seed}",
+                "--launch.engine=local",
+                "--trainer.num_threads=1",
+                "--sft.num_threads=1",
+                "--evaluation.before=false",
+                f"--evaluation.episodes={self.config.episodes}",
+                "--evaluation.every_updates=0",
+                "--evaluation.videos=0",
+                f"--output_dir={folder}",
+                *chosen,
+            ],
+        )
+        return config
 
 
 def bench_lag(config: BenchLagConfig) -> dict[str, Any]:
@@ -107,34 +160,31 @@ def bench_lag(config: BenchLagConfig) -> dict[str, Any]:
         each run) and ``groups``: algorithm, lag, successes and episodes over the seeds.
 
     Raises:
-        InputError: a cell's settings are wrong; all are checked before the first run.
-        RuntimeError: a run failed; the others that were under way have ended, and what is finished is kept.
+        InputError: the settings of a cell are wrong, which is found before the first run as far as a run
+            itself finds it before it begins; the folder holds runs of other settings, or is in use.
+        RuntimeError: a run failed; those that were under way have ended, and what is finished is kept.
     """
-    # Seeds outermost: a study that is stopped has compared everything on the first ones.
-    cells = [
-        Cell(algorithm=a, lag=lag, seed=seed)
-        for seed in config.seeds
-        for lag in config.lags
-        for a in config.algorithms
-    ]
-    recipes = [parse(RunConfig, cell.arguments(config, None)) for cell in cells]
-    given = recipes[0].policy.path
-    root = Path(config.output_dir).expanduser()
-    root.mkdir(parents=True, exist_ok=True)
+    from accerl_lerobot.preflight import check_start
+
+    study = Study(config)
+    for start in study.starts.values():
+        check_start(start)
     console = Console()
-    starts = {f"start-seed{seed}": [*_common(config, seed), "--trainer.updates=0"] for seed in config.seeds}
-    _run_all(root, starts, config.jobs, "warm starts", console)
-    checkpoints = {seed: _checkpoint(root / f"start-seed{seed}", given) for seed in config.seeds}
-    runs = {cell.name: cell.arguments(config, checkpoints[cell.seed]) for cell in cells}
-    _run_all(root, runs, config.jobs, "cells", console)
+    with _locked(study.root) as lock:
+        runner = _Runner(config.jobs, lock, console)
+        runner.run("warm starts", {study.start(seed): start for seed, start in study.starts.items()})
+        for cell in study.cells:
+            _check_newer(study.folder(cell), study.start(cell.seed))
+        runner.run("cells", {study.folder(cell): run for cell, run in study.runs.items()})
     result = compare(
-        config, {s: _summary(root / f"start-seed{s}") for s in config.seeds},
-        [(cell, _summary(root / cell.name)) for cell in cells],
-    )  # fmt: skip
-    (root / "lag.json").write_text(json.dumps(result, indent=2) + "\n")
-    (root / "lag.md").write_text(markdown(result))
-    draw(root / "lag.png", result)
-    console.say(f"wrote {root}/lag.json, lag.md and lag.png")
+        config,
+        {seed: _summary(study.start(seed)) for seed in config.seeds},
+        [(cell, _summary(study.folder(cell))) for cell in study.cells],
+    )
+    (study.root / "lag.json").write_text(json.dumps(result, indent=2) + "\n")
+    (study.root / "lag.md").write_text(markdown(result))
+    draw(study.root / "lag.png", result)
+    console.say(f"wrote lag.json, lag.md and lag.png into {study.root}")
     return result
 
 
@@ -221,9 +271,12 @@ def draw(path: Path, result: dict[str, Any]) -> None:
 
 
 def _columns(result: dict[str, Any]) -> list[str]:
-    of = result["config"]["algorithms"][0]
-    lags = [(g["lag"], g["lag_mean"]) for g in result["groups"] if g["algorithm"] == of]
-    return ["algorithm", *(f"held back {lag} (lag {mean:.0f})" for lag, mean in lags)]
+    columns = ["algorithm"]
+    for lag in result["config"]["lags"]:
+        means = [f"{g['lag_mean']:.0f}" for g in result["groups"] if g["lag"] == lag]
+        measured = "–".join(dict.fromkeys((min(means, key=int), max(means, key=int))))
+        columns.append(f"held back {lag} (lag {measured})")
+    return columns
 
 
 def _rows(result: dict[str, Any]) -> list[list[str]]:
@@ -237,66 +290,93 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
     return rows
 
 
-def _common(config: BenchLagConfig, seed: int) -> list[str]:
-    return [
-        f"--config_path={config.recipe}",
-        f"--seed={seed}",
-        "--launch.engine=local",
-        "--evaluation.before=false",
-        f"--evaluation.episodes={config.episodes}",
-        "--evaluation.every_updates=0",
-        "--evaluation.videos=0",
-    ]
-
-
-def _run_all(root: Path, runs: dict[str, list[str]], jobs: int, name: str, console: Console) -> None:
-    """Runs ``accerl train`` for each folder that has no summary yet, `jobs` at a time."""
-    missing = {folder: a for folder, a in runs.items() if not (root / folder / SUMMARY).is_file()}
-    for folder in runs:
-        if folder not in missing:
-            _check_same(root / folder, runs[folder])
-    with console.stage(name, total=len(runs)) as stage, ThreadPoolExecutor(jobs) as pool:
-        done = len(runs) - len(missing)
-        stage.update(done)
-        under_way = [pool.submit(_run, root, folder, arguments) for folder, arguments in missing.items()]
+@contextmanager
+def _locked(root: Path) -> Iterator[int]:
+    """Creates the study's folder and keeps others out, for as long as one of its runs is alive."""
+    root.mkdir(parents=True, exist_ok=True)
+    with (root / LOCK).open("w") as file:
         try:
-            for future in as_completed(under_way):
-                future.result()
-                done += 1
-                stage.update(done)
-        except BaseException:
-            for future in under_way:
-                future.cancel()
-            raise
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            remedy = "a study, or a run of one that was killed, still writes there; wait for it or end it"
+            raise InputError("bench.output_dir", str(root), remedy) from error
+        yield file.fileno()
 
 
-def _run(root: Path, folder: str, arguments: list[str]) -> None:
-    directory, log = root / folder, root / f"{folder}.log"
-    if directory.exists():  # a run that was stopped on its way
-        shutil.rmtree(directory)
-    command = [sys.executable, "-m", "accerl_lerobot.cli", "train", *arguments, f"--output_dir={directory}"]
-    threads = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
-    with log.open("w") as out:
-        ended = subprocess.run(command, stdout=out, stderr=out, env=os.environ | threads, check=False)
-    if ended.returncode:
-        tail = "\n".join(log.read_text().splitlines()[-LOG_LINES:])
-        raise RuntimeError(f"the run {folder} failed, see {log}:\n{tail}")
+class _Runner:
+    """Runs ``accerl train`` in processes of their own.
+
+    Args:
+        jobs: how many at a time.
+        lock: a file descriptor that they inherit.
+        console: progress for people.
+    """
+
+    def __init__(self, jobs: int, lock: int, console: Console) -> None:
+        self._jobs, self._lock, self._console = jobs, lock, console
+        self._processes: set[subprocess.Popen[bytes]] = set()
+        self._stopped = False
+
+    def run(self, name: str, runs: dict[Path, RunConfig]) -> None:
+        """Does those that have no summary yet."""
+        missing = {folder: config for folder, config in runs.items() if not (folder / SUMMARY).is_file()}
+        for folder, config in runs.items():
+            if folder not in missing:
+                _check_same(folder, config)
+        done = len(runs) - len(missing)
+        with self._console.stage(name, total=len(runs)) as stage, ThreadPoolExecutor(self._jobs) as pool:
+            stage.update(done)
+            under_way = [pool.submit(self._one, folder, config) for folder, config in missing.items()]
+            try:
+                for future in as_completed(under_way):
+                    future.result()
+                    done += 1
+                    stage.update(done)
+            except BaseException as error:
+                for future in under_way:
+                    future.cancel()
+                if not isinstance(error, Exception):  # asked to stop: nothing must train on alone
+                    self._stopped = True
+                    for process in list(self._processes):
+                        process.terminate()
+                raise
+
+    def _one(self, folder: Path, config: RunConfig) -> None:
+        if folder.exists():  # a run that was stopped on its way
+            shutil.rmtree(folder)
+        recipe, log = folder.with_suffix(".yaml"), folder.with_suffix(".log")
+        recipe.write_text(yaml.safe_dump(encode(config), sort_keys=False))
+        command = [sys.executable, "-m", "accerl_lerobot.cli", "train", f"--config_path={recipe}"]
+        threads = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
+        with log.open("wb") as out:
+            process = subprocess.Popen(
+                command, stdout=out, stderr=out, env=os.environ | threads, pass_fds=(self._lock,)
+            )
+        self._processes.add(process)
+        if self._stopped:
+            process.terminate()
+        code = process.wait()
+        self._processes.discard(process)
+        if code:
+            tail = "\n".join(log.read_text().splitlines()[-LOG_LINES:])
+            raise RuntimeError(f"the run {folder.name} failed, see {log}:\n{tail}")
 
 
-def _check_same(directory: Path, arguments: list[str]) -> None:
+def _check_same(folder: Path, config: RunConfig) -> None:
     """Refuses to count a finished run of other settings."""
-    then = parse(RunConfig, [f"--config_path={directory / CONFIG}"])
-    now = parse(RunConfig, [*arguments, f"--output_dir={then.output_dir}"])
-    if then != now:
-        remedy = f"{directory.name} in it was run with other settings; choose another folder or remove it"
-        raise InputError("bench.output_dir", str(directory.parent), remedy)
+    if parse(RunConfig, [f"--config_path={folder / CONFIG}"]) != config:
+        remedy = f"{folder.name} in it was run with other settings; choose another folder or remove it"
+        raise InputError("bench.output_dir", str(folder.parent), remedy)
 
 
-def _summary(directory: Path) -> dict[str, Any]:
-    summary: dict[str, Any] = json.loads((directory / SUMMARY).read_text())
+def _check_newer(folder: Path, start: Path) -> None:
+    """Refuses to count a run from a warm start that has been replaced."""
+    summary = folder / SUMMARY
+    if summary.is_file() and summary.stat().st_mtime < (start / SUMMARY).stat().st_mtime:
+        remedy = f"{folder.name} in it is older than {start.name}, where it would have begun; remove it"
+        raise InputError("bench.output_dir", str(folder.parent), remedy)
+
+
+def _summary(folder: Path) -> dict[str, Any]:
+    summary: dict[str, Any] = json.loads((folder / SUMMARY).read_text())
     return summary
-
-
-def _checkpoint(start: Path, given: str | None) -> Path:
-    """Where a seed's cells begin."""
-    return start / "checkpoints" / "last" / PRETRAINED if given is None else Path(given)

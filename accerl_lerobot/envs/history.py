@@ -63,8 +63,8 @@ class HistoryWorld(World):
             if results[-1].done:
                 break
         last, taken = results[-1], sum(r.steps for r in results)
-        if last.truncated and taken < steps and taken <= unseen:
-            self._seen.extend([self._seen[-1]] * (self._length - 1))
+        if results[0].steps > 1:  # some were passed unseen; `length` follow, unless it was cut
+            self._seen.extend([self._seen[-1]] * (self._length - len(results)))
         self._left -= taken
         return ChunkResult(
             observation=None if last.observation is None else self._observation(),

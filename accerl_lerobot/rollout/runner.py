@@ -49,8 +49,6 @@ class RolloutConfig:
     """Worlds per process; while some wait for a decision the others step."""
     segment_length: int = 16
     """Largest number of decisions in a segment."""
-    history: int | None = None
-    """Env steps whose observations a decision sees, the policy's ``n_obs_steps``; None: asks the policy."""
     decision_cost: float = 0.01
     """Subtracted from the reward of every decision, so that faster is better; ≥ 0."""
     time_limit: str = "truncate"
@@ -94,8 +92,6 @@ class RolloutConfig:
         for name in ("workers", "worlds", "segment_length", "task_window"):
             if getattr(self, name) < 1:
                 raise InputError(f"rollout.{name}", getattr(self, name), "use at least 1")
-        if self.history is not None and self.history < 1:
-            raise InputError("rollout.history", self.history, "use at least 1, or leave the field out")
         if self.time_limit not in ("truncate", "fail"):
             raise InputError("rollout.time_limit", self.time_limit, "use truncate or fail")
         if self.group_size == 1:

@@ -69,6 +69,7 @@ class RolloutWorker:
         index: of this worker.
         incarnation: how often it has been restarted; part of the segments' keys, and of the seeds.
         film: see `RolloutRunner`.
+        history: env steps that an observation holds.
     """
 
     def __init__(
@@ -80,6 +81,7 @@ class RolloutWorker:
         index: int,
         incarnation: int,
         film: tuple[int, int],
+        history: int = 1,
     ) -> None:
         self._plans = EpisodePlans(
             config, tasks, seed=seed, worlds=config.worlds, worker=index, incarnation=incarnation
@@ -89,7 +91,7 @@ class RolloutWorker:
         self._training = threading.Event()
         self._entered: float | None = None
         self._outbox: list[Segment] = []
-        worlds = [make_world(env, config.history or 1) for _ in range(config.worlds)]
+        worlds = [make_world(env, history) for _ in range(config.worlds)]
         name = f"rollout{index}.{incarnation}"
         self._runner = RolloutRunner(
             worlds,

@@ -16,6 +16,12 @@
 from __future__ import annotations
 
 import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +29,7 @@ import pytest
 import yaml
 
 from accerl_lerobot.bench import lag as bench
-from accerl_lerobot.bench.lag import BenchLagConfig, Cell
+from accerl_lerobot.bench.lag import BenchLagConfig, Cell, Study
 from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.errors import InputError
 from tests.runs import tiny_run
@@ -103,44 +109,124 @@ def test_a_study_is_run_and_goes_on_where_it_was_stopped(
     assert 0 < cell["lag_mean"] <= cell["lag_max"]
     study = tmp_path / "study"
     assert json.loads((study / "lag.json").read_text()) == json.loads(json.dumps(first))
-    made = {"start-seed3", "start-seed3.log", "gipo-lag2-seed3", "gipo-lag2-seed3.log"}
+    runs = ("start-seed3", "gipo-lag2-seed3")
+    made = {run + end for run in runs for end in ("", ".log", ".yaml")} | {".lock"}
     assert {p.name for p in study.iterdir()} == made | {"lag.json", "lag.md", "lag.png"}
 
     ran: list[str] = []
 
-    def fake(root: Path, folder: str, arguments: list[str]) -> None:
-        ran.append(folder)
-        (root / folder).mkdir()
-        (root / folder / "summary.json").write_text(json.dumps(a_summary(0.5)))
+    def fake(self: Any, folder: Path, run: RunConfig) -> None:
+        ran.append(folder.name)
+        folder.mkdir()
+        (folder / "config.yaml").write_text(yaml.safe_dump(encode(run)))
+        (folder / "summary.json").write_text(json.dumps(a_summary(0.5)))
 
-    monkeypatch.setattr(bench, "_run", fake)
+    monkeypatch.setattr(bench._Runner, "_one", fake)
     again = bench.bench_lag(small(tmp_path, tiny_checkpoint, lags=(2,), seeds=(3,)))
     assert ran == ["ppo-lag2-seed3"] and again["cells"][0] == cell
     with pytest.raises(InputError, match="gipo-lag2-seed3 in it was run with other settings; choose another"):
         bench.bench_lag(small(tmp_path, tiny_checkpoint, lags=(2,), seeds=(3,), updates=5))
+    shutil.rmtree(study / "start-seed3")
+    with pytest.raises(InputError, match="gipo-lag2-seed3 in it is older than start-seed3"):
+        bench.bench_lag(small(tmp_path, tiny_checkpoint, lags=(2,), seeds=(3,)))
+    assert ran == ["ppo-lag2-seed3", "start-seed3"]
 
 
 def test_cells_differ_from_the_recipe_in_what_is_studied(tmp_path: Path, tiny_checkpoint: Path):
-    config = small(tmp_path, tiny_checkpoint)
-    made = parse(RunConfig, Cell(algorithm="ppo", lag=2, seed=4).arguments(config, tmp_path))
+    study = Study(small(tmp_path, tiny_checkpoint))
+    assert [c.name for c in study.cells][:3] == ["gipo-lag0-seed3", "ppo-lag0-seed3", "gipo-lag2-seed3"]
+    assert len(study.cells) == 8
+    made = study.runs[Cell(algorithm="ppo", lag=2, seed=4)]
     assert (made.algorithm.type, made.trainer.hold_back, made.seed) == ("ppo", 2, 4)
-    assert (made.trainer.updates, made.launch.engine, made.sft.steps) == (4, "local", 0)
-    assert made.policy.path == str(tmp_path)
+    assert (made.trainer.updates, made.launch.engine, made.policy.path) == (4, "local", str(tiny_checkpoint))
     assert (made.evaluation.episodes, made.evaluation.before) == (4, False)
+    assert made.output_dir == str(tmp_path / "study" / "ppo-lag2-seed4")
     assert made.replay == tiny_run(tiny_checkpoint).replay
+    assert study.starts[4].trainer.updates == 0
+
+
+def test_without_a_checkpoint_cells_begin_at_their_seed_s_warm_start(tmp_path: Path):
+    study = Study(BenchLagConfig(output_dir=str(tmp_path), lags=(4,), seeds=(1, 2)))
+    for cell, run in study.runs.items():
+        start = tmp_path / f"start-seed{cell.seed}"
+        assert run.policy.path == str(start / "checkpoints" / "last" / "pretrained_model")
+        assert run.sft.steps == 0 < study.starts[cell.seed].sft.steps
+        assert (run.trainer.num_threads, study.starts[1].sft.num_threads) == (1, 1)
 
 
 def test_settings_are_checked_before_anything_runs(tmp_path: Path, tiny_checkpoint: Path):
     config = small(tmp_path, tiny_checkpoint, algorithms=("gipo", "pppo"))
     with pytest.raises(InputError, match="algorithm.type"):
         bench.bench_lag(config)
+    with pytest.raises(InputError, match="policy.path"):
+        bench.bench_lag(small(tmp_path, tiny_checkpoint, recipe=recipe(tmp_path, tmp_path / "nowhere")))
     assert not (tmp_path / "study").exists()
 
 
-def test_a_run_that_fails_ends_the_study_with_its_last_lines(tmp_path: Path, tiny_checkpoint: Path):
-    config = small(tmp_path, tiny_checkpoint, recipe=recipe(tmp_path, tmp_path / "nowhere"))
-    with pytest.raises(RuntimeError, match="the run start-seed. failed.*\n.*policy.path"):
+def failing(*, during: Callable[[], None] = lambda: None) -> Callable[..., subprocess.Popen[bytes]]:
+    """Stands where `subprocess.Popen` does: the run says why it fails."""
+    real = subprocess.Popen
+
+    def start(command: list[str], **options: Any) -> subprocess.Popen[bytes]:
+        during()
+        return real([sys.executable, "-c", "print('one'); print('it broke'); raise SystemExit(3)"], **options)
+
+    return start
+
+
+def test_a_run_that_fails_ends_the_study_with_its_last_lines(
+    tmp_path: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(bench.subprocess, "Popen", failing())
+    with pytest.raises(RuntimeError, match="the run start-seed. failed, see .*\\none\\nit broke"):
+        bench.bench_lag(small(tmp_path, tiny_checkpoint))
+
+
+def test_one_study_at_a_time_writes_into_a_folder(
+    tmp_path: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+):
+    config = small(tmp_path, tiny_checkpoint)
+    seen: list[BaseException] = []
+
+    def another() -> None:
+        with pytest.raises(InputError, match="a study, or a run of one that was killed, still") as caught:
+            bench.bench_lag(config)
+        seen.append(caught.value)
+
+    monkeypatch.setattr(bench.subprocess, "Popen", failing(during=another))
+    with pytest.raises(RuntimeError, match="it broke"):
         bench.bench_lag(config)
+    assert seen
+
+
+def test_a_study_that_is_stopped_ends_its_runs(
+    tmp_path: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+):
+    real, started = subprocess.Popen, []
+
+    def start(command: list[str], **options: Any) -> subprocess.Popen[bytes]:
+        started.append(real([sys.executable, "-c", "import time; time.sleep(600)"], **options))
+        return started[-1]
+
+    def interrupted(under_way: list[Any]) -> Any:
+        while len(started) < 2:
+            time.sleep(0.01)
+        time.sleep(0.2)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(bench.subprocess, "Popen", start)
+    monkeypatch.setattr(bench, "as_completed", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        bench.bench_lag(small(tmp_path, tiny_checkpoint))
+    assert len(started) == 2 and all(p.returncode == -signal.SIGTERM for p in started)
+
+
+def test_lists_as_people_type_them():
+    config = parse(BenchLagConfig, ["--algorithms=gipo,ppo", "--lags=0, 4", "--seeds=7"])
+    assert (config.algorithms, config.lags, config.seeds) == (("gipo", "ppo"), (0, 4), (7,))
+    for bad in ("--lags=a", "--lags=1.5", "--lags=[true]"):
+        with pytest.raises(InputError, match="use a list such as .*each a whole number"):
+            parse(BenchLagConfig, [bad])
 
 
 @pytest.mark.parametrize(

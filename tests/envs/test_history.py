@@ -15,6 +15,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -101,31 +103,46 @@ def test_bad_actions_are_refused_before_any_is_executed():
     assert np.array_equal(result.observation[STATE][0], first[STATE][-1])
 
 
-def test_a_world_that_ends_early_shows_its_last_state_for_those_it_did_not_show():
+@pytest.mark.parametrize(
+    ("length", "rows", "cut", "shown"),
+    [
+        (2, 6, 2, (2, 2)),  # among those that are passed unseen
+        (3, 6, 5, (4, 5, 5)),  # among the last ones
+        (4, 6, 5, (3, 4, 5, 5)),
+        (3, 6, 1, (0, 0, 1)),  # at the first step, nothing was passed
+        (4, 3, 2, (0, 0, 1, 2)),  # where all are seen
+        (2, 6, 6, (5, 6)),
+    ],
+)
+def test_a_world_that_ends_early_shows_its_last_state_for_those_it_did_not_show(
+    length: int, rows: int, cut: int, shown: tuple[int, ...]
+):
     inner = make_world(WORLD)
 
     class Early(World):
+        """Truncates after `cut` steps, whatever its spec says."""
+
         spec = inner.spec
+        taken = 0
 
         def reset(self, seed: int, task: str) -> Observation:
             return inner.reset(seed, task)
 
         def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-            result = inner.step_chunk(actions[:2])
-            return ChunkResult(
-                observation=result.observation, rewards=result.rewards, terminated=False, truncated=True,
-                success=False,
-            )  # fmt: skip
+            result = inner.step_chunk(actions[: cut - self.taken])
+            self.taken += result.steps
+            return replace(result, truncated=self.taken == cut)
 
         def render(self, height: int, width: int) -> np.ndarray:
             return inner.render(height, width)
 
-    world = HistoryWorld(Early(), 2)
-    first = world.reset(5, "match")
-    result = world.step_chunk(np.full((6, 2), 0.3, np.float32))
-    assert result.truncated and result.steps == 2 and result.observation is not None
-    assert np.array_equal(result.observation[STATE][0], result.observation[STATE][1])
-    assert not np.array_equal(result.observation[IMAGE][0], first[IMAGE][0])
+    actions = np.full((rows, 2), 0.3, np.float32)
+    states, _ = one_by_one(make_world(WORLD), "match", actions)
+    world = HistoryWorld(Early(), length)
+    world.reset(5, "match")
+    result = world.step_chunk(actions)
+    assert result.truncated and result.steps == cut and result.observation is not None
+    same(result.observation, [states[i] for i in shown])
 
 
 def test_metaworld_too():

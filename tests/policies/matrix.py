@@ -37,7 +37,7 @@ from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import save_pretrained
 from tests.conftest import write_smolvla
 from tests.policies.checkpoints import write_act, write_diffusion, write_gaussian_actor
-from tests.policies.tiny import adapter_at, log_ratio, perturb, requests
+from tests.policies.tiny import adapter_at, log_ratio, looking_back, perturb, requests
 from tests.policies.tiny_bins import write_bins
 from tests.policies.tiny_pi import hub, small, write_pi
 
@@ -53,6 +53,7 @@ class Kind:
     learns: str
     """The test in which it improves at a small problem in one process."""
     image: int = 32
+    ask: Callable[..., list[Request]] = requests
     supervised: bool = True
     """False: LeRobot has no loss on demonstrations for it."""
     context: Callable[[], contextlib.AbstractContextManager[None]] = contextlib.nullcontext
@@ -93,9 +94,10 @@ KINDS = {
         supervised=False,
     ),
     "diffusion": Kind(
-        write=write_diffusion,
+        write=lambda path: write_diffusion(path, image=40, n_obs_steps=2),
         learns="tests/policies/test_diffusion.py::test_a_random_policy_gets_better_at_the_task",
-        image=16,
+        image=40,
+        ask=looking_back,
     ),
 }
 
@@ -119,7 +121,7 @@ class Row:
 def examine(name: str, directory: Path) -> Row:
     """Does everything the table says, in `directory`, which is empty."""
     kind = KINDS[name]
-    asked = requests(DECISIONS, image=kind.image)
+    asked = kind.ask(DECISIONS, image=kind.image)
     with kind.context():
         path = kind.write(directory / "pretrained_model")
         parameters = sum(p.numel() for p in adapter_at(path).policy.parameters())
@@ -148,8 +150,7 @@ def _supervised(adapter: LeRobotAdapter, asked: Sequence[Request]) -> tuple[floa
     batch: dict[str, Any] = {TASK: list(tasks)}
     for key in config.input_features:
         value = torch.from_numpy(observations[key])
-        value = value.permute(0, 3, 1, 2) / 255.0 if value.dtype == torch.uint8 else value
-        batch[key] = value[:, None] if config.type == "diffusion" else value  # a history, of one
+        batch[key] = value.movedim(-1, -3) / 255.0 if value.dtype == torch.uint8 else value
     batch["action"] = 0.3 * torch.randn(len(asked), rows, dims, generator=generator)
     batch["action_is_pad"] = torch.zeros(len(asked), rows, dtype=torch.bool)
     batch = adapter.processing.preprocessor(batch)
@@ -174,33 +175,31 @@ def _reloaded(adapter: LeRobotAdapter, path: Path, saved: Path, request: Request
         stock = get_policy_class(adapter.policy.config.type).from_pretrained(saved)
     ours, theirs = adapter.policy.state_dict(), stock.state_dict()
     same = ours.keys() == theirs.keys() and all(torch.equal(ours[k], theirs[k]) for k in ours)
-    action = stock.select_action(adapter.processing.prepare(*stack_observations([request])))
+    batch = adapter.processing.prepare(*stack_observations([request]))
+    if adapter.policy.config.n_obs_steps > 1:  # LeRobot keeps the history itself
+        batch = {k: v[:, -1] if k in adapter.policy.config.input_features else v for k, v in batch.items()}
+    action = stock.select_action(batch)
     return same and bool(torch.isfinite(action).all())
+
+
+def fixed(row: Row) -> tuple[str, str, str]:
+    """The cells that are the same on every machine."""
+    return f"{row.parameters / 1e6:.2g} M", " × ".join(map(str, row.chunk)), str(row.factors)
 
 
 def markdown(rows: dict[str, Row]) -> str:
     """The table."""
     columns = (
-        "type", "parameters here", "loss in LeRobot's SFT steps", "a decision", "log-prob factors",
+        "type", "parameters here", "a decision", "log-prob factors", "loss in LeRobot's SFT steps",
         "largest error of ρ at equal weights", "stock LeRobot reloads it", "learns in one process",
     )  # fmt: skip
     lines = [columns, ("---",) * len(columns)]
     for name, row in rows.items():
         losses = "has none" if row.losses is None else f"{row.losses[0]:.2f} → {row.losses[1]:.2f}"
-        chunk = " × ".join(map(str, row.chunk))
         file, test = KINDS[name].learns.split("::")
-        lines.append(
-            (
-                f"`{name}`",
-                f"{row.parameters / 1e6:.2g} M",
-                losses,
-                chunk,
-                str(row.factors),
-                f"{row.mismatch:.1e}",
-                "yes" if row.reloaded else "NO",
-                f"`{Path(file).name}::{test}`",
-            )  # fmt: skip
-        )
+        reloaded = "yes" if row.reloaded else "NO"
+        test = f"`{Path(file).name}::{test}`"
+        lines.append((f"`{name}`", *fixed(row), losses, f"{row.mismatch:.1e}", reloaded, test))
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 

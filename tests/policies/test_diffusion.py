@@ -474,7 +474,8 @@ def test_a_random_policy_gets_better_at_the_task(tmp_path: Path):
     path = written(
         tmp_path,
         image=8,
-        horizon=4,
+        horizon=8,
+        n_obs_steps=2,
         executed=4,
         noise_scheduler_type="DDIM",
         prediction_type="sample",
@@ -494,7 +495,7 @@ def test_a_random_policy_gets_better_at_the_task(tmp_path: Path):
             updates=40, batch_decisions=96, lr=1e-3, value_lr=3e-3, warmup_updates=3, value_warmup_updates=5
         ),
     )
-    engine = LocalEngine(run, ("match",))
+    engine = LocalEngine(run, ("match",), history=2)
     before = success(engine)
     engine.train()
     history = updates(drive(engine))

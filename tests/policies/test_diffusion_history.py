@@ -25,38 +25,24 @@ from accerl_lerobot import run
 from accerl_lerobot.config import LaunchConfig, RunConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import SimulatedConfig, make_world
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
 from accerl_lerobot.experience import TASK, Request
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import normal
 from accerl_lerobot.policies.samplers import DiffusionSamplerConfig
+from accerl_lerobot.rollout import worker as module
 from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.rollout.worker import RolloutWorker
 from accerl_lerobot.trainer.config import TrainerConfig
+from tests.local_ray import Handle, Local
 from tests.policies.checkpoints import write_diffusion
 from tests.policies.contract import PolicyContract
-from tests.policies.tiny import adapter_at, requests
+from tests.policies.tiny import adapter_at, looking_back, requests
 from tests.runs import tiny_run
 
 OBSERVED = 2
 STATE = "observation.state"
 WORLD = SimulatedConfig(max_steps=13, tolerance=0.05, image_size=40)
-
-
-def looking_back(count: int, **options: bool) -> list[Request]:
-    """Two unrelated observations make a history."""
-    old = requests(count, image=40, seed=7)
-    return [
-        Request(
-            observation={
-                key: value if key == TASK else np.stack([earlier.observation[key], value])
-                for key, value in now.observation.items()
-            },
-            noise_seed=now.noise_seed,
-            explore=now.explore,
-        )
-        for earlier, now in zip(old, requests(count, image=40, **options), strict=True)
-    ]
 
 
 def write(directory: Path) -> Path:
@@ -77,7 +63,7 @@ class TestContract(PolicyContract):
         return write(directory)
 
     def ask(self, count: int, **options: bool) -> list[Request]:
-        return looking_back(count, **options)
+        return looking_back(count, image=40, **options)
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +73,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_both_observations_matter(path: Path):
     adapter = adapter_at(path)
-    first = looking_back(1)[0]
+    first = looking_back(1, image=40)[0]
     chunk = adapter.decide([first], 0)[0].chunk
     for place in range(OBSERVED):
         for key in (STATE, "observation.images.front"):
@@ -131,14 +117,14 @@ def test_an_episode_is_the_one_that_stock_lerobot_plays(path: Path):
     assert steps == 13 and decisions == 5
 
 
-def config_for(path: Path, output_dir: Path | None = None, **rooms: object) -> RunConfig:
+def config_for(path: Path, output_dir: Path, **rooms: object) -> RunConfig:
     defaults = {
         "env": WORLD,
         "policy": PolicyConfig(path=str(path), device="cpu", sampler=DiffusionSamplerConfig(std_min=0.3)),
         "trainer": TrainerConfig(updates=3, batch_decisions=16),
         "launch": LaunchConfig(engine="local"),
         "evaluation": EvaluationConfig(episodes=4, videos=0, before=False),
-        "output_dir": str(output_dir) if output_dir else None,
+        "output_dir": str(output_dir),
     }
     return tiny_run(path, **(defaults | rooms))
 
@@ -149,9 +135,23 @@ def test_a_run_asks_the_policy_how_far_it_looks_back(path: Path, tmp_path: Path)
     assert summary["updates"] == 3 and summary["n_after"] == 4 and summary["ratio_max_dev"] < 1
 
 
-@pytest.mark.parametrize("history", [1, 3])
-def test_another_history_is_refused(path: Path, history: int):
-    config = config_for(path, rollout=RolloutConfig(history=history))
-    with pytest.raises(InputError, match=f"rollout.history={history}: the policy's n_obs_steps is 2"):
-        run.check_policy(config)
-    assert run.check_policy(config_for(path)).rollout.history == OBSERVED
+def test_a_world_without_a_history_is_refused_in_words(path: Path):
+    request = requests(1, image=40)[0]
+    with pytest.raises(ValueError, match="but the policy reads 2 env steps at a time: make worlds"):
+        adapter_at(path).decide([request], 0)
+
+
+def test_a_rollout_process_asks_with_the_history(monkeypatch: pytest.MonkeyPatch):
+    worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), ("match",), 0, 0, 0, (8, 2), OBSERVED)
+    asked: list[Request] = []
+
+    def decide(due: list[Request]) -> list[Request]:
+        asked.extend(due)
+        raise InterruptedError
+
+    monkeypatch.setattr(module, "ray", Local)
+    worker.report(True, [])
+    with pytest.raises(InterruptedError):
+        worker.run(Handle(decide=decide), Handle(insert=lambda segments: True))
+    assert asked[0].observation[STATE].shape == (OBSERVED, 4)
+    assert asked[0].observation["observation.images.front"].shape == (OBSERVED, 40, 40, 3)

@@ -21,11 +21,12 @@ import pytest
 
 from accerl_lerobot.policies.loading import POLICIES
 from tests.policies.flow_contract import TOLERANCE
-from tests.policies.matrix import KINDS, examine, markdown
+from tests.policies.matrix import KINDS, examine, fixed, markdown
 
 RESNETS = ("act", "diffusion")
 """Their 18 layers round differently in a batch, and the default std makes 1e-5 of that, or a little more."""
 ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs" / "policies.md"
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -35,11 +36,13 @@ def test_a_policy_type_does_all_of_it(name: str, tmp_path: Path):
     assert row.mismatch <= (2 if name in RESNETS else 1) * TOLERANCE and row.reloaded
     assert row.chunk[1] == 2 and row.factors > 0 and 0 < row.parameters < 20e6
     assert "nan" not in markdown({name: row}).lower()
+    cells = f"| `{name}` | {' | '.join(fixed(row))} |"
+    assert cells in DOCS.read_text(), "python -m tests.policies.matrix prints it anew"
 
 
 def test_the_table_has_every_type_and_names_tests_that_exist():
     assert set(KINDS) == set(POLICIES)
-    text = (ROOT / "docs" / "policies.md").read_text()
+    text = DOCS.read_text()
     for name, kind in KINDS.items():
         file, test = kind.learns.split("::")
         assert f"def {test}(" in (ROOT / file).read_text()

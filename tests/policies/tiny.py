@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,22 @@ def requests(count: int, *, explore: bool = True, seed: int = 0, image: int = 32
             explore=explore,
         )
         for i in range(count)
+    ]
+
+
+def looking_back(count: int, *, explore: bool = True, image: int = 32) -> list[Request]:
+    """Requests whose observations hold two env steps, unrelated ones."""
+    return [
+        replace(
+            now,
+            observation={
+                key: value if key == TASK else np.stack([before.observation[key], value])
+                for key, value in now.observation.items()
+            },
+        )
+        for before, now in zip(
+            requests(count, seed=7, image=image), requests(count, explore=explore, image=image), strict=True
+        )
     ]
 
 
