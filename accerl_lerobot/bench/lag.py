@@ -74,10 +74,10 @@ class BenchLagConfig:
         for name in ("algorithms", "lags", "seeds"):
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
-                raise InputError(f"bench.{name}", values, "name at least one, none of them twice")
+                raise InputError(name, values, "name at least one, none of them twice")
         for name in ("episodes", "jobs"):
             if getattr(self, name) < 1:
-                raise InputError(f"bench.{name}", getattr(self, name), "use at least 1")
+                raise InputError(name, getattr(self, name), "use at least 1")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -299,7 +299,7 @@ def _locked(root: Path) -> Iterator[int]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             remedy = "a study, or a run of one that was killed, still writes there; wait for it or end it"
-            raise InputError("bench.output_dir", str(root), remedy) from error
+            raise InputError("output_dir", str(root), remedy) from error
         yield file.fileno()
 
 
@@ -366,7 +366,7 @@ def _check_same(folder: Path, config: RunConfig) -> None:
     """Refuses to count a finished run of other settings."""
     if parse(RunConfig, [f"--config_path={folder / CONFIG}"]) != config:
         remedy = f"{folder.name} in it was run with other settings; choose another folder or remove it"
-        raise InputError("bench.output_dir", str(folder.parent), remedy)
+        raise InputError("output_dir", str(folder.parent), remedy)
 
 
 def _check_newer(folder: Path, start: Path) -> None:
@@ -374,7 +374,7 @@ def _check_newer(folder: Path, start: Path) -> None:
     summary = folder / SUMMARY
     if summary.is_file() and summary.stat().st_mtime < (start / SUMMARY).stat().st_mtime:
         remedy = f"{folder.name} in it is older than {start.name}, where it would have begun; remove it"
-        raise InputError("bench.output_dir", str(folder.parent), remedy)
+        raise InputError("output_dir", str(folder.parent), remedy)
 
 
 def _summary(folder: Path) -> dict[str, Any]:

@@ -62,12 +62,12 @@ class BenchPolicyConfig:
 
     def __post_init__(self) -> None:
         if self.type not in BUILDERS:
-            raise InputError("bench.type", self.type, f"use one of {', '.join(BUILDERS)}")
+            raise InputError("type", self.type, f"use one of {', '.join(BUILDERS)}")
         for name in ("cameras", "batch", "repeats"):
             if getattr(self, name) < 1:
-                raise InputError(f"bench.{name}", getattr(self, name), "use at least 1")
+                raise InputError(name, getattr(self, name), "use at least 1")
         if self.precision not in ("fp32", "bf16"):
-            raise InputError("bench.precision", self.precision, "use fp32 or bf16")
+            raise InputError("precision", self.precision, "use fp32 or bf16")
 
 
 def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:

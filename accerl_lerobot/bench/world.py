@@ -63,13 +63,13 @@ class BenchWorldConfig:
 
     def __post_init__(self) -> None:
         if len(self.env.tasks) != 1:
-            raise InputError("bench.task", self.task, "name one task")
+            raise InputError("task", self.task, "name one task")
         if not 1 <= self.chunk <= 500:
-            raise InputError("bench.chunk", self.chunk, "use 1 to 500")
+            raise InputError("chunk", self.chunk, "use 1 to 500")
         if not self.seconds > 0:
-            raise InputError("bench.seconds", self.seconds, "use a positive time")
+            raise InputError("seconds", self.seconds, "use a positive time")
         if self.rounds < 1:
-            raise InputError("bench.rounds", self.rounds, "use at least 1")
+            raise InputError("rounds", self.rounds, "use at least 1")
 
     @property
     def env(self) -> MetaWorldConfig:

@@ -102,6 +102,17 @@ def resolve_device(name: str) -> torch.device:
         raise InputError("policy.device", name, "use cpu, cuda or auto") from error
 
 
+def no_tf32(device: torch.device) -> None:
+    """Makes fp32 mean fp32 on a GPU, where torch convolves with 10 bits of mantissa unless told otherwise.
+
+    Acting and learning see the same observation in batches of different sizes, for which cuDNN chooses other
+    algorithms; what they round differently is divided by the std of the noise in every log-prob.
+    """
+    if device.type == "cuda":
+        torch.backends.cudnn.allow_tf32 = False
+        torch.backends.cuda.matmul.allow_tf32 = False
+
+
 def check_type(policy_type: Any, field: str, prefix: str = "") -> str:
     """Refuses a LeRobot policy type that has no likelihood here; `prefix` begins the remedy.
 
@@ -189,6 +200,8 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
     verify_weights(policy, model_class, folder / WEIGHTS, config.path)
     model = model_class(policy)  # type: ignore[call-arg]
     device = torch.device(lerobot_config.device)
+    if config.precision == "fp32":
+        no_tf32(device)
     overrides = {"device_processor": {"device": str(device)}, **model.processor_overrides}
     try:
         overrides |= tokenizer_overrides(lerobot_config, folder)

@@ -44,7 +44,7 @@ def test_three_arms_in_turns():
 
 @pytest.mark.parametrize(
     ("values", "field"),
-    [({"task": "easy"}, "bench.task"), ({"chunk": 0}, "bench.chunk"), ({"seconds": 0.0}, "bench.seconds")],
+    [({"task": "easy"}, "task"), ({"chunk": 0}, "chunk"), ({"seconds": 0.0}, "seconds")],
 )
 def test_bad_values_name_their_field(values: dict, field: str):
     with pytest.raises(InputError, match=f"^{field}="):

@@ -34,6 +34,7 @@ from accerl_lerobot.policies.loading import (
     example_observations,
     load_adapter,
     load_lerobot_config,
+    no_tf32,
     resolve_device,
     save_pretrained,
 )
@@ -349,6 +350,21 @@ def test_another_sampler_is_pointed_out(
     assert (
         "policy.sampler.stochastic=all, there last, policy.sampler.noise_level=0.2, there 0.4" in caplog.text
     )
+
+
+def test_fp32_is_fp32_on_a_gpu_too():
+    backends = (torch.backends.cudnn, torch.backends.cuda.matmul)
+    before = [backend.allow_tf32 for backend in backends]
+    try:
+        for backend in backends:
+            backend.allow_tf32 = True
+        no_tf32(torch.device("cpu"))
+        assert all(backend.allow_tf32 for backend in backends)
+        no_tf32(torch.device("cuda"))
+        assert not any(backend.allow_tf32 for backend in backends)
+    finally:
+        for backend, allowed in zip(backends, before, strict=True):
+            backend.allow_tf32 = allowed
 
 
 def test_a_checkpoint_of_lerobot_s_own_trainer_has_neither(
