@@ -30,10 +30,16 @@ from accerl_lerobot.policies.base import stack_observations
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import save_pretrained
 from accerl_lerobot.policies.samplers import SamplerConfig
-from tests.policies.tiny import adapter_at, as_segment, check_gradient, log_ratio, perturb, requests, stored
-
-TOLERANCE = 1e-5
-"""|ρ − 1| of a whole chunk at equal weights, in fp32."""
+from tests.policies.tiny import (
+    TOLERANCE,
+    adapter_at,
+    check_gradient,
+    check_journey,
+    log_ratio,
+    perturb,
+    requests,
+    stored,
+)
 
 
 def label(config: SamplerConfig) -> str:
@@ -127,21 +133,7 @@ class PolicyContract:
     ):
         adapter, asked = self.exploring(adapter, config), self.ask(7)
         perturb(adapter, 0.1)
-        segment = as_segment(asked, adapter, 6)
-        save_pretrained(
-            adapter, tmp_path / "saved", PolicyConfig(path=str(path), device="cpu", sampler=config)
-        )
-        again = adapter_at(tmp_path / "saved", config)
-        with torch.no_grad():
-            evaluation = again.evaluate(
-                {k: v[:-1] for k, v in segment.observations.items()},
-                [str(r.observation["task"]) for r in asked[:6]],
-                {k: torch.from_numpy(v) for k, v in segment.latent.items()},
-            )
-        ratio = (evaluation.log_prob - torch.from_numpy(segment.log_prob)).sum(1).exp()
-        assert (ratio - 1).abs().max() <= TOLERANCE
-        assert np.abs(evaluation.value.mean.numpy() - segment.value).max() <= TOLERANCE
-        assert np.abs(segment.value).max() > 0, "the critic was saved and loaded, not made anew"
+        check_journey(adapter, asked, path, tmp_path / "saved")
         untouched = self.exploring(adapter_at(path), config)
         assert log_ratio(untouched, asked[:6], adapter.decide(asked[:6], 0)).abs().max() > 1e-3
 

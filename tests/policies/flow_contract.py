@@ -29,9 +29,6 @@ from accerl_lerobot.policies.flow import FlowFamily
 from accerl_lerobot.policies.samplers import FlowSamplerConfig
 from tests.policies import oracle
 
-TOLERANCE = 1e-5
-"""The contract: |ρ − 1| of a whole chunk at equal weights, in fp32."""
-
 
 def samplers(euler: float) -> list[FlowSamplerConfig]:
     """All that flow policies share; `euler` is the noise level of that law, rounding is over it."""

@@ -34,9 +34,8 @@ from accerl_lerobot.policies.loading import save_pretrained
 from accerl_lerobot.policies.samplers import FlowSamplerConfig
 from tests.conftest import write_smolvla
 from tests.policies import test_importance as importance
-from tests.policies.tiny import adapter_at, log_ratio, perturb, requests, stored
+from tests.policies.tiny import TOLERANCE, adapter_at, log_ratio, perturb, requests, stored
 
-TOLERANCE = 1e-5
 SAMPLERS = [
     FlowSamplerConfig(stochastic=s, noise="learned", noise_level=0.2, padded=p)
     for s, p in (("last", "joint"), ("all", "joint"), ("all", "analytic"), ("one", "joint"))

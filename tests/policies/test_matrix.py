@@ -20,8 +20,8 @@ from pathlib import Path
 import pytest
 
 from accerl_lerobot.policies.loading import POLICIES
-from tests.policies.flow_contract import TOLERANCE
 from tests.policies.matrix import KINDS, examine, fixed, markdown
+from tests.policies.tiny import TOLERANCE
 
 RESNETS = ("act", "diffusion")
 """Their 18 layers round differently in a batch, and the default std makes 1e-5 of that, or a little more."""

@@ -33,11 +33,18 @@ from accerl_lerobot.experience import Request
 from accerl_lerobot.policies import flow
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import stack_observations
-from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.loading import save_pretrained
 from accerl_lerobot.policies.samplers import FlowSamplerConfig
-from tests.policies.flow_contract import TOLERANCE, exploring, name, samplers, slow_log_prob
-from tests.policies.tiny import adapter_at, as_segment, check_gradient, log_ratio, perturb, requests, stored
+from tests.policies.flow_contract import exploring, name, samplers, slow_log_prob
+from tests.policies.tiny import (
+    TOLERANCE,
+    adapter_at,
+    check_gradient,
+    check_journey,
+    log_ratio,
+    perturb,
+    requests,
+    stored,
+)
 from tests.policies.tiny_pi import KINDS, small, write_pi
 
 SAMPLERS = samplers(0.4)
@@ -147,19 +154,7 @@ def test_ratio_one_after_save_and_load_and_a_segment_s_journey(
 ):
     adapter, asked = exploring(adapter, config), requests(9)
     perturb(adapter, 0.1)
-    segment = as_segment(asked, adapter, 8)
-    save_pretrained(adapter, tmp_path / "saved", PolicyConfig(path=str(path), device="cpu", sampler=config))
-    again = adapter_at(tmp_path / "saved", config)
-    with torch.no_grad():
-        evaluation = again.evaluate(
-            {k: v[:-1] for k, v in segment.observations.items()},
-            [str(r.observation["task"]) for r in asked[:8]],
-            {k: torch.from_numpy(v) for k, v in segment.latent.items()},
-        )
-    ratio = (evaluation.log_prob - torch.from_numpy(segment.log_prob)).sum(1).exp()
-    assert (ratio - 1).abs().max() <= TOLERANCE
-    assert np.abs(evaluation.value.mean.numpy() - segment.value).max() <= TOLERANCE
-    assert np.abs(segment.value).max() > 0, "the critic was saved and loaded, not made anew"
+    check_journey(adapter, asked, path, tmp_path / "saved")
 
 
 @pytest.mark.parametrize("config", SAMPLERS, ids=name)

@@ -32,13 +32,10 @@ from torch import Tensor
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import stack_observations
-from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.loading import save_pretrained
 from accerl_lerobot.policies.models import pi0_fast
 from accerl_lerobot.policies.samplers import TokenSamplerConfig
 from accerl_lerobot.policies.tokens import TokenContext, TokenFamily
-from tests.policies.flow_contract import TOLERANCE
-from tests.policies.tiny import adapter_at, as_segment, log_ratio, perturb, requests, stored
+from tests.policies.tiny import TOLERANCE, adapter_at, check_journey, log_ratio, perturb, requests, stored
 from tests.policies.tiny_pi import CHARACTERS, LOWEST, SCALE, SKIP, VOCABULARY, small, write_pi
 
 LENGTH = 10
@@ -230,22 +227,9 @@ def test_decisions_are_their_own_and_equal_to_the_bit(adapter: LeRobotAdapter):
 def test_ratio_one_after_save_and_load_and_a_segment_s_journey(
     adapter: LeRobotAdapter, path: Path, tmp_path: Path
 ):
-    sampler = TokenSamplerConfig(temperature=0.7)
     adapter, asked = at(adapter, 0.7), requests(9)
     perturb(adapter, 0.1)
-    segment = as_segment(asked, adapter, 8)
-    save_pretrained(adapter, tmp_path / "saved", PolicyConfig(path=str(path), device="cpu", sampler=sampler))
-    again = adapter_at(tmp_path / "saved", sampler)
-    with torch.no_grad():
-        evaluation = again.evaluate(
-            {k: v[:-1] for k, v in segment.observations.items()},
-            [str(r.observation["task"]) for r in asked[:8]],
-            {k: torch.from_numpy(v) for k, v in segment.latent.items()},
-        )
-    ratio = (evaluation.log_prob - torch.from_numpy(segment.log_prob)).sum(1).exp()
-    assert (ratio - 1).abs().max() <= TOLERANCE
-    assert np.abs(evaluation.value.mean.numpy() - segment.value).max() <= TOLERANCE
-    assert np.abs(segment.value).max() > 0
+    check_journey(adapter, asked, path, tmp_path / "saved")
 
 
 def test_what_follows_the_terminator_does_not_count(adapter: LeRobotAdapter):

@@ -41,8 +41,7 @@ from accerl_lerobot.policies.samplers import TokenSamplerConfig
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
-from tests.policies.flow_contract import TOLERANCE
-from tests.policies.tiny import adapter_at, check_gradient, log_ratio, perturb, requests, stored
+from tests.policies.tiny import TOLERANCE, adapter_at, check_gradient, log_ratio, perturb, requests, stored
 from tests.policies.tiny_pi import LOWEST, SKIP, VOCABULARY, small, write_pi
 from tests.runs import collect, drive, tiny_run
 

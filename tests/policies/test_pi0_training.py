@@ -36,8 +36,8 @@ from accerl_lerobot.policies.samplers import FlowSamplerConfig, NoiseSpaceSample
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
-from tests.policies.flow_contract import TOLERANCE, slow_log_prob
-from tests.policies.tiny import adapter_at, log_ratio, perturb, requests, stored
+from tests.policies.flow_contract import slow_log_prob
+from tests.policies.tiny import TOLERANCE, adapter_at, log_ratio, perturb, requests, stored
 from tests.policies.tiny_pi import KINDS, small, write_pi
 from tests.runs import collect, drive, tiny_run
 

@@ -32,8 +32,17 @@ from accerl_lerobot.policies.config import PolicyConfig, ValueHeadConfig
 from accerl_lerobot.policies.loading import save_pretrained
 from accerl_lerobot.policies.samplers import FlowSamplerConfig
 from tests.conftest import write_smolvla
-from tests.policies.flow_contract import TOLERANCE, exploring, name, samplers, slow_log_prob
-from tests.policies.tiny import adapter_at, as_segment, check_gradient, log_ratio, perturb, requests, stored
+from tests.policies.flow_contract import exploring, name, samplers, slow_log_prob
+from tests.policies.tiny import (
+    TOLERANCE,
+    adapter_at,
+    check_gradient,
+    check_journey,
+    log_ratio,
+    perturb,
+    requests,
+    stored,
+)
 
 SAMPLERS = samplers(0.2)
 
@@ -128,19 +137,7 @@ def test_ratio_one_after_save_and_load_and_a_segment_s_journey(
 ):
     adapter, asked = exploring(adapter, config), requests(9)
     perturb(adapter, 0.1)
-    segment = as_segment(asked, adapter, 8)
-    save_pretrained(adapter, tmp_path / "saved", PolicyConfig(path=str(path), device="cpu", sampler=config))
-    again = adapter_at(tmp_path / "saved", config)
-    with torch.no_grad():
-        evaluation = again.evaluate(
-            {k: v[:-1] for k, v in segment.observations.items()},
-            [str(r.observation["task"]) for r in asked[:8]],
-            {k: torch.from_numpy(v) for k, v in segment.latent.items()},
-        )
-    ratio = (evaluation.log_prob - torch.from_numpy(segment.log_prob)).sum(1).exp()
-    assert (ratio - 1).abs().max() <= TOLERANCE
-    assert np.abs(evaluation.value.mean.numpy() - segment.value).max() <= TOLERANCE
-    assert np.abs(segment.value).max() > 0, "the critic was saved and loaded, not made anew"
+    check_journey(adapter, asked, path, tmp_path / "saved")
 
 
 @pytest.mark.parametrize("config", SAMPLERS, ids=name)

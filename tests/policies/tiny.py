@@ -30,10 +30,12 @@ from accerl_lerobot.experience import TASK, Decision, Request, Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import PolicyAdapter, stack_observations
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.loading import load_adapter
+from accerl_lerobot.policies.loading import load_adapter, save_pretrained
 from accerl_lerobot.policies.samplers import SamplerConfig
 from accerl_lerobot.rollout.segments import SegmentBuilder
 
+TOLERANCE = 1e-5
+"""The contract: |ρ − 1| of a whole chunk at equal weights, in fp32."""
 TEXTS = ("Match the target", "Go", "Mirror the target slowly, then stay")
 """Of different lengths, so that a batch pads some of them."""
 
@@ -104,6 +106,30 @@ def perturb(adapter: PolicyAdapter, scale: float, seed: int = 0) -> None:
         for parameter in adapter.trainable().values():
             size = parameter.abs().mean() + 1e-3
             parameter += scale * size * torch.randn(parameter.shape, generator=generator)
+
+
+def check_journey(adapter: LeRobotAdapter, asked: Sequence[Request], path: Path, saved: Path) -> None:
+    """ρ = 1 for a segment of decisions, each made alone, re-scored together by what was saved and loaded.
+
+    Args:
+        adapter: of perturbed weights, else nothing is shown.
+        asked: one more than there are decisions.
+        path: the checkpoint it was loaded from.
+        saved: where to save it, new.
+    """
+    count, sampler = len(asked) - 1, adapter.family.sampler
+    segment = as_segment(asked, adapter, count)
+    save_pretrained(adapter, saved, PolicyConfig(path=str(path), device="cpu", sampler=sampler))
+    with torch.no_grad():
+        evaluation = adapter_at(saved, sampler).evaluate(
+            {k: v[:-1] for k, v in segment.observations.items()},
+            [str(r.observation[TASK]) for r in asked[:count]],
+            {k: torch.from_numpy(v) for k, v in segment.latent.items()},
+        )
+    ratio = (evaluation.log_prob - torch.from_numpy(segment.log_prob)).sum(1).exp()
+    assert (ratio - 1).abs().max() <= TOLERANCE
+    assert np.abs(evaluation.value.mean.numpy() - segment.value).max() <= TOLERANCE
+    assert np.abs(segment.value).max() > 0, "the critic was saved and loaded, not made anew"
 
 
 def check_gradient(
