@@ -1,0 +1,108 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What a world model is: it begins at what was seen, and goes one action chunk at a time.
+
+    state = model.begin(frames, robot, tasks)
+    dream = model.step(state, actions, generator)     # dream.frames, dream.robot; go on from dream.state
+
+States are dicts of tensors with the batch in front, so that rows can be replaced, repeated and sent away. A
+model says in its `spec` what it provides, and whoever wants more is refused before anything runs. Whether a
+frame shows a success is another model's judgement, see `success.py`.
+
+Shapes: B batch, L frames of context, V cameras, H×W pixels, S robot state dims, K env steps of a chunk, A
+action dims.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from accerl_lerobot.errors import InputError
+
+State = dict[str, Tensor]
+"""Each (B, ...)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldModelSpec:
+    """What a world model shows, and of what world."""
+
+    cameras: tuple[str, ...]
+    """``observation.images.<camera>``, in the order of V."""
+    image_size: tuple[int, int]
+    """(H, W)."""
+    state_dim: int
+    """S; 0: it has no ``observation.state``."""
+    action_dim: int
+    chunk: int
+    """K."""
+    context: int
+    """L."""
+    provides: frozenset[str]
+    """Of pixels, state, uncertainty."""
+
+    def check(self, wanted: frozenset[str]) -> None:
+        """Refuses what is asked for and not there.
+
+        Raises:
+            InputError: something is missing.
+        """
+        missing = sorted(wanted - self.provides)
+        if missing:
+            remedy = f"this model provides {', '.join(sorted(self.provides)) or 'nothing'}; choose another"
+            raise InputError("world_model.type", missing[0], remedy)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dream:
+    """What is seen after a chunk."""
+
+    state: State
+    """To go on from."""
+    frames: Tensor
+    """uint8 (B, V, H, W, 3)."""
+    robot: Tensor
+    """float32 (B, S), in the world's units."""
+    uncertainty: Tensor
+    """float32 (B,), ≥ 0; 1 is the 95th percentile on held-out real chunks. NaN where it is not provided."""
+
+
+class WorldModel(ABC):
+    """A world that is imagined."""
+
+    spec: WorldModelSpec
+
+    @abstractmethod
+    def begin(self, frames: Tensor, robot: Tensor, tasks: Sequence[str]) -> State:
+        """Starts an imagination.
+
+        Args:
+            frames: uint8 (B, L, V, H, W, 3), K env steps apart, the newest last; it is the anchor too.
+            robot: float32 (B, S), at the newest.
+            tasks: B instructions.
+        """
+
+    @abstractmethod
+    def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Dream:
+        """Goes on by one chunk.
+
+        Args:
+            state: of `begin`, or of the last dream; it is not changed.
+            actions: float32 (B, K, A), in the world's units.
+            seeds: B seeds of the randomness, so that a row does not depend on its batch.
+        """

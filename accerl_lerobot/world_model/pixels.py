@@ -1,0 +1,315 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The learnt world models: frames by one of three objectives, the robot's state by a small ensemble.
+
+The image that is made is, for ``refiner`` and ``flow``, the change from the newest frame to the one after the
+chunk, in units of its usual size; for ``edm`` the frame itself, as in DIAMOND. It is conditioned on the
+context, and on the anchor, the frame at which imagination began, which no error of the model has touched.
+
+The state is predicted apart from the image, by several heads from state, chunk and a coarse look at the
+frame; where they disagree the model is asked for something it has not seen.
+
+Shapes: see `contract.py`; C = 3·V channels, R chunks of a window.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model import objectives
+from accerl_lerobot.world_model.contract import Dream, State, WorldModel, WorldModelSpec
+from accerl_lerobot.world_model.episodes import Windows
+from accerl_lerobot.world_model.network import Denoiser, NetworkConfig
+
+Objective = Literal["refiner", "edm", "flow"]
+
+SIGMA_FRAME = 0.5
+"""Standard deviation of frames in [−1, 1], EDM's σ_data of natural images."""
+LOOK = 8
+"""Side of the coarse look that the state heads take."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PixelModelConfig:
+    """How it learns and dreams."""
+
+    objective: Objective = "refiner"
+    """refiner: predict the change, then refine it. edm: denoise the frame, as DIAMOND does. flow: rectified
+    flow of the change."""
+    steps: int = 1
+    """Network passes per chunk, at least 1. One pass of the refiner is regression."""
+    context: int = 2
+    """Frames it sees, the newest included, a chunk apart."""
+    context_noise: float = 0.02
+    """Largest standard deviation of the noise on context and anchor in training, in units of [−1, 1]; ≥ 0.
+    What it dreams is never as clean as what it learns from."""
+    refine_levels: tuple[float, float] = (0.2, 0.05)
+    """Noise of the first and last refinement, in usual changes; those between are spaced evenly in log."""
+    sigma_max: float = 5.0
+    """Noise an edm dream starts from."""
+    heads: int = 3
+    """Of the robot's state, at least 2, or they cannot disagree."""
+    state_weight: float = 1.0
+    """Of the state's loss beside the image's."""
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+
+    def __post_init__(self) -> None:
+        if self.objective not in get_args(Objective):
+            raise InputError(
+                "world_model.objective", self.objective, f"use {' or '.join(get_args(Objective))}"
+            )
+        for name, least in (("steps", 1), ("context", 1), ("heads", 2)):
+            if getattr(self, name) < least:
+                raise InputError(f"world_model.{name}", getattr(self, name), f"use at least {least}")
+        if not self.context_noise >= 0:
+            raise InputError("world_model.context_noise", self.context_noise, "use 0 (none) or more")
+        if not self.refine_levels[0] >= self.refine_levels[1] > 0:
+            raise InputError("world_model.refine_levels", self.refine_levels, "use two falling numbers > 0")
+        if not self.sigma_max > 0.002:
+            raise InputError("world_model.sigma_max", self.sigma_max, "use more than 0.002, where it ends")
+
+
+class PixelWorldModel(nn.Module, WorldModel):
+    """Trainable; `fit_statistics` comes before the first loss, and is saved with the weights.
+
+    Args:
+        spec: of the world.
+        config: how it learns and dreams.
+
+    Raises:
+        InputError: the images do not divide into the network's blocks.
+    """
+
+    def __init__(self, spec: WorldModelSpec, config: PixelModelConfig) -> None:
+        super().__init__()
+        multiple = config.network.multiple
+        if any(side % multiple for side in spec.image_size):
+            remedy = f"use sides that are multiples of {multiple}, or change world_model.network"
+            raise InputError("world_model.image_size", spec.image_size, remedy)
+        self.spec, self.config = spec, config
+        channels, chunk = 3 * len(spec.cameras), spec.chunk * (spec.action_dim + 1)
+        self.network = Denoiser(
+            channels, (spec.context + 1) * channels, chunk, spec.state_dim, config.network
+        )
+        look = channels * LOOK * LOOK
+        self.heads = nn.ModuleList(
+            StateHead(spec.state_dim + chunk + look, spec.state_dim) for _ in range(config.heads)
+        )
+        for name, size in (
+            ("robot", spec.state_dim),
+            ("action", spec.action_dim),
+            ("motion", spec.state_dim),
+        ):
+            self.register_buffer(f"{name}_mean", torch.zeros(size))
+            self.register_buffer(f"{name}_std", torch.ones(size))
+        self.register_buffer("change", torch.tensor(0.1))
+        self.register_buffer("doubt", torch.tensor(1.0))
+
+    # What it is told.
+
+    def fit_statistics(self, windows: Windows) -> None:
+        """Means and sizes of states, actions, motions and changes, from many windows of real experience."""
+        valid = windows.valid[:, 0]
+        state = windows.state[:, 0]
+        motion = (windows.state[:, 1] - state)[valid]
+        made = np.arange(self.spec.chunk) < windows.steps[:, 0, None]
+        sizes = {"robot": state, "motion": motion, "action": windows.actions[:, 0][made]}
+        for name, values in sizes.items():
+            getattr(self, f"{name}_mean").copy_(torch.from_numpy(values.mean(0)))
+            getattr(self, f"{name}_std").copy_(torch.from_numpy(values.std(0)).clamp(min=1e-3))
+        frames = windows.frames[valid, -windows.steps.shape[1] - 1 :][:, :2].astype(np.float32) / 127.5
+        change = float(np.sqrt(np.square(frames[:, 1] - frames[:, 0]).mean()))
+        self.change.fill_(max(change, 1e-3))
+
+    def begin(self, frames: Tensor, robot: Tensor, tasks: Sequence[str]) -> State:
+        """See the base class."""
+        return {"frames": frames, "anchor": frames[:, -1], "robot": robot}
+
+    @torch.no_grad()
+    def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Dream:
+        """See the base class."""
+        steps = torch.full(actions.shape[:1], self.spec.chunk, device=actions.device)
+        chunk = self._chunk(actions, steps)
+        newest = state["frames"][:, -1]
+        image = self._sample(state, chunk, self._noise(seeds, state["frames"]), self.config.steps)
+        frames = _to_bytes(image, len(self.spec.cameras))
+        robot, doubt = self._robot(state["robot"], chunk, newest)
+        following = {
+            "frames": torch.cat([state["frames"][:, 1:], frames[:, None]], 1),
+            "anchor": state["anchor"],
+            "robot": robot,
+        }
+        return Dream(state=following, frames=frames, robot=robot, uncertainty=doubt / self.doubt)
+
+    def loss(self, windows: Windows, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+        """What is minimised, over every valid chunk of the windows; after the first it sees its own dreams.
+
+        Returns:
+            The loss, and ``image``, ``state`` and, of the dreamt ones, ``image_dreamt``.
+        """
+        device = self.change.device
+        tensors = {
+            key: torch.from_numpy(getattr(windows, key)).to(device)
+            for key in ("frames", "anchor", "state", "actions", "steps", "valid")
+        }
+        length, chunks = self.spec.context, tensors["steps"].shape[1]
+        state = {
+            "frames": tensors["frames"][:, :length],
+            "anchor": tensors["anchor"],
+            "robot": tensors["state"][:, 0],
+        }
+        images, robots, weights = [], [], []
+        for r in range(chunks):
+            valid = tensors["valid"][:, r].float()
+            chunk = self._chunk(tensors["actions"][:, r], tensors["steps"][:, r])
+            wanted = _to_floats(tensors["frames"][:, length + r])
+            images.append(self._image_loss(state, chunk, wanted, generator))
+            robots.append(self._robot_loss(state, chunk, tensors["state"][:, r + 1]))
+            weights.append(valid)
+            if r + 1 < chunks:
+                state = self._dreamt(state, chunk, generator)
+        weight = torch.stack(weights)
+        total = weight.sum().clamp(min=1)
+        image, robot = ((torch.stack(part) * weight).sum() / total for part in (images, robots))
+        metrics = {"image": float(image), "state": float(robot)}
+        if chunks > 1:
+            later = weight[1:].sum().clamp(min=1)
+            metrics["image_dreamt"] = float((torch.stack(images[1:]) * weight[1:]).sum() / later)
+        return image + self.config.state_weight * robot, metrics
+
+    # How frames are made.
+
+    def _image_loss(self, state: State, chunk: Tensor, wanted: Tensor, generator: torch.Generator) -> Tensor:
+        b = len(wanted)
+        newest, network = _to_floats(state["frames"][:, -1]), self._network(state, chunk, generator)
+        noise = torch.randn(wanted.shape, generator=generator).to(wanted)
+        spread = torch.randn(b, generator=generator).to(wanted)
+        if self.config.objective == "edm":
+            return objectives.edm_loss(network, wanted, noise, (1.2 * spread - 0.4).exp(), SIGMA_FRAME)
+        residual = (wanted - newest) / self.change
+        if self.config.objective == "flow":
+            return objectives.flow_loss(network, residual, noise, torch.sigmoid(spread))
+        # A model that is to dream in one pass has no use for refining; others spend half on each.
+        alone = 0.5 if self.config.steps > 1 else 1.0
+        predict = (torch.rand(b, generator=generator) < alone).to(wanted.device)
+        return objectives.refiner_loss(network, residual, noise, (spread - 2.0).exp(), predict, 1.0)
+
+    def _sample(self, state: State, chunk: Tensor, noise: Tensor, steps: int) -> Tensor:
+        """The frame after the chunk, (B, C, H, W) in [−1, 1]; noise (B, steps, C, H, W)."""
+        network = self._network(state, chunk, None)
+        if self.config.objective == "edm":
+            levels = objectives.edm_levels(steps, 0.002, self.config.sigma_max)
+            return objectives.edm_sample(network, noise[:, 0], levels, SIGMA_FRAME).clamp(-1, 1)
+        newest = _to_floats(state["frames"][:, -1])
+        if self.config.objective == "flow":
+            residual = objectives.flow_sample(network, noise[:, 0], steps)
+        else:
+            levels = np.geomspace(*self.config.refine_levels, max(1, steps - 1))[: steps - 1].tolist()
+            residual = objectives.refiner_sample(network, noise[:, : steps - 1], levels, 1.0)
+        return (newest + self.change * residual).clamp(-1, 1)
+
+    def _network(self, state: State, chunk: Tensor, generator: torch.Generator | None) -> objectives.Network:
+        """The network with all but image and label bound; with a generator, what it is shown is noisy."""
+        shown = _to_floats(torch.cat([state["frames"], state["anchor"][:, None]], 1).flatten(1, 2))
+        if generator is not None and self.config.context_noise:
+            level = self.config.context_noise * torch.rand(len(shown), 1, 1, 1, generator=generator)
+            shown = shown + (level * torch.randn(shown.shape, generator=generator)).to(shown)
+        robot = None
+        if self.spec.state_dim:
+            robot = (state["robot"] - self.robot_mean) / self.robot_std
+        return lambda x, label: self.network(x, label, shown, chunk, robot)[0]
+
+    def _dreamt(self, state: State, chunk: Tensor, generator: torch.Generator) -> State:
+        """Where the model itself believes to be after a chunk, for the next one to be learnt from there."""
+        with torch.no_grad():
+            b, side = len(chunk), state["frames"].shape[3:5]
+            noise = torch.randn(b, 1, 3 * len(self.spec.cameras), *side, generator=generator).to(chunk)
+            frames = _to_bytes(self._sample(state, chunk, noise, 1), len(self.spec.cameras))
+            robot, _ = self._robot(state["robot"], chunk, state["frames"][:, -1])
+        return {
+            "frames": torch.cat([state["frames"][:, 1:], frames[:, None]], 1),
+            "anchor": state["anchor"],
+            "robot": robot,
+        }
+
+    def _noise(self, seeds: Sequence[int], frames: Tensor) -> Tensor:
+        """(B, steps, C, H, W), each row from its own seed."""
+        size = (self.config.steps, 3 * len(self.spec.cameras), *frames.shape[3:5])
+        if self.config.objective == "refiner" and self.config.steps == 1:
+            return frames.new_zeros(len(frames), *size, dtype=torch.float32)
+        rows = [np.random.default_rng(seed).standard_normal(size, dtype=np.float32) for seed in seeds]
+        return torch.from_numpy(np.stack(rows)).to(frames.device)
+
+    # How the robot moves.
+
+    def _robot(self, robot: Tensor, chunk: Tensor, newest: Tensor) -> tuple[Tensor, Tensor]:
+        """Where it is after the chunk, (B, S), and how far the heads disagree, (B,)."""
+        motions = self._motions(robot, chunk, newest)
+        moved = robot + self.motion_mean + self.motion_std * motions.mean(0)
+        return moved, motions.std(0).mean(-1) if self.spec.state_dim else robot.new_full(
+            (len(robot),), torch.nan
+        )
+
+    def _robot_loss(self, state: State, chunk: Tensor, wanted: Tensor) -> Tensor:
+        motion = (wanted - state["robot"] - self.motion_mean) / self.motion_std
+        motions = self._motions(state["robot"], chunk, state["frames"][:, -1])
+        if not self.spec.state_dim:
+            return motion.new_zeros(len(motion))
+        return (motions - motion).square().mean((0, 2))
+
+    def _motions(self, robot: Tensor, chunk: Tensor, newest: Tensor) -> Tensor:
+        """(heads, B, S), in units of usual motions."""
+        look = functional.adaptive_avg_pool2d(_to_floats(newest), LOOK).flatten(1)
+        seen = torch.cat([(robot - self.robot_mean) / self.robot_std, chunk, look], 1)
+        return torch.stack([head(seen) for head in self.heads])
+
+    def _chunk(self, actions: Tensor, steps: Tensor) -> Tensor:
+        """(B, K·(A + 1)): normalised actions, and which of them are executed."""
+        made = torch.arange(self.spec.chunk, device=actions.device) < steps[:, None]
+        normal = (actions - self.action_mean) / self.action_std * made[..., None]
+        return torch.cat([normal.flatten(1), made.float()], 1)
+
+
+class StateHead(nn.Module):
+    """Where the robot goes; starts at the usual motion."""
+
+    def __init__(self, into: int, state: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(nn.Linear(into, 128), nn.SiLU(), nn.Linear(128, 128), nn.SiLU())
+        self.out = nn.Linear(128, state)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, seen: Tensor) -> Tensor:
+        """(B, into) to (B, S)."""
+        out: Tensor = self.out(self.layers(seen))
+        return out
+
+
+def _to_floats(frames: Tensor) -> Tensor:
+    """uint8 (B, V, H, W, 3) to float32 (B, 3·V, H, W) in [−1, 1]."""
+    return (frames.float() / 127.5 - 1).movedim(-1, 2).flatten(1, 2)
+
+
+def _to_bytes(image: Tensor, cameras: int) -> Tensor:
+    """The other way, rounded."""
+    return ((image + 1) * 127.5).round().clamp(0, 255).byte().unflatten(1, (cameras, 3)).movedim(2, -1)

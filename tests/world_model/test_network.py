@@ -1,0 +1,128 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The network: starts at nothing, and everything it is told can matter."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model.network import Attention, Denoiser, NetworkConfig
+
+SMALL = NetworkConfig(channels=(8, 12), condition=16, planes=4)
+
+
+def network(config: NetworkConfig = SMALL, state: int = 3) -> Denoiser:
+    torch.manual_seed(0)
+    return Denoiser(image=3, frames=6, action=8, state=state, config=config)
+
+
+def inputs(seed: int = 0, size: int = 16, state: int = 3) -> dict[str, Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    return {
+        "x": torch.randn(2, 3, size, size, generator=g),
+        "label": torch.randn(2, generator=g),
+        "frames": torch.randn(2, 6, size, size, generator=g),
+        "chunk": torch.randn(2, 8, generator=g),
+        "state": torch.randn(2, state, generator=g),
+    }
+
+
+def awake(made: Denoiser) -> Denoiser:
+    """Without the zeros it starts with."""
+    with torch.no_grad():
+        for p in made.parameters():
+            if not p.any():
+                p.normal_(std=0.2)
+    return made
+
+
+def test_it_starts_at_nothing_and_can_leave_it():
+    made = network()
+    image, summary = made(**inputs())
+    assert image.shape == (2, 3, 16, 16) and not image.any()
+    assert summary.shape == (2, made.width) and summary.std() > 0
+    (image - 1).square().sum().backward()
+    assert made.leave[-1].bias.grad.abs().max() > 0
+
+
+def test_all_parameters_learn():
+    made = awake(network())
+    image, summary = made(**inputs())
+    (image.square().sum() + summary.square().sum()).backward()
+    assert all(p.grad is not None and p.grad.abs().max() > 0 for p in made.parameters())
+
+
+@pytest.mark.parametrize("what", ["x", "label", "frames", "chunk", "state"])
+def test_everything_it_is_told_matters(what: str):
+    made, one = awake(network()), inputs()
+    other = one | {what: inputs(seed=1)[what]}
+    with torch.no_grad():
+        assert (made(**one)[0] - made(**other)[0]).abs().max() > 1e-3
+
+
+def test_rows_of_a_batch_do_not_meet():
+    made, one = awake(network()), inputs()
+    with torch.no_grad():
+        together = made(**one)
+        alone = made(**{k: v[1:] for k, v in one.items()})
+    for a, b in zip(together, alone, strict=True):
+        assert torch.allclose(a[1:], b, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        NetworkConfig(space_to_depth=2, channels=(8, 8, 12), blocks=2, condition=16, planes=0),
+        NetworkConfig(space_to_depth=1, channels=(7,), condition=16),
+        NetworkConfig(channels=(10, 14), condition=16),
+    ],
+    ids=["deep", "flat", "odd widths"],
+)
+def test_other_sizes(config: NetworkConfig):
+    side = 2 * config.multiple
+    image, summary = awake(network(config))(**inputs(size=side))
+    assert image.shape == (2, 3, side, side) and torch.isfinite(image).all() and torch.isfinite(summary).all()
+
+
+def test_a_world_without_a_state():
+    made = awake(network(state=0))
+    image, _ = made(**(inputs() | {"state": None}))
+    assert torch.isfinite(image).all()
+
+
+def test_attention_is_softmax_attention():
+    torch.manual_seed(0)
+    layer = Attention(6)
+    torch.nn.init.normal_(layer.out.weight, std=0.3)
+    x = torch.randn(2, 6, 3, 2)
+    with torch.no_grad():
+        got = layer(x)
+        h = layer.into(layer.norm(x)).flatten(2)
+        for b in range(2):
+            q, k, v = h[b].view(3, 6, 6)
+            mixed = v @ torch.softmax(q.T @ k / 6**0.5, -1).T
+            want = x[b] + layer.out(mixed.view(1, 6, 3, 2))[0]
+            assert torch.allclose(got[b], want, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("space_to_depth", 0), ("channels", ()), ("channels", (8, 0)), ("blocks", 0), ("planes", -1)],
+)
+def test_bad_sizes_name_their_field(name: str, value: object):
+    with pytest.raises(InputError, match=f"^network.{name}="):
+        NetworkConfig(**{name: value})
