@@ -190,10 +190,10 @@ class PixelWorldModel(nn.Module, WorldModel):
         weight = torch.stack(weights)
         total = weight.sum().clamp(min=1)
         image, robot = ((torch.stack(part) * weight).sum() / total for part in (images, robots))
-        metrics = {"image": float(image), "state": float(robot)}
+        metrics = {"image": image.item(), "state": robot.item()}
         if chunks > 1:
             later = weight[1:].sum().clamp(min=1)
-            metrics["image_dreamt"] = float((torch.stack(images[1:]) * weight[1:]).sum() / later)
+            metrics["image_dreamt"] = ((torch.stack(images[1:]) * weight[1:]).sum() / later).item()
         return image + self.config.state_weight * robot, metrics
 
     # How frames are made.

@@ -1,0 +1,116 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A LeRobotDataset as episodes of a world model."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from accerl_lerobot.demos.windows import open_metadata
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model.contract import WorldModelSpec
+from accerl_lerobot.world_model.episodes import Episode
+
+if TYPE_CHECKING:
+    from accerl_lerobot.config import DatasetConfig
+
+SUCCESS = "next.success"
+
+
+def load_episodes(
+    dataset: DatasetConfig, spec: WorldModelSpec, fps: int, source: str = "demo"
+) -> list[Episode]:
+    """Reads all of it into memory, one uint8 image per env step and camera.
+
+    Args:
+        dataset: on the Hub, or in a folder.
+        spec: the cameras, sizes and dims that are wanted; images are shrunk or enlarged to its size.
+        fps: control rate of the world it is to be a model of.
+        source: see `Episode.source`.
+
+    Raises:
+        InputError: a camera, the success labels or the rate are not the world's; state or actions are another
+            robot's; a single episode; only successes, or only failures.
+    """
+    meta = open_metadata(dataset)
+    check_metadata(meta, dataset.repo_id or "", spec, fps)
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    data = LeRobotDataset(meta.repo_id, root=meta.root, revision=meta.revision)
+    episodes = [_episode(data, meta, index, spec, source) for index in range(meta.total_episodes)]
+    remedies = {True: "add episodes that succeed", False: "add failures, see demos.failure_share"}
+    for outcome, remedy in remedies.items():
+        if not any(e.success is outcome for e in episodes):
+            why = f"no {'success' if outcome else 'failure'} among {len(episodes)} episodes; {remedy}"
+            raise InputError("dataset.repo_id", dataset.repo_id, why)
+    return episodes
+
+
+def check_metadata(meta: Any, name: str, spec: WorldModelSpec, fps: int) -> None:
+    """Refuses a dataset that a world model of `spec` cannot learn from, before any image is read.
+
+    Raises:
+        InputError: see `load_episodes`.
+    """
+
+    def refuse(why: str) -> InputError:
+        return InputError("dataset.repo_id", name, why)
+
+    for camera in spec.cameras:
+        if camera not in meta.features:
+            there = ", ".join(meta.camera_keys) or "no camera"
+            raise refuse(f"no {camera}: the dataset has {there}; choose env.camera accordingly")
+    wanted = {"action": spec.action_dim} | ({"observation.state": spec.state_dim} if spec.state_dim else {})
+    for key, size in wanted.items():
+        shape = tuple(meta.features[key]["shape"]) if key in meta.features else None
+        if shape != (size,):
+            raise refuse(f"{key} has shape {shape}, the world's has ({size},): it is another robot's")
+    if SUCCESS not in meta.features:
+        raise refuse(f"no {SUCCESS}: record it, as accerl demos does, or add it to the dataset")
+    if meta.fps != fps:
+        raise refuse(
+            f"{meta.fps} frames a second, and the world makes {fps} steps: a chunk would take another time; "
+            "record at the world's rate"
+        )
+    if meta.total_episodes < 2:
+        raise refuse("a single episode; at least one to learn from and one to be judged on are needed")
+
+
+def _episode(data: Any, meta: Any, index: int, spec: WorldModelSpec, source: str) -> Episode:
+    first, last = (int(meta.episodes[index][f"dataset_{end}_index"]) for end in ("from", "to"))
+    items = [data[i] for i in range(first, last)]
+    success = np.array([bool(item[SUCCESS]) for item in items])
+    state = [item["observation.state"].numpy() if spec.state_dim else np.zeros(0) for item in items]
+    frames = [np.stack([_image(item[camera], spec.image_size) for camera in spec.cameras]) for item in items]
+    return Episode(
+        frames=np.stack(frames),
+        times=np.arange(len(items)),
+        state=np.stack(state).astype(np.float32),
+        actions=np.stack([item["action"].numpy() for item in items]).astype(np.float32),
+        success_at=int(success.argmax()) if success.any() else -1,
+        task=str(items[0]["task"]),
+        source=source,
+    )
+
+
+def _image(image: Any, size: tuple[int, int]) -> np.ndarray:
+    """uint8 (H, W, 3) from LeRobot's float (3, h, w) in [0, 1]."""
+    from torch.nn import functional
+
+    if tuple(image.shape[1:]) != size:
+        image = functional.interpolate(image[None], size=size, mode="bilinear", antialias=True)[0]
+    bytes_: np.ndarray = (image * 255).round().clamp(0, 255).byte().permute(1, 2, 0).numpy()
+    return bytes_

@@ -1,0 +1,142 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What a world model is worth, in numbers that a model which ignores its actions cannot have.
+
+    skill          1 − MSE(model) / MSE(copy of the last frame), on all pixels or on those that changed
+    sensitivity    MSE(with the actions of other windows) / MSE(with the true ones); 1 if actions are ignored
+    AUROC          of a score that is to tell successes from failures
+
+Better pixels than a copy prove nothing: a model may learn to blur what moves and never hear an action.
+Intervals are percentile bootstraps over windows. NumPy only; M windows, D depths in chunks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+CHANGED = 16
+"""A pixel counts as changed if a colour of it moved by more, of 255."""
+
+
+class Estimate(NamedTuple):
+    """A number with its 95 % bootstrap interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+def bootstrap(
+    count: int, statistic: Callable[[np.ndarray], float], *, draws: int = 1000, seed: int = 0
+) -> Estimate:
+    """A statistic of rows, and how it varies when rows are drawn again.
+
+    Args:
+        count: of rows.
+        statistic: of row indices, int64; draws for which it is NaN are left out.
+        draws: resamples.
+        seed: of the resampling.
+    """
+    rng = np.random.default_rng(seed)
+    values = np.array([statistic(rng.integers(count, size=count)) for _ in range(draws)])
+    values = values[np.isfinite(values)]
+    low, high = np.quantile(values, [0.025, 0.975]) if len(values) else (np.nan, np.nan)
+    return Estimate(statistic(np.arange(count)), float(low), float(high))
+
+
+def changed(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """bool (M, V, H, W): pixels that differ by more than `CHANGED` between uint8 frames (M, V, H, W, 3)."""
+    return np.asarray(np.abs(before.astype(np.int16) - after).max(-1) > CHANGED)
+
+
+def squared_errors(frames: np.ndarray, wanted: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+    """(M, 2) sums of squared errors and of pixels, of uint8 frames (M, V, H, W, 3), where `mask` holds."""
+    errors = np.square(frames.astype(np.float64) - wanted).mean(-1)
+    counted = np.ones(errors.shape) if mask is None else mask.astype(np.float64)
+    sums: np.ndarray = np.stack([(errors * counted).sum((1, 2, 3)), counted.sum((1, 2, 3))], 1)
+    return sums
+
+
+def mean_error(sums: np.ndarray) -> float:
+    """Mean squared error of `squared_errors` rows; NaN without a pixel."""
+    total, count = sums.sum(0)
+    return float(total / count) if count else float("nan")
+
+
+def skill(model: np.ndarray, copy: np.ndarray) -> Estimate:
+    """1 − MSE(model)/MSE(copy), from `squared_errors` of both (M, 2)."""
+
+    def of(rows: np.ndarray) -> float:
+        copied = mean_error(copy[rows])
+        return 1 - mean_error(model[rows]) / copied if copied > 0 else float("nan")
+
+    return bootstrap(len(model), of)
+
+
+def sensitivity(true: np.ndarray, other: np.ndarray) -> Estimate:
+    """MSE(other actions)/MSE(true actions), from `squared_errors` of both (M, 2)."""
+
+    def of(rows: np.ndarray) -> float:
+        right = mean_error(true[rows])
+        return mean_error(other[rows]) / right if right > 0 else float("nan")
+
+    return bootstrap(len(true), of)
+
+
+def auroc(scores: np.ndarray, labels: np.ndarray) -> float:
+    """Chance that a success scores above a failure, ties counting half; NaN without both."""
+    scores, labels = np.asarray(scores, np.float64), np.asarray(labels, bool)
+    good, bad = int(labels.sum()), int((~labels).sum())
+    if not good or not bad:
+        return float("nan")
+    _, places, counts = np.unique(scores, return_inverse=True, return_counts=True)
+    ranks = (np.cumsum(counts) - (counts - 1) / 2)[places]
+    return float((ranks[labels].sum() - good * (good + 1) / 2) / (good * bad))
+
+
+def threshold(scores: np.ndarray, labels: np.ndarray, false_positives: float) -> float:
+    """The lowest threshold at which at most this share of failures scores at or above it.
+
+    Args:
+        scores: (M,).
+        labels: bool (M,).
+        false_positives: in [0, 1).
+
+    Raises:
+        ValueError: no failure to calibrate on.
+    """
+    failures = np.sort(np.asarray(scores, np.float64)[~np.asarray(labels, bool)])[::-1]
+    if not len(failures):
+        raise ValueError("no failures to calibrate a threshold on")
+    allowed = int(np.floor(false_positives * len(failures)))
+    return float(np.nextafter(failures[allowed], np.inf))
+
+
+def shuffled(count: int, groups: Sequence[object], rng: np.random.Generator) -> np.ndarray:
+    """A permutation that gives every window the actions of one from another group, where there is one.
+
+    Args:
+        count: windows.
+        groups: what each belongs to, its episode for instance.
+        rng: of the choice.
+    """
+    chosen = np.empty(count, np.int64)
+    of = np.array([hash(g) for g in groups])
+    for i in range(count):
+        others = np.flatnonzero(of != of[i])
+        chosen[i] = rng.choice(others if len(others) else np.flatnonzero(np.arange(count) != i))
+    return chosen

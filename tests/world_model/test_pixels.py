@@ -1,0 +1,283 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The pixel model on a world of one dot that goes where it is told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model.contract import Dream, WorldModelSpec
+from accerl_lerobot.world_model.episodes import Episode, Windows, cut, places
+from accerl_lerobot.world_model.judge import mean_error, sensitivity, shuffled, skill, squared_errors
+from accerl_lerobot.world_model.learn import LearnConfig, Learner, pretrain
+from accerl_lerobot.world_model.network import NetworkConfig
+from accerl_lerobot.world_model.pixels import Objective, PixelModelConfig, PixelWorldModel
+
+SIZE, K = 16, 2
+SPEC = WorldModelSpec(
+    cameras=("observation.images.top",),
+    image_size=(SIZE, SIZE),
+    state_dim=2,
+    action_dim=2,
+    chunk=K,
+    context=2,
+    provides=frozenset({"pixels", "state", "uncertainty"}),
+)
+NETWORK = NetworkConfig(space_to_depth=2, channels=(24, 32), condition=48, planes=6)
+
+
+def dots(count: int, steps: int = 12, seed: int = 0) -> list[Episode]:
+    """A white square of 4×4 pixels on grey, moved by its actions; its state is where it is."""
+    rng = np.random.default_rng(seed)
+    made = []
+    for _ in range(count):
+        at = rng.uniform(2, SIZE - 6, 2)
+        frames, states, actions = [], [], []
+        for _ in range(steps):
+            frame = np.full((1, SIZE, SIZE, 3), 60, np.uint8)
+            y, x = np.round(at).astype(int)
+            frame[:, y : y + 4, x : x + 4] = 220
+            frames.append(frame)
+            states.append(at.astype(np.float32))
+            action = rng.uniform(-2, 2, 2)
+            at = np.clip(at + action, 0, SIZE - 4)
+            actions.append((action / 2).astype(np.float32))
+        made.append(
+            Episode(
+                frames=np.stack(frames),
+                times=np.arange(steps),
+                state=np.stack(states),
+                actions=np.stack(actions),
+                success_at=-1,
+                task="go",
+                source="demo",
+            )
+        )
+    return made
+
+
+def model(**options: object) -> PixelWorldModel:
+    torch.manual_seed(0)
+    return PixelWorldModel(SPEC, PixelModelConfig(network=NETWORK, **options))  # type: ignore[arg-type]
+
+
+def windows(episodes: list[Episode], chunks: int = 3) -> Windows:
+    at = [p for p in places(episodes) if p.frame + K * chunks < len(episodes[p.episode].frames)]
+    return cut(episodes, at, chunk=K, context=2, chunks=chunks)
+
+
+def dream(
+    made: PixelWorldModel, of: Windows, actions: np.ndarray | None = None, seed: int = 0
+) -> list[Dream]:
+    """One dream after another, as many as the windows have chunks."""
+    chosen = of.actions if actions is None else actions
+    state = made.begin(torch.from_numpy(of.frames[:, :2]), torch.from_numpy(of.state[:, 0]), of.task)
+    dreams = []
+    for r in range(chosen.shape[1]):
+        seeds = [1000 * seed + 10 * i + r for i in range(len(of))]
+        dreams.append(made.step(state, torch.from_numpy(chosen[:, r]), seeds))
+        state = dreams[-1].state
+    return dreams
+
+
+def awake(made: PixelWorldModel) -> PixelWorldModel:
+    """Random where it starts at zero."""
+    with torch.no_grad():
+        for p in made.parameters():
+            if not p.any():
+                p.normal_(std=0.1)
+    return made
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_a_new_refiner_is_a_copy_of_the_last_frame(steps: int):
+    of = windows(dots(2))
+    made = model(steps=steps)
+    for one in dream(made, of)[: 1 if steps > 1 else None]:
+        # Refining adds noise that only a trained network takes away again.
+        off = np.abs(one.frames.numpy().astype(int) - of.frames[:, 1])
+        assert off.max() == 0 if steps == 1 else off.mean() < 30
+
+
+def test_a_new_model_s_robot_stays_about_where_it_is():
+    of = windows(dots(2))
+    made = model()
+    made.fit_statistics(of)
+    moved = dream(made, of)[0]
+    assert np.allclose(moved.robot, of.state[:, 0] + made.motion_mean.numpy(), atol=1e-5)
+    assert moved.uncertainty.tolist() == [0.0] * len(of), "the heads still agree"
+
+
+@pytest.mark.parametrize("objective", ["refiner", "edm", "flow"])
+@pytest.mark.parametrize("steps", [1, 3])
+def test_a_dream_depends_on_its_row_and_seed_alone(objective: Objective, steps: int):
+    of = windows(dots(2), chunks=2)
+    made = awake(model(objective=objective, steps=steps))
+    together = dream(made, of)
+    assert torch.equal(together[1].frames, dream(made, of)[1].frames)
+    state = made.begin(torch.from_numpy(of.frames[3:4, :2]), torch.from_numpy(of.state[3:4, 0]), of.task[3:4])
+    alone = made.step(state, torch.from_numpy(of.actions[3:4, 0]), [30])
+    assert (alone.frames.int() - together[0].frames[3:4].int()).abs().max() <= 1, "rounding"
+    assert torch.allclose(alone.robot, together[0].robot[3:4], atol=1e-5)
+    random = objective != "refiner" or steps > 1
+    assert torch.equal(together[0].frames, dream(made, of, seed=1)[0].frames) is not random
+
+
+def test_a_state_is_not_changed_by_going_on_from_it():
+    of = windows(dots(1))
+    made = awake(model())
+    state = made.begin(torch.from_numpy(of.frames[:, :2]), torch.from_numpy(of.state[:, 0]), of.task)
+    before = {k: v.clone() for k, v in state.items()}
+    first = made.step(state, torch.from_numpy(of.actions[:, 0]), range(len(of)))
+    assert all(torch.equal(v, state[k]) for k, v in before.items())
+    assert torch.equal(first.state["frames"][:, 0], state["frames"][:, 1]), "the context rolls"
+    assert torch.equal(first.state["frames"][:, 1], first.frames)
+    assert torch.equal(first.state["anchor"], state["anchor"]), "the anchor stays"
+
+
+def test_actions_that_are_not_executed_do_not_matter():
+    of = windows(dots(2))
+    cut_short = replace(of, steps=np.where(np.arange(3) == 0, 1, of.steps))
+    changed = cut_short.actions.copy()
+    changed[:, 0, 1] = 9.0
+    made = awake(model())
+    made.fit_statistics(of)
+    losses = [
+        float(made.loss(w, torch.Generator().manual_seed(0))[0])
+        for w in (cut_short, replace(cut_short, actions=changed), replace(of, actions=changed))
+    ]
+    assert losses[0] == losses[1] != losses[2]
+
+
+def test_what_is_not_valid_is_not_learnt():
+    of = windows(dots(2))
+    valid = of.valid.copy()
+    valid[1:] = False
+    frames = of.frames.copy()
+    frames[1:, 2:] = 0
+    made = awake(model())
+
+    def loss(of: Windows) -> float:
+        return float(made.loss(of, torch.Generator().manual_seed(0))[0])
+
+    one = loss(replace(of, valid=valid))
+    assert one == loss(replace(of, valid=valid, frames=frames)) != loss(replace(of, frames=frames))
+
+
+def test_statistics_by_hand():
+    of = windows(dots(4))
+    made = model()
+    made.fit_statistics(of)
+    state, motion = of.state[:, 0], of.state[:, 1] - of.state[:, 0]
+    assert np.allclose(made.robot_mean, state.mean(0))
+    assert np.allclose(made.robot_std, state.std(0), rtol=1e-5)
+    assert np.allclose(made.motion_std, motion.std(0), rtol=1e-5)
+    assert np.allclose(made.action_std, of.actions[:, 0].reshape(-1, 2).std(0), rtol=1e-5)
+    off = of.frames[:, 2].astype(float) - of.frames[:, 1]
+    assert float(made.change) == pytest.approx(np.sqrt(np.square(off / 127.5).mean()), rel=1e-5)
+
+
+@pytest.mark.parametrize(("objective", "steps"), [("refiner", 1), ("refiner", 2), ("flow", 4), ("edm", 3)])
+def test_the_loss_reaches_every_weight(objective: Objective, steps: int):
+    made = awake(model(objective=objective, steps=steps))
+    of = windows(dots(3))
+    made.fit_statistics(of)
+    loss, metrics = made.loss(of, torch.Generator().manual_seed(0))
+    loss.backward()
+    silent = [k for k, p in made.named_parameters() if p.grad is None or not p.grad.abs().max() > 0]
+    assert silent == [] and set(metrics) == {"image", "state", "image_dreamt"}
+
+
+def trained(shuffle: bool = False, **options: object) -> Learner:
+    episodes = dots(60)
+    if shuffle:  # what a model of a world that does not listen would learn
+        rng = np.random.default_rng(0)
+        episodes = [replace(e, actions=rng.permutation(e.actions)[::-1].copy()) for e in episodes]
+    config = LearnConfig(steps=250, batch=16, lr=2e-3, warmup=10, anchors=3)
+    return pretrain(model(**options), episodes, config, seed=0)
+
+
+@pytest.fixture(scope="module")
+def learnt() -> Learner:
+    return trained()
+
+
+def judged(learner: Learner, depth: int = 0) -> tuple[float, float]:
+    """(skill, sensitivity) on dots that were not seen."""
+    episodes = dots(12, seed=5)
+    of = windows(episodes)
+    wanted = of.frames[:, 2 + depth]
+    with torch.no_grad():
+        true = squared_errors(dream(learner.serving, of)[depth].frames.numpy(), wanted)
+        rows = shuffled(len(of), range(len(of)), np.random.default_rng(0))
+        other = squared_errors(dream(learner.serving, of, of.actions[rows])[depth].frames.numpy(), wanted)
+    copy = squared_errors(of.frames[:, 1], wanted)
+    return skill(true, copy).value, sensitivity(true, other).low
+
+
+def test_it_learns_where_the_dot_goes(learnt: Learner):
+    assert judged(learnt)[0] > 0.5 and judged(learnt, depth=2)[0] > 0.3
+    assert judged(learnt)[1] > 2
+
+
+def test_it_learns_where_the_robot_goes(learnt: Learner):
+    of = windows(dots(12, seed=5))
+    dreams = dream(learnt.serving, of)
+    for depth, most in ((0, 0.5), (2, 1.0)):
+        assert np.abs(dreams[depth].robot.numpy() - of.state[:, depth + 1]).mean() < most
+    strange = of.actions + 20
+    assert dream(learnt.serving, of, strange)[0].uncertainty.mean() > 3 * dreams[0].uncertainty.mean()
+
+
+def test_a_model_of_shuffled_actions_ignores_them():
+    assert judged(trained(shuffle=True))[1] < 1.2
+
+
+def test_the_weights_that_serve_follow_those_that_learn(learnt: Learner):
+    now, mean = learnt.model.state_dict(), learnt.serving.state_dict()
+    assert all(torch.equal(now[k], mean[k]) for k in now if "." not in k), "statistics"
+    far = mean_error(np.array([[float((now[k] - mean[k]).square().sum()), now[k].numel()] for k in now]))
+    assert 0 < far < 1e-3
+
+
+def test_sizes_that_do_not_fit():
+    with pytest.raises(InputError, match=r"world_model.image_size=\(18, 16\): use .* multiples of 4"):
+        PixelWorldModel(replace(SPEC, image_size=(18, 16)), PixelModelConfig(network=NETWORK))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("objective", "vae"), ("steps", 0), ("context", 0), ("heads", 1), ("context_noise", -1.0),
+        ("refine_levels", (0.05, 0.2)), ("sigma_max", 0.001),
+    ],
+)  # fmt: skip
+def test_bad_values_name_their_field(name: str, value: object):
+    with pytest.raises(InputError, match=f"^world_model.{name}="):
+        PixelModelConfig(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("steps", 0), ("batch", 0), ("chunks", 0), ("warmup", -1), ("anchors", -1), ("lr", 0.0), ("lr", 1.0),
+     ("grad_clip", 0.0), ("average", 1.0)],
+)  # fmt: skip
+def test_bad_learning_names_its_field(name: str, value: object):
+    with pytest.raises(InputError, match=f"^learn.{name}="):
+        LearnConfig(**{name: value})
