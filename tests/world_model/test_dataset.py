@@ -1,0 +1,149 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""LeRobotDatasets as episodes: the committed one, and datasets that nothing can be learnt from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.config import DatasetConfig
+from accerl_lerobot.demos.record import DemosConfig, record_demos
+from accerl_lerobot.envs import SimulatedConfig, make_world
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model import dataset as module
+from accerl_lerobot.world_model.contract import WorldModelSpec
+from accerl_lerobot.world_model.dataset import check_metadata, load_episodes
+
+TINY = DatasetConfig(
+    repo_id="accerl/metaworld_tiny", root=str(Path(__file__).parents[2] / "datasets" / "metaworld_tiny")
+)
+SPEC = WorldModelSpec(
+    cameras=("observation.images.corner2",),
+    image_size=(64, 64),
+    state_dim=4,
+    action_dim=4,
+    chunk=10,
+    context=2,
+    provides=frozenset({"pixels", "state"}),
+)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[DatasetConfig, WorldModelSpec, int]:
+    """Six episodes of the simulated world, some of which fail."""
+    root = tmp_path_factory.mktemp("demos") / "dataset"
+    env = SimulatedConfig(max_steps=60, hold=25, image_size=16)
+    config = DemosConfig(episodes=6, failure_share=0.5, processes=1, root=str(root), repo_id="a/b")
+    record_demos(env, config)
+    world = make_world(env).spec
+    spec = replace(
+        SPEC, cameras=tuple(world.images), image_size=(16, 16), state_dim=world.state_dim,
+        action_dim=world.action_dim,
+    )  # fmt: skip
+    return DatasetConfig(repo_id="a/b", root=str(root)), spec, world.fps
+
+
+def test_every_frame_and_action_is_the_dataset_s(recorded: tuple[DatasetConfig, WorldModelSpec, int]):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset, spec, fps = recorded
+    episodes = load_episodes(dataset, spec, fps)
+    data = LeRobotDataset(dataset.repo_id, root=dataset.root)
+    assert len(episodes) == data.meta.total_episodes == 6 and sum(map(len, episodes)) == len(data)
+    index = 0
+    for episode in episodes:
+        assert episode.source == "demo" and episode.task in data.meta.tasks.index
+        found = -1
+        for t in range(len(episode)):
+            item = data[index + t]
+            image = (item[spec.cameras[0]] * 255).round().numpy()
+            assert np.array_equal(episode.frames[t, 0].transpose(2, 0, 1), image)
+            assert np.array_equal(episode.state[t], item["observation.state"].numpy())
+            assert np.array_equal(episode.actions[t], item["action"].numpy())
+            if found < 0 and bool(item["next.success"]):
+                found = t
+        assert episode.success_at == found
+        index += len(episode)
+    assert {e.success for e in episodes} == {True, False}
+
+
+def test_images_are_brought_to_size(recorded: tuple[DatasetConfig, WorldModelSpec, int]):
+    dataset, spec, fps = recorded
+    episodes = load_episodes(dataset, replace(spec, image_size=(8, 24)), fps)
+    for small, full in zip(episodes, load_episodes(dataset, spec, fps), strict=True):
+        assert small.frames.shape == (len(full), 1, 8, 24, 3) and small.frames.dtype == np.uint8
+        assert abs(small.frames.mean() - full.frames.mean()) < 2
+
+
+def metadata(**changes: Any) -> SimpleNamespace:
+    shapes = {
+        "observation.images.corner2": (64, 64, 3), "observation.state": (4,), "action": (4,),
+        "next.success": (1,),
+    }  # fmt: skip
+    shapes |= changes.pop("shapes", {})
+    features = {k: {"shape": v} for k, v in shapes.items() if v is not None}
+    cameras = [k for k in features if "images" in k]
+    return SimpleNamespace(
+        **({"features": features, "camera_keys": cameras, "fps": 80, "total_episodes": 9} | changes)
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        (
+            {"shapes": {"observation.images.corner2": None, "observation.images.top": (64, 64, 3)}},
+            "no observation.images.corner2: the dataset has observation.images.top; choose env.camera",
+        ),
+        (
+            {"shapes": {"action": (7,)}},
+            r"action has shape \(7,\), the world's has \(4,\): it is another",
+        ),
+        (
+            {"shapes": {"observation.state": None}},
+            "observation.state has shape None, the world's has",
+        ),
+        ({"shapes": {"next.success": None}}, "no next.success: record it, as accerl demos does"),
+        ({"fps": 10}, "10 frames a second, and the world makes 80 steps"),
+        ({"total_episodes": 1}, "a single episode; at least one to learn from and one to be judged on"),
+    ],
+)
+def test_what_cannot_be_learnt_from(changes: dict[str, Any], why: str):
+    check_metadata(metadata(), "a/b", SPEC, 80)
+    with pytest.raises(InputError, match=f"^dataset.repo_id='a/b': {why}"):
+        check_metadata(metadata(**changes), "a/b", SPEC, 80)
+
+
+def test_a_world_without_a_state_does_not_ask_for_one():
+    check_metadata(metadata(shapes={"observation.state": None}), "a/b", replace(SPEC, state_dim=0), 80)
+
+
+def test_only_successes():
+    with pytest.raises(
+        InputError, match="no failure among 4 episodes; add failures, see demos"
+    ):
+        load_episodes(TINY, SPEC, 80)
+
+
+def test_only_failures(recorded: tuple[DatasetConfig, WorldModelSpec, int], monkeypatch: pytest.MonkeyPatch):
+    real = module._episode
+    monkeypatch.setattr(module, "_episode", lambda *args: replace(real(*args), success_at=-1))
+    with pytest.raises(InputError, match="no success among 6 episodes; add episodes that succeed"):
+        load_episodes(*recorded)
