@@ -128,16 +128,22 @@ def test_image_memory_by_hand():
 
 
 @pytest.mark.parametrize(
-    ("transforms", "streaming", "limit", "expected"),
+    ("transforms", "streaming", "limit", "history", "expected"),
     [
-        (False, False, 1000, True),
-        (True, False, 1000, False),
-        (False, True, 1000, False),
-        (False, False, 100, False),
+        (False, False, 1000, 1, True),
+        (True, False, 1000, 1, False),
+        (False, True, 1000, 1, False),
+        (False, False, 100, 1, False),
+        (False, False, 1000, 2, False),  # twice the images
     ],
 )
 def test_what_cannot_be_cached_is_read_the_stock_way(
-    monkeypatch: pytest.MonkeyPatch, transforms: bool, streaming: bool, limit: int, expected: bool
+    monkeypatch: pytest.MonkeyPatch,
+    transforms: bool,
+    streaming: bool,
+    limit: int,
+    expected: bool,
+    history: int,
 ):
     from lerobot.scripts import lerobot_train
 
@@ -149,7 +155,11 @@ def test_what_cannot_be_cached_is_read_the_stock_way(
     monkeypatch.setattr(
         lerobot_train,
         "main",
-        lambda: got.extend(lerobot_train.make_train_eval_datasets(SimpleNamespace(dataset=options))),
+        lambda: got.extend(
+            lerobot_train.make_train_eval_datasets(
+                SimpleNamespace(dataset=options, policy=SimpleNamespace(n_obs_steps=history))
+            )
+        ),
     )
     monkeypatch.setattr(cached_train, "MAX_BYTES", limit)
     cached_train.main()

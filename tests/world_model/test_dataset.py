@@ -136,9 +136,7 @@ def test_a_world_without_a_state_does_not_ask_for_one():
 
 
 def test_only_successes():
-    with pytest.raises(
-        InputError, match="no failure among 4 episodes; add failures, see demos"
-    ):
+    with pytest.raises(InputError, match="no failure among 4 episodes; add failures, see demos"):
         load_episodes(TINY, SPEC, 80)
 
 

@@ -1,0 +1,73 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Its configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lerobot.configs.rewards import RewardModelConfig
+from lerobot.optim import AdamWConfig, LRSchedulerConfig, OptimizerConfig
+
+from accerl_lerobot.errors import InputError
+
+
+@RewardModelConfig.register_subclass("success_pairs")
+@dataclass
+class SuccessPairsConfig(RewardModelConfig):
+    """What it looks at, and how large it is."""
+
+    chunk: int = 10
+    """Env steps between the two frames."""
+    channels: tuple[int, ...] = (32, 64, 96)
+    """Of the convolutions, each of which halves the image; the first one does so twice."""
+    hidden: int = 128
+    """Width of the layer behind them."""
+    success_reward: float = 0.5
+    """A ``next.reward`` above it is a success; datasets of ``accerl demos`` give 1."""
+    noise: float = 0.03
+    """Largest standard deviation of the noise on frames in training, where 1 is white; ≥ 0."""
+    shift: int = 3
+    """Largest shift of the frames in training, in pixels; ≥ 0. Both frames of a pair are shifted alike."""
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-2
+    grad_clip_norm: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, least in (("chunk", 1), ("hidden", 1), ("shift", 0), ("noise", 0)):
+            if getattr(self, name) < least:
+                raise InputError(f"reward_model.{name}", getattr(self, name), f"use at least {least}")
+        if not self.channels or min(self.channels) < 1:
+            raise InputError("reward_model.channels", self.channels, "name at least one width")
+
+    @property
+    def observation_delta_indices(self) -> list[int]:
+        """The frames before and after a chunk."""
+        return [0, self.chunk]
+
+    @property
+    def reward_delta_indices(self) -> list[int]:
+        """Every reward of it."""
+        return list(range(self.chunk))
+
+    def get_optimizer_preset(self) -> OptimizerConfig:
+        """See LeRobot."""
+        return AdamWConfig(
+            lr=self.learning_rate, weight_decay=self.weight_decay, grad_clip_norm=self.grad_clip_norm
+        )
+
+    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
+        """See LeRobot."""
+        return None

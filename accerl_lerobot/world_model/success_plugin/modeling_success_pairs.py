@@ -1,0 +1,132 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The network, its loss, and what LeRobot asks of a reward model.
+
+Cameras share their convolutions, and what they see is averaged, so a model serves any number of them.
+
+Shapes: B batch, V cameras, C×H×W image.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from lerobot.rewards.pretrained import PreTrainedRewardModel
+from torch import Tensor, nn
+from torch.nn import functional
+
+from accerl_lerobot.world_model.success_plugin.configuration_success_pairs import SuccessPairsConfig
+
+IMAGES, REWARD, PAD = "observation.image", "next.reward", "_is_pad"
+GRID = 4
+"""Side of the map that is flattened: where something is matters."""
+
+
+class SuccessPairsRewardModel(PreTrainedRewardModel):
+    """P(the chunk between two frames achieved the task), and the episode's progress after it.
+
+    Args:
+        config: its size.
+        unused: LeRobot hands over a dataset's statistics, which it does not need.
+    """
+
+    config_class = SuccessPairsConfig
+    name = "success_pairs"
+
+    def __init__(self, config: SuccessPairsConfig, **unused: Any) -> None:
+        super().__init__(config)
+        layers: list[nn.Module] = [nn.PixelUnshuffle(2)]
+        into = 6 * 4
+        for width in config.channels:
+            norm = nn.GroupNorm(math.gcd(width, 8), width)
+            layers += [nn.Conv2d(into, width, 3, stride=2, padding=1), norm, nn.SiLU()]
+            into = width
+        self.convolutions = nn.Sequential(*layers)
+        self.hidden = nn.Linear(into * GRID * GRID, config.hidden)
+        self.out = nn.Linear(config.hidden, 2)
+
+    def logits(self, before: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
+        """Success and progress, each (B,), from frames (B, V, 3, H, W) in [0, 1]."""
+        pairs = 2 * torch.cat([before, after - before + 0.5], 2) - 1
+        seen = self.convolutions(pairs.flatten(0, 1))
+        seen = functional.adaptive_avg_pool2d(seen, GRID).flatten(1)
+        features = functional.silu(self.hidden(seen)).unflatten(0, before.shape[:2]).mean(1)
+        success, progress = self.out(features).unbind(1)
+        return success, progress
+
+    def loss(
+        self, before: Tensor, after: Tensor, success: Tensor, progress: Tensor | None = None
+    ) -> tuple[Tensor, dict[str, float]]:
+        """Cross-entropy in which successes and failures of the batch weigh the same, on augmented frames.
+
+        Args:
+            before: (B, V, 3, H, W) in [0, 1].
+            after: the same, a chunk later.
+            success: (B,) 0 or 1.
+            progress: (B,) in [0, 1], NaN where it is not known; None: nowhere.
+        """
+        if self.training:
+            before, after = self._augmented(before, after)
+        said, along = self.logits(before, after)
+        each = functional.binary_cross_entropy_with_logits(said, success, reduction="none")
+        total = each.new_zeros(())
+        kinds = [kind for kind in (success > 0.5, success <= 0.5) if kind.any()]
+        for kind in kinds:
+            total = total + each[kind].mean() / len(kinds)
+        metrics = {"accuracy": float(((said > 0) == (success > 0.5)).float().mean())}
+        if progress is not None and bool((known := ~progress.isnan()).any()):
+            error = (torch.sigmoid(along[known]) - progress[known]).square().mean()
+            total, metrics = total + error, metrics | {"progress": error.item()}
+        return total, {"loss": total.item()} | metrics
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any]]:
+        """LeRobot's training step; its batch holds pairs of frames and a chunk's rewards."""
+        before, after = self._frames(batch)
+        reward = batch[REWARD]
+        pad = batch.get(REWARD + PAD)
+        achieved = reward > self.config.success_reward
+        if pad is not None:
+            achieved = achieved & ~pad
+        return self.loss(before, after, achieved.reshape(len(reward), -1).any(1).float())
+
+    @torch.no_grad()
+    def compute_reward(self, batch: dict[str, Tensor]) -> Tensor:
+        """P(success), (B,), of the same batches, or of single frames, which are taken for both."""
+        success, _ = self.logits(*self._frames(batch))
+        return torch.sigmoid(success)
+
+    def _frames(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        keys = sorted(k for k in batch if k.startswith(IMAGES) and not k.endswith(PAD))
+        images = torch.stack([batch[k] for k in keys], 1)
+        images = images.float() / 255 if images.dtype == torch.uint8 else images.float()
+        if images.ndim == 5:  # one frame each
+            return images, images
+        return images[:, :, 0], images[:, :, -1]
+
+    def _augmented(self, before: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
+        b, size = len(before), before.shape[3:]
+        both = torch.cat([before, after], 1).flatten(1, 2)
+        shift = self.config.shift
+        if shift:
+            # One shift for a batch is enough: there are many batches.
+            y, x = (int(torch.randint(2 * shift + 1, ())) for _ in range(2))
+            padded = functional.pad(both, (shift,) * 4, mode="replicate")
+            both = padded[:, :, y : y + size[0], x : x + size[1]]
+        light = 1 + 0.1 * torch.randn(b, 1, 1, 1, device=both.device)
+        level = self.config.noise * torch.rand(b, 1, 1, 1, device=both.device)
+        both = both * light + level * torch.randn_like(both)
+        first, second = both.clamp(0, 1).unflatten(1, (-1, 3)).chunk(2, 1)
+        return first, second
