@@ -33,6 +33,7 @@ VERBS = {
     "demos": ("verbs:demos", "record scripted-expert demonstrations into a LeRobotDataset"),
     "sft": ("verbs:sft", "fine-tune on a LeRobotDataset with LeRobot's own trainer"),
     "eval": ("verbs:evaluate", "success of a checkpoint, with its confidence interval"),
+    "world-model": ("verbs:world_model", "learn to dream a world from a LeRobotDataset, and be tried on it"),
     "doctor": ("doctor:main", "resolve a recipe and check this machine"),
     "bench": ("verbs:bench", "measure: accerl bench world, policy, lag"),
 }
@@ -46,7 +47,7 @@ def usage() -> str:
         "usage: accerl VERB [recipe.yaml] [--room.field=value …]",
         "",
     ]
-    lines += [f"  {verb:8} {what}" for verb, (_, what) in VERBS.items()]
+    lines += [f"  {verb:11} {what}" for verb, (_, what) in VERBS.items()]
     lines += [
         "",
         "examples:",

@@ -33,7 +33,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import yaml
@@ -59,8 +59,20 @@ RECENT = 100
 """Exploring episodes over which the training success of the curve is averaged."""
 
 
-def make_output_dir(config: RunConfig) -> Path:
-    """Creates the run's folder.
+class Placed(Protocol):
+    """A config that says where its results go."""
+
+    @property
+    def output_dir(self) -> str | None:
+        """The folder, which must not exist; None: one named after date, time and job."""
+
+    @property
+    def job_name(self) -> str:
+        """What the folder is called then."""
+
+
+def make_output_dir(config: Placed) -> Path:
+    """Creates the folder of a run.
 
     Raises:
         InputError: it exists.

@@ -41,6 +41,7 @@ from accerl_lerobot.evaluation.config import EvaluationConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
+from accerl_lerobot.world_model.config import WorldModelConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +88,22 @@ class EvalRun:
     inference: InferenceConfig = field(default_factory=InferenceConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     launch: LaunchConfig = field(default_factory=LaunchConfig)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldModelRun:
+    """``accerl world-model``: a world model, and a success model, from a LeRobotDataset."""
+
+    seed: int = 0
+    """0 to 99."""
+    output_dir: str | None = None
+    """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
+    job_name: str = "world_model"
+    """Last part of the folder's name."""
+    env: EnvConfig = field(default_factory=MetaWorldConfig)
+    """The world it is to be a model of: its cameras, sizes and rate."""
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
 
 
 def train(arguments: list[str]) -> int:
@@ -145,7 +162,7 @@ def sft(arguments: list[str]) -> int:
     else:
         meta = check_dataset(config.dataset, config.env, {})
     device = str(resolve_device(config.device))
-    directory = run.make_output_dir(RunConfig(output_dir=config.output_dir, job_name=config.job_name))
+    directory = run.make_output_dir(config)
     console = Console()
     with redirect_stdout(sys.stderr), console.stage("SFT", total=config.sft.steps) as stage:
         path = run_sft(
@@ -195,6 +212,29 @@ def evaluate(arguments: list[str]) -> int:
     return 0
 
 
+def world_model(arguments: list[str]) -> int:
+    """``accerl world-model``; 1 if it fails its trial."""
+    config: WorldModelRun = parse(WorldModelRun, arguments, recipe_class=RunConfig)
+    from accerl_lerobot.run import make_output_dir
+    from accerl_lerobot.world_model.offline import learn_from_dataset, table
+
+    directory = make_output_dir(config)
+    console = Console()
+    console.say(f"run {directory}")
+    try:
+        with redirect_stdout(sys.stderr):
+            found = learn_from_dataset(
+                config.world_model, config.env, config.dataset, directory, config.seed, console
+            )
+    except InputError:
+        _discard_unused(directory)
+        raise
+    console.rich.print(table(found))
+    console.say(f"{'passed' if found['passed'] else 'FAILED'}; see {directory / 'preview.mp4'}")
+    sys.stdout.write(json.dumps(found, indent=2) + "\n")
+    return 0 if found["passed"] else 1
+
+
 def bench(arguments: list[str]) -> int:
     """``accerl bench world``, ``policy`` and ``lag``."""
     name = arguments[0] if arguments else ""
@@ -215,6 +255,7 @@ CONFIGS: dict[str, type[Any]] = {
     "demos": DemosRun,
     "sft": SFTRun,
     "eval": EvalRun,
+    "world-model": WorldModelRun,
     "doctor": RunConfig,
     "bench world": BenchWorldConfig,
     "bench policy": BenchPolicyConfig,

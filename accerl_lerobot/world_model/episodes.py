@@ -98,6 +98,8 @@ class Windows:
     """bool (B, R), whether the task was achieved in this chunk."""
     valid: np.ndarray
     """bool (B, R), whether the chunk's frame shows what follows, at least one step on."""
+    episode: np.ndarray
+    """int64 (B,), which episode each is from."""
     task: tuple[str, ...]
 
     def __len__(self) -> int:
@@ -133,7 +135,11 @@ def cut(
         for place, anchor in zip(at, anchors or [0] * len(at), strict=True)
     ]
     stacked = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
-    return Windows(**stacked, task=tuple(episodes[p.episode].task for p in at))
+    return Windows(
+        **stacked,
+        episode=np.array([p.episode for p in at], np.int64),
+        task=tuple(episodes[p.episode].task for p in at),
+    )
 
 
 def _window(

@@ -53,8 +53,9 @@ def bootstrap(
     """
     rng = np.random.default_rng(seed)
     values = np.array([statistic(rng.integers(count, size=count)) for _ in range(draws)])
-    values = values[np.isfinite(values)]
-    low, high = np.quantile(values, [0.025, 0.975]) if len(values) else (np.nan, np.nan)
+    values = values[~np.isnan(values)]
+    # The nearest draw, since between two infinite ones there is nothing to interpolate.
+    low, high = np.quantile(values, [0.025, 0.975], method="nearest") if len(values) else (np.nan, np.nan)
     return Estimate(statistic(np.arange(count)), float(low), float(high))
 
 
@@ -88,11 +89,13 @@ def skill(model: np.ndarray, copy: np.ndarray) -> Estimate:
 
 
 def sensitivity(true: np.ndarray, other: np.ndarray) -> Estimate:
-    """MSE(other actions)/MSE(true actions), from `squared_errors` of both (M, 2)."""
+    """MSE(other actions)/MSE(true actions), from `squared_errors` of both (M, 2); of two exact ones 1."""
 
     def of(rows: np.ndarray) -> float:
-        right = mean_error(true[rows])
-        return mean_error(other[rows]) / right if right > 0 else float("nan")
+        right, wrong = mean_error(true[rows]), mean_error(other[rows])
+        if right > 0:
+            return wrong / right
+        return float("inf") if wrong > 0 else 1.0
 
     return bootstrap(len(true), of)
 

@@ -20,63 +20,18 @@ a running average of those that are trained.
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 import torch
 
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model.config import LearnConfig
 from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, places
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 
 STATISTICS = 2048
 """Windows from which means and sizes are taken."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class LearnConfig:
-    """How a world model is trained."""
-
-    steps: int = 2000
-    """Gradient steps of the pre-training, at least 1."""
-    batch: int = 16
-    """Windows in each."""
-    lr: float = 1e-3
-    """Peak; falls to a tenth by a cosine."""
-    warmup: int = 50
-    """Steps in which it rises."""
-    weight_decay: float = 1e-2
-    grad_clip: float = 1.0
-    """Largest gradient norm; > 0."""
-    average: float = 0.99
-    """[0, 1): how slowly the weights that serve follow those that are trained."""
-    chunks: int = 2
-    """Length of a window. From its second chunk on, the model learns from its own dream."""
-    anchors: int = 8
-    """The anchor lies up to so many chunks back, as far as dreams will go."""
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "batch", "chunks"):
-            if getattr(self, name) < 1:
-                raise InputError(f"learn.{name}", getattr(self, name), "use at least 1")
-        for name in ("warmup", "weight_decay", "anchors"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"learn.{name}", getattr(self, name), "use 0 or more")
-        if not 0 < self.lr < 1:
-            raise InputError("learn.lr", self.lr, "use a value in (0, 1), e.g. 1e-3")
-        if not self.grad_clip > 0:
-            raise InputError("learn.grad_clip", self.grad_clip, "use a positive norm")
-        if not 0 <= self.average < 1:
-            raise InputError("learn.average", self.average, "use a value in [0, 1)")
-
-    def lr_at(self, step: int) -> float:
-        """The learning rate of a step, counted from 0; beyond `steps` it stays at its end."""
-        if step < self.warmup:
-            return self.lr * (step + 1) / self.warmup
-        done = min(1.0, (step - self.warmup) / max(1, self.steps - self.warmup))
-        return self.lr * (0.1 + 0.9 * 0.5 * (1 + math.cos(math.pi * done)))
 
 
 class Learner:
@@ -91,10 +46,11 @@ class Learner:
         model: with its statistics fitted.
         config: how it is trained.
         seed: of noise and of what is drawn.
+        shuffle: learn with the actions of other windows, as a placebo.
     """
 
-    def __init__(self, model: PixelWorldModel, config: LearnConfig, seed: int) -> None:
-        self.model, self.config = model, config
+    def __init__(self, model: PixelWorldModel, config: LearnConfig, seed: int, shuffle: bool = False) -> None:
+        self.model, self.config, self._shuffle = model, config, shuffle
         self.serving = copy.deepcopy(model).requires_grad_(False)
         self.count = 0
         self.rng = np.random.default_rng((seed, 1))
@@ -106,7 +62,7 @@ class Learner:
         chosen = self.rng.integers(len(at), size=count or self.config.batch)
         back = self.rng.integers(self.config.anchors + 1, size=len(chosen))
         spec = self.model.spec
-        return cut(
+        windows = cut(
             episodes,
             [at[i] for i in chosen],
             chunk=spec.chunk,
@@ -114,6 +70,9 @@ class Learner:
             chunks=self.config.chunks,
             anchors=back.tolist(),
         )
+        if self._shuffle:
+            windows = replace(windows, actions=windows.actions[self.rng.permutation(len(windows))])
+        return windows
 
     def step(self, windows: Windows) -> dict[str, float]:
         """Learns from them once; returns the losses and ``grad_norm``."""
@@ -142,6 +101,7 @@ def pretrain(
     episodes: Sequence[Episode],
     config: LearnConfig,
     seed: int,
+    shuffle: bool = False,
     on_step: Callable[[int, dict[str, float]], None] = lambda step, metrics: None,
 ) -> Learner:
     """Fits the statistics and trains from the beginning.
@@ -151,10 +111,11 @@ def pretrain(
         episodes: to learn from; others are for judging.
         config: how.
         seed: of everything random.
+        shuffle: see `Learner`.
         on_step: told of each step and its losses.
     """
     at = places(episodes)
-    learner = Learner(model, config, seed)
+    learner = Learner(model, config, seed, shuffle)
     model.fit_statistics(learner.draw(episodes, at, min(STATISTICS, 4 * len(at))))
     learner.serving.load_state_dict(model.state_dict())
     for step in range(config.steps):

@@ -24,44 +24,12 @@ Shapes: B batch, C×H×W image, S state dims, K actions per chunk, A action dims
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from accerl_lerobot.errors import InputError
-
-
-@dataclass(frozen=True, kw_only=True)
-class NetworkConfig:
-    """How large it is."""
-
-    space_to_depth: int = 4
-    """Side of the pixel blocks that become channels; image height and width are multiples of it times 2 for
-    every further level."""
-    channels: tuple[int, ...] = (64, 96)
-    """Of each level, finest first."""
-    blocks: int = 1
-    """Residual blocks per level, at least 1."""
-    condition: int = 128
-    """Width of what the adaptive norms read."""
-    planes: int = 8
-    """Channels of the action planes; 0: none."""
-
-    def __post_init__(self) -> None:
-        for name in ("space_to_depth", "blocks", "condition"):
-            if getattr(self, name) < 1:
-                raise InputError(f"network.{name}", getattr(self, name), "use at least 1")
-        if not self.channels or min(self.channels) < 1:
-            raise InputError("network.channels", self.channels, "name the width of at least one level")
-        if self.planes < 0:
-            raise InputError("network.planes", self.planes, "use 0 (none) or more")
-
-    @property
-    def multiple(self) -> int:
-        """What image sides must be a multiple of."""
-        return self.space_to_depth * 2 ** (len(self.channels) - 1)
+from accerl_lerobot.world_model.config import NetworkConfig
 
 
 class Denoiser(nn.Module):

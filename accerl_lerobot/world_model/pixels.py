@@ -26,8 +26,6 @@ Shapes: see `contract.py`; C = 3·V channels, R chunks of a window.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -36,56 +34,15 @@ from torch.nn import functional
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model import objectives
+from accerl_lerobot.world_model.config import PixelModelConfig
 from accerl_lerobot.world_model.contract import Dream, State, WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.episodes import Windows
-from accerl_lerobot.world_model.network import Denoiser, NetworkConfig
-
-Objective = Literal["refiner", "edm", "flow"]
+from accerl_lerobot.world_model.network import Denoiser
 
 SIGMA_FRAME = 0.5
 """Standard deviation of frames in [−1, 1], EDM's σ_data of natural images."""
 LOOK = 8
 """Side of the coarse look that the state heads take."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PixelModelConfig:
-    """How it learns and dreams."""
-
-    objective: Objective = "refiner"
-    """refiner: predict the change, then refine it. edm: denoise the frame, as DIAMOND does. flow: rectified
-    flow of the change."""
-    steps: int = 1
-    """Network passes per chunk, at least 1. One pass of the refiner is regression."""
-    context: int = 2
-    """Frames it sees, the newest included, a chunk apart."""
-    context_noise: float = 0.02
-    """Largest standard deviation of the noise on context and anchor in training, in units of [−1, 1]; ≥ 0.
-    What it dreams is never as clean as what it learns from."""
-    refine_levels: tuple[float, float] = (0.2, 0.05)
-    """Noise of the first and last refinement, in usual changes; those between are spaced evenly in log."""
-    sigma_max: float = 5.0
-    """Noise an edm dream starts from."""
-    heads: int = 3
-    """Of the robot's state, at least 2, or they cannot disagree."""
-    state_weight: float = 1.0
-    """Of the state's loss beside the image's."""
-    network: NetworkConfig = field(default_factory=NetworkConfig)
-
-    def __post_init__(self) -> None:
-        if self.objective not in get_args(Objective):
-            raise InputError(
-                "world_model.objective", self.objective, f"use {' or '.join(get_args(Objective))}"
-            )
-        for name, least in (("steps", 1), ("context", 1), ("heads", 2)):
-            if getattr(self, name) < least:
-                raise InputError(f"world_model.{name}", getattr(self, name), f"use at least {least}")
-        if not self.context_noise >= 0:
-            raise InputError("world_model.context_noise", self.context_noise, "use 0 (none) or more")
-        if not self.refine_levels[0] >= self.refine_levels[1] > 0:
-            raise InputError("world_model.refine_levels", self.refine_levels, "use two falling numbers > 0")
-        if not self.sigma_max > 0.002:
-            raise InputError("world_model.sigma_max", self.sigma_max, "use more than 0.002, where it ends")
 
 
 class PixelWorldModel(nn.Module, WorldModel):

@@ -66,6 +66,8 @@ def test_skill_and_sensitivity_by_hand():
     assert sensitivity(model, copy).value == pytest.approx(100 / 10)
     assert skill(copy, copy)[:] == pytest.approx((0, 0, 0))
     assert sensitivity(copy, copy)[:] == pytest.approx((1, 1, 1))
+    exact = squared_errors(wanted, wanted)
+    assert sensitivity(exact, copy) == (np.inf, np.inf, np.inf) and sensitivity(exact, exact) == (1, 1, 1)
 
 
 def test_the_interval_narrows_with_windows_and_holds_the_value():

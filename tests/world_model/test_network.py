@@ -20,7 +20,8 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.world_model.network import Attention, Denoiser, NetworkConfig
+from accerl_lerobot.world_model.config import NetworkConfig
+from accerl_lerobot.world_model.network import Attention, Denoiser
 
 SMALL = NetworkConfig(channels=(8, 12), condition=16, planes=4)
 
@@ -124,5 +125,5 @@ def test_attention_is_softmax_attention():
     [("space_to_depth", 0), ("channels", ()), ("channels", (8, 0)), ("blocks", 0), ("planes", -1)],
 )
 def test_bad_sizes_name_their_field(name: str, value: object):
-    with pytest.raises(InputError, match=f"^network.{name}="):
+    with pytest.raises(InputError, match=f"^world_model.model.network.{name}="):
         NetworkConfig(**{name: value})

@@ -22,12 +22,12 @@ import pytest
 import torch
 
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model.config import LearnConfig, NetworkConfig, Objective, PixelModelConfig
 from accerl_lerobot.world_model.contract import Dream, WorldModelSpec
 from accerl_lerobot.world_model.episodes import Episode, Windows, cut, places
 from accerl_lerobot.world_model.judge import mean_error, sensitivity, shuffled, skill, squared_errors
-from accerl_lerobot.world_model.learn import LearnConfig, Learner, pretrain
-from accerl_lerobot.world_model.network import NetworkConfig
-from accerl_lerobot.world_model.pixels import Objective, PixelModelConfig, PixelWorldModel
+from accerl_lerobot.world_model.learn import Learner, pretrain
+from accerl_lerobot.world_model.pixels import PixelWorldModel
 
 SIZE, K = 16, 2
 SPEC = WorldModelSpec(
@@ -205,12 +205,8 @@ def test_the_loss_reaches_every_weight(objective: Objective, steps: int):
 
 
 def trained(shuffle: bool = False, **options: object) -> Learner:
-    episodes = dots(60)
-    if shuffle:  # what a model of a world that does not listen would learn
-        rng = np.random.default_rng(0)
-        episodes = [replace(e, actions=rng.permutation(e.actions)[::-1].copy()) for e in episodes]
     config = LearnConfig(steps=250, batch=16, lr=2e-3, warmup=10, anchors=3)
-    return pretrain(model(**options), episodes, config, seed=0)
+    return pretrain(model(**options), dots(60), config, seed=0, shuffle=shuffle)
 
 
 @pytest.fixture(scope="module")
@@ -269,7 +265,7 @@ def test_sizes_that_do_not_fit():
     ],
 )  # fmt: skip
 def test_bad_values_name_their_field(name: str, value: object):
-    with pytest.raises(InputError, match=f"^world_model.{name}="):
+    with pytest.raises(InputError, match=f"^world_model.model.{name}="):
         PixelModelConfig(**{name: value})
 
 
@@ -279,5 +275,5 @@ def test_bad_values_name_their_field(name: str, value: object):
      ("grad_clip", 0.0), ("average", 1.0)],
 )  # fmt: skip
 def test_bad_learning_names_its_field(name: str, value: object):
-    with pytest.raises(InputError, match=f"^learn.{name}="):
+    with pytest.raises(InputError, match=f"^world_model.learn.{name}="):
         LearnConfig(**{name: value})

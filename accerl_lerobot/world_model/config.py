@@ -1,0 +1,222 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What a world model is told: its size, its objective, how it learns, and what it takes to pass.
+
+Free of torch, as all configs are.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+from accerl_lerobot.errors import InputError
+
+Objective = Literal["refiner", "edm", "flow"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkConfig:
+    """How large it is."""
+
+    space_to_depth: int = 4
+    """Side of the pixel blocks that become channels; image height and width are multiples of it times 2 for
+    every further level."""
+    channels: tuple[int, ...] = (64, 96)
+    """Of each level, finest first."""
+    blocks: int = 1
+    """Residual blocks per level, at least 1."""
+    condition: int = 128
+    """Width of what the adaptive norms read."""
+    planes: int = 8
+    """Channels of the action planes; 0: none."""
+
+    def __post_init__(self) -> None:
+        for name in ("space_to_depth", "blocks", "condition"):
+            if getattr(self, name) < 1:
+                raise InputError(f"world_model.model.network.{name}", getattr(self, name), "use at least 1")
+        if not self.channels or min(self.channels) < 1:
+            raise InputError("world_model.model.network.channels", self.channels, "name a level's width")
+        if self.planes < 0:
+            raise InputError("world_model.model.network.planes", self.planes, "use 0 (none) or more")
+
+    @property
+    def multiple(self) -> int:
+        """What image sides must be a multiple of."""
+        return self.space_to_depth * 2 ** (len(self.channels) - 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PixelModelConfig:
+    """How it learns and dreams."""
+
+    objective: Objective = "refiner"
+    """refiner: predict the change, then refine it. edm: denoise the frame, as DIAMOND does. flow: rectified
+    flow of the change."""
+    steps: int = 1
+    """Network passes per chunk, at least 1. One pass of the refiner is regression."""
+    context: int = 2
+    """Frames it sees, the newest included, a chunk apart."""
+    context_noise: float = 0.02
+    """Largest standard deviation of the noise on context and anchor in training, in units of [−1, 1]; ≥ 0.
+    What it dreams is never as clean as what it learns from."""
+    refine_levels: tuple[float, float] = (0.2, 0.05)
+    """Noise of the first and last refinement, in usual changes; those between are spaced evenly in log."""
+    sigma_max: float = 5.0
+    """Noise an edm dream starts from."""
+    heads: int = 3
+    """Of the robot's state, at least 2, or they cannot disagree."""
+    state_weight: float = 1.0
+    """Of the state's loss beside the image's."""
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+
+    def __post_init__(self) -> None:
+        if self.objective not in get_args(Objective):
+            raise InputError(
+                "world_model.model.objective", self.objective, f"use {' or '.join(get_args(Objective))}"
+            )
+        for name, least in (("steps", 1), ("context", 1), ("heads", 2)):
+            if getattr(self, name) < least:
+                raise InputError(f"world_model.model.{name}", getattr(self, name), f"use at least {least}")
+        if not self.context_noise >= 0:
+            raise InputError("world_model.model.context_noise", self.context_noise, "use 0 (none) or more")
+        if not self.refine_levels[0] >= self.refine_levels[1] > 0:
+            raise InputError(
+                "world_model.model.refine_levels", self.refine_levels, "use two falling numbers > 0"
+            )
+        if not self.sigma_max > 0.002:
+            raise InputError(
+                "world_model.model.sigma_max", self.sigma_max, "use more than 0.002, where it ends"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnConfig:
+    """How a world model is trained."""
+
+    steps: int = 2000
+    """Gradient steps of the pre-training, at least 1."""
+    batch: int = 16
+    """Windows in each."""
+    lr: float = 1e-3
+    """Peak; falls to a tenth by a cosine."""
+    warmup: int = 50
+    """Steps in which it rises."""
+    weight_decay: float = 1e-2
+    grad_clip: float = 1.0
+    """Largest gradient norm; > 0."""
+    average: float = 0.99
+    """[0, 1): how slowly the weights that serve follow those that are trained."""
+    chunks: int = 2
+    """Length of a window. From its second chunk on, the model learns from its own dream."""
+    anchors: int = 8
+    """The anchor lies up to so many chunks back, as far as dreams will go."""
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "chunks"):
+            if getattr(self, name) < 1:
+                raise InputError(f"world_model.learn.{name}", getattr(self, name), "use at least 1")
+        for name in ("warmup", "weight_decay", "anchors"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"world_model.learn.{name}", getattr(self, name), "use 0 or more")
+        if not 0 < self.lr < 1:
+            raise InputError("world_model.learn.lr", self.lr, "use a value in (0, 1), e.g. 1e-3")
+        if not self.grad_clip > 0:
+            raise InputError("world_model.learn.grad_clip", self.grad_clip, "use a positive norm")
+        if not 0 <= self.average < 1:
+            raise InputError("world_model.learn.average", self.average, "use a value in [0, 1)")
+
+    def lr_at(self, step: int) -> float:
+        """The learning rate of a step, counted from 0; beyond `steps` it stays at its end."""
+        if step < self.warmup:
+            return self.lr * (step + 1) / self.warmup
+        done = min(1.0, (step - self.warmup) / max(1, self.steps - self.warmup))
+        return self.lr * (0.1 + 0.9 * 0.5 * (1 + math.cos(math.pi * done)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuccessLearnConfig:
+    """How it is trained."""
+
+    steps: int = 400
+    """Gradient steps, at least 1."""
+    batch: int = 32
+    """Pairs of frames in each, at least 2."""
+    lr: float = 1e-3
+    weight_decay: float = 1e-2
+    dreamt: float = 0.5
+    """Share of pairs, in [0, 1], whose second frame is dreamt from the first."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("steps", 1), ("batch", 2)):
+            if getattr(self, name) < least:
+                raise InputError(f"world_model.success.{name}", getattr(self, name), f"use at least {least}")
+        if not 0 < self.lr < 1:
+            raise InputError("world_model.success.lr", self.lr, "use a value in (0, 1), e.g. 1e-3")
+        if not 0 <= self.dreamt <= 1:
+            raise InputError("world_model.success.dreamt", self.dreamt, "use a share in [0, 1]")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialConfig:
+    """What is tried, and what it takes to pass."""
+
+    depth: int = 6
+    """Chunks dreamt, the horizon it is judged for."""
+    every: int = 10
+    """A trial begins every so many frames of an episode."""
+    most: int = 400
+    """Trials at most, drawn at random."""
+    skill_first: float = 0.3
+    """Least skill on changed pixels after one chunk,"""
+    skill_last: float = 0.0
+    """and at the horizon, where more than this."""
+    sensitivity: float = 1.2
+    """What the lower end of the sensitivity's interval after one chunk must exceed."""
+    auroc: float = 0.9
+    """What the success model's AUROC on dreams must exceed at the horizon."""
+
+    def __post_init__(self) -> None:
+        for name in ("depth", "every", "most"):
+            if getattr(self, name) < 1:
+                raise InputError(f"world_model.trial.{name}", getattr(self, name), "use at least 1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldModelConfig:
+    """A world model with its success model."""
+
+    model: PixelModelConfig = field(default_factory=PixelModelConfig)
+    learn: LearnConfig = field(default_factory=LearnConfig)
+    success: SuccessLearnConfig = field(default_factory=SuccessLearnConfig)
+    trial: TrialConfig = field(default_factory=TrialConfig)
+    held_out: float = 0.2
+    """Share of the episodes, in (0, 1), that it is judged on and does not learn from."""
+    image_size: int = 64
+    """Height and width in pixels of the frames it dreams."""
+    chunk: int = 10
+    """Env steps it goes at a time: the actions a policy executes per decision."""
+    shuffle_actions: bool = False
+    """Learn with the actions of other windows: a placebo, which must fail the trial."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.held_out < 1:
+            raise InputError("world_model.held_out", self.held_out, "use a share in (0, 1), e.g. 0.2")
+        if self.chunk < 1:
+            raise InputError("world_model.chunk", self.chunk, "use at least 1")
+        multiple = self.model.network.multiple
+        if self.image_size < multiple or self.image_size % multiple:
+            remedy = f"use a multiple of {multiple}, or change world_model.model.network"
+            raise InputError("world_model.image_size", self.image_size, remedy)

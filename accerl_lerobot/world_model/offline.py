@@ -1,0 +1,203 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A world model from a dataset: learnt, tried on episodes it has not seen, filmed and saved.
+
+<output_dir>/
+  world_model/     what `store.py` writes
+  trial.json       what became of it
+  preview.mp4      what happened, what it dreamt with those actions, and with another episode's
+  metrics.jsonl    losses
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.table import Table
+
+from accerl_lerobot.config import DatasetConfig
+from accerl_lerobot.console import Console
+from accerl_lerobot.envs import EnvConfig, make_world
+from accerl_lerobot.evaluation.pictures import write_video
+from accerl_lerobot.world_model.config import WorldModelConfig
+from accerl_lerobot.world_model.contract import WorldModel, WorldModelSpec
+from accerl_lerobot.world_model.dataset import load_episodes
+from accerl_lerobot.world_model.episodes import Episode, split
+from accerl_lerobot.world_model.learn import pretrain
+from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.store import save_world_model
+from accerl_lerobot.world_model.success import SuccessLearner, new_success_model
+from accerl_lerobot.world_model.trial import dream, trial_windows, try_out, wrong_actions
+
+EVERY = 20
+"""Steps between two lines of metrics."""
+FILMED, SCALE = 4, 3
+"""Trials in the preview, and how much larger than life."""
+
+
+def world_spec(config: WorldModelConfig, env: EnvConfig) -> tuple[WorldModelSpec, int]:
+    """What the model is to be of, and the world's control rate."""
+    world = make_world(env)
+    try:
+        seen = world.spec
+    finally:
+        world.close()
+    provides = {"pixels", "uncertainty", "state"} if seen.state_dim else {"pixels"}
+    spec = WorldModelSpec(
+        cameras=tuple(seen.images),
+        image_size=(config.image_size, config.image_size),
+        state_dim=seen.state_dim,
+        action_dim=seen.action_dim,
+        chunk=config.chunk,
+        context=config.model.context,
+        provides=frozenset(provides),
+    )
+    return spec, seen.fps
+
+
+def learn_from_dataset(
+    config: WorldModelConfig,
+    env: EnvConfig,
+    dataset: DatasetConfig,
+    directory: Path,
+    seed: int,
+    console: Console,
+) -> dict[str, Any]:
+    """Does all of it; `directory` exists and is empty.
+
+    Returns:
+        What `try_out` found, with ``seconds`` of the learning and how many ``episodes`` and ``env_steps``
+        were learnt from and held out; also in ``trial.json``.
+
+    Raises:
+        InputError: nothing can be learnt from this dataset, see `load_episodes`.
+    """
+    spec, fps = world_spec(config, env)
+    with console.stage("episodes"):
+        episodes = load_episodes(dataset, spec, fps)
+    learn, held = ([episodes[i] for i in part] for part in split(episodes, config.held_out, _rng(seed)))
+    torch.manual_seed(seed)
+    model = PixelWorldModel(spec, config.model)
+    started = time.monotonic()
+    with (directory / "metrics.jsonl").open("w") as log:
+
+        def record(kind: str, step: int, metrics: dict[str, float]) -> None:
+            if step % EVERY == 0:
+                log.write(json.dumps({"kind": kind, "step": step} | metrics) + "\n")
+
+        with console.stage("world model", total=config.learn.steps) as stage:
+
+            def on_step(step: int, metrics: dict[str, float]) -> None:
+                stage.update(step, f"image {metrics['image']:.3f} state {metrics['state']:.3f}")
+                record("world_model", step, metrics)
+
+            serving = pretrain(model, learn, config.learn, seed, config.shuffle_actions, on_step).serving
+        _calibrate(serving, learn, config, seed)
+        success = new_success_model(config.chunk)
+        learner = SuccessLearner(success, config.success, seed)
+        with console.stage("success model", total=config.success.steps) as stage:
+            for step in range(1, config.success.steps + 1):
+                metrics = learner.step(learn, serving)
+                stage.update(step, f"loss {metrics['loss']:.3f}")
+                record("success_model", step, metrics)
+        success.eval()
+    seconds = time.monotonic() - started
+    save_world_model(directory / "world_model", serving, success)
+    with console.stage("trial"):
+        found = try_out(serving, held, config.trial, success, seed)
+        film(directory / "preview.mp4", serving, held, config, seed)
+    found |= {
+        "seconds": seconds,
+        "learnt": {"episodes": len(learn), "env_steps": sum(map(len, learn))},
+        "held_out": {"episodes": len(held), "env_steps": sum(map(len, held))},
+    }
+    (directory / "trial.json").write_text(json.dumps(found, indent=2) + "\n")
+    return found
+
+
+def film(
+    path: Path, model: WorldModel, episodes: Sequence[Episode], config: WorldModelConfig, seed: int
+) -> None:
+    """Real, dreamt, and dreamt with another episode's actions, one row each."""
+    windows = trial_windows(episodes, model, config.trial, seed)
+    rng = np.random.default_rng((seed, 3))
+    rows = sorted(rng.choice(len(windows), min(FILMED, len(windows)), replace=False))
+    arms = [dream(model, windows, wrong_actions(windows, arm, rng)).frames for arm in ("true", "shuffled")]
+    context = model.spec.context
+    lines = [windows.frames[:, context - 1 :]]
+    lines += [np.concatenate([windows.frames[:, context - 1 : context], frames], 1) for frames in arms]
+    write_video(path, [[list(_large(line[row])) for row in rows] for line in lines], fps=4)
+
+
+def table(found: dict[str, Any]) -> Table:
+    """A trial for people."""
+    outcome = "passed" if found["passed"] else "FAILED"
+    shown = Table(title=f"{found['trials']} trials on held-out episodes: {outcome}")
+    columns = (
+        "depth", "skill, changed pixels", "sensitivity", "PSNR", "AUROC real", "dreamt", "false success",
+    )  # fmt: skip
+    for column in columns:
+        shown.add_column(column, justify="right")
+    for row in found["depths"]:
+        shown.add_row(
+            str(row["depth"]),
+            _estimate(row.get("skill_changed")),
+            _estimate(row.get("sensitivity_shuffled")),
+            _number(row.get("psnr"), 1),
+            _number(row.get("auroc_real"), 2),
+            _number(row.get("auroc_dreamt"), 2),
+            _number(row.get("false_success_true"), 2),
+        )
+    for name, gate in found["gates"].items():
+        mark = "holds" if gate["holds"] else "FAILS"
+        shown.add_row(mark, name, f"{_number(gate['value'], 2)} > {gate['above']}")
+    return shown
+
+
+def _calibrate(
+    model: PixelWorldModel, episodes: Sequence[Episode], config: WorldModelConfig, seed: int
+) -> None:
+    """Makes an uncertainty of 1 the 95th percentile after one chunk of real experience."""
+    windows = trial_windows(episodes, model, config.trial, seed + 1)
+    doubts = dream(model, windows, windows.actions[:, :1]).uncertainty[:, 0]
+    usual = float(np.quantile(doubts, 0.95))
+    if math.isfinite(usual):
+        model.doubt.mul_(max(usual, 1e-6))
+
+
+def _rng(seed: int) -> np.random.Generator:
+    return np.random.default_rng((seed, 0))
+
+
+def _large(frames: np.ndarray) -> np.ndarray:
+    """(D, V, H, W, 3) as (D, SCALE·H, V·SCALE·W, 3): cameras beside each other."""
+    beside = np.concatenate(list(frames.transpose(1, 0, 2, 3, 4)), axis=2)
+    return beside.repeat(SCALE, 1).repeat(SCALE, 2)
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "" if value is None or math.isnan(value) else f"{value:.{digits}f}"
+
+
+def _estimate(estimate: dict[str, float] | None) -> str:
+    if estimate is None:
+        return ""
+    return f"{estimate['value']:.2f} [{estimate['low']:.2f}, {estimate['high']:.2f}]"

@@ -1,0 +1,77 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A world model on disk: configs as JSON, weights as safetensors, the success model in LeRobot's format.
+
+world_model/
+  config.json          what world it is of, and how it dreams
+  model.safetensors    weights and statistics
+  success_model/       a LeRobot reward model
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import draccus
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model.config import PixelModelConfig
+from accerl_lerobot.world_model.contract import WorldModelSpec
+from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+
+UNREADABLE = (OSError, KeyError, TypeError, ValueError, RuntimeError, SafetensorError)
+CONFIG, WEIGHTS, SUCCESS = "config.json", "model.safetensors", "success_model"
+
+
+def save_world_model(
+    directory: Path, model: PixelWorldModel, success: SuccessPairsRewardModel | None = None
+) -> None:
+    """Writes both into a folder that does not exist."""
+    directory.mkdir(parents=True)
+    spec = asdict(model.spec) | {"provides": sorted(model.spec.provides)}
+    content = {"spec": spec, "model": draccus.encode(model.config)}
+    (directory / CONFIG).write_text(json.dumps(content, indent=2) + "\n")
+    save_file({k: v.contiguous() for k, v in model.state_dict().items()}, directory / WEIGHTS)
+    if success is not None:
+        success.save_pretrained(directory / SUCCESS)
+
+
+def load_world_model(directory: Path) -> tuple[PixelWorldModel, SuccessPairsRewardModel | None]:
+    """Reads what `save_world_model` wrote; both serve, neither is in training.
+
+    Raises:
+        InputError: it is not there, or its weights are not those of its config.
+    """
+    try:
+        content = json.loads((directory / CONFIG).read_text())
+        spec = content["spec"]
+        spec |= {k: tuple(spec[k]) for k in ("cameras", "image_size")} | {
+            "provides": frozenset(spec["provides"])
+        }
+        model = PixelWorldModel(WorldModelSpec(**spec), draccus.decode(PixelModelConfig, content["model"]))
+        model.load_state_dict(load_file(directory / WEIGHTS))
+    except (*UNREADABLE, draccus.utils.DraccusException) as error:
+        first = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(
+            "world_model.path", str(directory), f"not a world model of accerl world-model ({first})"
+        ) from error
+    success = None
+    if (directory / SUCCESS).is_dir():
+        success = SuccessPairsRewardModel.from_pretrained(directory / SUCCESS, strict=True)
+    return model.requires_grad_(False), success

@@ -1,0 +1,137 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""``accerl world-model`` from a dataset to its trial, saved and loaded again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from accerl_lerobot import cli
+from accerl_lerobot.demos.record import DemosConfig, record_demos
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model.config import WorldModelConfig
+from accerl_lerobot.world_model.store import load_world_model, save_world_model
+from accerl_lerobot.world_model.success import new_success_model
+from tests.world_model.test_pixels import awake, dots, dream, model, windows
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("demos") / "dataset"
+    env = SimulatedConfig(max_steps=60, hold=25, image_size=16)
+    record_demos(env, DemosConfig(episodes=8, failure_share=0.5, processes=1, root=str(root), repo_id="a/b"))
+    return root
+
+
+def arguments(demos: Path, output_dir: Path) -> list[str]:
+    return [
+        "world-model", "--env.type=simulated", "--env.image_size=16", "--dataset.repo_id=a/b",
+        f"--dataset.root={demos}", f"--output_dir={output_dir}", "--world_model.image_size=16",
+        "--world_model.chunk=5", "--world_model.learn.steps=25", "--world_model.success.steps=10",
+        "--world_model.trial.depth=2", "--world_model.model.network.channels=16,24",
+    ]  # fmt: skip
+
+
+def test_from_a_dataset_to_a_trial(demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = tmp_path / "out"
+    code = cli.main(arguments(demos, out))
+    stdout, stderr = capsys.readouterr()
+    found = json.loads(stdout)
+    assert code == (0 if found["passed"] else 1) and found == json.loads((out / "trial.json").read_text())
+    assert {p.name for p in out.iterdir()} == {"world_model", "trial.json", "preview.mp4", "metrics.jsonl"}
+    assert found["learnt"]["episodes"] + found["held_out"]["episodes"] == 8
+    assert [row["depth"] for row in found["depths"]] == [1, 2] and found["seconds"] > 0
+    assert set(found["gates"]) == {
+        "skill_changed_first",
+        "skill_changed_last",
+        "sensitivity_low",
+        "auroc_last",
+    }
+    kinds = [json.loads(line)["kind"] for line in (out / "metrics.jsonl").read_text().splitlines()]
+    assert kinds == ["world_model"]
+    assert "trials on held-out episodes" in stderr and "preview.mp4" in stderr
+    world, success = load_world_model(out / "world_model")
+    assert success is not None and success.config.chunk == world.spec.chunk == 5
+    assert world.spec.cameras == ("observation.images.front",) and float(world.doubt) != 1
+    assert (out / "preview.mp4").stat().st_size > 1000
+
+
+def test_what_is_refused_leaves_no_folder(demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = tmp_path / "out"
+    assert cli.main([*arguments(demos, out), "--env.image_size=16", "--env.state_dim=6"]) == 2
+    assert "observation.state has shape (4,), the world's has (6,)" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_what_is_saved_dreams_the_same(tmp_path: Path):
+    of = windows(dots(2))
+    made = awake(model())
+    made.fit_statistics(of)
+    success = new_success_model(2).eval()
+    save_world_model(tmp_path / "w", made, success)
+    again, loaded = load_world_model(tmp_path / "w")
+    assert again.spec == made.spec and again.config == made.config and loaded is not None
+    for one, other in zip(dream(made, of), dream(again, of), strict=True):
+        assert torch.equal(one.frames, other.frames) and torch.equal(one.robot, other.robot)
+    pair = torch.rand(1, 1, 3, 16, 16)
+    assert torch.equal(success.logits(pair, pair)[0], loaded.logits(pair, pair)[0])
+    assert not any(p.requires_grad for p in again.parameters())
+    save_world_model(tmp_path / "alone", made)
+    assert load_world_model(tmp_path / "alone")[1] is None
+
+
+@pytest.mark.parametrize("harm", ["nowhere", "config", "weights", "size"])
+def test_what_cannot_be_loaded(tmp_path: Path, harm: str):
+    folder = tmp_path / "w"
+    save_world_model(folder, model())
+    if harm == "nowhere":
+        folder = tmp_path / "nowhere"
+    if harm == "config":
+        (folder / "config.json").write_text("{}")
+    if harm == "weights":
+        (folder / "model.safetensors").write_bytes(b"\x00" * 64)
+    if harm == "size":
+        content = json.loads((folder / "config.json").read_text())
+        content["spec"]["action_dim"] = 7
+        (folder / "config.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="^world_model.path=.*not a world model of accerl world-model"):
+        load_world_model(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("held_out", 0.0), ("held_out", 1.0), ("chunk", 0), ("image_size", 60), ("image_size", 4)],
+)
+def test_bad_values_name_their_field(name: str, value: float):
+    with pytest.raises(InputError, match=f"^world_model.{name}="):
+        WorldModelConfig(**{name: value})
+
+
+def test_the_tiny_one_is_tiny():
+    from accerl_lerobot.world_model.contract import WorldModelSpec
+    from accerl_lerobot.world_model.pixels import PixelWorldModel
+
+    spec = WorldModelSpec(
+        cameras=("observation.images.corner2",), image_size=(64, 64), state_dim=4, action_dim=4, chunk=10,
+        context=2, provides=frozenset({"pixels"}),
+    )  # fmt: skip
+    size = sum(p.numel() for p in PixelWorldModel(spec, WorldModelConfig().model).parameters())
+    assert 1.5e6 < size < 2.5e6
+    assert np.isfinite(float(size))
