@@ -34,6 +34,7 @@ VERBS = {
     "sft": ("verbs:sft", "fine-tune on a LeRobotDataset with LeRobot's own trainer"),
     "eval": ("verbs:evaluate", "success of a checkpoint, with its confidence interval"),
     "world-model": ("verbs:world_model", "learn to dream a world from a LeRobotDataset, and be tried on it"),
+    "world-model-eval": ("verbs:world_model_eval", "try a world model on another dataset"),
     "doctor": ("doctor:main", "resolve a recipe and check this machine"),
     "bench": ("verbs:bench", "measure: accerl bench world, policy, lag"),
 }
@@ -47,7 +48,7 @@ def usage() -> str:
         "usage: accerl VERB [recipe.yaml] [--room.field=value …]",
         "",
     ]
-    lines += [f"  {verb:11} {what}" for verb, (_, what) in VERBS.items()]
+    lines += [f"  {verb:16} {what}" for verb, (_, what) in VERBS.items()]
     lines += [
         "",
         "examples:",

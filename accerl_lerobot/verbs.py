@@ -23,6 +23,7 @@ import importlib
 import json
 import shutil
 import sys
+from collections.abc import Callable
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -41,7 +42,7 @@ from accerl_lerobot.evaluation.config import EvaluationConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
-from accerl_lerobot.world_model.config import WorldModelConfig
+from accerl_lerobot.world_model.config import TrialConfig, WorldModelConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,6 +105,27 @@ class WorldModelRun:
     """The world it is to be a model of: its cameras, sizes and rate."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldModelEvalRun:
+    """``accerl world-model-eval``: a saved world model on another dataset."""
+
+    path: str | None = None
+    """The folder named world_model that ``accerl world-model`` wrote."""
+    seed: int = 0
+    """Of which windows are tried."""
+    output_dir: str | None = None
+    """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
+    job_name: str = "world_model_eval"
+    """Last part of the folder's name."""
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    """Episodes it has not learnt from."""
+    trial: TrialConfig = field(default_factory=TrialConfig)
+
+    def __post_init__(self) -> None:
+        if self.path is None:
+            raise InputError("path", None, "name the folder world_model of an accerl world-model run")
 
 
 def train(arguments: list[str]) -> int:
@@ -215,17 +237,41 @@ def evaluate(arguments: list[str]) -> int:
 def world_model(arguments: list[str]) -> int:
     """``accerl world-model``; 1 if it fails its trial."""
     config: WorldModelRun = parse(WorldModelRun, arguments, recipe_class=RunConfig)
+    from accerl_lerobot.world_model.offline import learn_from_dataset
+
+    return _tried(
+        config,
+        lambda directory, console: learn_from_dataset(
+            config.world_model, config.env, config.dataset, directory, config.seed, console
+        ),
+    )
+
+
+def world_model_eval(arguments: list[str]) -> int:
+    """``accerl world-model-eval``; 1 if it fails its trial."""
+    config: WorldModelEvalRun = parse(WorldModelEvalRun, arguments, recipe_class=RunConfig)
+    from accerl_lerobot.world_model.offline import try_on_dataset
+
+    path = Path(str(config.path)).expanduser()
+    return _tried(
+        config,
+        lambda directory, console: try_on_dataset(
+            path, config.dataset, config.trial, directory, config.seed, console
+        ),
+    )
+
+
+def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Console], dict[str, Any]]) -> int:
+    """Does the work in a new folder and shows the trial it ends with."""
     from accerl_lerobot.run import make_output_dir
-    from accerl_lerobot.world_model.offline import learn_from_dataset, table
+    from accerl_lerobot.world_model.offline import table
 
     directory = make_output_dir(config)
     console = Console()
     console.say(f"run {directory}")
     try:
         with redirect_stdout(sys.stderr):
-            found = learn_from_dataset(
-                config.world_model, config.env, config.dataset, directory, config.seed, console
-            )
+            found = work(directory, console)
     except InputError:
         _discard_unused(directory)
         raise
@@ -256,6 +302,7 @@ CONFIGS: dict[str, type[Any]] = {
     "sft": SFTRun,
     "eval": EvalRun,
     "world-model": WorldModelRun,
+    "world-model-eval": WorldModelEvalRun,
     "doctor": RunConfig,
     "bench world": BenchWorldConfig,
     "bench policy": BenchPolicyConfig,

@@ -51,6 +51,8 @@ class WorldModelSpec:
     action_dim: int
     chunk: int
     """K."""
+    fps: int
+    """Env steps per second of the world, which a dataset's frames must have too."""
     context: int
     """L."""
     provides: frozenset[str]

@@ -31,35 +31,35 @@ SUCCESS = "next.success"
 
 
 def load_episodes(
-    dataset: DatasetConfig, spec: WorldModelSpec, fps: int, source: str = "demo"
+    dataset: DatasetConfig, spec: WorldModelSpec, source: str = "demo", *, both: bool = True
 ) -> list[Episode]:
     """Reads all of it into memory, one uint8 image per env step and camera.
 
     Args:
         dataset: on the Hub, or in a folder.
         spec: the cameras, sizes and dims that are wanted; images are shrunk or enlarged to its size.
-        fps: control rate of the world it is to be a model of.
         source: see `Episode.source`.
+        both: whether there must be successes and failures.
 
     Raises:
         InputError: a camera, the success labels or the rate are not the world's; state or actions are another
             robot's; a single episode; only successes, or only failures.
     """
     meta = open_metadata(dataset)
-    check_metadata(meta, dataset.repo_id or "", spec, fps)
+    check_metadata(meta, dataset.repo_id or "", spec)
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     data = LeRobotDataset(meta.repo_id, root=meta.root, revision=meta.revision)
     episodes = [_episode(data, meta, index, spec, source) for index in range(meta.total_episodes)]
     remedies = {True: "add episodes that succeed", False: "add failures, see demos.failure_share"}
-    for outcome, remedy in remedies.items():
+    for outcome, remedy in remedies.items() if both else ():
         if not any(e.success is outcome for e in episodes):
             why = f"no {'success' if outcome else 'failure'} among {len(episodes)} episodes; {remedy}"
             raise InputError("dataset.repo_id", dataset.repo_id, why)
     return episodes
 
 
-def check_metadata(meta: Any, name: str, spec: WorldModelSpec, fps: int) -> None:
+def check_metadata(meta: Any, name: str, spec: WorldModelSpec) -> None:
     """Refuses a dataset that a world model of `spec` cannot learn from, before any image is read.
 
     Raises:
@@ -80,11 +80,9 @@ def check_metadata(meta: Any, name: str, spec: WorldModelSpec, fps: int) -> None
             raise refuse(f"{key} has shape {shape}, the world's has ({size},): it is another robot's")
     if SUCCESS not in meta.features:
         raise refuse(f"no {SUCCESS}: record it, as accerl demos does, or add it to the dataset")
-    if meta.fps != fps:
-        raise refuse(
-            f"{meta.fps} frames a second, and the world makes {fps} steps: a chunk would take another time; "
-            "record at the world's rate"
-        )
+    if meta.fps != spec.fps:
+        why = f"{meta.fps} frames a second, and the world makes {spec.fps} steps"
+        raise refuse(f"{why}: its chunks would be other chunks; record at the world's rate")
     if meta.total_episodes < 2:
         raise refuse("a single episode; at least one to learn from and one to be judged on are needed")
 

@@ -37,13 +37,13 @@ from accerl_lerobot.config import DatasetConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.evaluation.pictures import write_video
-from accerl_lerobot.world_model.config import WorldModelConfig
+from accerl_lerobot.world_model.config import TrialConfig, WorldModelConfig
 from accerl_lerobot.world_model.contract import WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.dataset import load_episodes
 from accerl_lerobot.world_model.episodes import Episode, split
 from accerl_lerobot.world_model.learn import pretrain
 from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.store import save_world_model
+from accerl_lerobot.world_model.store import load_world_model, save_world_model
 from accerl_lerobot.world_model.success import SuccessLearner, new_success_model
 from accerl_lerobot.world_model.trial import dream, trial_windows, try_out, wrong_actions
 
@@ -53,24 +53,24 @@ FILMED, SCALE = 4, 3
 """Trials in the preview, and how much larger than life."""
 
 
-def world_spec(config: WorldModelConfig, env: EnvConfig) -> tuple[WorldModelSpec, int]:
-    """What the model is to be of, and the world's control rate."""
+def world_spec(config: WorldModelConfig, env: EnvConfig) -> WorldModelSpec:
+    """What the model is to be of."""
     world = make_world(env)
     try:
         seen = world.spec
     finally:
         world.close()
     provides = {"pixels", "uncertainty", "state"} if seen.state_dim else {"pixels"}
-    spec = WorldModelSpec(
+    return WorldModelSpec(
         cameras=tuple(seen.images),
         image_size=(config.image_size, config.image_size),
         state_dim=seen.state_dim,
         action_dim=seen.action_dim,
         chunk=config.chunk,
         context=config.model.context,
+        fps=seen.fps,
         provides=frozenset(provides),
     )
-    return spec, seen.fps
 
 
 def learn_from_dataset(
@@ -90,9 +90,9 @@ def learn_from_dataset(
     Raises:
         InputError: nothing can be learnt from this dataset, see `load_episodes`.
     """
-    spec, fps = world_spec(config, env)
+    spec = world_spec(config, env)
     with console.stage("episodes"):
-        episodes = load_episodes(dataset, spec, fps)
+        episodes = load_episodes(dataset, spec)
     learn, held = ([episodes[i] for i in part] for part in split(episodes, config.held_out, _rng(seed)))
     torch.manual_seed(seed)
     model = PixelWorldModel(spec, config.model)
@@ -123,7 +123,7 @@ def learn_from_dataset(
     save_world_model(directory / "world_model", serving, success)
     with console.stage("trial"):
         found = try_out(serving, held, config.trial, success, seed)
-        film(directory / "preview.mp4", serving, held, config, seed)
+        film(directory / "preview.mp4", serving, held, config.trial, seed)
     found |= {
         "seconds": seconds,
         "learnt": {"episodes": len(learn), "env_steps": sum(map(len, learn))},
@@ -133,11 +133,31 @@ def learn_from_dataset(
     return found
 
 
-def film(
-    path: Path, model: WorldModel, episodes: Sequence[Episode], config: WorldModelConfig, seed: int
-) -> None:
+def try_on_dataset(
+    path: Path, dataset: DatasetConfig, trial: TrialConfig, directory: Path, seed: int, console: Console
+) -> dict[str, Any]:
+    """Tries a saved world model on a whole dataset, which should be one it has not learnt from.
+
+    Returns:
+        What `try_out` found; also in ``trial.json``, beside ``preview.mp4``.
+
+    Raises:
+        InputError: no world model there, or a dataset of another world.
+    """
+    model, success = load_world_model(path)
+    with console.stage("episodes"):
+        episodes = load_episodes(dataset, model.spec, both=success is not None)
+    with console.stage("trial"):
+        found = try_out(model, episodes, trial, success, seed)
+        film(directory / "preview.mp4", model, episodes, trial, seed)
+    found |= {"held_out": {"episodes": len(episodes), "env_steps": sum(map(len, episodes))}}
+    (directory / "trial.json").write_text(json.dumps(found, indent=2) + "\n")
+    return found
+
+
+def film(path: Path, model: WorldModel, episodes: Sequence[Episode], config: TrialConfig, seed: int) -> None:
     """Real, dreamt, and dreamt with another episode's actions, one row each."""
-    windows = trial_windows(episodes, model, config.trial, seed)
+    windows = trial_windows(episodes, model, config, seed)
     rng = np.random.default_rng((seed, 3))
     rows = sorted(rng.choice(len(windows), min(FILMED, len(windows)), replace=False))
     arms = [dream(model, windows, wrong_actions(windows, arm, rng)).frames for arm in ("true", "shuffled")]
@@ -150,7 +170,7 @@ def film(
 def table(found: dict[str, Any]) -> Table:
     """A trial for people."""
     outcome = "passed" if found["passed"] else "FAILED"
-    shown = Table(title=f"{found['trials']} trials on held-out episodes: {outcome}")
+    shown = Table(title=f"{found['trials']} trials: {outcome}")
     columns = (
         "depth", "skill, changed pixels", "sensitivity", "PSNR", "AUROC real", "dreamt", "false success",
     )  # fmt: skip

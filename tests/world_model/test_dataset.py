@@ -41,12 +41,13 @@ SPEC = WorldModelSpec(
     action_dim=4,
     chunk=10,
     context=2,
+    fps=80,
     provides=frozenset({"pixels", "state"}),
 )
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[DatasetConfig, WorldModelSpec, int]:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[DatasetConfig, WorldModelSpec]:
     """Six episodes of the simulated world, some of which fail."""
     root = tmp_path_factory.mktemp("demos") / "dataset"
     env = SimulatedConfig(max_steps=60, hold=25, image_size=16)
@@ -55,16 +56,16 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[DatasetConfig, W
     world = make_world(env).spec
     spec = replace(
         SPEC, cameras=tuple(world.images), image_size=(16, 16), state_dim=world.state_dim,
-        action_dim=world.action_dim,
+        action_dim=world.action_dim, fps=world.fps,
     )  # fmt: skip
-    return DatasetConfig(repo_id="a/b", root=str(root)), spec, world.fps
+    return DatasetConfig(repo_id="a/b", root=str(root)), spec
 
 
-def test_every_frame_and_action_is_the_dataset_s(recorded: tuple[DatasetConfig, WorldModelSpec, int]):
+def test_every_frame_and_action_is_the_dataset_s(recorded: tuple[DatasetConfig, WorldModelSpec]):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    dataset, spec, fps = recorded
-    episodes = load_episodes(dataset, spec, fps)
+    dataset, spec = recorded
+    episodes = load_episodes(dataset, spec)
     data = LeRobotDataset(dataset.repo_id, root=dataset.root)
     assert len(episodes) == data.meta.total_episodes == 6 and sum(map(len, episodes)) == len(data)
     index = 0
@@ -84,10 +85,10 @@ def test_every_frame_and_action_is_the_dataset_s(recorded: tuple[DatasetConfig, 
     assert {e.success for e in episodes} == {True, False}
 
 
-def test_images_are_brought_to_size(recorded: tuple[DatasetConfig, WorldModelSpec, int]):
-    dataset, spec, fps = recorded
-    episodes = load_episodes(dataset, replace(spec, image_size=(8, 24)), fps)
-    for small, full in zip(episodes, load_episodes(dataset, spec, fps), strict=True):
+def test_images_are_brought_to_size(recorded: tuple[DatasetConfig, WorldModelSpec]):
+    dataset, spec = recorded
+    episodes = load_episodes(dataset, replace(spec, image_size=(8, 24)))
+    for small, full in zip(episodes, load_episodes(dataset, spec), strict=True):
         assert small.frames.shape == (len(full), 1, 8, 24, 3) and small.frames.dtype == np.uint8
         assert abs(small.frames.mean() - full.frames.mean()) < 2
 
@@ -126,21 +127,22 @@ def metadata(**changes: Any) -> SimpleNamespace:
     ],
 )
 def test_what_cannot_be_learnt_from(changes: dict[str, Any], why: str):
-    check_metadata(metadata(), "a/b", SPEC, 80)
+    check_metadata(metadata(), "a/b", SPEC)
     with pytest.raises(InputError, match=f"^dataset.repo_id='a/b': {why}"):
-        check_metadata(metadata(**changes), "a/b", SPEC, 80)
+        check_metadata(metadata(**changes), "a/b", SPEC)
 
 
 def test_a_world_without_a_state_does_not_ask_for_one():
-    check_metadata(metadata(shapes={"observation.state": None}), "a/b", replace(SPEC, state_dim=0), 80)
+    check_metadata(metadata(shapes={"observation.state": None}), "a/b", replace(SPEC, state_dim=0))
 
 
 def test_only_successes():
     with pytest.raises(InputError, match="no failure among 4 episodes; add failures, see demos"):
-        load_episodes(TINY, SPEC, 80)
+        load_episodes(TINY, SPEC)
+    assert len(load_episodes(TINY, SPEC, both=False)) == 4
 
 
-def test_only_failures(recorded: tuple[DatasetConfig, WorldModelSpec, int], monkeypatch: pytest.MonkeyPatch):
+def test_only_failures(recorded: tuple[DatasetConfig, WorldModelSpec], monkeypatch: pytest.MonkeyPatch):
     real = module._episode
     monkeypatch.setattr(module, "_episode", lambda *args: replace(real(*args), success_at=-1))
     with pytest.raises(InputError, match="no success among 6 episodes; add episodes that succeed"):

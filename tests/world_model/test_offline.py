@@ -66,11 +66,28 @@ def test_from_a_dataset_to_a_trial(demos: Path, tmp_path: Path, capsys: pytest.C
     }
     kinds = [json.loads(line)["kind"] for line in (out / "metrics.jsonl").read_text().splitlines()]
     assert kinds == ["world_model"]
-    assert "trials on held-out episodes" in stderr and "preview.mp4" in stderr
+    assert " trials: " in stderr and "preview.mp4" in stderr
     world, success = load_world_model(out / "world_model")
     assert success is not None and success.config.chunk == world.spec.chunk == 5
     assert world.spec.cameras == ("observation.images.front",) and float(world.doubt) != 1
     assert (out / "preview.mp4").stat().st_size > 1000
+
+
+def test_a_saved_one_is_tried_on_another_dataset(
+    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    cli.main(arguments(demos, tmp_path / "out"))
+    capsys.readouterr()
+    path = tmp_path / "out" / "world_model"
+    told = [f"--path={path}", "--dataset.repo_id=a/b", f"--dataset.root={demos}", "--trial.depth=2"]
+    code = cli.main(["world-model-eval", *told, f"--output_dir={tmp_path / 'again'}"])
+    found = json.loads(capsys.readouterr().out)
+    assert code == (0 if found["passed"] else 1) and found["held_out"]["episodes"] == 8
+    assert {p.name for p in (tmp_path / "again").iterdir()} == {"trial.json", "preview.mp4"}
+    assert cli.main(["world-model-eval", "--path=nowhere", f"--output_dir={tmp_path / 'third'}"]) == 2
+    assert "world_model.path='nowhere': not a world model" in capsys.readouterr().err
+    assert cli.main(["world-model-eval"]) == 2
+    assert "path=None: name the folder world_model" in capsys.readouterr().err
 
 
 def test_what_is_refused_leaves_no_folder(demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -130,7 +147,7 @@ def test_the_tiny_one_is_tiny():
 
     spec = WorldModelSpec(
         cameras=("observation.images.corner2",), image_size=(64, 64), state_dim=4, action_dim=4, chunk=10,
-        context=2, provides=frozenset({"pixels"}),
+        context=2, fps=80, provides=frozenset({"pixels"}),
     )  # fmt: skip
     size = sum(p.numel() for p in PixelWorldModel(spec, WorldModelConfig().model).parameters())
     assert 1.5e6 < size < 2.5e6

@@ -37,6 +37,7 @@ SPEC = WorldModelSpec(
     action_dim=2,
     chunk=K,
     context=2,
+    fps=80,
     provides=frozenset({"pixels", "state", "uncertainty"}),
 )
 NETWORK = NetworkConfig(space_to_depth=2, channels=(24, 32), condition=48, planes=6)
