@@ -264,7 +264,7 @@ def world_model_eval(arguments: list[str]) -> int:
 def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Console], dict[str, Any]]) -> int:
     """Does the work in a new folder and shows the trial it ends with."""
     from accerl_lerobot.run import make_output_dir
-    from accerl_lerobot.world_model.offline import table
+    from accerl_lerobot.world_model.offline import gates, table
 
     directory = make_output_dir(config)
     console = Console()
@@ -276,6 +276,8 @@ def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Cons
         _discard_unused(directory)
         raise
     console.rich.print(table(found))
+    for line in gates(found):
+        console.say(line)
     console.say(f"{'passed' if found['passed'] else 'FAILED'}; see {directory / 'preview.mp4'}")
     sys.stdout.write(json.dumps(found, indent=2) + "\n")
     return 0 if found["passed"] else 1

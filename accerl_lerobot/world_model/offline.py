@@ -186,10 +186,16 @@ def table(found: dict[str, Any]) -> Table:
             _number(row.get("auroc_dreamt"), 2),
             _number(row.get("false_success_true"), 2),
         )
-    for name, gate in found["gates"].items():
-        mark = "holds" if gate["holds"] else "FAILS"
-        shown.add_row(mark, name, f"{_number(gate['value'], 2)} > {gate['above']}")
     return shown
+
+
+def gates(found: dict[str, Any]) -> list[str]:
+    """Each gate of a trial in a line."""
+    return [
+        f"{'holds' if gate['holds'] else 'FAILS'}  {name} = {_number(gate['value'], 2) or 'unknown'}, "
+        f"above {gate['above']} wanted"
+        for name, gate in found["gates"].items()
+    ]
 
 
 def _calibrate(

@@ -66,7 +66,7 @@ def test_from_a_dataset_to_a_trial(demos: Path, tmp_path: Path, capsys: pytest.C
     }
     kinds = [json.loads(line)["kind"] for line in (out / "metrics.jsonl").read_text().splitlines()]
     assert kinds == ["world_model"]
-    assert " trials: " in stderr and "preview.mp4" in stderr
+    assert " trials: " in stderr and stderr.count(" wanted") == 4 and "preview.mp4" in stderr
     world, success = load_world_model(out / "world_model")
     assert success is not None and success.config.chunk == world.spec.chunk == 5
     assert world.spec.cameras == ("observation.images.front",) and float(world.doubt) != 1
