@@ -29,10 +29,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from accerl_lerobot.bench.lag import BenchLagConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
-from accerl_lerobot.config import DatasetConfig, LaunchConfig, RunConfig, check_chunk, parse
+from accerl_lerobot.config import DatasetConfig, LaunchConfig, RunConfig, check_chunk, encode, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
@@ -106,6 +108,10 @@ class WorldModelRun:
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.seed < 100:
+            raise InputError("seed", self.seed, "use 0 to 99")
+
 
 @dataclass(frozen=True, kw_only=True)
 class WorldModelEvalRun:
@@ -126,6 +132,8 @@ class WorldModelEvalRun:
     def __post_init__(self) -> None:
         if self.path is None:
             raise InputError("path", None, "name the folder world_model of an accerl world-model run")
+        if self.seed < 0:
+            raise InputError("seed", self.seed, "use 0 or more")
 
 
 def train(arguments: list[str]) -> int:
@@ -267,6 +275,7 @@ def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Cons
     from accerl_lerobot.world_model.offline import gates, table
 
     directory = make_output_dir(config)
+    (directory / "config.yaml").write_text(yaml.safe_dump(encode(config), sort_keys=False))
     console = Console()
     console.say(f"run {directory}")
     try:

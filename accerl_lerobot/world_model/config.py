@@ -87,7 +87,7 @@ class PixelModelConfig:
             raise InputError(
                 "world_model.model.objective", self.objective, f"use {' or '.join(get_args(Objective))}"
             )
-        for name, least in (("steps", 1), ("context", 1), ("heads", 2)):
+        for name, least in (("steps", 1), ("context", 1), ("heads", 2), ("state_weight", 0)):
             if getattr(self, name) < least:
                 raise InputError(f"world_model.model.{name}", getattr(self, name), f"use at least {least}")
         if not self.context_noise >= 0:
@@ -109,7 +109,7 @@ class LearnConfig:
     steps: int = 2000
     """Gradient steps of the pre-training, at least 1."""
     batch: int = 16
-    """Windows in each."""
+    """Windows in each, at least 2."""
     lr: float = 1e-3
     """Peak; falls to a tenth by a cosine."""
     warmup: int = 50
@@ -125,9 +125,9 @@ class LearnConfig:
     """The anchor lies up to so many chunks back, as far as dreams will go."""
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "chunks"):
-            if getattr(self, name) < 1:
-                raise InputError(f"world_model.learn.{name}", getattr(self, name), "use at least 1")
+        for name, least in (("steps", 1), ("batch", 2), ("chunks", 1)):
+            if getattr(self, name) < least:
+                raise InputError(f"world_model.learn.{name}", getattr(self, name), f"use at least {least}")
         for name in ("warmup", "weight_decay", "anchors"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"world_model.learn.{name}", getattr(self, name), "use 0 or more")
@@ -160,8 +160,8 @@ class SuccessLearnConfig:
     """Share of pairs, in [0, 1], whose second frame is dreamt from the first."""
 
     def __post_init__(self) -> None:
-        for name, least in (("steps", 1), ("batch", 2)):
-            if getattr(self, name) < least:
+        for name, least in (("steps", 1), ("batch", 2), ("weight_decay", 0)):
+            if not getattr(self, name) >= least:
                 raise InputError(f"world_model.success.{name}", getattr(self, name), f"use at least {least}")
         if not 0 < self.lr < 1:
             raise InputError("world_model.success.lr", self.lr, "use a value in (0, 1), e.g. 1e-3")
@@ -216,7 +216,7 @@ class WorldModelConfig:
             raise InputError("world_model.held_out", self.held_out, "use a share in (0, 1), e.g. 0.2")
         if self.chunk < 1:
             raise InputError("world_model.chunk", self.chunk, "use at least 1")
-        multiple = self.model.network.multiple
+        multiple = math.lcm(2, self.model.network.multiple)  # the success model halves it first
         if self.image_size < multiple or self.image_size % multiple:
             remedy = f"use a multiple of {multiple}, or change world_model.model.network"
             raise InputError("world_model.image_size", self.image_size, remedy)

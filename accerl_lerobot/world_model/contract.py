@@ -81,7 +81,7 @@ class Dream:
     robot: Tensor
     """float32 (B, S), in the world's units."""
     uncertainty: Tensor
-    """float32 (B,), ≥ 0; 1 is the 95th percentile on held-out real chunks. NaN where it is not provided."""
+    """float32 (B,), ≥ 0; 1 is the 95th percentile on chunks it has learnt from. NaN where it has none."""
 
 
 class WorldModel(ABC):

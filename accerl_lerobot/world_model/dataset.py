@@ -93,11 +93,14 @@ def _episode(data: Any, meta: Any, index: int, spec: WorldModelSpec, source: str
     success = np.array([bool(item[SUCCESS]) for item in items])
     state = [item["observation.state"].numpy() if spec.state_dim else np.zeros(0) for item in items]
     frames = [np.stack([_image(item[camera], spec.image_size) for camera in spec.cameras]) for item in items]
+    actions = np.stack([item["action"].numpy() for item in items])
+    if not (np.isfinite(actions).all() and np.isfinite(np.stack(state)).all()):
+        raise InputError("dataset.repo_id", meta.repo_id, f"episode {index} has a NaN state or action")
     return Episode(
         frames=np.stack(frames),
         times=np.arange(len(items)),
         state=np.stack(state).astype(np.float32),
-        actions=np.stack([item["action"].numpy() for item in items]).astype(np.float32),
+        actions=actions.astype(np.float32),
         success_at=int(success.argmax()) if success.any() else -1,
         task=str(items[0]["task"]),
         source=source,

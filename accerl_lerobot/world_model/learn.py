@@ -28,6 +28,7 @@ import torch
 
 from accerl_lerobot.world_model.config import LearnConfig
 from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, places
+from accerl_lerobot.world_model.judge import shuffled
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 
 STATISTICS = 2048
@@ -71,20 +72,28 @@ class Learner:
             anchors=back.tolist(),
         )
         if self._shuffle:
-            windows = replace(windows, actions=windows.actions[self.rng.permutation(len(windows))])
+            donors = shuffled(len(windows), windows.episode.tolist(), self.rng)
+            windows = replace(windows, actions=windows.actions[donors])
         return windows
 
     def step(self, windows: Windows) -> dict[str, float]:
-        """Learns from them once; returns the losses and ``grad_norm``."""
+        """Learns from them once; returns the losses and ``grad_norm``.
+
+        Raises:
+            FloatingPointError: it has diverged.
+        """
         for group in self._optimizer.param_groups:
             group["lr"] = self.config.lr_at(self.count)
         loss, metrics = self.model.loss(windows, self._generator)
         self._optimizer.zero_grad(set_to_none=True)
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.grad_clip)
-        if bool(torch.isfinite(norm)):
-            self._optimizer.step()
-            self._average()
+        if not bool(torch.isfinite(norm)):
+            raise FloatingPointError(
+                f"the world model's loss or gradient is not finite at step {self.count + 1}; lower its lr"
+            )
+        self._optimizer.step()
+        self._average()
         self.count += 1
         return metrics | {"loss": loss.item(), "grad_norm": norm.item()}
 

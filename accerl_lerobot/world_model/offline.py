@@ -36,6 +36,7 @@ from rich.table import Table
 from accerl_lerobot.config import DatasetConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, make_world
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.pictures import write_video
 from accerl_lerobot.world_model.config import TrialConfig, WorldModelConfig
 from accerl_lerobot.world_model.contract import WorldModel, WorldModelSpec
@@ -94,6 +95,7 @@ def learn_from_dataset(
     with console.stage("episodes"):
         episodes = load_episodes(dataset, spec)
     learn, held = ([episodes[i] for i in part] for part in split(episodes, config.held_out, _rng(seed)))
+    _check_held_out(dataset, learn, held, config)
     torch.manual_seed(seed)
     model = PixelWorldModel(spec, config.model)
     started = time.monotonic()
@@ -150,7 +152,7 @@ def try_on_dataset(
     with console.stage("trial"):
         found = try_out(model, episodes, trial, success, seed)
         film(directory / "preview.mp4", model, episodes, trial, seed)
-    found |= {"held_out": {"episodes": len(episodes), "env_steps": sum(map(len, episodes))}}
+    found |= {"tried": {"episodes": len(episodes), "env_steps": sum(map(len, episodes))}}
     (directory / "trial.json").write_text(json.dumps(found, indent=2) + "\n")
     return found
 
@@ -201,12 +203,28 @@ def gates(found: dict[str, Any]) -> list[str]:
 def _calibrate(
     model: PixelWorldModel, episodes: Sequence[Episode], config: WorldModelConfig, seed: int
 ) -> None:
-    """Makes an uncertainty of 1 the 95th percentile after one chunk of real experience."""
+    """Makes an uncertainty of 1 the 95th percentile after one whole chunk of real experience."""
     windows = trial_windows(episodes, model, config.trial, seed + 1)
-    doubts = dream(model, windows, windows.actions[:, :1]).uncertainty[:, 0]
-    usual = float(np.quantile(doubts, 0.95))
-    if math.isfinite(usual):
+    doubts = dream(model, windows, windows.actions[:, :1]).uncertainty[windows.steps[:, 0] == config.chunk, 0]
+    usual = float(np.quantile(doubts, 0.95)) if len(doubts) else math.nan
+    if math.isfinite(usual):  # a model without a state has no doubts
         model.doubt.mul_(max(usual, 1e-6))
+
+
+def _check_held_out(
+    dataset: DatasetConfig, learn: Sequence[Episode], held: Sequence[Episode], config: WorldModelConfig
+) -> None:
+    """Refuses a split that could not be judged, before anything is learnt."""
+    counts = [sum(e.success for e in part) for part in (learn, held)]
+    failures = [len(part) - count for part, count in zip((learn, held), counts, strict=True)]
+    if min(*counts, *failures) < 1:
+        remedy = "at least two successes and two failures are needed, to learn from and to be judged on"
+        raise InputError("dataset.repo_id", dataset.repo_id, remedy)
+    wanted = config.chunk * config.trial.depth + 1
+    longest = max(len(e.frames) for e in held)
+    if longest < wanted:
+        remedy = f"held-out episodes have at most {longest} frames, and dreams of this depth need {wanted}"
+        raise InputError("world_model.trial.depth", config.trial.depth, remedy)
 
 
 def _rng(seed: int) -> np.random.Generator:

@@ -60,7 +60,7 @@ class PixelWorldModel(nn.Module, WorldModel):
         super().__init__()
         multiple = config.network.multiple
         if any(side % multiple for side in spec.image_size):
-            remedy = f"use sides that are multiples of {multiple}, or change world_model.network"
+            remedy = f"use sides that are multiples of {multiple}, or change world_model.model.network"
             raise InputError("world_model.image_size", spec.image_size, remedy)
         self.spec, self.config = spec, config
         channels, chunk = 3 * len(spec.cameras), spec.chunk * (spec.action_dim + 1)
@@ -164,7 +164,9 @@ class PixelWorldModel(nn.Module, WorldModel):
             return objectives.edm_loss(network, wanted, noise, (1.2 * spread - 0.4).exp(), SIGMA_FRAME)
         residual = (wanted - newest) / self.change
         if self.config.objective == "flow":
-            return objectives.flow_loss(network, residual, noise, torch.sigmoid(spread))
+            # Dreams begin at t = 1, so some rows do.
+            t = torch.rand(b, generator=generator).mul(1.1).clamp(max=1).to(wanted)
+            return objectives.flow_loss(network, residual, noise, t)
         # A model that is to dream in one pass has no use for refining; others spend half on each.
         alone = 0.5 if self.config.steps > 1 else 1.0
         predict = (torch.rand(b, generator=generator) < alone).to(wanted.device)

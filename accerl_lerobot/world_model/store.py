@@ -69,7 +69,7 @@ def load_world_model(directory: Path) -> tuple[PixelWorldModel, SuccessPairsRewa
     except (*UNREADABLE, draccus.utils.DraccusException) as error:
         first = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(
-            "world_model.path", str(directory), f"not a world model of accerl world-model ({first})"
+            "path", str(directory), f"not a world model of accerl world-model ({first})"
         ) from error
     success = None
     if (directory / SUCCESS).is_dir():

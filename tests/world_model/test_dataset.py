@@ -147,3 +147,20 @@ def test_only_failures(recorded: tuple[DatasetConfig, WorldModelSpec], monkeypat
     monkeypatch.setattr(module, "_episode", lambda *args: replace(real(*args), success_at=-1))
     with pytest.raises(InputError, match="no success among 6 episodes; add episodes that succeed"):
         load_episodes(*recorded)
+
+
+def test_what_is_not_a_number(
+    recorded: tuple[DatasetConfig, WorldModelSpec], monkeypatch: pytest.MonkeyPatch
+):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    real = LeRobotDataset.__getitem__
+
+    def broken(self: Any, index: int) -> Any:
+        item = real(self, index)
+        item["action"] = item["action"] * (np.nan if index == 3 else 1)
+        return item
+
+    monkeypatch.setattr(LeRobotDataset, "__getitem__", broken)
+    with pytest.raises(InputError, match="episode 0 has a NaN state or action"):
+        load_episodes(*recorded)

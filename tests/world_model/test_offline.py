@@ -16,19 +16,22 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 from accerl_lerobot import cli
+from accerl_lerobot.config import DatasetConfig
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model import offline
 from accerl_lerobot.world_model.config import WorldModelConfig
 from accerl_lerobot.world_model.store import load_world_model, save_world_model
-from accerl_lerobot.world_model.success import new_success_model
+from accerl_lerobot.world_model.success import SuccessLearner, new_success_model
 from tests.world_model.test_pixels import awake, dots, dream, model, windows
 
 
@@ -55,7 +58,9 @@ def test_from_a_dataset_to_a_trial(demos: Path, tmp_path: Path, capsys: pytest.C
     stdout, stderr = capsys.readouterr()
     found = json.loads(stdout)
     assert code == (0 if found["passed"] else 1) and found == json.loads((out / "trial.json").read_text())
-    assert {p.name for p in out.iterdir()} == {"world_model", "trial.json", "preview.mp4", "metrics.jsonl"}
+    assert {p.name for p in out.iterdir()} == {
+        "config.yaml", "world_model", "trial.json", "preview.mp4", "metrics.jsonl",
+    }  # fmt: skip
     assert found["learnt"]["episodes"] + found["held_out"]["episodes"] == 8
     assert [row["depth"] for row in found["depths"]] == [1, 2] and found["seconds"] > 0
     assert set(found["gates"]) == {
@@ -82,10 +87,10 @@ def test_a_saved_one_is_tried_on_another_dataset(
     told = [f"--path={path}", "--dataset.repo_id=a/b", f"--dataset.root={demos}", "--trial.depth=2"]
     code = cli.main(["world-model-eval", *told, f"--output_dir={tmp_path / 'again'}"])
     found = json.loads(capsys.readouterr().out)
-    assert code == (0 if found["passed"] else 1) and found["held_out"]["episodes"] == 8
-    assert {p.name for p in (tmp_path / "again").iterdir()} == {"trial.json", "preview.mp4"}
+    assert code == (0 if found["passed"] else 1) and found["tried"]["episodes"] == 8
+    assert {p.name for p in (tmp_path / "again").iterdir()} == {"config.yaml", "trial.json", "preview.mp4"}
     assert cli.main(["world-model-eval", "--path=nowhere", f"--output_dir={tmp_path / 'third'}"]) == 2
-    assert "world_model.path='nowhere': not a world model" in capsys.readouterr().err
+    assert "path='nowhere': not a world model" in capsys.readouterr().err
     assert cli.main(["world-model-eval"]) == 2
     assert "path=None: name the folder world_model" in capsys.readouterr().err
 
@@ -95,6 +100,52 @@ def test_what_is_refused_leaves_no_folder(demos: Path, tmp_path: Path, capsys: p
     assert cli.main([*arguments(demos, out), "--env.image_size=16", "--env.state_dim=6"]) == 2
     assert "observation.state has shape (4,), the world's has (6,)" in capsys.readouterr().err
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("--world_model.trial.depth=20", "world_model.trial.depth=20: held-out episodes have at most"),
+        ("--world_model.success.weight_decay=-1", "world_model.success.weight_decay=-1.0: use at least 0"),
+        ("--world_model.model.state_weight=-1", "world_model.model.state_weight=-1.0: use at least 0"),
+        ("--world_model.image_size=13", "world_model.image_size=13: use a multiple of 8"),
+        ("--seed=-1", "seed=-1: use 0 to 99"),
+    ],
+)
+def test_what_is_refused_before_anything_is_learnt(
+    option: str, message: str, demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert cli.main([*arguments(demos, tmp_path / "out"), option]) == 2
+    assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_one_success_is_not_enough_to_learn_from_and_be_judged_on():
+    config = WorldModelConfig()
+    failures = dots(4, steps=80)
+    success = [replace(failures[0], success_at=79)]
+    with pytest.raises(InputError, match="at least two successes and two failures"):
+        offline._check_held_out(DatasetConfig(), success + failures[:2], failures[2:], config)
+    offline._check_held_out(DatasetConfig(), success + failures[:2], success + failures[2:], config)
+
+
+def test_the_trial_is_on_episodes_that_were_not_learnt_from(
+    demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    seen: dict[str, list[bytes]] = {}
+
+    def spy(name: str, place: int, real: Any) -> Any:
+        def called(*args: Any, **options: Any) -> Any:
+            seen.setdefault(name, []).extend(e.frames.tobytes() for e in args[place])
+            return real(*args, **options)
+
+        return called
+
+    monkeypatch.setattr(offline, "pretrain", spy("learnt", 1, offline.pretrain))
+    monkeypatch.setattr(offline, "try_out", spy("tried", 1, offline.try_out))
+    monkeypatch.setattr(SuccessLearner, "step", spy("success", 1, SuccessLearner.step))
+    cli.main(arguments(demos, tmp_path / "out"))
+    assert set(seen["learnt"]) == set(seen["success"]) and len(set(seen["learnt"] + seen["tried"])) == 8
+    assert not set(seen["learnt"]) & set(seen["tried"])
 
 
 def test_what_is_saved_dreams_the_same(tmp_path: Path):
@@ -128,7 +179,7 @@ def test_what_cannot_be_loaded(tmp_path: Path, harm: str):
         content = json.loads((folder / "config.json").read_text())
         content["spec"]["action_dim"] = 7
         (folder / "config.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match="^world_model.path=.*not a world model of accerl world-model"):
+    with pytest.raises(InputError, match="^path=.*not a world model of accerl world-model"):
         load_world_model(folder)
 
 
@@ -151,4 +202,3 @@ def test_the_tiny_one_is_tiny():
     )  # fmt: skip
     size = sum(p.numel() for p in PixelWorldModel(spec, WorldModelConfig().model).parameters())
     assert 1.5e6 < size < 2.5e6
-    assert np.isfinite(float(size))
