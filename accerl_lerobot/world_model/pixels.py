@@ -99,11 +99,13 @@ class PixelWorldModel(nn.Module, WorldModel):
 
     def begin(self, frames: Tensor, robot: Tensor, tasks: Sequence[str]) -> State:
         """See the base class."""
+        frames, robot = (x.to(self.change.device) for x in (frames, robot))
         return {"frames": frames, "anchor": frames[:, -1], "robot": robot}
 
     @torch.no_grad()
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Dream:
         """See the base class."""
+        actions = actions.to(self.change.device)
         steps = torch.full(actions.shape[:1], self.spec.chunk, device=actions.device)
         chunk = self._chunk(actions, steps)
         newest = state["frames"][:, -1]

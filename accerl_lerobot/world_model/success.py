@@ -64,14 +64,13 @@ class SuccessLearner:
                 frames, torch.from_numpy(windows.state[rows, 0]), [windows.task[r] for r in rows]
             )
             seeds = self.rng.integers(2**31, size=len(rows)).tolist()
-            after[rows] = world.step(state, torch.from_numpy(windows.actions[rows, 0]), seeds).frames.numpy()
+            after[rows] = (
+                world.step(state, torch.from_numpy(windows.actions[rows, 0]), seeds).frames.cpu().numpy()
+            )
         progress = np.array([_progress(episodes[p.episode], p.frame, spec.chunk) for p in at], np.float32)
-        loss, metrics = self.model.loss(
-            _floats(before),
-            _floats(after),
-            torch.from_numpy(windows.success[:, 0].astype(np.float32)),
-            torch.from_numpy(progress),
-        )
+        device = self.model.out.weight.device
+        given = (_floats(before), _floats(after), torch.from_numpy(windows.success[:, 0].astype(np.float32)))
+        loss, metrics = self.model.loss(*(x.to(device) for x in given), torch.from_numpy(progress).to(device))
         self._optimizer.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)

@@ -93,15 +93,17 @@ def wrong_actions(windows: Windows, arm: str, rng: np.random.Generator) -> np.nd
 def scores(success: SuccessPairsRewardModel, before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """P(success) of each pair of frames (M, V, H, W, 3)."""
 
+    device = success.out.weight.device
+
     def floats(frames: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(frames).movedim(-1, 2).float() / 255
+        return torch.from_numpy(frames).movedim(-1, 2).to(device).float() / 255
 
     with torch.no_grad():
         parts = [
             torch.sigmoid(success.logits(floats(before[i : i + BATCH]), floats(after[i : i + BATCH]))[0])
             for i in range(0, len(before), BATCH)
         ]
-    return torch.cat(parts).numpy()
+    return torch.cat(parts).cpu().numpy()
 
 
 def try_out(

@@ -14,7 +14,7 @@
 """A small success model as a LeRobot reward model: did a chunk achieve the task, and how far along is it?
 
 LeRobot's own ``reward_classifier`` trains the last layers only and fetches the others; the large ones are for
-inference. This one is a convolutional network of half a million weights that looks at the frames before and
+inference. This one is a convolutional network of 0.3 million weights that looks at the frames before and
 after a chunk, so it can be trained beside a policy.
 
 Example:
