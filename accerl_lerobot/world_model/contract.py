@@ -14,11 +14,11 @@
 """What a world model is: it begins at what was seen, and goes one action chunk at a time.
 
     state = model.begin(frames, robot, tasks)
-    dream = model.step(state, actions, generator)     # dream.frames, dream.robot; go on from dream.state
+    dream = model.step(state, actions, seeds)         # dream.frames, dream.robot; go on from dream.state
 
 States are dicts of tensors with the batch in front, so that rows can be replaced, repeated and sent away. A
-model says in its `spec` what it provides, and whoever wants more is refused before anything runs. Whether a
-frame shows a success is another model's judgement, see `success.py`.
+model says in its `spec` what it provides. Whether a frame shows a success is another model's judgement, see
+`success.py`.
 
 Shapes: B batch, L frames of context, V cameras, H×W pixels, S robot state dims, K env steps of a chunk, A
 action dims.
@@ -31,8 +31,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
-
-from accerl_lerobot.errors import InputError
 
 State = dict[str, Tensor]
 """Each (B, ...)."""
@@ -57,17 +55,6 @@ class WorldModelSpec:
     """L."""
     provides: frozenset[str]
     """Of pixels, state, uncertainty."""
-
-    def check(self, wanted: frozenset[str]) -> None:
-        """Refuses what is asked for and not there.
-
-        Raises:
-            InputError: something is missing.
-        """
-        missing = sorted(wanted - self.provides)
-        if missing:
-            remedy = f"this model provides {', '.join(sorted(self.provides)) or 'nothing'}; choose another"
-            raise InputError("world_model.type", missing[0], remedy)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -105,6 +105,11 @@ class Windows:
     def __len__(self) -> int:
         return len(self.frames)
 
+    def rows(self, chosen: Sequence[int]) -> Windows:
+        """Some of them."""
+        arrays = {k: v[list(chosen)] for k, v in vars(self).items() if k != "task"}
+        return Windows(**arrays, task=tuple(self.task[i] for i in chosen))
+
 
 def places(episodes: Sequence[Episode]) -> list[Place]:
     """Every frame that something follows, of every episode."""

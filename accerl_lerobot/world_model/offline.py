@@ -46,6 +46,7 @@ from accerl_lerobot.world_model.learn import pretrain
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.store import load_world_model, save_world_model
 from accerl_lerobot.world_model.success import SuccessLearner, new_success_model
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 from accerl_lerobot.world_model.trial import dream, trial_windows, try_out, wrong_actions
 
 EVERY = 20
@@ -123,16 +124,8 @@ def learn_from_dataset(
         success.eval()
     seconds = time.monotonic() - started
     save_world_model(directory / "world_model", serving, success)
-    with console.stage("trial"):
-        found = try_out(serving, held, config.trial, success, seed)
-        film(directory / "preview.mp4", serving, held, config.trial, seed)
-    found |= {
-        "seconds": seconds,
-        "learnt": {"episodes": len(learn), "env_steps": sum(map(len, learn))},
-        "held_out": {"episodes": len(held), "env_steps": sum(map(len, held))},
-    }
-    (directory / "trial.json").write_text(json.dumps(found, indent=2) + "\n")
-    return found
+    amounts = {"seconds": seconds, "learnt": _amount(learn), "held_out": _amount(held)}
+    return _trial(serving, success, held, config.trial, directory, seed, console, amounts)
 
 
 def try_on_dataset(
@@ -149,24 +142,43 @@ def try_on_dataset(
     model, success = load_world_model(path)
     with console.stage("episodes"):
         episodes = load_episodes(dataset, model.spec, both=success is not None)
+    amounts = {"tried": _amount(episodes)}
+    return _trial(model, success, episodes, trial, directory, seed, console, amounts)
+
+
+def _trial(
+    model: PixelWorldModel,
+    success: SuccessPairsRewardModel | None,
+    episodes: Sequence[Episode],
+    trial: TrialConfig,
+    directory: Path,
+    seed: int,
+    console: Console,
+    amounts: dict[str, Any],
+) -> dict[str, Any]:
+    """Tries, films and writes down."""
     with console.stage("trial"):
-        found = try_out(model, episodes, trial, success, seed)
+        found = try_out(model, episodes, trial, success, seed) | amounts
         film(directory / "preview.mp4", model, episodes, trial, seed)
-    found |= {"tried": {"episodes": len(episodes), "env_steps": sum(map(len, episodes))}}
     (directory / "trial.json").write_text(json.dumps(found, indent=2) + "\n")
     return found
+
+
+def _amount(episodes: Sequence[Episode]) -> dict[str, int]:
+    return {"episodes": len(episodes), "env_steps": sum(map(len, episodes))}
 
 
 def film(path: Path, model: WorldModel, episodes: Sequence[Episode], config: TrialConfig, seed: int) -> None:
     """Real, dreamt, and dreamt with another episode's actions, one row each."""
     windows = trial_windows(episodes, model, config, seed)
     rng = np.random.default_rng((seed, 3))
-    rows = sorted(rng.choice(len(windows), min(FILMED, len(windows)), replace=False))
-    arms = [dream(model, windows, wrong_actions(windows, arm, rng)).frames for arm in ("true", "shuffled")]
-    context = model.spec.context
-    lines = [windows.frames[:, context - 1 :]]
-    lines += [np.concatenate([windows.frames[:, context - 1 : context], frames], 1) for frames in arms]
-    write_video(path, [[list(_large(line[row])) for row in rows] for line in lines], fps=4)
+    rows = sorted(rng.choice(len(windows), min(FILMED, len(windows)), replace=False).tolist())
+    filmed, context = windows.rows(rows), model.spec.context
+    lines = [filmed.frames[:, context - 1 :]]
+    for arm in ("true", "shuffled"):
+        dreamt = dream(model, filmed, wrong_actions(windows, arm, rng)[rows]).frames
+        lines.append(np.concatenate([filmed.frames[:, context - 1 : context], dreamt], 1))
+    write_video(path, [[list(_large(clip)) for clip in line] for line in lines], fps=4)
 
 
 def table(found: dict[str, Any]) -> Table:

@@ -112,11 +112,7 @@ class PixelWorldModel(nn.Module, WorldModel):
         image = self._sample(state, chunk, self._noise(seeds, state["frames"]), self.config.steps)
         frames = _to_bytes(image, len(self.spec.cameras))
         robot, doubt = self._robot(state["robot"], chunk, newest)
-        following = {
-            "frames": torch.cat([state["frames"][:, 1:], frames[:, None]], 1),
-            "anchor": state["anchor"],
-            "robot": robot,
-        }
+        following = _following(state, frames, robot)
         return Dream(state=following, frames=frames, robot=robot, uncertainty=doubt / self.doubt)
 
     def loss(self, windows: Windows, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
@@ -206,11 +202,7 @@ class PixelWorldModel(nn.Module, WorldModel):
             noise = torch.randn(b, 1, 3 * len(self.spec.cameras), *side, generator=generator).to(chunk)
             frames = _to_bytes(self._sample(state, chunk, noise, 1), len(self.spec.cameras))
             robot, _ = self._robot(state["robot"], chunk, state["frames"][:, -1])
-        return {
-            "frames": torch.cat([state["frames"][:, 1:], frames[:, None]], 1),
-            "anchor": state["anchor"],
-            "robot": robot,
-        }
+        return _following(state, frames, robot)
 
     def _noise(self, seeds: Sequence[int], frames: Tensor) -> Tensor:
         """(B, steps, C, H, W), each row from its own seed."""
@@ -264,6 +256,12 @@ class StateHead(nn.Module):
         """(B, into) to (B, S)."""
         out: Tensor = self.out(self.layers(seen))
         return out
+
+
+def _following(state: State, frames: Tensor, robot: Tensor) -> State:
+    """The context rolls on to the newest frame; the anchor stays."""
+    rolled = torch.cat([state["frames"][:, 1:], frames[:, None]], 1)
+    return {"frames": rolled, "anchor": state["anchor"], "robot": robot}
 
 
 def _to_floats(frames: Tensor) -> Tensor:

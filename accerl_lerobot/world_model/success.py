@@ -69,8 +69,12 @@ class SuccessLearner:
             )
         progress = np.array([_progress(episodes[p.episode], p.frame, spec.chunk) for p in at], np.float32)
         device = self.model.out.weight.device
-        given = (_floats(before), _floats(after), torch.from_numpy(windows.success[:, 0].astype(np.float32)))
-        loss, metrics = self.model.loss(*(x.to(device) for x in given), torch.from_numpy(progress).to(device))
+        loss, metrics = self.model.loss(
+            as_floats(before, device),
+            as_floats(after, device),
+            torch.from_numpy(windows.success[:, 0].astype(np.float32)).to(device),
+            torch.from_numpy(progress).to(device),
+        )
         self._optimizer.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
@@ -104,6 +108,6 @@ def _progress(episode: Episode, frame: int, chunk: int) -> float:
     return min(1.0, (int(episode.times[frame]) + chunk) / (episode.success_at + 1))
 
 
-def _floats(frames: np.ndarray) -> torch.Tensor:
-    """uint8 (B, V, H, W, 3) to float (B, V, 3, H, W) in [0, 1]."""
-    return torch.from_numpy(frames).movedim(-1, 2).float() / 255
+def as_floats(frames: np.ndarray, device: torch.device) -> torch.Tensor:
+    """uint8 (B, V, H, W, 3) to float (B, V, 3, H, W) in [0, 1], what a success model looks at."""
+    return torch.from_numpy(frames).movedim(-1, 2).to(device).float() / 255

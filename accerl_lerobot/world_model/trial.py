@@ -33,6 +33,7 @@ from accerl_lerobot.world_model import judge
 from accerl_lerobot.world_model.config import TrialConfig
 from accerl_lerobot.world_model.contract import WorldModel
 from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut
+from accerl_lerobot.world_model.success import as_floats
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
 BATCH = 64
@@ -42,11 +43,11 @@ ARMS = ("true", "shuffled", "zero", "opposite")
 
 
 def trial_windows(episodes: Sequence[Episode], model: WorldModel, config: TrialConfig, seed: int) -> Windows:
-    """Where trials begin: as many chunks follow as are dreamt, or the episode ends in success before."""
+    """Every so many frames of each episode, at most so many; chunks beyond an episode's end are not valid."""
     at = [
         Place(e, f)
         for e, episode in enumerate(episodes)
-        for f in range(0, len(episode.frames) - 1, max(1, config.every))
+        for f in range(0, len(episode.frames) - 1, config.every)
     ]
     rng = np.random.default_rng(seed)
     if len(at) > config.most:
@@ -92,17 +93,13 @@ def wrong_actions(windows: Windows, arm: str, rng: np.random.Generator) -> np.nd
 
 def scores(success: SuccessPairsRewardModel, before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """P(success) of each pair of frames (M, V, H, W, 3)."""
-
     device = success.out.weight.device
-
-    def floats(frames: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(frames).movedim(-1, 2).to(device).float() / 255
-
+    parts = []
     with torch.no_grad():
-        parts = [
-            torch.sigmoid(success.logits(floats(before[i : i + BATCH]), floats(after[i : i + BATCH]))[0])
-            for i in range(0, len(before), BATCH)
-        ]
+        for i in range(0, len(before), BATCH):
+            rows = slice(i, i + BATCH)
+            said, _ = success.logits(as_floats(before[rows], device), as_floats(after[rows], device))
+            parts.append(torch.sigmoid(said))
     return torch.cat(parts).cpu().numpy()
 
 
