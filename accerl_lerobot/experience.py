@@ -20,6 +20,7 @@ NumPy only: a rollout worker that imports this file stays free of torch and LeRo
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,6 +34,8 @@ front.
 """
 
 TASK = "task"
+REAL, IMAGINED = "real", "imagined"
+"""Which worlds a segment can be from."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +73,17 @@ class Decision:
     """Number of optimiser steps behind the weights that decided."""
 
 
+class Origin(NamedTuple):
+    """Where in which episode something begins."""
+
+    task: str
+    """Of `World.reset`, which is not the instruction."""
+    seed: int
+    """Of `World.reset`."""
+    decision: int
+    """Decisions made before."""
+
+
 @dataclass(kw_only=True)
 class Segment:
     """T consecutive decisions of one episode, plus the observation after the last one.
@@ -80,11 +94,8 @@ class Segment:
     """
 
     observations: dict[str, np.ndarray]
-    """Each (T + 1, ...) under LeRobot's names, without the task; the last row is the bootstrap observation.
-
-    After a termination no observation is rendered and the last row repeats the one before; it is never
-    bootstrapped from.
-    """
+    """Each (T + 1, ...) under LeRobot's names, without the task; the last row is the bootstrap observation,
+    or what was seen when the episode terminated, which nothing is bootstrapped from."""
     task: str
     latent: dict[str, np.ndarray]
     """Each (T, ...)."""
@@ -92,6 +103,8 @@ class Segment:
     """float32 (T, L), of the behaviour policy."""
     value: np.ndarray
     """float32 (T,), of the behaviour critic; stale by the time it is trained on."""
+    actions: np.ndarray
+    """float32 (T, K, A), the chunks within the world's bounds; the first `steps` of each were executed."""
     reward: np.ndarray
     """float32 (T,), summed over the steps of each chunk."""
     version: np.ndarray
@@ -106,8 +119,12 @@ class Segment:
     """Unique: worker, incarnation, sequence number. Makes an insert idempotent."""
     advantage: np.ndarray | None = None
     """float32 (T,), how much better the episode went than others that started alike; None: not compared."""
-    source: str = "real"
-    """Which world it is from: ``real``, or the name of an imagined one."""
+    source: str = REAL
+    """``real`` or ``imagined``."""
+    origin: Origin
+    """Where it begins; of an imagined one, the real observation that it was imagined from."""
+    world_version: int | None = None
+    """Of the world model that imagined it, in gradient steps."""
     episode: dict[str, float] = field(default_factory=dict)
     """Set on the last segment of an episode: ``return``, ``steps``, ``decisions``, ``success``."""
 
@@ -121,6 +138,7 @@ class Segment:
         if self.terminated and self.truncated:
             raise ValueError(f"segment {self.key}: terminated and truncated at once")
         sizes = {"log_prob": len(self.log_prob), "value": len(self.value), "version": len(self.version)}
+        sizes["actions"] = len(self.actions)
         sizes |= {"steps": len(self.steps)} | {f"latent.{k}": len(v) for k, v in self.latent.items()}
         sizes |= {k: len(v) - 1 for k, v in self.observations.items()}
         if self.advantage is not None:

@@ -51,8 +51,8 @@ class WorldSpec:
 class ChunkResult:
     """What happened while a chunk was executed; `rewards` has one entry per executed step, at most K."""
 
-    observation: Observation | None
-    """After the last executed step; None after a termination, which nobody looks at."""
+    observation: Observation
+    """After the last executed step."""
     rewards: np.ndarray
     """float32 (k,), 1 ≤ k ≤ K: the episode may end before the chunk does."""
     terminated: bool

@@ -58,8 +58,7 @@ class HistoryWorld(World):
         results: list[ChunkResult] = []
         for part in parts:
             results.append(self._world.step_chunk(part))
-            if results[-1].observation is not None:
-                self._seen.append(results[-1].observation)
+            self._seen.append(results[-1].observation)
             if results[-1].done:
                 break
         last, taken = results[-1], sum(r.steps for r in results)
@@ -67,7 +66,7 @@ class HistoryWorld(World):
             self._seen.extend([self._seen[-1]] * (self._length - len(results)))
         self._left -= taken
         return ChunkResult(
-            observation=None if last.observation is None else self._observation(),
+            observation=self._observation(),
             rewards=np.concatenate([r.rewards for r in results]),
             terminated=last.terminated,
             truncated=last.truncated,

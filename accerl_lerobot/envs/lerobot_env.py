@@ -130,7 +130,7 @@ class LeRobotWorld(World):
             if self._done:
                 break
         return ChunkResult(
-            observation=None if terminated else self._observe(raw),
+            observation=self._observe(raw),
             rewards=np.asarray(rewards, np.float32),
             terminated=terminated,
             truncated=truncated,

@@ -167,7 +167,7 @@ class MetaWorld(World):
             if self._done:
                 break
         return ChunkResult(
-            observation=None if terminated else self._observe(),
+            observation=self._observe(),
             rewards=np.asarray(rewards, np.float32),
             terminated=terminated,
             truncated=truncated,

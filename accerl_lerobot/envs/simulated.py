@@ -180,11 +180,9 @@ class SimulatedWorld(World):
             self._done = terminated or truncated
             if self._done:
                 break
-        if not terminated:
-            delay += self._delay(config.frame_ms)
-        _wait(delay)
+        _wait(delay + self._delay(config.frame_ms))
         return ChunkResult(
-            observation=None if terminated else self._observe(),
+            observation=self._observe(),
             rewards=np.asarray(rewards, np.float32),
             terminated=terminated,
             truncated=truncated,

@@ -29,7 +29,7 @@ import numpy as np
 
 from accerl_lerobot.envs.base import ChunkResult, World
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import Decision, Observation, Request, Segment
+from accerl_lerobot.experience import Decision, Observation, Origin, Request, Segment
 from accerl_lerobot.rollout.groups import GroupAdvantage, GroupFilter, Groups, Outcome, Place
 from accerl_lerobot.rollout.segments import SegmentBuilder
 from accerl_lerobot.rollout.tasks import TaskSampling
@@ -220,7 +220,9 @@ class RolloutRunner:
         observation = state.world.reset(plan.seed, plan.task)
         if not _finite(observation):
             raise RuntimeError(f"{plan.task} with seed {plan.seed}: the first observation is not finite")
-        self._slots[slot] = _Slot(state.world, plan, SegmentBuilder(observation, self.config.segment_length))
+        origin = Origin(plan.task, plan.seed, decision=0)
+        builder = SegmentBuilder(observation, self.config.segment_length, origin)
+        self._slots[slot] = _Slot(state.world, plan, builder)
         return self._request(self._slots[slot])
 
     def advance(self, slot: int, decision: Decision) -> Request | None:
@@ -243,7 +245,9 @@ class RolloutRunner:
         state.steps += result.steps
         state.decisions += 1
         state.versions.append(decision.version)
-        builder.add(decision, reward, result.steps, result.observation)
+        spec = state.world.spec
+        actions = np.clip(decision.chunk, spec.action_low, spec.action_high)
+        builder.add(decision, actions, reward, result.steps, result.observation)
         if result.done or builder.full:
             failed = result.truncated and self.config.time_limit == "fail"
             ended = (result.terminated or failed, result.truncated and not failed)
@@ -340,8 +344,6 @@ class RolloutRunner:
         self.counters.groups_dropped_decisions = counted.dropped_decisions
 
 
-def _finite(observation: Observation | None) -> bool:
-    if observation is None:
-        return True
+def _finite(observation: Observation) -> bool:
     arrays = [v for v in observation.values() if isinstance(v, np.ndarray) and v.dtype.kind == "f"]
     return all(np.isfinite(v).all() for v in arrays)

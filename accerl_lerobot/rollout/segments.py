@@ -17,27 +17,29 @@ from __future__ import annotations
 
 import numpy as np
 
-from accerl_lerobot.experience import TASK, Decision, Observation, Segment
+from accerl_lerobot.experience import REAL, TASK, Decision, Observation, Origin, Segment
 
 
 class SegmentBuilder:
     """Collects the decisions of one episode and cuts them into segments of at most `length` decisions.
 
     Example:
-        >>> builder = SegmentBuilder(observation, length=8)
-        >>> builder.add(decision, reward=0.0, steps=10, following=next_observation)   # repeated
+        >>> builder = SegmentBuilder(observation, length=8, origin=Origin("door-open-v3", seed=3, decision=0))
+        >>> builder.add(decision, actions, reward=0.0, steps=10, following=next_observation)   # repeated
         >>> segment = builder.cut(key="rollout0.0.17", terminated=True, success=True)
 
     Args:
         observation: what `World.reset` returned.
         length: largest T of a segment.
+        origin: of the first segment.
         source: stamped on every segment.
     """
 
-    def __init__(self, observation: Observation, length: int, source: str = "real") -> None:
-        self.length, self.source = length, source
+    def __init__(self, observation: Observation, length: int, origin: Origin, source: str = REAL) -> None:
+        self.length, self.origin, self.source = length, origin, source
         self.observations = [observation]
         self.decisions: list[Decision] = []
+        self.actions: list[np.ndarray] = []
         self.rewards: list[float] = []
         self.steps: list[int] = []
 
@@ -50,12 +52,15 @@ class SegmentBuilder:
     def full(self) -> bool:
         return len(self.decisions) >= self.length
 
-    def add(self, decision: Decision, reward: float, steps: int, following: Observation | None) -> None:
-        """Records one executed decision; `following` None (after a termination) repeats the observation."""
+    def add(
+        self, decision: Decision, actions: np.ndarray, reward: float, steps: int, following: Observation
+    ) -> None:
+        """Records one executed decision: what the world made of its chunk, and what was seen then."""
         self.decisions.append(decision)
+        self.actions.append(actions)
         self.rewards.append(reward)
         self.steps.append(steps)
-        self.observations.append(self.latest if following is None else following)
+        self.observations.append(following)
 
     def cut(
         self,
@@ -74,6 +79,7 @@ class SegmentBuilder:
             latent={k: np.stack([d.latent[k] for d in self.decisions]) for k in names},
             log_prob=np.stack([d.log_prob for d in self.decisions]).astype(np.float32),
             value=np.array([d.value for d in self.decisions], np.float32),
+            actions=np.stack(self.actions).astype(np.float32),
             reward=np.array(self.rewards, np.float32),
             version=np.array([d.version for d in self.decisions], np.int64),
             steps=np.array(self.steps, np.int64),
@@ -82,8 +88,10 @@ class SegmentBuilder:
             success=success,
             key=key,
             source=self.source,
+            origin=self.origin,
             episode=episode or {},
         )
+        self.origin = self.origin._replace(decision=self.origin.decision + len(self.decisions))
         self.observations = [self.latest]
-        self.decisions, self.rewards, self.steps = [], [], []
+        self.decisions, self.actions, self.rewards, self.steps = [], [], [], []
         return segment

@@ -38,8 +38,7 @@ def one_by_one(world: World, task: str, actions: np.ndarray) -> tuple[list[Obser
     seen, results = [world.reset(5, task)], []
     for action in actions:
         results.append(world.step_chunk(action[None]))
-        if results[-1].observation is not None:
-            seen.append(results[-1].observation)
+        seen.append(results[-1].observation)
         if results[-1].done:
             break
     return seen, results
@@ -82,13 +81,13 @@ def test_the_last_states_are_seen_and_nothing_else_changes(rows: int, length: in
 
 def test_a_termination_inside_a_chunk_ends_it():
     config = SimulatedConfig(max_steps=50, tolerance=3.0, image_size=8)
-    _, results = one_by_one(make_world(config), "match", np.zeros((5, 2), np.float32))
+    seen, results = one_by_one(make_world(config), "match", np.zeros((5, 2), np.float32))
     assert 1 <= len(results) < 5
     world = make_world(config, 2)
     world.reset(5, "match")
     result = world.step_chunk(np.zeros((5, 2), np.float32))
-    assert result.terminated and result.observation is None and result.success
-    assert result.steps == len(results)
+    assert result.terminated and result.success and result.steps == len(results)
+    same(result.observation, seen[-2:])
 
 
 def test_bad_actions_are_refused_before_any_is_executed():

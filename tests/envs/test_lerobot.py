@@ -53,7 +53,7 @@ def test_success_terminates_with_one_reward(pusht: LeRobotWorld):
     pusht._envs["pusht"] = Scripted(pusht._envs["pusht"])
     pusht.reset(0, "pusht")
     result = pusht.step_chunk(np.full((5, 2), 256, np.float32))
-    assert result.terminated and result.success and result.observation is None
+    assert result.terminated and result.success and "observation.state" in result.observation
     assert result.rewards.tolist() == [0, 0, 1]
 
 

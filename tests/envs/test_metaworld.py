@@ -42,15 +42,14 @@ def play(world: MetaWorld, seed: int = 0, chunk: int = 1) -> list:
     return results
 
 
-def test_success_terminates_with_one_reward_and_no_picture(monkeypatch: pytest.MonkeyPatch):
+def test_success_terminates_with_one_reward_and_a_last_picture(monkeypatch: pytest.MonkeyPatch):
     world, frames = MetaWorld(MetaWorldConfig(task=TASK)), []
     frame = MetaWorld._frame
     monkeypatch.setattr(MetaWorld, "_frame", lambda *args: frames.append(1) or frame(*args))
     results = play(world, chunk=3)
     assert results[-1].terminated and results[-1].success and not results[-1].truncated
-    assert results[-1].observation is None
     assert sum(float(r.rewards.sum()) for r in results) == 1.0 and results[-1].rewards[-1] == 1.0
-    assert len(frames) == len(results), "one picture at the reset and one per chunk, none after the end"
+    assert len(frames) == len(results) + 1, "one picture at the reset and one per chunk"
 
 
 def test_success_can_be_passed_by():

@@ -34,8 +34,9 @@ def test_holding_the_solution_succeeds_at_once(task: str):
     state = world.reset(0, task)["observation.state"]
     assert np.array_equal(world.solution, state[:2] if task == "match" else -state[:2])
     result = world.step_chunk(held(world))
-    assert result.terminated and result.success and result.steps == 4 and result.observation is None
+    assert result.terminated and result.success and result.steps == 4
     assert result.rewards.tolist() == [0, 0, 0, 1]
+    assert np.array_equal(result.observation["observation.state"][2:4], world.solution)
 
 
 def test_success_counts_once_when_it_does_not_end_the_episode():
@@ -71,7 +72,7 @@ def test_no_picture_is_drawn_inside_a_chunk(monkeypatch: pytest.MonkeyPatch):
     world.reset(0, "match")
     world.step_chunk(np.zeros((10, 2), np.float32))
     world.step_chunk(held(world))
-    assert len(drawn) == 2
+    assert len(drawn) == 3
 
 
 def test_latency_is_slept_and_has_the_mean_asked_for():

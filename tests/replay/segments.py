@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.experience import Segment
+from accerl_lerobot.experience import Origin, Segment
 
 
 def make_segment(key: str, n: int = 4, version: int | list[int] = 0, **replace: Any) -> Segment:
@@ -33,7 +33,9 @@ def make_segment(key: str, n: int = 4, version: int | list[int] = 0, **replace: 
         "value": np.zeros(n, np.float32),
         "reward": np.ones(n, np.float32),
         "version": versions,
+        "actions": np.zeros((n, 1, 1), np.float32),
         "steps": np.ones(n, np.int64),
+        "origin": Origin("push-v3", seed=0, decision=0),
         "terminated": False,
         "truncated": False,
         "success": False,

@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from accerl_lerobot.experience import TASK, Decision, Observation, Segment
+from accerl_lerobot.experience import TASK, Decision, Observation, Origin, Segment
 from accerl_lerobot.rollout.segments import SegmentBuilder
 
 
@@ -38,12 +38,16 @@ def decision(step: int, version: int = 0) -> Decision:
     )
 
 
-def collected(count: int, terminated: bool = False) -> SegmentBuilder:
-    builder = SegmentBuilder(observation(0), length=4)
+def collected(count: int) -> SegmentBuilder:
+    builder = SegmentBuilder(observation(0), 4, Origin("push-v3", seed=7, decision=0))
     for step in range(count):
-        following = None if terminated and step == count - 1 else observation(step + 1)
-        builder.add(decision(step, version=step), reward=float(step), steps=step + 1, following=following)
+        add(builder, step, float(step), step + 1)
     return builder
+
+
+def add(builder: SegmentBuilder, step: int, reward: float, steps: int) -> None:
+    actions = np.full((2, 1), step / 10, np.float32)
+    builder.add(decision(step, version=step), actions, reward, steps, following=observation(step + 1))
 
 
 def states(segment: Segment) -> list[float]:
@@ -60,7 +64,8 @@ def test_everything_about_a_decision_stays_together():
     assert segment.latent["x"].tolist() == [[0, 0], [1, -1], [2, -2]]
     np.testing.assert_allclose(segment.log_prob[:, 0], [0, 0.1, 0.2], rtol=1e-6)
     assert segment.value.tolist() == [100, 101, 102]
-    assert segment.reward.tolist() == [0, 1, 2]
+    np.testing.assert_allclose(segment.actions[:, 0, 0], [0, 0.1, 0.2], rtol=1e-6)
+    assert segment.reward.tolist() == [0, 1, 2] and segment.origin == ("push-v3", 7, 0)
     assert segment.version.tolist() == [0, 1, 2] and segment.steps.tolist() == [1, 2, 3]
     assert segment.log_prob.dtype == segment.reward.dtype == np.float32
     assert segment.version.dtype == segment.steps.dtype == np.int64
@@ -70,13 +75,14 @@ def test_everything_about_a_decision_stays_together():
 def test_the_next_segment_begins_where_this_one_was_cut():
     builder = collected(3)
     builder.cut("k1")
-    builder.add(decision(3), reward=0.0, steps=1, following=observation(4))
-    assert states(builder.cut("k2")) == [3, 4]
+    add(builder, 3, reward=0.0, steps=1)
+    segment = builder.cut("k2")
+    assert states(segment) == [3, 4] and segment.origin == ("push-v3", 7, 3)
 
 
-def test_after_a_termination_the_bootstrap_row_repeats_the_observation_before():
-    segment = collected(2, terminated=True).cut("k", terminated=True, success=True)
-    assert states(segment) == [0, 1, 1] and segment.terminated and segment.success
+def test_what_was_seen_when_the_episode_ended_is_the_last_row():
+    segment = collected(2).cut("k", terminated=True, success=True)
+    assert states(segment) == [0, 1, 2] and segment.terminated and segment.success
 
 
 @pytest.mark.parametrize("size", [1, 3])

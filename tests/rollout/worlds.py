@@ -61,7 +61,7 @@ class ScriptedWorld(World):
         over = self.now == self.steps
         terminated = over and self.end != "limit"
         return ChunkResult(
-            observation=None if terminated else self._observe(),
+            observation=self._observe(),
             rewards=np.asarray(rewards, np.float32),
             terminated=terminated,
             truncated=over and self.end == "limit",

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from accerl_lerobot.experience import Decision, Request, Segment
+from accerl_lerobot.experience import Decision, Origin, Request, Segment
 from accerl_lerobot.policies.base import Evaluation, PolicyAdapter
 from accerl_lerobot.policies.value_head import Value
 
@@ -106,7 +106,9 @@ def _segment(rng: np.random.Generator, n: int, key: str, version: int, replace: 
         "value": np.full(n, 100.0, np.float32),  # stale: no critic here says so
         "reward": rng.standard_normal(n, dtype=np.float32),
         "version": np.full(n, version, np.int64),
+        "actions": np.zeros((n, 1, 1), np.float32),
         "steps": np.ones(n, np.int64),
+        "origin": Origin("push-v3", seed=0, decision=0),
         "terminated": False,
         "truncated": False,
         "success": False,
