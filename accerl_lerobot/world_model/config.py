@@ -182,16 +182,25 @@ class TrialConfig:
     skill_first: float = 0.3
     """Least skill on changed pixels after one chunk,"""
     skill_last: float = 0.0
-    """and at the horizon, where more than this."""
+    """and at the horizon, more than this; there on all pixels too, or what should not move does."""
     sensitivity: float = 1.2
     """What the lower end of the sensitivity's interval after one chunk must exceed."""
     auroc: float = 0.9
-    """What the success model's AUROC on dreams must exceed at the horizon."""
+    """What the lower end of the interval of AUROC on dreams must exceed at the horizon."""
+    false_success: float = 0.05
+    """Largest share of dreams at the horizon that may be taken for a success although they cannot be one:
+    with the true actions of episodes that failed, and with none."""
+    false_positives: float = 0.02
+    """[0, 1). The success model's threshold is the least at which no larger share of the failures it learns
+    from is taken for a success in a dream."""
 
     def __post_init__(self) -> None:
         for name in ("depth", "every", "most"):
             if getattr(self, name) < 1:
                 raise InputError(f"world_model.trial.{name}", getattr(self, name), "use at least 1")
+        if not 0 <= self.false_positives < 1:
+            remedy = "use a share in [0, 1), e.g. 0.02"
+            raise InputError("world_model.trial.false_positives", self.false_positives, remedy)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -68,6 +68,14 @@ class Episode:
         """Whether the task was achieved."""
         return self.success_at >= 0
 
+    @property
+    def achieved(self) -> np.ndarray:
+        """bool (F,), whether a frame shows the task achieved.
+
+        Demonstrations have no frame after their last step: the one before it counts.
+        """
+        return self.times >= self.success_at if self.success else np.zeros(len(self.times), bool)
+
     def __len__(self) -> int:
         """Env steps."""
         return len(self.actions)
@@ -109,6 +117,19 @@ class Windows:
         """Some of them."""
         arrays = {k: v[list(chosen)] for k, v in vars(self).items() if k != "task"}
         return Windows(**arrays, task=tuple(self.task[i] for i in chosen))
+
+
+def held(actions: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Chunks made whole: an action that was not executed is replaced by the last one that was.
+
+    Args:
+        actions: (B, R, K, A).
+        steps: int (B, R), how many of each were.
+    """
+    b, r, k, a = actions.shape
+    made = (np.arange(k) < steps[..., None]).reshape(b, r * k)
+    last = np.maximum.accumulate(np.where(made, np.arange(r * k), 0), axis=1)
+    return np.take_along_axis(actions.reshape(b, r * k, a), last[..., None], 1).reshape(actions.shape)
 
 
 def places(episodes: Sequence[Episode]) -> list[Place]:

@@ -18,7 +18,8 @@
     AUROC          of a score that is to tell successes from failures
 
 Better pixels than a copy prove nothing: a model may learn to blur what moves and never hear an action.
-Intervals are percentile bootstraps over windows. NumPy only; M windows, D depths in chunks.
+Intervals are percentile bootstraps over episodes, as windows of one episode are alike. NumPy only; M windows,
+D depths in chunks.
 """
 
 from __future__ import annotations
@@ -41,18 +42,25 @@ class Estimate(NamedTuple):
 
 
 def bootstrap(
-    count: int, statistic: Callable[[np.ndarray], float], *, draws: int = 1000, seed: int = 0
+    groups: np.ndarray, statistic: Callable[[np.ndarray], float], *, draws: int = 1000, seed: int = 0
 ) -> Estimate:
-    """A statistic of rows, and how it varies when rows are drawn again.
+    """A statistic of rows, and how it varies when groups of them are drawn again.
 
     Args:
-        count: of rows.
+        groups: (M,) what each row belongs to, its episode for instance.
         statistic: of row indices, int64; draws for which it is NaN are left out.
         draws: resamples.
         seed: of the resampling.
     """
-    rng = np.random.default_rng(seed)
-    values = np.array([statistic(rng.integers(count, size=count)) for _ in range(draws)])
+    rng, count = np.random.default_rng(seed), len(groups)
+    order = np.argsort(groups, kind="stable")
+    rows = np.split(order, np.flatnonzero(np.diff(np.asarray(groups)[order])) + 1)
+    values = np.array(
+        [
+            statistic(np.concatenate([rows[i] for i in rng.integers(len(rows), size=len(rows))]))
+            for _ in range(draws)
+        ]
+    )
     values = values[~np.isnan(values)]
     # The nearest draw, since between two infinite ones there is nothing to interpolate.
     low, high = np.quantile(values, [0.025, 0.975], method="nearest") if len(values) else (np.nan, np.nan)
@@ -78,17 +86,17 @@ def mean_error(sums: np.ndarray) -> float:
     return float(total / count) if count else float("nan")
 
 
-def skill(model: np.ndarray, copy: np.ndarray) -> Estimate:
+def skill(model: np.ndarray, copy: np.ndarray, groups: np.ndarray) -> Estimate:
     """1 − MSE(model)/MSE(copy), from `squared_errors` of both (M, 2)."""
 
     def of(rows: np.ndarray) -> float:
         copied = mean_error(copy[rows])
         return 1 - mean_error(model[rows]) / copied if copied > 0 else float("nan")
 
-    return bootstrap(len(model), of)
+    return bootstrap(groups, of)
 
 
-def sensitivity(true: np.ndarray, other: np.ndarray) -> Estimate:
+def sensitivity(true: np.ndarray, other: np.ndarray, groups: np.ndarray) -> Estimate:
     """MSE(other actions)/MSE(true actions), from `squared_errors` of both (M, 2); of two exact ones 1."""
 
     def of(rows: np.ndarray) -> float:
@@ -97,7 +105,7 @@ def sensitivity(true: np.ndarray, other: np.ndarray) -> Estimate:
             return wrong / right
         return float("inf") if wrong > 0 else 1.0
 
-    return bootstrap(len(true), of)
+    return bootstrap(groups, of)
 
 
 def auroc(scores: np.ndarray, labels: np.ndarray) -> float:
@@ -109,6 +117,13 @@ def auroc(scores: np.ndarray, labels: np.ndarray) -> float:
     _, places, counts = np.unique(scores, return_inverse=True, return_counts=True)
     ranks = (np.cumsum(counts) - (counts - 1) / 2)[places]
     return float((ranks[labels].sum() - good * (good + 1) / 2) / (good * bad))
+
+
+def separation(scores: np.ndarray, labels: np.ndarray, groups: np.ndarray) -> Estimate:
+    """`auroc` with its interval; NaN without both kinds."""
+    if len(np.unique(labels)) < 2:
+        return Estimate(float("nan"), float("nan"), float("nan"))
+    return bootstrap(groups, lambda rows: auroc(scores[rows], labels[rows]))
 
 
 def threshold(scores: np.ndarray, labels: np.ndarray, false_positives: float) -> float:
@@ -129,17 +144,21 @@ def threshold(scores: np.ndarray, labels: np.ndarray, false_positives: float) ->
     return float(np.nextafter(failures[allowed], np.inf))
 
 
-def shuffled(count: int, groups: Sequence[object], rng: np.random.Generator) -> np.ndarray:
-    """A permutation that gives every window the actions of one from another group, where there is one.
+def shuffled(
+    count: int, groups: Sequence[object], rng: np.random.Generator, donors: np.ndarray | None = None
+) -> np.ndarray:
+    """For every window another one, of another group where there is one.
 
     Args:
         count: windows.
         groups: what each belongs to, its episode for instance.
         rng: of the choice.
+        donors: windows to choose from; None: all.
     """
+    donors = np.arange(count) if donors is None else donors
     chosen = np.empty(count, np.int64)
     of = np.array([hash(g) for g in groups])
     for i in range(count):
-        others = np.flatnonzero(of != of[i])
+        others = donors[of[donors] != of[i]]
         chosen[i] = rng.choice(others if len(others) else np.flatnonzero(np.arange(count) != i))
     return chosen

@@ -11,12 +11,15 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Open-loop trials of a world model on held-out episodes: what it dreams beside what happened.
+"""Trying a world model out on episodes that it has not learnt from.
 
 Every trial begins at a real frame and dreams some chunks with the actions that were really made, and again
-with actions that were not: another episode's, none, and the opposite. A model must be better than a copy of
-the last frame where something moves, and worse with wrong actions; and its successes must be judged as the
-real ones were.
+with actions that were not: another episode's, none, the opposite, and a failed episode's. A model
+must be better than a copy of the last frame where something moves, and worse with wrong actions; and its
+successes must be judged as the real ones were.
+
+A dream is of whole chunks. Where an episode ended within one, its last action is held; and a failure is cut
+short and held just as often when the two are to be told apart.
 
 Depths are counted in chunks, from 1. Shapes: M trials, D depths; see `episodes.py` for the others.
 """
@@ -24,6 +27,7 @@ Depths are counted in chunks, from 1. Shapes: M trials, D depths; see `episodes.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,18 +36,25 @@ import torch
 from accerl_lerobot.world_model import judge
 from accerl_lerobot.world_model.config import TrialConfig
 from accerl_lerobot.world_model.contract import WorldModel
-from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut
-from accerl_lerobot.world_model.success import as_floats
+from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, held
+from accerl_lerobot.world_model.success import Examples, cut_alike, probabilities
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
 BATCH = 64
 """Trials that are dreamt at once."""
-ARMS = ("true", "shuffled", "zero", "opposite")
+ARMS = ("true", "shuffled", "zero", "opposite", "failed")
 """Which actions are dreamt with."""
+PAIRS = 400
+"""Real pairs of frames that the success model is tried on, half of them successes."""
+NEVER = ("true", "zero")
+"""Arms that cannot succeed, the first one from failures. Actions of other episodes may well do so."""
 
 
 def trial_windows(episodes: Sequence[Episode], model: WorldModel, config: TrialConfig, seed: int) -> Windows:
-    """Every so many frames of each episode, at most so many; chunks beyond an episode's end are not valid."""
+    """Every so many frames of each episode, at most so many; chunks beyond an episode's end are not valid.
+
+    Their actions are whole chunks all the same, see `held`.
+    """
     at = [
         Place(e, f)
         for e, episode in enumerate(episodes)
@@ -52,7 +63,8 @@ def trial_windows(episodes: Sequence[Episode], model: WorldModel, config: TrialC
     rng = np.random.default_rng(seed)
     if len(at) > config.most:
         at = [at[i] for i in sorted(rng.choice(len(at), config.most, replace=False))]
-    return cut(episodes, at, chunk=model.spec.chunk, context=model.spec.context, chunks=config.depth)
+    windows = cut(episodes, at, chunk=model.spec.chunk, context=model.spec.context, chunks=config.depth)
+    return replace(windows, actions=held(windows.actions, windows.steps))
 
 
 class Dreams(NamedTuple):
@@ -64,43 +76,41 @@ class Dreams(NamedTuple):
     """float32 (M, D, S)."""
     uncertainty: np.ndarray
     """float32 (M, D)."""
+    ends: np.ndarray
+    """uint8 (M, D, V, H, W, 3): what the chunk at a depth would show with the actions of `ends` instead."""
 
 
-def dream(model: WorldModel, windows: Windows, actions: np.ndarray) -> Dreams:
-    """Dreams all windows with these actions (M, D, K, A)."""
+def dream(model: WorldModel, windows: Windows, actions: np.ndarray, ends: np.ndarray | None = None) -> Dreams:
+    """Dreams all windows with these actions (M, D, K, A), and with `ends`, other last chunks, if given."""
     context = model.spec.context
     parts: list[list[np.ndarray]] = []
     for start in range(0, len(windows), BATCH):
         rows = slice(start, start + BATCH)
         frames = torch.from_numpy(windows.frames[rows, :context])
         state = model.begin(frames, torch.from_numpy(windows.state[rows, 0]), windows.task[rows])
-        dreams = []
+        dreams, last = [], []
         for depth in range(actions.shape[1]):
             seeds = [start + i + 1_000_003 * depth for i in range(len(frames))]
             dreams.append(model.step(state, torch.from_numpy(actions[rows, depth]), seeds))
+            if ends is not None:
+                last.append(model.step(state, torch.from_numpy(ends[rows, depth]), seeds).frames)
             state = dreams[-1].state
-        parts.append([np.stack([getattr(d, k).cpu().numpy() for d in dreams], 1) for k in Dreams._fields])
+        shown = [[getattr(d, k) for d in dreams] for k in ("frames", "robot", "uncertainty")]
+        parts.append([np.stack([x.cpu().numpy() for x in of], 1) for of in (*shown, last or shown[0])])
     return Dreams(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def wrong_actions(windows: Windows, arm: str, rng: np.random.Generator) -> np.ndarray:
-    """(M, D, K, A) of one of `ARMS`."""
+def wrong_actions(
+    windows: Windows, arm: str, rng: np.random.Generator, failed: np.ndarray | None = None
+) -> np.ndarray:
+    """(M, D, K, A) of one of `ARMS`; `failed`, bool (M,), says whose episode failed."""
     actions = windows.actions
     if arm == "shuffled":
         return actions[judge.shuffled(len(windows), windows.episode.tolist(), rng)]
+    if arm == "failed":
+        assert failed is not None
+        return actions[judge.shuffled(len(windows), windows.episode.tolist(), rng, np.flatnonzero(failed))]
     return {"true": actions, "zero": np.zeros_like(actions), "opposite": -actions}[arm]
-
-
-def scores(success: SuccessPairsRewardModel, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """P(success) of each pair of frames (M, V, H, W, 3)."""
-    device = success.out.weight.device
-    parts = []
-    with torch.no_grad():
-        for i in range(0, len(before), BATCH):
-            rows = slice(i, i + BATCH)
-            said, _ = success.logits(as_floats(before[rows], device), as_floats(after[rows], device))
-            parts.append(torch.sigmoid(said))
-    return torch.cat(parts).cpu().numpy()
 
 
 def try_out(
@@ -114,12 +124,19 @@ def try_out(
 
     Returns:
         ``depths``: a row per depth with `judge`'s estimates of skill and sensitivity, errors in pixels, state
-        and, with a success model, AUROC on real and dreamt pairs and the share of dreams taken for a success
-        under each arm's actions; ``gates``: each with its value and whether it holds; ``passed``; ``trials``.
+        and, with a success model, AUROC on dreams and the share of them taken for a success under each arm's
+        actions; ``auroc_real``, of the success model on real pairs; ``gates``: each with its value and
+        whether it holds; ``passed``; ``trials``, of so many ``episodes``.
     """
     windows = trial_windows(episodes, model, config, seed)
     rng = np.random.default_rng((seed, 1))
-    arms = {arm: dream(model, windows, wrong_actions(windows, arm, rng)) for arm in ARMS}
+    failed = np.array([not episodes[e].success for e in windows.episode])
+    ends = held(windows.actions, cut_alike(windows.steps, windows.success, rng))
+    arms = {
+        arm: dream(model, windows, wrong_actions(windows, arm, rng, failed), ends if arm == "true" else None)
+        for arm in ARMS
+        if arm != "failed" or failed.any()
+    }
     context = model.spec.context
     newest = windows.frames[:, context - 1]
     rows = []
@@ -129,7 +146,7 @@ def try_out(
         fits, real = whole[:, d], windows.frames[:, context + d]
         row: dict[str, Any] = {"depth": d + 1, "trials": int(fits.sum())}
         if fits.sum() >= 2:
-            row |= _pixels(arms, newest[fits], real[fits], fits, d)
+            row |= _pixels(arms, newest[fits], real[fits], fits, d, windows.episode[fits])
             robots = arms["true"].robot[fits, d]
             if robots.shape[1]:
                 there = windows.state[fits, d + 1]
@@ -137,11 +154,13 @@ def try_out(
                 row["state_error_copy"] = float(np.abs(windows.state[fits, 0] - there).mean())
             row["uncertainty"] = float(arms["true"].uncertainty[fits, d].mean())
         if success is not None:
-            row |= _judged(success, arms, windows, newest, d)
+            row |= _judged(success, arms, windows, failed, newest, d)
         rows.append(row)
     gates = _gates(rows, config, success is not None)
-    return {
+    real_pairs = {} if success is None else {"auroc_real": _auroc_real(success, episodes, model, rng)}
+    return real_pairs | {
         "trials": len(windows),
+        "episodes": len(np.unique(windows.episode)),
         "depths": rows,
         "gates": gates,
         "passed": all(gate["holds"] for gate in gates.values()),
@@ -154,19 +173,23 @@ def _pixels(
     real: np.ndarray,
     fits: np.ndarray,
     d: int,
+    groups: np.ndarray,
 ) -> dict[str, Any]:
     moved = judge.changed(newest, real)
     errors = {arm: judge.squared_errors(dreams.frames[fits, d], real) for arm, dreams in arms.items()}
     copy = judge.squared_errors(newest, real)
     where_moved = judge.squared_errors(arms["true"].frames[fits, d], real, moved)
+    copy_where = judge.squared_errors(newest, real, moved)
+    wrong = [arm for arm in ("shuffled", "zero", "opposite") if arm in errors]
     return {
         "mse": judge.mean_error(errors["true"]),
         "mse_copy": judge.mean_error(copy),
         "psnr": float(10 * np.log10(255**2 / max(judge.mean_error(errors["true"]), 1e-9))),
-        "skill": judge.skill(errors["true"], copy)._asdict(),
-        "skill_changed": judge.skill(where_moved, judge.squared_errors(newest, real, moved))._asdict(),
+        "skill": judge.skill(errors["true"], copy, groups)._asdict(),
+        "skill_changed": judge.skill(where_moved, copy_where, groups)._asdict(),
         **{
-            f"sensitivity_{arm}": judge.sensitivity(errors["true"], errors[arm])._asdict() for arm in ARMS[1:]
+            f"sensitivity_{arm}": judge.sensitivity(errors["true"], errors[arm], groups)._asdict()
+            for arm in wrong
         },
     }
 
@@ -175,28 +198,40 @@ def _judged(
     success: SuccessPairsRewardModel,
     arms: dict[str, Dreams],
     windows: Windows,
+    failed: np.ndarray,
     newest: np.ndarray,
     d: int,
 ) -> dict[str, Any]:
-    """What the success model makes of the chunk at this depth, real and dreamt."""
+    """What the success model makes of the chunk at this depth."""
     # Chunks that were really made, until the task was achieved or the episode ended.
     made = windows.valid[:, d] | windows.success[:, d]
-    labels = windows.success[made, d]
-    context = windows.frames.shape[1] - windows.steps.shape[1]
-    real = scores(success, windows.frames[made, context + d - 1], windows.frames[made, context + d])
-    found: dict[str, Any] = {
-        "successes": int(labels.sum()),
-        "failures": int((~labels).sum()),
-        "auroc_real": judge.auroc(real, labels),
-    }
+    labels, groups = windows.success[made, d], windows.episode[made]
+    found: dict[str, Any] = {"successes": int(labels.sum()), "failures": int((~labels).sum())}
     for arm, dreams in arms.items():
         before = newest if d == 0 else dreams.frames[:, d - 1]
-        said = scores(success, before[made], dreams.frames[made, d])
         if arm == "true":
-            found["auroc_dreamt"] = judge.auroc(said, labels)
-        wrong = ~labels if arm == "true" else np.ones(len(labels), bool)
-        found[f"false_success_{arm}"] = float((said[wrong] > 0.5).mean()) if wrong.any() else float("nan")
+            said = probabilities(success, before[made], dreams.ends[made, d])
+            found["auroc_dreamt"] = judge.separation(said, labels, groups)._asdict()
+        # Of an episode that succeeds, some chunk before the last is all but a success.
+        counted = made & failed if arm == "true" else made
+        said = probabilities(success, before[counted], dreams.frames[counted, d])
+        taken = said > success.config.threshold
+        found[f"false_success_{arm}"] = float(taken.mean()) if len(taken) else float("nan")
     return found
+
+
+def _auroc_real(
+    success: SuccessPairsRewardModel,
+    episodes: Sequence[Episode],
+    model: WorldModel,
+    rng: np.random.Generator,
+) -> float:
+    """On pairs that were seen, up to a chunk apart whatever they show; NaN without both kinds."""
+    kinds = {bool(shown) for episode in episodes for shown in episode.achieved}
+    if len(kinds) < 2:
+        return float("nan")
+    before, after, labels, _ = Examples(episodes, model.spec.chunk).seen(PAIRS, rng)
+    return judge.auroc(probabilities(success, before, after), labels)
 
 
 def _gates(rows: list[dict[str, Any]], config: TrialConfig, judged: bool) -> dict[str, dict[str, Any]]:
@@ -206,14 +241,21 @@ def _gates(rows: list[dict[str, Any]], config: TrialConfig, judged: bool) -> dic
         return float(row[key][part]) if key in row else float("nan")
 
     wanted = {
-        "skill_changed_first": (at(first, "skill_changed"), config.skill_first),
-        "skill_changed_last": (at(last, "skill_changed"), config.skill_last),
-        "sensitivity_low": (at(first, "sensitivity_shuffled", "low"), config.sensitivity),
+        "skill_changed_first": (at(first, "skill_changed"), "above", config.skill_first),
+        "skill_changed_last": (at(last, "skill_changed"), "above", config.skill_last),
+        "skill_last": (at(last, "skill"), "above", config.skill_last),
+        "sensitivity_low": (at(first, "sensitivity_shuffled", "low"), "above", config.sensitivity),
     }
     if judged:
-        wanted["auroc_last"] = (float(last["auroc_dreamt"]), config.auroc)
+        wanted["auroc_last"] = (at(last, "auroc_dreamt", "low"), "above", config.auroc)
+        false = [last[f"false_success_{arm}"] for arm in NEVER if f"false_success_{arm}" in last]
+        wanted["false_success_last"] = (float(np.max(false)), "at most", config.false_success)
     # A number that could not be had passes nothing.
     return {
-        name: {"value": value, "above": least, "holds": bool(value > least)}
-        for name, (value, least) in wanted.items()
+        name: {
+            "value": value,
+            "wanted": f"{how} {bound}",
+            "holds": bool(value > bound if how == "above" else value <= bound),
+        }
+        for name, (value, how, bound) in wanted.items()
     }

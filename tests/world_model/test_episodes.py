@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from accerl_lerobot.world_model.episodes import Episode, Place, cut, places, split
+from accerl_lerobot.world_model.episodes import Episode, Place, cut, held, places, split
 
 K = 3
 
@@ -65,6 +65,22 @@ def test_an_episode_that_ends_within_a_chunk():
     assert windows.steps.tolist() == [[3, 1, 0]] and windows.valid.tolist() == [[True, True, False]]
     assert windows.actions[0, :, :, 0].tolist() == [[3, 4, 5], [6, 0, 0], [0, 0, 0]]
     assert windows.success.tolist() == [[False, True, False]]
+
+
+def test_chunks_are_made_whole_by_holding_the_last_action():
+    windows = cut([an_episode(8, success_at=7)], [Place(0, 3)], chunk=K, context=1, chunks=3)
+    whole = held(windows.actions, windows.steps)
+    assert whole[0, :, :, 0].tolist() == [[3, 4, 5], [6, 6, 6], [6, 6, 6]]
+    assert whole[0, :, :, 1].tolist() == [[-3, -4, -5], [-6, -6, -6], [-6, -6, -6]]
+    cut_short = held(windows.actions, np.array([[1, 0, 0]]))
+    assert cut_short[0, :, :, 0].tolist() == [[3, 3, 3]] * 3
+    assert windows.actions[0, 1, 1, 0] == 0, "they themselves stay"
+
+
+def test_frames_that_show_the_task_achieved():
+    assert an_episode(8, success_at=7).achieved.tolist() == [False] * 7 + [True]
+    assert an_episode(8, every=K, success_at=7, last=True).achieved.tolist() == [False] * 3 + [True]
+    assert not an_episode(8).achieved.any()
 
 
 def test_an_episode_that_was_looked_at_when_decisions_were_due():

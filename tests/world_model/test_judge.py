@@ -24,6 +24,7 @@ from accerl_lerobot.world_model.judge import (
     changed,
     mean_error,
     sensitivity,
+    separation,
     shuffled,
     skill,
     squared_errors,
@@ -60,14 +61,14 @@ def test_errors_are_sums_over_counted_pixels():
 
 
 def test_skill_and_sensitivity_by_hand():
-    wanted = frames(100, 100)
+    wanted, of = frames(100, 100), np.arange(2)
     model, copy = squared_errors(frames(98, 96), wanted), squared_errors(frames(90, 110), wanted)
-    assert skill(model, copy).value == pytest.approx(1 - 10 / 100)
-    assert sensitivity(model, copy).value == pytest.approx(100 / 10)
-    assert skill(copy, copy)[:] == pytest.approx((0, 0, 0))
-    assert sensitivity(copy, copy)[:] == pytest.approx((1, 1, 1))
+    assert skill(model, copy, of).value == pytest.approx(1 - 10 / 100)
+    assert sensitivity(model, copy, of).value == pytest.approx(100 / 10)
+    assert skill(copy, copy, of)[:] == pytest.approx((0, 0, 0))
+    assert sensitivity(copy, copy, of)[:] == pytest.approx((1, 1, 1))
     exact = squared_errors(wanted, wanted)
-    assert sensitivity(exact, copy) == (np.inf, np.inf, np.inf) and sensitivity(exact, exact) == (1, 1, 1)
+    assert sensitivity(exact, copy, of) == (np.inf,) * 3 and sensitivity(exact, exact, of) == (1, 1, 1)
 
 
 def test_the_interval_narrows_with_windows_and_holds_the_value():
@@ -78,7 +79,7 @@ def test_the_interval_narrows_with_windows_and_holds_the_value():
         off = rng.integers(-4, 5, wanted.shape) * rng.integers(1, 5, (count, 1, 1, 1, 1))
         near = (wanted + off).astype(np.uint8)
         far = (wanted + rng.integers(-20, 21, wanted.shape)).astype(np.uint8)
-        return skill(squared_errors(near, wanted), squared_errors(far, wanted))
+        return skill(squared_errors(near, wanted), squared_errors(far, wanted), np.arange(count))
 
     few, many = of(10), of(1000)
     for value, low, high in (few, many):
@@ -86,10 +87,23 @@ def test_the_interval_narrows_with_windows_and_holds_the_value():
     assert many[2] - many[1] < 0.3 * (few[2] - few[1])
 
 
+def test_windows_of_one_episode_are_drawn_together():
+    """A hundred copies of ten rows say no more than the ten do."""
+    rng = np.random.default_rng(0)
+    values = rng.standard_normal(10)
+    ten = bootstrap(np.arange(10), lambda rows: float(values[rows].mean()))
+    copies, groups = np.tile(values, 100), np.tile(np.arange(10), 100)
+    grouped = bootstrap(groups, lambda rows: float(copies[rows].mean()))
+    assert grouped == pytest.approx(ten)
+    alone = bootstrap(np.arange(1000), lambda rows: float(copies[rows].mean()))
+    assert alone.high - alone.low < 0.2 * (ten.high - ten.low)
+
+
 def test_a_statistic_that_is_not_always_there():
     labels = np.array([True] + [False] * 9)
-    estimate = bootstrap(10, lambda rows: auroc(np.arange(10.0)[rows], labels[rows]))
+    estimate = separation(np.arange(10.0), labels, np.arange(10))
     assert estimate.value == 0.0 and estimate.low == 0.0 <= estimate.high
+    assert all(np.isnan(separation(np.arange(3.0), np.zeros(3, bool), np.arange(3))))
 
 
 def test_auroc_is_the_share_of_pairs_in_order():
@@ -121,3 +135,8 @@ def test_shuffled_actions_are_another_episode_s():
     assert all(groups[i] != groups[j] for i, j in enumerate(chosen))
     alone = shuffled(5, [0] * 5, np.random.default_rng(0))
     assert all(i != j for i, j in enumerate(alone))
+    donors = np.array([2, 9, 13])
+    given = shuffled(20, groups, np.random.default_rng(0), donors)
+    assert set(given.tolist()) <= set(donors.tolist()) and all(
+        groups[i] != groups[j] for i, j in enumerate(given)
+    )

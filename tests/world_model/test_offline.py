@@ -31,7 +31,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model import offline
 from accerl_lerobot.world_model.config import WorldModelConfig
 from accerl_lerobot.world_model.store import load_world_model, save_world_model
-from accerl_lerobot.world_model.success import SuccessLearner, new_success_model
+from accerl_lerobot.world_model.success import new_success_model
 from tests.world_model.test_pixels import awake, dots, dream, model, windows
 
 
@@ -66,14 +66,17 @@ def test_from_a_dataset_to_a_trial(demos: Path, tmp_path: Path, capsys: pytest.C
     assert set(found["gates"]) == {
         "skill_changed_first",
         "skill_changed_last",
+        "skill_last",
         "sensitivity_low",
         "auroc_last",
+        "false_success_last",
     }
     kinds = [json.loads(line)["kind"] for line in (out / "metrics.jsonl").read_text().splitlines()]
     assert kinds == ["world_model"]
-    assert " trials: " in stderr and stderr.count(" wanted") == 4 and "preview.mp4" in stderr
+    assert " trials: " in stderr and stderr.count(" wanted") == 6 and "preview.mp4" in stderr
     world, success = load_world_model(out / "world_model")
     assert success is not None and success.config.chunk == world.spec.chunk == 5
+    assert 0.5 <= success.config.threshold < 1
     assert world.spec.cameras == ("observation.images.front",) and float(world.doubt) != 1
     assert (out / "preview.mp4").stat().st_size > 1000
 
@@ -142,7 +145,7 @@ def test_the_trial_is_on_episodes_that_were_not_learnt_from(
 
     monkeypatch.setattr(offline, "pretrain", spy("learnt", 1, offline.pretrain))
     monkeypatch.setattr(offline, "try_out", spy("tried", 1, offline.try_out))
-    monkeypatch.setattr(SuccessLearner, "step", spy("success", 1, SuccessLearner.step))
+    monkeypatch.setattr(offline, "Examples", spy("success", 0, offline.Examples))
     cli.main(arguments(demos, tmp_path / "out"))
     assert set(seen["learnt"]) == set(seen["success"]) and len(set(seen["learnt"] + seen["tried"])) == 8
     assert not set(seen["learnt"]) & set(seen["tried"])

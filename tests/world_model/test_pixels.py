@@ -225,7 +225,7 @@ def judged(learner: Learner, depth: int = 0) -> tuple[float, float]:
         rows = shuffled(len(of), range(len(of)), np.random.default_rng(0))
         other = squared_errors(dream(learner.serving, of, of.actions[rows])[depth].frames.numpy(), wanted)
     copy = squared_errors(of.frames[:, 1], wanted)
-    return skill(true, copy).value, sensitivity(true, other).low
+    return skill(true, copy, of.episode).value, sensitivity(true, other, of.episode).low
 
 
 def test_it_learns_where_the_dot_goes(learnt: Learner):

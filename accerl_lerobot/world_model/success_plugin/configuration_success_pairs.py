@@ -36,6 +36,11 @@ class SuccessPairsConfig(RewardModelConfig):
     """Width of the layer behind them."""
     success_reward: float = 0.5
     """A ``next.reward`` above it is a success; datasets of ``accerl demos`` give 1."""
+    threshold: float = 0.5
+    """P above which a frame counts as a success where one has to decide, [0, 1]."""
+    alone: float = 0.25
+    """Share of pairs, in [0, 1], whose first frame is replaced by the second in training: what counts is what
+    that one shows, not how far they are apart."""
     noise: float = 0.03
     """Largest standard deviation of the noise on frames in training, where 1 is white; ≥ 0."""
     shift: int = 3
@@ -49,6 +54,9 @@ class SuccessPairsConfig(RewardModelConfig):
         for name, least in (("chunk", 1), ("hidden", 1), ("shift", 0), ("noise", 0)):
             if getattr(self, name) < least:
                 raise InputError(f"reward_model.{name}", getattr(self, name), f"use at least {least}")
+        for name in ("threshold", "alone"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"reward_model.{name}", getattr(self, name), "use a value in [0, 1]")
         if not self.channels or min(self.channels) < 1:
             raise InputError("reward_model.channels", self.channels, "name at least one width")
 

@@ -36,7 +36,7 @@ GRID = 4
 
 
 class SuccessPairsRewardModel(PreTrainedRewardModel):
-    """P(the chunk between two frames achieved the task), and the episode's progress after it.
+    """P(the second of two frames shows the task achieved), and the episode's progress by then.
 
     Args:
         config: its size.
@@ -68,7 +68,12 @@ class SuccessPairsRewardModel(PreTrainedRewardModel):
         return success, progress
 
     def loss(
-        self, before: Tensor, after: Tensor, success: Tensor, progress: Tensor | None = None
+        self,
+        before: Tensor,
+        after: Tensor,
+        success: Tensor,
+        progress: Tensor | None = None,
+        generator: torch.Generator | None = None,
     ) -> tuple[Tensor, dict[str, float]]:
         """Cross-entropy in which successes and failures of the batch weigh the same, on augmented frames.
 
@@ -77,9 +82,10 @@ class SuccessPairsRewardModel(PreTrainedRewardModel):
             after: the same, a chunk later.
             success: (B,) 0 or 1.
             progress: (B,) in [0, 1], NaN where it is not known; None: nowhere.
+            generator: of the augmentation, on the CPU; None: torch's own.
         """
         if self.training:
-            before, after = self._augmented(before, after)
+            before, after = self._augmented(before, after, generator)
         said, along = self.logits(before, after)
         each = functional.binary_cross_entropy_with_logits(said, success, reduction="none")
         total = each.new_zeros(())
@@ -116,17 +122,21 @@ class SuccessPairsRewardModel(PreTrainedRewardModel):
             return images, images
         return images[:, :, 0], images[:, :, -1]
 
-    def _augmented(self, before: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
+    def _augmented(
+        self, before: Tensor, after: Tensor, generator: torch.Generator | None = None
+    ) -> tuple[Tensor, Tensor]:
         b, size = len(before), before.shape[3:]
         both = torch.cat([before, after], 1).flatten(1, 2)
         shift = self.config.shift
         if shift:
             # One shift for a batch is enough: there are many batches.
-            y, x = (int(torch.randint(2 * shift + 1, ())) for _ in range(2))
+            y, x = torch.randint(2 * shift + 1, (2,), generator=generator).tolist()
             padded = functional.pad(both, (shift,) * 4, mode="replicate")
             both = padded[:, :, y : y + size[0], x : x + size[1]]
-        light = 1 + 0.1 * torch.randn(b, 1, 1, 1, device=both.device)
-        level = self.config.noise * torch.rand(b, 1, 1, 1, device=both.device)
-        both = both * light + level * torch.randn_like(both)
+        light = 1 + 0.1 * torch.randn(b, 1, 1, 1, generator=generator)
+        level = self.config.noise * torch.rand(b, 1, 1, 1, generator=generator)
+        noise = level * torch.randn(both.shape, generator=generator)
+        both = both * light.to(both) + noise.to(both)
         first, second = both.clamp(0, 1).unflatten(1, (-1, 3)).chunk(2, 1)
-        return first, second
+        alone = torch.rand(b, 1, 1, 1, 1, generator=generator) < self.config.alone
+        return torch.where(alone.to(both.device), second, first), second
