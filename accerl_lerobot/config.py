@@ -35,6 +35,7 @@ from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 
 __all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "check_chunk", "decode", "encode", "parse"]
 
@@ -100,6 +101,7 @@ class RunConfig:
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     algorithm: AlgorithmConfig = field(default_factory=GIPOConfig)
     trainer: TrainerConfig = field(default_factory=TrainerConfig)
+    imagination: ImaginationConfig = field(default_factory=ImaginationConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     launch: LaunchConfig = field(default_factory=LaunchConfig)
     wandb: WandBConfig = field(default_factory=WandBConfig)
@@ -127,10 +129,17 @@ class RunConfig:
                 f"use more than trainer.hold_back, {self.trainer.hold_back}, or all is thrown away as too old"
             )
             raise InputError("replay.max_lag", self.replay.max_lag, remedy)
+        batch, imagination = self.trainer.batch_decisions, self.imagination
         if self.trainer.updates:
-            self.replay.check(
-                batch_decisions=self.trainer.batch_decisions, segment_decisions=self.rollout.segment_length
-            )
+            dreamt = imagination.dreamt(batch)
+            self.replay.check(batch_decisions=batch - dreamt, segment_decisions=self.rollout.segment_length)
+            if imagination.share:
+                imagination.replay.check(
+                    batch_decisions=dreamt, segment_decisions=imagination.horizon, field="imagination.replay"
+                )
+        if imagination.share and self.algorithm.advantage == "group":
+            remedy = "use algorithm.advantage=gae: dreams do not begin alike, so they are not compared"
+            raise InputError("imagination.share", imagination.share, remedy)
 
 
 def check_chunk(policy: dict[str, Any]) -> None:

@@ -39,6 +39,8 @@ class Progress:
     """Counters over all rollout workers since the run began."""
     replay: dict[str, float] = field(default_factory=dict)
     inference: dict[str, float] = field(default_factory=dict)
+    imagination: dict[str, float] = field(default_factory=dict)
+    """Empty where nothing is imagined."""
 
 
 class Engine(ABC):

@@ -14,6 +14,7 @@
 """The whole picture in one process, without Ray: the same parts, called in turn, deterministic for a seed.
 
     every poll:   all worlds get a decision and step it → segments enter replay, as far as the pace allows
+                  → all dreams get a decision and are dreamt on, if the pace allows it
                   → one update, if the pace allows it
 
 For tests and debugging. Weights reach the acting policy at once, so the lag comes from replay alone, unless
@@ -32,8 +33,8 @@ import numpy as np
 from accerl_lerobot.config import RunConfig
 from accerl_lerobot.engine import Engine, Progress, check_new, episode_key
 from accerl_lerobot.envs import make_world
-from accerl_lerobot.experience import Request, Segment
-from accerl_lerobot.replay import Replay
+from accerl_lerobot.experience import IMAGINED, REAL, Request, Segment
+from accerl_lerobot.replay import MixedReplay
 from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutRunner
 from accerl_lerobot.weights.held_back import HeldBack
@@ -65,7 +66,13 @@ class LocalEngine(Engine):
         if config.trainer.hold_back:
             self._acting = load_adapter(config.policy)
             self._acting.load_trainable(self._adapter.export_trainable())
-        self._replay = Replay(config.replay)
+        imagination = config.imagination
+        self._replay = MixedReplay(config.replay, imagination.replay, imagination.share)
+        self._dreams = None
+        if imagination.share:
+            from accerl_lerobot.world_model.dreaming import make_imagination
+
+            self._dreams = make_imagination(config, "dream", self._replay.insert)
         self._rng = np.random.default_rng(config.seed)
         self._outstanding: set[tuple[str, int]] = set()
         self._episodes: list[EpisodeResult] = []
@@ -73,7 +80,13 @@ class LocalEngine(Engine):
         self._outbox: deque[Segment] = deque()
         count = config.rollout.worlds * config.rollout.workers
         worlds = [make_world(config.env, history) for _ in range(count)]
-        self._plans = EpisodePlans(config.rollout, tasks, seed=config.seed, worlds=len(worlds))
+        self._plans = EpisodePlans(
+            config.rollout,
+            tasks,
+            seed=config.seed,
+            worlds=len(worlds),
+            budget=config.rollout.episodes or None,
+        )
         self._runner = RolloutRunner(
             worlds,
             lambda: self._plans.next(self._exploring),
@@ -98,6 +111,7 @@ class LocalEngine(Engine):
         self._store()
         self._act()
         self._store()
+        self._dream()
         updates = []
         n = self._config.trainer.batch_decisions
         if self._exploring and self._replay.may_sample(n):
@@ -110,11 +124,12 @@ class LocalEngine(Engine):
         self._outstanding -= {episode_key(e.plan) for e in episodes}
         return Progress(
             version=self._update.version,
-            done=self._update.version >= self._config.trainer.updates,
+            done=self._training and not self._exploring,
             updates=updates,
             episodes=episodes,
             rollout={k: float(v) for k, v in asdict(self._runner.counters).items()},
             replay=self._replay.metrics(),
+            imagination={} if self._dreams is None else self._dreams.metrics(),
             inference={"version": float(self._acting_version)},
         )
 
@@ -132,7 +147,10 @@ class LocalEngine(Engine):
 
     @property
     def _exploring(self) -> bool:
-        return self._training and self._update.version < self._config.trainer.updates
+        """Whether learning goes on."""
+        if not self._training or self._update.version >= self._config.trainer.updates:
+            return False
+        return not self._replay.exhausted(self._config.trainer.batch_decisions)
 
     def _act(self) -> None:
         """One decision in every world that may go on."""
@@ -157,6 +175,14 @@ class LocalEngine(Engine):
             else:
                 self._due[slot] = request
 
+    def _dream(self) -> None:
+        """One decision in every dream, if any is wanted."""
+        if self._dreams is None or not self._exploring:
+            return
+        self._replay.share = 0.0 if self._dreams.switch.tripped else self._config.imagination.share
+        if self._replay.may_insert(IMAGINED) and (requests := self._dreams.requests()):
+            self._dreams.advance(self._acting.decide(requests, self._acting_version))
+
     def _publish(self) -> None:
         """Hands weights to the policy that acts, which is the trainer's own unless they are held back."""
         version = self._update.version
@@ -170,8 +196,13 @@ class LocalEngine(Engine):
 
     def _store(self) -> None:
         """Lets in what stands at the door, one segment at a time: a group's come all at once."""
-        while self._outbox and self._replay.may_insert():
-            self._replay.insert(self._outbox.popleft())
+        while self._outbox and self._replay.may_insert(REAL):
+            segment = self._outbox.popleft()
+            self._replay.insert(segment)
+            if self._dreams is not None:
+                self._dreams.remember(segment)
+        if self._plans.spent and not self._outbox and not self._runner.exploring:
+            self._replay.end_real()
 
     def _ended(self, result: EpisodeResult) -> None:
         self._plans.report(result)

@@ -147,6 +147,10 @@ def train(config: RunConfig, directory: Path, console: Console) -> dict[str, Any
     started = time.monotonic()
     (directory / "config.yaml").write_text(yaml.safe_dump(encode(config), sort_keys=False))
     tasks = check_world(config)
+    if config.imagination.share:
+        from accerl_lerobot.world_model.dreaming import check_imagination
+
+        check_imagination(config)
     config = warm_start(config, directory, console)
     warm_s = time.monotonic() - started
     history = check_policy(config)
@@ -206,6 +210,8 @@ class _Loop:
         self.evaluations: list[dict[str, Any]] = []
         self.curve: list[tuple[float, float]] = []
         self.recent: list[bool] = []
+        self.explored = 0
+        """Exploring episodes that have ended."""
         self.lags: list[float] = []
         self.lag_max = 0.0
         self.mismatch_max = 0.0
@@ -267,6 +273,8 @@ class _Loop:
             "wall_s": times[0],
             "warm_start_s": times[1],
             "rl_s": times[2],
+            "episodes_explored": self.explored,
+            "imagination": last.imagination,
             "algorithm": self.config.algorithm.type,
             "tasks": list(self.tasks),
             "seed": self.config.seed,
@@ -300,6 +308,7 @@ class _Loop:
             self.mismatch_max = max(self.mismatch_max, metrics["ratio_max_dev"])
             self.log.write("train", int(metrics["update"]), metrics)
         explored = [e for e in progress.episodes if e.plan.explore]
+        self.explored += len(explored)
         if explored:
             self.recent = (self.recent + [e.success for e in explored])[-RECENT:]
             share = float(np.mean(self.recent))
@@ -309,6 +318,7 @@ class _Loop:
             values = progress.rollout | {"success_exploring": share}
             values |= {f"replay_{k}": v for k, v in progress.replay.items()}
             values |= {f"inference_{k}": v for k, v in progress.inference.items()}
+            values |= {f"imagination_{k}": v for k, v in progress.imagination.items()}
             self.log.write("rollout", progress.version, values)
         for episode in progress.episodes:
             results = self.during.get(episode.plan.group)

@@ -17,6 +17,7 @@ go."""
 from __future__ import annotations
 
 from accerl_lerobot.replay.buffer import Replay, ReplayCounters
+from accerl_lerobot.replay.mixed import MixedReplay
 from accerl_lerobot.replay.pacing import (
     Pace,
     ReplayConfig,
@@ -27,6 +28,7 @@ from accerl_lerobot.replay.pacing import (
 )
 
 __all__ = [
+    "MixedReplay",
     "Pace",
     "Replay",
     "ReplayConfig",

@@ -188,7 +188,7 @@ class Replay:
         """
         if num_decisions < 1:
             raise ValueError(f"sample of {num_decisions} decisions: ask for at least 1")
-        self._retire(trainer_version)
+        self.retire(trainer_version)
         if self._available < num_decisions:
             return []
         available = [e for e in self._entries.values() if e.unspent]
@@ -241,7 +241,8 @@ class Replay:
         uses = {int(k): int(v) for k, v in state["departed_uses"].items()}
         self.counters = ReplayCounters(**{**state, "departed_uses": uses})
 
-    def _retire(self, trainer_version: int) -> None:
+    def retire(self, trainer_version: int) -> None:
+        """Takes out what is too old for a trainer that has made so many updates."""
         cutoff = trainer_version - self.config.max_lag
         for key in [k for k, e in self._entries.items() if e.oldest < cutoff]:
             self._depart(key, "retired")

@@ -77,12 +77,13 @@ class ReplayConfig:
         if not 1 <= self.ahead <= self.capacity:
             raise InputError("replay.ahead", self.ahead, f"use 1 to capacity, {self.capacity}")
 
-    def check(self, *, batch_decisions: int, segment_decisions: int) -> None:
+    def check(self, *, batch_decisions: int, segment_decisions: int, field: str = "replay") -> None:
         """Refuses a pace that could stall or waste, once the batch size and the segment length are known.
 
         Args:
             batch_decisions: decisions one update asks for.
             segment_decisions: T of the longest segment.
+            field: that this config stands in.
 
         Raises:
             InputError: both sides could wait for each other forever, or the trainer for the warm start, or
@@ -90,11 +91,11 @@ class ReplayConfig:
         """
         if self.ahead < batch_decisions:
             remedy = f"use at least one batch, {batch_decisions}, or both sides wait for each other"
-            raise InputError("replay.ahead", self.ahead, remedy)
+            raise InputError(f"{field}.ahead", self.ahead, remedy)
         least = max(self.min_decisions, self.ahead) + segment_decisions - 1
         if self.capacity < least:
             remedy = f"use at least {least}: the larger of min_decisions and ahead, and one segment"
-            raise InputError("replay.capacity", self.capacity, remedy)
+            raise InputError(f"{field}.capacity", self.capacity, remedy)
 
 
 @dataclass(frozen=True, kw_only=True)

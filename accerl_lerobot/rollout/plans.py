@@ -47,6 +47,7 @@ class EpisodePlans:
         worlds: how many the worker steps.
         worker: its index.
         incarnation: how often it has been restarted.
+        budget: exploring episodes at most; None: no end.
     """
 
     def __init__(
@@ -58,7 +59,9 @@ class EpisodePlans:
         worlds: int,
         worker: int = 0,
         incarnation: int = 0,
+        budget: int | None = None,
     ) -> None:
+        self._budget = budget
         self.groups: Groups | None = None
         if config.group_size:
             self.groups = Groups(config.group_size, worlds, config.group_advantage, config.group_filter)
@@ -87,8 +90,19 @@ class EpisodePlans:
         """
         if self._queued:
             return self._queued.popleft()
-        if not exploring:
+        if not exploring or self.spent:
             return None
+        plan = self._explore()
+        if plan is not None and self._budget is not None:
+            self._budget -= 1
+        return plan
+
+    @property
+    def spent(self) -> bool:
+        """Whether every exploring episode has been handed out."""
+        return self._budget is not None and self._budget <= 0
+
+    def _explore(self) -> EpisodePlan | None:
         if self.groups is None:
             task, seed = self._new_start()
             return EpisodePlan(task=task, seed=seed, explore=True)

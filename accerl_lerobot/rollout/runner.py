@@ -82,6 +82,10 @@ class RolloutConfig:
     """
     task_window: int = 100
     """Exploring episodes of a task that `task_sampling` remembers, at least 1."""
+    episodes: int = 0
+    """Exploring episodes in all; 0: as many as the updates need. Once they are played, learning goes on while
+    replay has something to give, which is little unless more is imagined, and then ends.
+    """
     max_restarts: int = 3
     """How often each worker is started again after it died or hung; once more ends the run with its error.
 
@@ -108,7 +112,10 @@ class RolloutConfig:
         for name, kind in choices.items():
             if getattr(self, name) not in get_args(kind):
                 raise InputError(f"rollout.{name}", getattr(self, name), f"use {' or '.join(get_args(kind))}")
-        for name in ("decision_cost", "max_restarts"):
+        if self.group_size and self.episodes % self.group_size:
+            remedy = f"use a multiple of rollout.group_size, {self.group_size}"
+            raise InputError("rollout.episodes", self.episodes, remedy)
+        for name in ("decision_cost", "max_restarts", "episodes"):
             if getattr(self, name) < 0:
                 raise InputError(f"rollout.{name}", getattr(self, name), "use 0 or more")
 
@@ -210,6 +217,11 @@ class RolloutRunner:
 
     def __len__(self) -> int:
         return len(self._slots)
+
+    @property
+    def exploring(self) -> bool:
+        """Whether an exploring episode is under way."""
+        return any(slot.plan is not None and slot.plan.explore for slot in self._slots)
 
     def start(self, slot: int) -> Request | None:
         """Begins the next planned episode in `slot`; None when nothing is planned."""

@@ -29,7 +29,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import numpy as np
 from torch import Tensor
 
 State = dict[str, Tensor]
@@ -54,7 +56,7 @@ class WorldModelSpec:
     context: int
     """L."""
     provides: frozenset[str]
-    """Of pixels, state, uncertainty."""
+    """Of pixels, state, uncertainty, success."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +71,19 @@ class Dream:
     """float32 (B, S), in the world's units."""
     uncertainty: Tensor
     """float32 (B,), ≥ 0; 1 is the 95th percentile on chunks it has learnt from. NaN where it has none."""
+    success: Tensor | None = None
+    """float32 (B,), P(the task has been achieved); None: a success model has to tell."""
+
+
+class History(NamedTuple):
+    """How to get to where a dream begins, for those that can go there."""
+
+    task: str
+    """Of `World.reset`,"""
+    seed: int
+    """and this too."""
+    actions: np.ndarray
+    """float32 (t, A), made since."""
 
 
 class WorldModel(ABC):
@@ -77,13 +92,20 @@ class WorldModel(ABC):
     spec: WorldModelSpec
 
     @abstractmethod
-    def begin(self, frames: Tensor, robot: Tensor, tasks: Sequence[str]) -> State:
+    def begin(
+        self,
+        frames: Tensor,
+        robot: Tensor,
+        tasks: Sequence[str],
+        histories: Sequence[History | None] | None = None,
+    ) -> State:
         """Starts an imagination.
 
         Args:
             frames: uint8 (B, L, V, H, W, 3), K env steps apart, the newest last; it is the anchor too.
             robot: float32 (B, S), at the newest.
             tasks: B instructions.
+            histories: what led to each, where that is known.
         """
 
     @abstractmethod

@@ -23,6 +23,7 @@ from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.episodes import Episode
+from accerl_lerobot.world_model.frames import resized
 
 if TYPE_CHECKING:
     from accerl_lerobot.config import DatasetConfig
@@ -92,12 +93,12 @@ def _episode(data: Any, meta: Any, index: int, spec: WorldModelSpec, source: str
     items = [data[i] for i in range(first, last)]
     success = np.array([bool(item[SUCCESS]) for item in items])
     state = [item["observation.state"].numpy() if spec.state_dim else np.zeros(0) for item in items]
-    frames = [np.stack([_image(item[camera], spec.image_size) for camera in spec.cameras]) for item in items]
+    shown = [np.stack([_bytes(item[camera]) for item in items]) for camera in spec.cameras]
     actions = np.stack([item["action"].numpy() for item in items])
     if not (np.isfinite(actions).all() and np.isfinite(np.stack(state)).all()):
         raise InputError("dataset.repo_id", meta.repo_id, f"episode {index} has a NaN state or action")
     return Episode(
-        frames=np.stack(frames),
+        frames=np.stack([resized(frames, spec.image_size) for frames in shown], 1),
         times=np.arange(len(items)),
         state=np.stack(state).astype(np.float32),
         actions=actions.astype(np.float32),
@@ -107,11 +108,7 @@ def _episode(data: Any, meta: Any, index: int, spec: WorldModelSpec, source: str
     )
 
 
-def _image(image: Any, size: tuple[int, int]) -> np.ndarray:
-    """uint8 (H, W, 3) from LeRobot's float (3, h, w) in [0, 1]."""
-    from torch.nn import functional
-
-    if tuple(image.shape[1:]) != size:
-        image = functional.interpolate(image[None], size=size, mode="bilinear", antialias=True)[0]
+def _bytes(image: Any) -> np.ndarray:
+    """uint8 (h, w, 3) from LeRobot's float (3, h, w) in [0, 1]."""
     bytes_: np.ndarray = (image * 255).round().clamp(0, 255).byte().permute(1, 2, 0).numpy()
     return bytes_

@@ -35,7 +35,7 @@ from torch.nn import functional
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model import objectives
 from accerl_lerobot.world_model.config import PixelModelConfig
-from accerl_lerobot.world_model.contract import Dream, State, WorldModel, WorldModelSpec
+from accerl_lerobot.world_model.contract import Dream, History, State, WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.episodes import Windows
 from accerl_lerobot.world_model.network import Denoiser
 
@@ -97,7 +97,13 @@ class PixelWorldModel(nn.Module, WorldModel):
         change = float(np.sqrt(np.square(frames[:, 1] - frames[:, 0]).mean()))
         self.change.fill_(max(change, 1e-3))
 
-    def begin(self, frames: Tensor, robot: Tensor, tasks: Sequence[str]) -> State:
+    def begin(
+        self,
+        frames: Tensor,
+        robot: Tensor,
+        tasks: Sequence[str],
+        histories: Sequence[History | None] | None = None,
+    ) -> State:
         """See the base class."""
         frames, robot = (x.to(self.change.device) for x in (frames, robot))
         return {"frames": frames, "anchor": frames[:, -1], "robot": robot}

@@ -52,11 +52,17 @@ def save_world_model(
         success.save_pretrained(directory / SUCCESS)
 
 
-def load_world_model(directory: Path) -> tuple[PixelWorldModel, SuccessPairsRewardModel | None]:
+def load_world_model(
+    directory: Path, field: str = "path"
+) -> tuple[PixelWorldModel, SuccessPairsRewardModel | None]:
     """Reads what `save_world_model` wrote; both serve, neither is in training.
 
+    Args:
+        directory: the folder.
+        field: that named it, for the error.
+
     Raises:
-        InputError: it is not there, or its weights are not those of its config.
+        InputError: it is not there, its weights are not those of its config, or its success model is broken.
     """
     try:
         content = json.loads((directory / CONFIG).read_text())
@@ -69,9 +75,15 @@ def load_world_model(directory: Path) -> tuple[PixelWorldModel, SuccessPairsRewa
     except (*UNREADABLE, draccus.utils.DraccusException) as error:
         first = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(
-            "path", str(directory), f"not a world model of accerl world-model ({first})"
+            field, str(directory), f"not a world model of accerl world-model ({first})"
         ) from error
     success = None
     if (directory / SUCCESS).is_dir():
-        success = SuccessPairsRewardModel.from_pretrained(directory / SUCCESS, strict=True)
+        try:
+            success = SuccessPairsRewardModel.from_pretrained(directory / SUCCESS, strict=True).eval()
+        except (*UNREADABLE, draccus.utils.DraccusException) as error:
+            first = (str(error).splitlines() or [type(error).__name__])[0]
+            raise InputError(
+                field, str(directory / SUCCESS), f"the success model is broken ({first})"
+            ) from error
     return model.requires_grad_(False), success

@@ -1,0 +1,101 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Real and imagined experience side by side, each with its own size and pace.
+
+A batch takes its imagined share from one store and the rest from the other, and is drawn only when both can
+give. Two things end that:
+
+* the real episodes that were paid for have all been collected (`end_real`): from then on a batch takes what
+  draws they have left, and imagined ones for the rest;
+* nothing is imagined any more (`share` is 0): a batch is real.
+
+When neither can give, and neither ever will, the replay is *exhausted*.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from accerl_lerobot.experience import REAL, Segment
+from accerl_lerobot.replay.buffer import Replay
+from accerl_lerobot.replay.pacing import ReplayConfig
+
+
+class MixedReplay:
+    """Segments in, batches of segments out.
+
+    Args:
+        real: size and pace of real experience.
+        imagined: of imagined experience.
+        share: of a batch's decisions, in [0, 1), that are imagined; may be set to 0 and back at any time.
+    """
+
+    def __init__(self, real: ReplayConfig, imagined: ReplayConfig, share: float) -> None:
+        self.real, self.imagined, self.share = Replay(real), Replay(imagined), share
+        self.real_ended = False
+
+    def may_insert(self, source: str = REAL) -> bool:
+        """Whether another segment of this source should be brought now."""
+        return self._of(source).may_insert()
+
+    def insert(self, segment: Segment) -> bool:
+        """See `Replay.insert`."""
+        return self._of(segment.source).insert(segment)
+
+    def end_real(self) -> None:
+        """No real segment will come any more."""
+        self.real_ended = True
+
+    def may_sample(self, batch_decisions: int) -> bool:
+        """Whether a batch should be drawn now."""
+        return self._parts(batch_decisions) is not None
+
+    def exhausted(self, batch_decisions: int) -> bool:
+        """Whether there is no batch and never will be."""
+        return self.real_ended and not self.share and not self.may_sample(batch_decisions)
+
+    def sample(self, num_decisions: int, trainer_version: int, rng: np.random.Generator) -> list[Segment]:
+        """See `Replay.sample`: empty, with nothing counted as used, if a part cannot be had."""
+        self.real.retire(trainer_version)
+        self.imagined.retire(trainer_version)
+        parts = self._parts(num_decisions)
+        if parts is None:
+            return []
+        drawn: list[Segment] = []
+        for replay, count in zip((self.real, self.imagined), parts, strict=True):
+            drawn += replay.sample(count, trainer_version, rng) if count else []
+        return drawn
+
+    def metrics(self) -> dict[str, float]:
+        """Of the real store by their names, of the other one with ``imagined_`` before them."""
+        imagined = {f"imagined_{k}": v for k, v in self.imagined.metrics().items()}
+        return self.real.metrics() | imagined | {"imagined_share": self.share}
+
+    def _of(self, source: str) -> Replay:
+        return self.real if source == REAL else self.imagined
+
+    def _parts(self, batch: int) -> tuple[int, int] | None:
+        """Decisions to draw from either store; None if one of them cannot give its part."""
+        real = batch - round(self.share * batch)
+        if self.real_ended:
+            left = self.real.pace.available
+            real = min(real, left) if self.share else (batch if left >= batch else 0)
+            if not real and not self.share:
+                return None
+        elif real and not self.real.may_sample(real):
+            return None
+        imagined = batch - real
+        if imagined and not self.imagined.may_sample(imagined):
+            return None
+        return real, imagined

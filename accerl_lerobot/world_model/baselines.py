@@ -1,0 +1,188 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""World models to compare with: the best there can be, and two that are worth nothing.
+
+What a policy learns from a copy of the last frame, or from a model that is told other actions, it does not
+learn from the world.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from accerl_lerobot.envs.base import ChunkResult, World
+from accerl_lerobot.world_model.contract import Dream, History, State, WorldModel, WorldModelSpec
+from accerl_lerobot.world_model.frames import resized
+
+
+class CopyModel(WorldModel):
+    """Nothing ever changes.
+
+    Args:
+        spec: of the world.
+    """
+
+    def __init__(self, spec: WorldModelSpec) -> None:
+        self.spec = replace(spec, provides=spec.provides - {"uncertainty"})
+
+    def begin(
+        self,
+        frames: Tensor,
+        robot: Tensor,
+        tasks: Sequence[str],
+        histories: Sequence[History | None] | None = None,
+    ) -> State:
+        """See the base class."""
+        return {"frames": frames[:, -1], "robot": robot}
+
+    def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Dream:
+        """See the base class."""
+        unknown = torch.full((len(actions),), torch.nan)
+        return Dream(state=state, frames=state["frames"], robot=state["robot"], uncertainty=unknown)
+
+
+class ShuffledModel(WorldModel):
+    """Another model that is told the actions of the next row; a batch of one gets its own.
+
+    Args:
+        model: what dreams.
+    """
+
+    def __init__(self, model: WorldModel) -> None:
+        self.model, self.spec = model, model.spec
+
+    def begin(
+        self,
+        frames: Tensor,
+        robot: Tensor,
+        tasks: Sequence[str],
+        histories: Sequence[History | None] | None = None,
+    ) -> State:
+        """See the base class."""
+        return self.model.begin(frames, robot, tasks, histories)
+
+    def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Dream:
+        """See the base class."""
+        return self.model.step(state, actions.roll(1, 0), seeds)
+
+
+class OracleModel(WorldModel):
+    """Simulators that are put where a dream begins, by playing what led there.
+
+    A state holds what was played, so it can be gone on from more than once; a simulator that is there already
+    just goes on.
+
+    Args:
+        spec: of the world.
+        make: a new simulator.
+        simulators: kept at most.
+    """
+
+    def __init__(self, spec: WorldModelSpec, make: Callable[[], World], simulators: int) -> None:
+        self.spec = replace(spec, provides=spec.provides - {"uncertainty"} | {"success"})
+        self._make, self._most = make, simulators
+        self._at: OrderedDict[bytes, World] = OrderedDict()  # the longest unused first
+        self._free: list[World] = []
+        self._tasks: list[str] = []
+
+    def begin(
+        self,
+        frames: Tensor,
+        robot: Tensor,
+        tasks: Sequence[str],
+        histories: Sequence[History | None] | None = None,
+    ) -> State:
+        """See the base class.
+
+        Raises:
+            ValueError: what led to a start is not known.
+        """
+        if histories is None or any(h is None for h in histories):
+            raise ValueError("an oracle needs the history of every start")
+        known = [h for h in histories if h is not None]
+        self._tasks += sorted({h.task for h in known} - set(self._tasks))
+        longest = max(len(h.actions) for h in known)
+        played = np.zeros((len(known), longest, self.spec.action_dim), np.float32)
+        for row, h in zip(played, known, strict=True):
+            row[: len(h.actions)] = h.actions
+        return {
+            "task": torch.tensor([self._tasks.index(h.task) for h in known]),
+            "seed": torch.tensor([h.seed for h in known]),
+            "count": torch.tensor([len(h.actions) for h in known]),
+            "played": torch.from_numpy(played),
+        }
+
+    def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Dream:
+        """See the base class."""
+        results = [self._play(state, i, actions[i].numpy()) for i in range(len(actions))]
+        count, chunk = state["count"], actions.shape[1]
+        room = int(count.max()) + chunk - state["played"].shape[1]
+        played = torch.nn.functional.pad(state["played"], (0, 0, 0, max(0, room)))
+        for i, n in enumerate(count.tolist()):
+            played[i, n : n + chunk] = actions[i]
+        seen = [r.observation for r in results]
+        pictures = [
+            resized(np.stack([np.asarray(o[camera]) for o in seen]), self.spec.image_size)
+            for camera in self.spec.cameras
+        ]
+        robot = (
+            np.stack([np.asarray(o["observation.state"]) for o in seen])
+            if self.spec.state_dim
+            else np.zeros((len(seen), 0), np.float32)
+        )
+        return Dream(
+            state={**state, "count": count + chunk, "played": played},
+            frames=torch.from_numpy(np.stack(pictures, 1)),
+            robot=torch.from_numpy(robot),
+            uncertainty=torch.full((len(actions),), torch.nan),
+            success=torch.tensor([float(r.success) for r in results]),
+        )
+
+    def close(self) -> None:
+        """Closes the simulators."""
+        for world in (*self._at.values(), *self._free):
+            world.close()
+        self._at.clear()
+        self._free.clear()
+
+    def _play(self, state: State, row: int, actions: np.ndarray) -> ChunkResult:
+        task, seed = self._tasks[int(state["task"][row])], int(state["seed"][row])
+        played = state["played"][row, : int(state["count"][row])].numpy()
+        world = self._at.pop(_name(task, seed, played), None)
+        if world is None:
+            world = self._somewhere()
+            world.reset(seed, task)
+            if len(played):
+                world.step_chunk(played)
+        result = world.step_chunk(actions)
+        if result.done:
+            self._free.append(world)
+        else:
+            self._at[_name(task, seed, np.concatenate([played, actions]))] = world
+        return result
+
+    def _somewhere(self) -> World:
+        if self._free:
+            return self._free.pop()
+        return self._make() if len(self._at) < self._most else self._at.popitem(last=False)[1]
+
+
+def _name(task: str, seed: int, played: np.ndarray) -> bytes:
+    return f"{task} {seed} ".encode() + np.ascontiguousarray(played, np.float32).tobytes()

@@ -1,0 +1,31 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Pictures in another size."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def resized(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Frames uint8 (B, h, w, 3) at size (H, W); the same array if that is theirs."""
+    if frames.shape[1:3] == size:
+        return frames
+    import torch
+    from torch.nn import functional
+
+    tall = torch.from_numpy(frames).permute(0, 3, 1, 2).float()
+    tall = functional.interpolate(tall, size=size, mode="bilinear", antialias=True)
+    shrunk: np.ndarray = tall.round().clamp(0, 255).byte().permute(0, 2, 3, 1).contiguous().numpy()
+    return shrunk

@@ -1,0 +1,130 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Configuration of experience that is imagined while a policy learns. Free of torch, as all configs are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.replay.pacing import ReplayConfig
+
+Kind = Literal["learned", "shuffled", "copy", "oracle"]
+Reward = Literal["potential", "success"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnlineLearnConfig:
+    """How a world model goes on learning from what the policy lives through."""
+
+    steps_per_episode: float = 0.0
+    """Gradient steps of world and success model each, per real episode; 0: it stays as it is."""
+    batch: int = 16
+    """Windows in each, at least 2."""
+    lr: float = 3e-4
+    """Constant."""
+    offline: float = 0.5
+    """Share of windows, in [0, 1], from the dataset that it was pre-trained on, where `dataset` names it."""
+    recent: float = 0.7
+    """Share of the others, in [0, 1], from the newest quarter of episodes."""
+    failures: float = 0.6
+    """Share of those, in [0, 1], from episodes that failed, as long as there are both kinds."""
+    held_out: float = 0.2
+    """Share of real episodes, in (0, 1), that it does not learn from and is tried on."""
+    try_every: int = 20
+    """Real episodes between two trials of what it has become, at least 1."""
+    memory: int = 400
+    """Real episodes kept to learn from, at least 2."""
+
+    def __post_init__(self) -> None:
+        where = "imagination.learn"
+        for name, least in (("steps_per_episode", 0), ("batch", 2), ("try_every", 1), ("memory", 2)):
+            if not getattr(self, name) >= least:
+                raise InputError(f"{where}.{name}", getattr(self, name), f"use at least {least}")
+        for name in ("offline", "recent", "failures"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"{where}.{name}", getattr(self, name), "use a share in [0, 1]")
+        if not 0 < self.held_out < 1:
+            raise InputError(f"{where}.held_out", self.held_out, "use a share in (0, 1), e.g. 0.2")
+        if not 0 < self.lr < 1:
+            raise InputError(f"{where}.lr", self.lr, "use a value in (0, 1), e.g. 3e-4")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImaginationConfig:
+    """What the policy learns from dreams."""
+
+    share: float = 0.0
+    """Of the decisions of a batch, in [0, 1): how many were imagined. 0: nothing is."""
+    model: Kind = "learned"
+    """learned: the one in `path`. oracle: a simulator, put where a dream begins, the best there can be.
+    copy: nothing ever moves. shuffled: the learnt one, told the actions of another dream. The last two are
+    placebos: what helps as much as they do is not the world model."""
+    path: str | None = None
+    """The folder ``world_model`` that ``accerl world-model`` has written; oracle needs none, copy one for its
+    success model."""
+    dreams: int = 32
+    """Dreams at a time, decided and dreamt as one batch."""
+    horizon: int = 4
+    """Decisions of a dream at most; V of its last observation stands for the rest."""
+    keyframes: float = 0.5
+    """Share of dreams, in [0, 1], that begin where the critic was surprised; the others begin anywhere."""
+    reward: Reward = "potential"
+    """potential: P(success) now less P(success) before, the start's own included. success: 1 where it exceeds
+    the success model's threshold. Either way that ends the dream, and decisions cost what they always do."""
+    doubt: float = 2.0
+    """A dream ends before what the model is more uncertain about, where 1 is the 95th percentile; > 0."""
+    memory: int = 4096
+    """Newest real decisions that dreams begin from."""
+    gap: float = 0.3
+    """Nothing is imagined any more once dreams succeed so much more often, as a share of 1, than the episodes
+    they begin in did in as many decisions; > 0. A world model that was promoted since gets another chance."""
+    window: int = 200
+    """Dreams over which that is measured, at least 1."""
+    replay: ReplayConfig = field(
+        default_factory=lambda: ReplayConfig(
+            capacity=4096, min_decisions=1, samples_per_insert=2.0, ahead=1024
+        )
+    )
+    """Size and pace of what is imagined; its `max_lag` is the lag of the policy that dreamt."""
+    learn: OnlineLearnConfig = field(default_factory=OnlineLearnConfig)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.share < 1:
+            remedy = "use a share in [0, 1): some of what it learns must be real"
+            raise InputError("imagination.share", self.share, remedy)
+        for name, kinds in (("model", Kind), ("reward", Reward)):
+            if getattr(self, name) not in get_args(kinds):
+                raise InputError(
+                    f"imagination.{name}", getattr(self, name), f"use {' or '.join(get_args(kinds))}"
+                )
+        for name in ("dreams", "horizon", "memory", "window"):
+            if getattr(self, name) < 1:
+                raise InputError(f"imagination.{name}", getattr(self, name), "use at least 1")
+        for name in ("doubt", "gap"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"imagination.{name}", getattr(self, name), "use a positive number")
+        if not 0 <= self.keyframes <= 1:
+            raise InputError("imagination.keyframes", self.keyframes, "use a share in [0, 1]")
+        if self.share and self.path is None and self.model != "oracle":
+            remedy = "give the folder world_model that accerl world-model has written"
+            raise InputError("imagination.path", None, remedy)
+        if self.learn.steps_per_episode and self.model != "learned":
+            remedy = f"use 0: {self.model} has nothing to learn"
+            raise InputError("imagination.learn.steps_per_episode", self.learn.steps_per_episode, remedy)
+
+    def dreamt(self, batch_decisions: int) -> int:
+        """How many decisions of a batch are imagined."""
+        return round(self.share * batch_decisions)

@@ -1,0 +1,311 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Experience that is imagined: the policy acts, and a world model says what is seen then.
+
+A dream begins at a real observation and lasts a few decisions. What comes of it is a segment like any other,
+but for its source: a success ends it, the world's time limit ends it, and otherwise V of its last observation
+stands for the rest. Nothing that follows a success is imagined, and nothing that the model is too uncertain
+about is kept.
+
+Knows no process: whoever drives it asks for `requests`, has them decided, and hands that to `advance`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import torch
+
+from accerl_lerobot.envs.base import WorldSpec
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import IMAGINED, TASK, Decision, Observation, Request, Segment
+from accerl_lerobot.rollout.segments import SegmentBuilder
+from accerl_lerobot.world_model.contract import Dream, State, WorldModel, WorldModelSpec
+from accerl_lerobot.world_model.frames import resized
+from accerl_lerobot.world_model.guard import KillSwitch
+from accerl_lerobot.world_model.imagination_config import ImaginationConfig
+from accerl_lerobot.world_model.starts import Start, StartPool
+from accerl_lerobot.world_model.success import probabilities
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+
+
+def check_fit(spec: WorldModelSpec, world: WorldSpec, executed: int, history: int, judged: bool) -> None:
+    """Refuses a world model that cannot stand for a world, before a run begins.
+
+    Args:
+        spec: what it shows.
+        world: what the policy acts in.
+        executed: actions that the policy executes per decision.
+        history: env steps that the policy's observations hold.
+        judged: whether there is a success model beside it.
+
+    Raises:
+        InputError: it shows other cameras or another robot, goes another number of steps at a time, cannot
+            tell a success, or the policy looks back at what is not imagined.
+    """
+
+    def refuse(value: object, why: str) -> InputError:
+        return InputError("imagination.path", value, why)
+
+    if missing := [camera for camera in world.images if camera not in spec.cameras]:
+        raise refuse(missing[0], f"the world shows this camera, the world model {', '.join(spec.cameras)}")
+    needed = {"pixels"} | ({"state"} if world.state_dim else set())
+    if lacking := needed - spec.provides:
+        raise refuse(sorted(lacking)[0], "the policy reads it, and the world model does not provide it")
+    for name in ("state_dim", "action_dim", "fps"):
+        theirs, ours = getattr(spec, name), getattr(world, name)
+        if theirs != ours:
+            remedy = f"is the world model's {name}, and the world's is {ours}; learn one of this world"
+            raise refuse(theirs, remedy)
+    if spec.chunk != executed:
+        why = f"env steps to a dream's chunk, and the policy executes {executed} actions per decision"
+        raise refuse(spec.chunk, f"{why}; learn one with world_model.chunk={executed}")
+    if history > 1:
+        why = f"the policy looks back {history} env steps, and dreams show one frame per decision"
+        raise InputError("imagination.share", history, f"{why}; use a policy with n_obs_steps=1")
+    if not judged and "success" not in spec.provides:
+        raise refuse(None, "there is no success model beside the world model, and it cannot tell a success")
+
+
+@dataclass
+class Counters:
+    """What was imagined so far."""
+
+    dreams: int = 0
+    """That have ended."""
+    decisions: int = 0
+    successes: int = 0
+    doubted: int = 0
+    """Dreams that ended before something too uncertain."""
+
+
+@dataclass
+class _Row:
+    builder: SegmentBuilder
+    start: Start
+    frames: np.ndarray
+    """uint8 (V, H, W, 3), the newest."""
+    potential: float
+    """P(success) there."""
+    ends_at: int
+    """Decisions after which the world's time limit ends it."""
+    depth: int = 0
+
+
+class Imagination:
+    """A batch of dreams, each of which begins anew when it has ended.
+
+    Example:
+        >>> imagination.remember(real_segment)
+        >>> requests = imagination.requests()
+        >>> imagination.advance(adapter.decide(requests, version))
+
+    Args:
+        model: what dreams; in inference.
+        success: what tells successes; None if `model` does.
+        world: whose pictures the policy is to see.
+        config: how.
+        decision_cost: subtracted from every reward.
+        fails: whether the world's time limit is a failure, see `RolloutConfig.time_limit`; else a truncation.
+        seed: of starts and dreams.
+        name: prefix of the segments' keys.
+        on_segment: receives what was imagined.
+    """
+
+    def __init__(
+        self,
+        model: WorldModel,
+        success: SuccessPairsRewardModel | None,
+        world: WorldSpec,
+        config: ImaginationConfig,
+        *,
+        decision_cost: float,
+        fails: bool,
+        seed: int,
+        name: str,
+        on_segment: Callable[[Segment], object],
+    ) -> None:
+        self.config, self.counters = config, Counters()
+        self.switch = KillSwitch(config.gap, config.window)
+        self.version = 0
+        self._model, self._success, self._world = model, success, world
+        self._cost, self._fails, self._name = decision_cost, fails, name
+        self._on_segment = on_segment
+        self._starts = StartPool(
+            model.spec,
+            memory=config.memory,
+            horizon=config.horizon,
+            keyframes=config.keyframes,
+            whole=config.model == "oracle",
+        )
+        self._rng = np.random.default_rng((seed, 3))
+        self._rows: list[_Row | None] = [None] * config.dreams
+        self._state: State | None = None
+        self._sequence = 0
+        self._limit = math.ceil(world.max_steps / model.spec.chunk)
+
+    def remember(self, segment: Segment) -> None:
+        """Dreams may begin in a real segment from now on."""
+        self._starts.add(segment)
+
+    def swap(self, model: WorldModel, success: SuccessPairsRewardModel | None, version: int) -> None:
+        """Another world model of the same world dreams from now on; dreams under way go on in it."""
+        self._model, self._success, self.version = model, success, version
+        self.switch.reset()
+
+    def requests(self) -> list[Request]:
+        """What is to be decided, one for each dream; none before anything real was seen, or switched off."""
+        if not len(self._starts) or self.switch.tripped:
+            return []
+        self._begin([i for i, row in enumerate(self._rows) if row is None])
+        return [
+            Request(observation=row.builder.latest, noise_seed=int(self._rng.integers(2**62)))
+            for row in self._rows
+            if row is not None
+        ]
+
+    def advance(self, decisions: list[Decision]) -> None:
+        """Dreams a chunk on in every row, with decisions in the order of `requests`."""
+        assert self._state is not None
+        low, high = self._world.action_low, self._world.action_high
+        actions = np.stack([np.clip(d.chunk, low, high) for d in decisions]).astype(np.float32)
+        seeds = self._rng.integers(2**31, size=len(actions)).tolist()
+        dream = self._model.step(self._state, torch.from_numpy(actions), seeds)
+        self._state = dream.state
+        frames, robot = dream.frames.cpu().numpy(), dream.robot.cpu().numpy()
+        said = self._said(dream, frames)
+        doubt = dream.uncertainty.cpu().numpy()
+        for i, decision in enumerate(decisions):
+            row = self._rows[i]
+            assert row is not None
+            if doubt[i] > self.config.doubt:  # never true of a NaN
+                self.counters.doubted += 1
+                self._end(i, row, success=False, terminated=False)
+                continue
+            observation = self._observation(frames[i], robot[i], row.start.task)
+            self._step(i, row, decision, actions[i], float(said[i]), observation)
+            row.frames = frames[i]
+
+    def metrics(self) -> dict[str, float]:
+        """Counters, the model's version, and the shares of successes that `guard` compares."""
+        dreamt, real = self.switch.shares
+        return {k: float(v) for k, v in asdict(self.counters).items()} | {
+            "version": float(self.version),
+            "success": dreamt,
+            "success_real": real,
+            "off": float(self.switch.tripped),
+        }
+
+    def _step(
+        self,
+        i: int,
+        row: _Row,
+        decision: Decision,
+        actions: np.ndarray,
+        said: float,
+        observation: Observation,
+    ) -> None:
+        achieved = said > self._threshold
+        gained = said - row.potential if self.config.reward == "potential" else float(achieved)
+        row.builder.add(decision, actions, gained - self._cost, len(actions), observation)
+        row.potential, row.depth = said, row.depth + 1
+        self.counters.decisions += 1
+        late = row.depth >= row.ends_at
+        if achieved or late or row.depth >= self.config.horizon:
+            self._end(i, row, achieved, terminated=achieved or (late and self._fails), truncated=late)
+
+    def _end(self, i: int, row: _Row, success: bool, *, terminated: bool, truncated: bool = False) -> None:
+        self._rows[i] = None
+        self.counters.dreams += 1
+        self.counters.successes += success
+        self.switch.add(success, row.start.achieved)
+        if not row.builder.decisions:
+            return
+        self._sequence += 1
+        segment = row.builder.cut(
+            f"{self._name}.{self._sequence}", terminated, truncated and not terminated, success
+        )
+        segment.world_version = self.version
+        self._on_segment(segment)
+
+    def _begin(self, rows: list[int]) -> None:
+        """Fills the rows that are free."""
+        if not rows:
+            return
+        starts = self._starts.draw(len(rows), self._rng)
+        context = np.stack([s.frames for s in starts])
+        state = self._model.begin(
+            torch.from_numpy(context),
+            torch.from_numpy(np.stack([s.robot for s in starts])),
+            [s.task for s in starts],
+            [s.history for s in starts],
+        )
+        self._state = state if self._state is None else _replaced(self._state, rows, state)
+        newest = context[:, -1]
+        said = np.zeros(len(rows))
+        if self._success is not None and "success" not in self._model.spec.provides:
+            said = probabilities(self._success, newest, newest)
+        for i, start, frames, potential in zip(rows, starts, newest, said, strict=True):
+            observation = self._observation(frames, start.robot, start.task)
+            self._rows[i] = _Row(
+                builder=SegmentBuilder(observation, self.config.horizon, start.origin, IMAGINED),
+                start=start,
+                frames=frames,
+                potential=float(potential),
+                ends_at=max(1, self._limit - start.origin.decision),
+            )
+
+    def _said(self, dream: Dream, frames: np.ndarray) -> np.ndarray:
+        """P(success) of each row, (B,)."""
+        if dream.success is not None:
+            return dream.success.cpu().numpy()
+        assert self._success is not None
+        return probabilities(self._success, np.stack([r.frames for r in self._rows if r is not None]), frames)
+
+    @property
+    def _threshold(self) -> float:
+        if self._success is None or "success" in self._model.spec.provides:
+            return 0.5
+        return self._success.config.threshold
+
+    def _observation(self, frames: np.ndarray, robot: np.ndarray, task: str) -> Observation:
+        observation: Observation = {TASK: task}
+        for v, camera in enumerate(self._model.spec.cameras):
+            if camera in self._world.images:
+                size = self._world.images[camera][:2]
+                observation[camera] = resized(frames[v : v + 1], size)[0]
+        if self._world.state_dim:
+            observation["observation.state"] = robot
+        return observation
+
+
+def _replaced(state: State, rows: list[int], fresh: State) -> State:
+    """The state with some rows replaced; where a dimension grows with a dream, the shorter is padded."""
+    merged = {}
+    for key, old in state.items():
+        new = fresh[key].to(old.device)
+        sides = [max(a, b) for a, b in zip(old.shape[1:], new.shape[1:], strict=True)]
+        old, new = (_padded(x, sides) for x in (old, new))
+        merged[key] = old.clone()
+        merged[key][rows] = new
+    return merged
+
+
+def _padded(x: torch.Tensor, sides: list[int]) -> torch.Tensor:
+    """At the far end of each dimension but the first."""
+    missing = [n for want, have in zip(sides, x.shape[1:], strict=True) for n in (want - have, 0)]
+    return torch.nn.functional.pad(x, missing[::-1]) if any(missing) else x

@@ -1,0 +1,141 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Where dreams begin: real observations, drawn anywhere or where the critic was surprised.
+
+NumPy only, but for pictures of another size. Shapes: see `contract.py`; T decisions of a segment.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from accerl_lerobot.experience import Origin, Segment
+from accerl_lerobot.world_model.contract import History, WorldModelSpec
+from accerl_lerobot.world_model.frames import resized
+
+
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """A real observation, and what led there."""
+
+    frames: np.ndarray
+    """uint8 (L, V, H, W, 3), of the model's size, the newest last."""
+    robot: np.ndarray
+    """float32 (S,)."""
+    task: str
+    """The instruction."""
+    origin: Origin
+    history: History | None
+    """None: where the segment began in mid-episode, what came before is not known."""
+    achieved: bool | None
+    """Whether the real episode achieved the task within the horizon; None: it is not known."""
+
+
+class StartPool:
+    """The newest real decisions.
+
+    Args:
+        spec: of the world model.
+        memory: decisions held at least, as long as there were so many.
+        horizon: decisions of a dream.
+        keyframes: share of dreams that begin where |r + V(next) − V| was large.
+        whole: whether only starts are given whose history is known.
+    """
+
+    def __init__(
+        self, spec: WorldModelSpec, *, memory: int, horizon: int, keyframes: float, whole: bool = False
+    ) -> None:
+        self.spec, self.memory, self.horizon, self.keyframes = spec, memory, horizon, keyframes
+        self._whole = whole
+        self._held: deque[_Held] = deque()
+        self._count = 0
+
+    def __len__(self) -> int:
+        """Decisions to begin at."""
+        return self._count
+
+    def add(self, segment: Segment) -> None:
+        """Takes a real segment; the oldest ones leave."""
+        if self._whole and segment.origin.decision:
+            return
+        self._held.append(_Held(segment, self.spec))
+        self._count += len(segment)
+        while self._count - len(self._held[0].segment) >= self.memory:
+            self._count -= len(self._held.popleft().segment)
+
+    def draw(self, count: int, rng: np.random.Generator) -> list[Start]:
+        """So many starts, with repetition.
+
+        Raises:
+            ValueError: there are none yet.
+        """
+        if not self._count:
+            raise ValueError("no real experience to dream from yet")
+        lengths = np.array([len(h.segment) for h in self._held])
+        surprise = np.concatenate([h.surprise for h in self._held])
+        even = np.full(self._count, 1 / self._count)
+        key = surprise / surprise.sum() if surprise.sum() > 0 else even
+        chances = self.keyframes * key + (1 - self.keyframes) * even
+        drawn = rng.choice(self._count, size=count, p=chances / chances.sum())
+        ends = np.cumsum(lengths)
+        of = np.searchsorted(ends, drawn, side="right")
+        return [
+            self._start(self._held[s], int(i - ends[s] + lengths[s])) for s, i in zip(of, drawn, strict=True)
+        ]
+
+    def _start(self, held: _Held, t: int) -> Start:
+        segment, spec = held.segment, self.spec
+        context = [max(0, t - back) for back in range(spec.context - 1, -1, -1)]
+        history = None
+        if not segment.origin.decision:
+            made = [a[:n] for a, n in zip(segment.actions[:t], segment.steps[:t], strict=True)]
+            dims = segment.actions.shape[2]
+            actions = np.concatenate(made) if made else np.zeros((0, dims), np.float32)
+            history = History(segment.origin.task, segment.origin.seed, actions)
+        left = len(segment) - t
+        achieved: bool | None = None
+        if left >= self.horizon or segment.terminated or segment.truncated:
+            achieved = segment.terminated and segment.success and left <= self.horizon
+        return Start(
+            frames=held.frames[context],
+            robot=held.robot[t],
+            task=segment.task,
+            origin=segment.origin._replace(decision=segment.origin.decision + t),
+            history=history,
+            achieved=achieved,
+        )
+
+
+class _Held:
+    """A segment, as the model sees it."""
+
+    def __init__(self, segment: Segment, spec: WorldModelSpec) -> None:
+        self.segment = segment
+        self.frames, self.robot = seen(segment, spec)
+        following = np.append(segment.value[1:], 0.0 if segment.terminated else segment.value[-1])
+        self.surprise = np.abs(segment.reward + following - segment.value).astype(np.float64)
+
+
+def seen(segment: Segment, spec: WorldModelSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Frames uint8 (T + 1, V, H, W, 3) and states float32 (T + 1, S) of a segment, as a model knows them."""
+    pictures = [resized(segment.observations[camera], spec.image_size) for camera in spec.cameras]
+    robot = (
+        segment.observations["observation.state"]
+        if spec.state_dim
+        else np.zeros((len(segment) + 1, 0), np.float32)
+    )
+    return np.stack(pictures, 1), robot

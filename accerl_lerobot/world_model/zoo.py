@@ -1,0 +1,89 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The world models that ``imagination.model`` can name. A new one is a class and a line here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from accerl_lerobot.envs import EnvConfig, make_world
+from accerl_lerobot.envs.base import WorldSpec
+from accerl_lerobot.world_model.baselines import CopyModel, OracleModel, ShuffledModel
+from accerl_lerobot.world_model.contract import WorldModel, WorldModelSpec
+from accerl_lerobot.world_model.imagination_config import ImaginationConfig
+from accerl_lerobot.world_model.store import load_world_model
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+
+
+class Dreamer(NamedTuple):
+    """What dreams, and what tells successes, where that is another."""
+
+    model: WorldModel
+    success: SuccessPairsRewardModel | None
+
+
+def make_dreamer(config: ImaginationConfig, env: EnvConfig, world: WorldSpec, executed: int) -> Dreamer:
+    """The one that `config` names.
+
+    Args:
+        config: which, and from where.
+        env: the real world, for an oracle.
+        world: what that shows.
+        executed: actions that the policy executes per decision.
+
+    Raises:
+        InputError: it cannot be loaded.
+    """
+    return _MODELS[config.model](config, env, world, executed)
+
+
+def _learned(config: ImaginationConfig, env: EnvConfig, world: WorldSpec, executed: int) -> Dreamer:
+    assert config.path is not None  # ImaginationConfig has seen to that
+    model, success = load_world_model(Path(config.path), "imagination.path")
+    return Dreamer(model.eval(), success)
+
+
+def _copy(config: ImaginationConfig, env: EnvConfig, world: WorldSpec, executed: int) -> Dreamer:
+    model, success = _learned(config, env, world, executed)
+    return Dreamer(CopyModel(model.spec), success)
+
+
+def _shuffled(config: ImaginationConfig, env: EnvConfig, world: WorldSpec, executed: int) -> Dreamer:
+    model, success = _learned(config, env, world, executed)
+    return Dreamer(ShuffledModel(model), success)
+
+
+def _oracle(config: ImaginationConfig, env: EnvConfig, world: WorldSpec, executed: int) -> Dreamer:
+    height, width, _ = next(iter(world.images.values()))
+    spec = WorldModelSpec(
+        cameras=tuple(world.images),
+        image_size=(height, width),
+        state_dim=world.state_dim,
+        action_dim=world.action_dim,
+        chunk=executed,
+        fps=world.fps,
+        context=1,
+        provides=frozenset({"pixels", "state"} if world.state_dim else {"pixels"}),
+    )
+    return Dreamer(OracleModel(spec, lambda: make_world(env), config.dreams), None)
+
+
+_MODELS: dict[str, Callable[[ImaginationConfig, EnvConfig, WorldSpec, int], Dreamer]] = {
+    "learned": _learned,
+    "shuffled": _shuffled,
+    "copy": _copy,
+    "oracle": _oracle,
+}
