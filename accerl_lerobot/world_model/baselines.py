@@ -100,6 +100,7 @@ class OracleModel(WorldModel):
         self._make, self._most = make, simulators
         self._at: OrderedDict[bytes, World] = OrderedDict()  # the longest unused first
         self._free: list[World] = []
+        self._made = 0
         self._tasks: list[str] = []
 
     def begin(
@@ -181,7 +182,10 @@ class OracleModel(WorldModel):
     def _somewhere(self) -> World:
         if self._free:
             return self._free.pop()
-        return self._make() if len(self._at) < self._most else self._at.popitem(last=False)[1]
+        if self._made < self._most or not self._at:
+            self._made += 1
+            return self._make()
+        return self._at.popitem(last=False)[1]
 
 
 def _name(task: str, seed: int, played: np.ndarray) -> bytes:

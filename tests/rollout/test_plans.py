@@ -107,3 +107,14 @@ def test_tasks_that_fail_are_explored_more(group_size):
     starts = take(plans, 4000)[:: group_size or 1]
     share = sum(p.task == "lift" for p in starts) / len(starts)
     assert share == pytest.approx(51 / 53, abs=0.02)
+
+
+@pytest.mark.parametrize("group_size", [0, 2])
+def test_no_more_episodes_than_were_paid_for(group_size: int):
+    config = RolloutConfig(group_size=group_size, episodes=4)
+    plans = EpisodePlans(config, TASKS, seed=3, worlds=8, budget=4)
+    assert not plans.spent and len(take(plans, 9)) == 4 and plans.spent
+    plans.queue([evaluate(index=0)])
+    assert plans.next(exploring=True) == evaluate(index=0), "evaluations are not counted"
+    endless = EpisodePlans(config, TASKS, seed=3, worlds=8)
+    assert len(take(endless, 9)) >= 8 and not endless.spent

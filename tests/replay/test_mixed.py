@@ -1,0 +1,108 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from accerl_lerobot.experience import IMAGINED, REAL, Segment
+from accerl_lerobot.replay import MixedReplay, ReplayConfig
+from tests.replay.segments import make_segment
+
+
+def mixed(share: float = 0.5, **imagined: Any) -> MixedReplay:
+    real = ReplayConfig(capacity=100, min_decisions=8, samples_per_insert=2.0, ahead=16, max_lag=5)
+    config = {"capacity": 100, "min_decisions": 1, "samples_per_insert": 1.0, "ahead": 16, "max_lag": 5}
+    return MixedReplay(real, ReplayConfig(**(config | imagined)), share)
+
+
+def fill(replay: MixedReplay, source: str, count: int, version: int = 0) -> None:
+    for i in range(count):
+        assert replay.insert(make_segment(f"{source}{i}", 4, version, source=source))
+
+
+def drawn(replay: MixedReplay, count: int, version: int = 0) -> dict[str, int]:
+    segments = replay.sample(count, version, np.random.default_rng(0))
+    return {s: sum(len(x) for x in segments if x.source == s) for s in (REAL, IMAGINED)}
+
+
+def test_a_batch_is_of_both_and_waits_for_both():
+    replay = mixed()
+    fill(replay, REAL, 4)
+    assert not replay.may_sample(16) and drawn(replay, 16) == {REAL: 0, IMAGINED: 0}
+    assert replay.real.counters.trained_decisions == 0, "nothing is used up by waiting"
+    fill(replay, IMAGINED, 1)
+    assert not replay.may_sample(16)
+    replay.insert(make_segment("more", 4, source=IMAGINED))
+    assert replay.may_sample(16) and drawn(replay, 16) == {REAL: 8, IMAGINED: 8}
+
+
+def test_either_door_has_its_own_pace():
+    replay = mixed()
+    fill(replay, REAL, 4)
+    assert not replay.may_insert(REAL) and replay.may_insert(IMAGINED)
+    fill(replay, IMAGINED, 4)
+    assert not replay.may_insert(IMAGINED)
+    assert replay.metrics()["imagined_stored_decisions"] == replay.metrics()["stored_decisions"] == 16
+
+
+def test_without_a_share_it_is_a_replay_of_what_is_real():
+    replay = mixed(share=0.0)
+    fill(replay, REAL, 4)
+    fill(replay, IMAGINED, 4)
+    assert drawn(replay, 16) == {REAL: 16, IMAGINED: 0}
+
+
+def test_once_all_real_episodes_are_in_they_are_used_up_and_dreams_go_on():
+    replay = mixed()
+    fill(replay, REAL, 1)
+    fill(replay, IMAGINED, 4)
+    assert not replay.may_sample(8), "fewer than the warm start asks for"
+    replay.end_real()
+    assert drawn(replay, 8) == {REAL: 4, IMAGINED: 4}
+    assert drawn(replay, 8) == {REAL: 4, IMAGINED: 4}, "twice, as samples_per_insert says"
+    assert drawn(replay, 8) == {REAL: 0, IMAGINED: 8}
+    assert not replay.may_sample(8) and not replay.exhausted(8), "dreams will come"
+
+
+def test_it_is_exhausted_when_nothing_will_come():
+    replay = mixed(share=0.0)
+    fill(replay, REAL, 3)
+    assert not replay.exhausted(12)
+    replay.end_real()
+    for _ in range(2):
+        assert not replay.exhausted(12) and drawn(replay, 12) == {REAL: 12, IMAGINED: 0}
+    assert replay.exhausted(12) and drawn(replay, 12) == {REAL: 0, IMAGINED: 0}
+    dreaming = mixed()
+    dreaming.end_real()
+    assert not dreaming.exhausted(8)
+    dreaming.share = 0.0  # the kill switch
+    assert dreaming.exhausted(8)
+
+
+def test_what_is_too_old_for_one_part_costs_the_other_nothing():
+    replay = mixed()
+    fill(replay, REAL, 4, version=10)
+    fill(replay, IMAGINED, 4, version=0)
+    assert replay.may_sample(16) and drawn(replay, 16, version=10) == {REAL: 0, IMAGINED: 0}
+    assert replay.real.counters.trained_decisions == 0 and replay.imagined.counters.retired_segments == 4
+
+
+def test_a_segment_goes_where_it_belongs():
+    replay = mixed()
+    segment: Segment = make_segment("a", 4, source=IMAGINED)
+    assert replay.insert(segment) and not replay.insert(segment)
+    assert replay.imagined.stored_decisions == 4 and replay.real.stored_decisions == 0

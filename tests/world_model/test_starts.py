@@ -1,0 +1,112 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.world_model.starts import StartPool, seen
+from tests.world_model.lived import SPEC, K, lived
+
+
+def pool(**options: object) -> StartPool:
+    defaults = {"memory": 1000, "horizon": 2, "keyframes": 0.0}
+    return StartPool(SPEC, **(defaults | options))  # type: ignore[arg-type]
+
+
+def test_a_start_is_a_real_observation_with_what_led_there():
+    [segment] = lived(3)
+    held = pool()
+    held.add(segment)
+    frames, robot = seen(segment, SPEC)
+    assert len(segment) == len(held) == 4
+    for start in held.draw(50, np.random.default_rng(0)):
+        t = start.origin.decision
+        assert start.origin[:2] == ("match", 3) and start.task == segment.task
+        assert np.array_equal(start.frames, frames[[max(0, t - 1), t]])
+        assert np.array_equal(start.robot, robot[t])
+        assert start.history is not None and start.history[:2] == ("match", 3)
+        assert np.array_equal(start.history.actions, segment.actions[:t].reshape(-1, 2))
+
+
+def test_whether_the_task_was_achieved_in_as_many_decisions():
+    [success] = lived(1, solve_at=2)
+    assert success.terminated and success.success and len(success) == 4
+    held = pool()
+    held.add(success)
+    found = {s.origin.decision: s.achieved for s in held.draw(100, np.random.default_rng(0))}
+    assert found == {0: False, 1: False, 2: True, 3: True}
+    [failure] = lived(1)
+    held = pool()
+    held.add(failure)
+    assert {s.achieved for s in held.draw(50, np.random.default_rng(0))} == {False}
+
+
+def test_where_a_segment_was_cut_the_outcome_or_the_history_is_not_known():
+    first, second = lived(5, length=3)
+    assert len(first) == 3 and len(second) == 1
+    held = pool()
+    held.add(first)
+    found = {s.origin.decision: s.achieved for s in held.draw(100, np.random.default_rng(0))}
+    assert found == {0: False, 1: False, 2: None}
+    held.add(second)
+    starts = {s.origin.decision: s for s in held.draw(200, np.random.default_rng(0))}
+    assert starts[3].history is None and starts[3].achieved is False
+    whole = pool(whole=True)
+    for segment in (first, second):
+        whole.add(segment)
+    assert len(whole) == 3
+
+
+def test_keyframes_are_where_the_critic_was_surprised():
+    [segment] = lived(3)
+    # V says 0, 0, 1, 1: it is surprised at the second decision, and at the end, after which comes nothing.
+    segment = replace(
+        segment, value=np.array([0, 0, 1, 1], np.float32), reward=np.zeros(4, np.float32), terminated=True,
+        truncated=False,
+    )  # fmt: skip
+    held = pool(keyframes=1.0)
+    held.add(segment)
+    counts = Counter(s.origin.decision for s in held.draw(1000, np.random.default_rng(0)))
+    assert set(counts) == {1, 3} and abs(counts[1] - 500) < 80
+    even = pool(keyframes=0.5)
+    even.add(segment)
+    counts = Counter(s.origin.decision for s in even.draw(4000, np.random.default_rng(0)))
+    assert counts[0] == pytest.approx(500, abs=90) and counts[1] == pytest.approx(1500, abs=140)
+    still = pool(keyframes=1.0)
+    still.add(replace(segment, value=np.zeros(4, np.float32)))
+    assert len({s.origin.decision for s in still.draw(100, np.random.default_rng(0))}) == 4
+
+
+def test_the_newest_are_kept():
+    held = pool(memory=9)
+    for seed in range(6):
+        held.add(lived(seed)[0])
+    assert 9 <= len(held) < 13
+    assert {s.origin.seed for s in held.draw(300, np.random.default_rng(0))} == {3, 4, 5}
+    with pytest.raises(ValueError, match="no real experience"):
+        pool().draw(1, np.random.default_rng(0))
+
+
+def test_pictures_have_the_model_s_size():
+    [segment] = lived(3)
+    frames, robot = seen(segment, replace(SPEC, image_size=(8, 8), state_dim=0))
+    assert frames.shape == (5, 1, 8, 8, 3) and frames.dtype == np.uint8 and robot.shape == (5, 0)
+    full, _ = seen(segment, SPEC)
+    assert abs(frames.astype(float).mean() - full.mean()) < 2
+    assert full.shape == (5, 1, 16, 16, 3) and K == 4
