@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from accerl_lerobot.algorithms import AlgorithmConfig, GIPOConfig
+from accerl_lerobot.dataset_config import DatasetConfig
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
@@ -38,24 +39,6 @@ from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 
 __all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "check_chunk", "decode", "encode", "parse"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class DatasetConfig:
-    """A LeRobotDataset, on the Hub or in a folder."""
-
-    repo_id: str | None = None
-    """Hub id, or a label for `root`. None: the run records its own demonstrations."""
-    root: str | None = None
-    """Local folder; None uses the Hub and its cache."""
-    revision: str | None = None
-    """Hub revision."""
-
-    def __post_init__(self) -> None:
-        if self.root is not None and self.repo_id is None:
-            raise InputError(
-                "dataset.repo_id", None, "name the dataset in dataset.root; any owner/name will do"
-            )
 
 
 @dataclass(frozen=True, kw_only=True)

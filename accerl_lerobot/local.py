@@ -68,11 +68,13 @@ class LocalEngine(Engine):
             self._acting.load_trainable(self._adapter.export_trainable())
         imagination = config.imagination
         self._replay = MixedReplay(config.replay, imagination.replay, imagination.share)
-        self._dreams = None
+        self._dreams = self._world_learner = None
         if imagination.share:
-            from accerl_lerobot.world_model.dreaming import make_imagination
+            from accerl_lerobot.world_model.dreaming import make_imagination, make_learner
 
             self._dreams = make_imagination(config, "dream", self._replay.insert)
+            if imagination.learns:
+                self._world_learner = make_learner(config, self._dreams)
         self._rng = np.random.default_rng(config.seed)
         self._outstanding: set[tuple[str, int]] = set()
         self._episodes: list[EpisodeResult] = []
@@ -111,6 +113,7 @@ class LocalEngine(Engine):
         self._store()
         self._act()
         self._store()
+        self._learn_world()
         self._dream()
         updates = []
         n = self._config.trainer.batch_decisions
@@ -129,7 +132,7 @@ class LocalEngine(Engine):
             episodes=episodes,
             rollout={k: float(v) for k, v in asdict(self._runner.counters).items()},
             replay=self._replay.metrics(),
-            imagination={} if self._dreams is None else self._dreams.metrics(),
+            imagination=self._imagined(),
             inference={"version": float(self._acting_version)},
         )
 
@@ -177,11 +180,25 @@ class LocalEngine(Engine):
 
     def _dream(self) -> None:
         """One decision in every dream, if any is wanted."""
-        if self._dreams is None or not self._exploring:
+        if self._dreams is None or not self._training:
             return
-        self._replay.share = 0.0 if self._dreams.switch.tripped else self._config.imagination.share
+        learner, on = self._world_learner, self._dreams.on
+        awaited = learner is not None and learner.promising(self._replay.real_ended)
+        self._replay.mix(self._config.imagination.share if on else 0.0, on or awaited)
+        if not self._exploring:
+            return
         if self._replay.may_insert(IMAGINED) and (requests := self._dreams.requests()):
             self._dreams.advance(self._acting.decide(requests, self._acting_version))
+
+    def _learn_world(self) -> None:
+        """One gradient step of the world model, or its trial, if either is due."""
+        learner, last = self._world_learner, self._replay.real_ended
+        if learner is None or self._dreams is None or not self._training:
+            return
+        if learner.owed >= 1:
+            learner.step()
+        elif learner.due(last) and (promotion := learner.promote(last)):
+            self._dreams.swap(promotion.model, promotion.success, promotion.version)
 
     def _publish(self) -> None:
         """Hands weights to the policy that acts, which is the trainer's own unless they are held back."""
@@ -201,8 +218,14 @@ class LocalEngine(Engine):
             self._replay.insert(segment)
             if self._dreams is not None:
                 self._dreams.remember(segment)
+            if self._world_learner is not None:
+                self._world_learner.add(segment)
         if self._plans.spent and not self._outbox and not self._runner.exploring:
             self._replay.end_real()
+
+    def _imagined(self) -> dict[str, float]:
+        learner = {} if self._world_learner is None else self._world_learner.metrics()
+        return {} if self._dreams is None else self._dreams.metrics() | learner
 
     def _ended(self, result: EpisodeResult) -> None:
         self._plans.report(result)

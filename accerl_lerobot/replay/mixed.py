@@ -18,7 +18,7 @@ give. Two things end that:
 
 * the real episodes that were paid for have all been collected (`end_real`): from then on a batch takes what
   draws they have left, and imagined ones for the rest;
-* nothing is imagined any more (`share` is 0): a batch is real.
+* nothing is imagined, yet or any more (`share` is 0): a batch is real.
 
 When neither can give, and neither ever will, the replay is *exhausted*.
 """
@@ -38,12 +38,14 @@ class MixedReplay:
     Args:
         real: size and pace of real experience.
         imagined: of imagined experience.
-        share: of a batch's decisions, in [0, 1), that are imagined; may be set to 0 and back at any time.
+        share: of a batch's decisions, in [0, 1), that are imagined.
     """
 
     def __init__(self, real: ReplayConfig, imagined: ReplayConfig, share: float) -> None:
         self.real, self.imagined, self.share = Replay(real), Replay(imagined), share
         self.real_ended = False
+        self.awaited = share > 0
+        """Whether anything may be imagined later on, although nothing is now."""
 
     def may_insert(self, source: str = REAL) -> bool:
         """Whether another segment of this source should be brought now."""
@@ -63,7 +65,12 @@ class MixedReplay:
 
     def exhausted(self, batch_decisions: int) -> bool:
         """Whether there is no batch and never will be."""
-        return self.real_ended and not self.share and not self.may_sample(batch_decisions)
+        hopeless = self.real_ended and not self.share and not self.awaited
+        return hopeless and not self.may_sample(batch_decisions)
+
+    def mix(self, share: float, awaited: bool) -> None:
+        """From now on, so much of a batch is imagined; `awaited`: or may be later on."""
+        self.share, self.awaited = share, awaited
 
     def sample(self, num_decisions: int, trainer_version: int, rng: np.random.Generator) -> list[Segment]:
         """See `Replay.sample`: empty, with nothing counted as used, if a part cannot be had."""

@@ -176,7 +176,7 @@ class TrialConfig:
     depth: int = 6
     """Chunks dreamt, the horizon it is judged for."""
     every: int = 10
-    """A trial begins every so many frames of an episode."""
+    """A trial begins every so many env steps of an episode."""
     most: int = 400
     """Trials at most, drawn at random."""
     skill_first: float = 0.3

@@ -15,6 +15,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,21 +29,27 @@ from accerl_lerobot.world_model.episodes import Episode
 from accerl_lerobot.world_model.frames import resized
 
 if TYPE_CHECKING:
-    from accerl_lerobot.config import DatasetConfig
+    from accerl_lerobot.dataset_config import DatasetConfig
 
 SUCCESS = "next.success"
 
 
 def load_episodes(
-    dataset: DatasetConfig, spec: WorldModelSpec, source: str = "demo", *, both: bool = True
+    dataset: DatasetConfig,
+    spec: WorldModelSpec,
+    source: str = "demo",
+    *,
+    both: bool = True,
+    only: Sequence[int] | None = None,
 ) -> list[Episode]:
-    """Reads all of it into memory, one uint8 image per env step and camera.
+    """Reads it into memory, one uint8 image per env step and camera.
 
     Args:
         dataset: on the Hub, or in a folder.
         spec: the cameras, sizes and dims that are wanted; images are shrunk or enlarged to its size.
         source: see `Episode.source`.
         both: whether there must be successes and failures.
+        only: indices of the episodes that are wanted; None: all.
 
     Raises:
         InputError: a camera, the success labels or the rate are not the world's; state or actions are another
@@ -50,14 +59,22 @@ def load_episodes(
     check_metadata(meta, dataset.repo_id or "", spec)
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+    wanted = range(meta.total_episodes) if only is None else only
     data = LeRobotDataset(meta.repo_id, root=meta.root, revision=meta.revision)
-    episodes = [_episode(data, meta, index, spec, source) for index in range(meta.total_episodes)]
+    episodes = [_episode(data, meta, index, spec, source) for index in wanted]
     remedies = {True: "add episodes that succeed", False: "add failures, see demos.failure_share"}
     for outcome, remedy in remedies.items() if both else ():
         if not any(e.success is outcome for e in episodes):
             why = f"no {'success' if outcome else 'failure'} among {len(episodes)} episodes; {remedy}"
             raise InputError("dataset.repo_id", dataset.repo_id, why)
     return episodes
+
+
+def fingerprint(meta: Any) -> str:
+    """What tells a dataset from others, whatever it is called: its sizes and statistics of its actions."""
+    moments = [np.asarray(meta.stats["action"][k], np.float64).round(6).tolist() for k in ("mean", "std")]
+    said = json.dumps([meta.total_episodes, meta.total_frames, meta.fps, moments])
+    return hashlib.sha256(said.encode()).hexdigest()
 
 
 def check_metadata(meta: Any, name: str, spec: WorldModelSpec) -> None:

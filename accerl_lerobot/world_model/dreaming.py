@@ -16,14 +16,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.loading import load_lerobot_config
+from accerl_lerobot.world_model.baselines import ShuffledModel
+from accerl_lerobot.world_model.dataset import fingerprint, load_episodes
+from accerl_lerobot.world_model.episodes import Episode
 from accerl_lerobot.world_model.imagine import Imagination, check_fit
+from accerl_lerobot.world_model.online import OnlineLearner
+from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.store import load_source
 from accerl_lerobot.world_model.zoo import Dreamer, make_dreamer
 
 if TYPE_CHECKING:
@@ -57,6 +66,37 @@ def make_imagination(config: RunConfig, name: str, on_segment: Callable[[Segment
     )
 
 
+def make_learner(config: RunConfig, dreams: Imagination) -> OnlineLearner:
+    """What a run's world model goes on learning with; `dreams` are of the model it begins with.
+
+    Raises:
+        InputError: the dataset it was pre-trained on cannot be read, or is of another world.
+    """
+    learn = config.imagination.learn
+    model, success = dreams.dreamer
+    if isinstance(model, ShuffledModel):
+        model = model.model
+    assert isinstance(model, PixelWorldModel) and success is not None  # as `check_imagination` has found
+    offline: list[Episode] = []
+    held_out: list[Episode] = []
+    if learn.dataset.repo_id is not None:
+        episodes = load_episodes(learn.dataset, model.spec)
+        source = load_source(Path(str(config.imagination.path)))
+        if source is not None and source.fingerprint == fingerprint(open_metadata(learn.dataset)):
+            offline, held_out = ([episodes[i] for i in part] for part in (source.learnt, source.held_out))
+        else:
+            offline = episodes
+    return OnlineLearner(
+        model,
+        success,
+        learn,
+        replace(learn.trial, depth=config.imagination.horizon),
+        offline=offline,
+        held_out=held_out,
+        seed=config.seed,
+    )
+
+
 def check_imagination(config: RunConfig) -> None:
     """Refuses, before a run begins, what `make_imagination` would refuse in the middle of it.
 
@@ -87,5 +127,8 @@ def _dreamer(config: RunConfig, spec: WorldSpec, executed: int, history: int) ->
         remedy = "use true with imagination.share: a success ends a dream, and so it must a real episode"
         raise InputError("env.terminate_on_success", False, remedy)
     dreamer = make_dreamer(config.imagination, config.env, spec, executed)
+    if config.imagination.learns and dreamer.success is None:
+        remedy = "it has no success model to go on learning with; use imagination.learn.steps_per_episode=0"
+        raise InputError("imagination.path", config.imagination.path, remedy)
     check_fit(dreamer.model.spec, spec, executed, history, dreamer.success is not None)
     return dreamer

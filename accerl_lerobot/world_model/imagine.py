@@ -34,6 +34,7 @@ from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, TASK, Decision, Observation, Request, Segment
 from accerl_lerobot.rollout.segments import SegmentBuilder
+from accerl_lerobot.world_model.baselines import ShuffledModel
 from accerl_lerobot.world_model.contract import Dream, State, WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.frames import resized
 from accerl_lerobot.world_model.guard import KillSwitch
@@ -142,6 +143,8 @@ class Imagination:
         self.config, self.counters = config, Counters()
         self.switch = KillSwitch(config.gap, config.window)
         self.version = 0
+        self.waits = config.learns
+        """Whether no model has passed its trial yet."""
         self._model, self._success, self._world = model, success, world
         self._cost, self._fails, self._name = decision_cost, fails, name
         self._on_segment = on_segment
@@ -158,18 +161,33 @@ class Imagination:
         self._sequence = 0
         self._limit = math.ceil(world.max_steps / model.spec.chunk)
 
+    @property
+    def dreamer(self) -> tuple[WorldModel, SuccessPairsRewardModel | None]:
+        """What dreams now, and what tells successes."""
+        return self._model, self._success
+
     def remember(self, segment: Segment) -> None:
         """Dreams may begin in a real segment from now on."""
         self._starts.add(segment)
 
     def swap(self, model: WorldModel, success: SuccessPairsRewardModel | None, version: int) -> None:
-        """Another world model of the same world dreams from now on; dreams under way go on in it."""
-        self._model, self._success, self.version = model, success, version
+        """Another world model of the same world dreams from now on; dreams under way go on in it.
+
+        A placebo goes on telling it the wrong actions.
+        """
+        wrapped = isinstance(self._model, ShuffledModel)
+        self._model = ShuffledModel(model) if wrapped else model
+        self._success, self.version, self.waits = success, version, False
         self.switch.reset()
+
+    @property
+    def on(self) -> bool:
+        """Whether anything is to be imagined now."""
+        return not self.waits and not self.switch.tripped
 
     def requests(self) -> list[Request]:
         """What is to be decided, one for each dream; none before anything real was seen, or switched off."""
-        if not len(self._starts) or self.switch.tripped:
+        if not len(self._starts) or not self.on:
             return []
         self._begin([i for i, row in enumerate(self._rows) if row is None])
         return [
@@ -207,7 +225,7 @@ class Imagination:
             "version": float(self.version),
             "success": dreamt,
             "success_real": real,
-            "off": float(self.switch.tripped),
+            "on": float(self.on),
         }
 
     def _step(

@@ -61,11 +61,15 @@ class Learner:
     def draw(self, episodes: Sequence[Episode], at: Sequence[Place], count: int | None = None) -> Windows:
         """Windows at random places, all equally likely."""
         chosen = self.rng.integers(len(at), size=count or self.config.batch)
-        back = self.rng.integers(self.config.anchors + 1, size=len(chosen))
+        return self.windows(episodes, [at[i] for i in chosen])
+
+    def windows(self, episodes: Sequence[Episode], at: Sequence[Place]) -> Windows:
+        """Windows at these places, with anchors as far back as dreams will go."""
+        back = self.rng.integers(self.config.anchors + 1, size=len(at))
         spec = self.model.spec
         windows = cut(
             episodes,
-            [at[i] for i in chosen],
+            at,
             chunk=spec.chunk,
             context=spec.context,
             chunks=self.config.chunks,

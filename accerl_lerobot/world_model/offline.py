@@ -35,20 +35,27 @@ from rich.table import Table
 
 from accerl_lerobot.config import DatasetConfig
 from accerl_lerobot.console import Console
+from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.pictures import write_video
 from accerl_lerobot.world_model.config import TrialConfig, WorldModelConfig
 from accerl_lerobot.world_model.contract import WorldModel, WorldModelSpec
-from accerl_lerobot.world_model.dataset import load_episodes
+from accerl_lerobot.world_model.dataset import fingerprint, load_episodes
 from accerl_lerobot.world_model.episodes import Episode, split
-from accerl_lerobot.world_model.judge import threshold
 from accerl_lerobot.world_model.learn import pretrain
 from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.store import load_world_model, save_world_model
-from accerl_lerobot.world_model.success import Examples, SuccessLearner, new_success_model, probabilities
+from accerl_lerobot.world_model.store import Source, load_source, load_world_model, save_world_model
+from accerl_lerobot.world_model.success import Examples, SuccessLearner, new_success_model
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
-from accerl_lerobot.world_model.trial import NEVER, dream, trial_windows, try_out, wrong_actions
+from accerl_lerobot.world_model.trial import (
+    NEVER,
+    dream,
+    set_threshold,
+    trial_windows,
+    try_out,
+    wrong_actions,
+)
 
 EVERY = 20
 """Steps between two lines of metrics."""
@@ -96,7 +103,8 @@ def learn_from_dataset(
     spec = world_spec(config, env)
     with console.stage("episodes"):
         episodes = load_episodes(dataset, spec)
-    learn, held = ([episodes[i] for i in part] for part in split(episodes, config.held_out, _rng(seed)))
+    learnt, held_out = split(episodes, config.held_out, _rng(seed))
+    learn, held = ([episodes[i] for i in part] for part in (learnt, held_out))
     _check_held_out(dataset, learn, held, config)
     torch.manual_seed(seed)
     model = PixelWorldModel(spec, config.model)
@@ -124,9 +132,15 @@ def learn_from_dataset(
                 stage.update(step, f"loss {metrics['loss']:.3f}")
                 record("success_model", step, metrics)
         success.eval()
-        _set_threshold(serving, success, learn, config, seed)
+        set_threshold(serving, success, [e for e in learn if not e.success], config.trial, seed)
     seconds = time.monotonic() - started
-    save_world_model(directory / "world_model", serving, success)
+    source = Source(
+        repo_id=dataset.repo_id or "",
+        fingerprint=fingerprint(open_metadata(dataset)),
+        learnt=tuple(learnt),
+        held_out=tuple(held_out),
+    )
+    save_world_model(directory / "world_model", serving, success, source)
     amounts = {"seconds": seconds, "learnt": _amount(learn), "held_out": _amount(held)}
     return _trial(serving, success, held, config.trial, directory, seed, console, amounts)
 
@@ -134,17 +148,24 @@ def learn_from_dataset(
 def try_on_dataset(
     path: Path, dataset: DatasetConfig, trial: TrialConfig, directory: Path, seed: int, console: Console
 ) -> dict[str, Any]:
-    """Tries a saved world model on a whole dataset, which should be one it has not learnt from.
+    """Tries a saved world model on a dataset; of the one it has learnt from, on what was held out.
 
     Returns:
         What `try_out` found; also in ``trial.json``, beside ``preview.mp4``.
 
     Raises:
-        InputError: no world model there, or a dataset of another world.
+        InputError: no world model there, a dataset of another world, or nothing of it was held out.
     """
     model, success = load_world_model(path)
+    source, only = load_source(path), None
+    if source is not None and source.fingerprint == fingerprint(open_metadata(dataset)):
+        only = source.held_out
+        if not only:
+            remedy = "the world model has learnt from every episode of it; give another dataset"
+            raise InputError("dataset.repo_id", dataset.repo_id, remedy)
+        console.say(f"it has learnt from this dataset: tried on the {len(only)} episodes that were held out")
     with console.stage("episodes"):
-        episodes = load_episodes(dataset, model.spec, both=success is not None)
+        episodes = load_episodes(dataset, model.spec, both=success is not None, only=only)
     amounts = {"tried": _amount(episodes)}
     return _trial(model, success, episodes, trial, directory, seed, console, amounts)
 
@@ -225,26 +246,6 @@ def _calibrate(
     usual = float(np.quantile(doubts, 0.95)) if len(doubts) else math.nan
     if math.isfinite(usual):  # a model without a state has no doubts
         model.doubt.mul_(max(usual, 1e-6))
-
-
-def _set_threshold(
-    model: PixelWorldModel,
-    success: SuccessPairsRewardModel,
-    episodes: Sequence[Episode],
-    config: WorldModelConfig,
-    seed: int,
-) -> None:
-    """Sets it by what is dreamt of failures that were learnt from, at every depth."""
-    windows = trial_windows([e for e in episodes if not e.success], model, config.trial, seed + 2)
-    dreams = dream(model, windows, windows.actions).frames
-    before = np.concatenate([windows.frames[:, None, model.spec.context - 1], dreams[:, :-1]], 1)
-    said = [
-        probabilities(success, before[:, d], dreams[:, d])[windows.valid[:, d]]
-        for d in range(dreams.shape[1])
-    ]
-    scores = np.concatenate(said)
-    least = threshold(scores, np.zeros(len(scores), bool), config.trial.false_positives)
-    success.config.threshold = float(np.clip(least, 0.5, 1 - 1e-6))
 
 
 def _check_held_out(

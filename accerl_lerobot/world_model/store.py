@@ -14,7 +14,7 @@
 """A world model on disk: configs as JSON, weights as safetensors, the success model in LeRobot's format.
 
 world_model/
-  config.json          what world it is of, and how it dreams
+  config.json          what world it is of, how it dreams, and which episodes it has learnt from
   model.safetensors    weights and statistics
   success_model/       a LeRobot reward model
 """
@@ -22,7 +22,7 @@ world_model/
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import draccus
@@ -39,17 +39,56 @@ UNREADABLE = (OSError, KeyError, TypeError, ValueError, RuntimeError, Safetensor
 CONFIG, WEIGHTS, SUCCESS = "config.json", "model.safetensors", "success_model"
 
 
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """Which episodes of which dataset a world model knows."""
+
+    repo_id: str
+    fingerprint: str
+    """Of the dataset, whatever it is called, see `dataset.fingerprint`."""
+    learnt: tuple[int, ...]
+    """Indices of episodes that it has learnt from,"""
+    held_out: tuple[int, ...]
+    """and of those that it was only tried on."""
+
+
 def save_world_model(
-    directory: Path, model: PixelWorldModel, success: SuccessPairsRewardModel | None = None
+    directory: Path,
+    model: PixelWorldModel,
+    success: SuccessPairsRewardModel | None = None,
+    source: Source | None = None,
 ) -> None:
-    """Writes both into a folder that does not exist."""
+    """Writes all of it into a folder that does not exist."""
     directory.mkdir(parents=True)
     spec = asdict(model.spec) | {"provides": sorted(model.spec.provides)}
     content = {"spec": spec, "model": draccus.encode(model.config)}
+    content |= {} if source is None else {"source": asdict(source)}
     (directory / CONFIG).write_text(json.dumps(content, indent=2) + "\n")
     save_file({k: v.contiguous() for k, v in model.state_dict().items()}, directory / WEIGHTS)
     if success is not None:
         success.save_pretrained(directory / SUCCESS)
+
+
+def load_source(directory: Path) -> Source | None:
+    """What a saved world model has learnt from; None if it does not say.
+
+    Raises:
+        InputError: it says something else.
+    """
+    try:
+        content = json.loads((directory / CONFIG).read_text()).get("source")
+        if content is None:
+            return None
+        return Source(
+            repo_id=str(content["repo_id"]),
+            fingerprint=str(content["fingerprint"]),
+            learnt=tuple(map(int, content["learnt"])),
+            held_out=tuple(map(int, content["held_out"])),
+        )
+    except UNREADABLE as error:
+        raise InputError(
+            "path", str(directory), f"its {CONFIG} does not say what it learnt ({error})"
+        ) from error
 
 
 def load_world_model(

@@ -51,20 +51,27 @@ NEVER = ("true", "zero")
 
 
 def trial_windows(episodes: Sequence[Episode], model: WorldModel, config: TrialConfig, seed: int) -> Windows:
-    """Every so many frames of each episode, at most so many; chunks beyond an episode's end are not valid.
+    """Every so many env steps of each episode, at most so many; chunks beyond an episode's end are not valid.
 
     Their actions are whole chunks all the same, see `held`.
     """
     at = [
-        Place(e, f)
-        for e, episode in enumerate(episodes)
-        for f in range(0, len(episode.frames) - 1, config.every)
+        Place(e, f) for e, episode in enumerate(episodes) for f in _spaced(episode.times[:-1], config.every)
     ]
     rng = np.random.default_rng(seed)
     if len(at) > config.most:
         at = [at[i] for i in sorted(rng.choice(len(at), config.most, replace=False))]
     windows = cut(episodes, at, chunk=model.spec.chunk, context=model.spec.context, chunks=config.depth)
     return replace(windows, actions=held(windows.actions, windows.steps))
+
+
+def _spaced(times: np.ndarray, every: int) -> list[int]:
+    """Frames, each at least so many env steps after the one before."""
+    chosen: list[int] = []
+    for frame, time in enumerate(times):
+        if not chosen or time >= times[chosen[-1]] + every:
+            chosen.append(frame)
+    return chosen
 
 
 class Dreams(NamedTuple):
@@ -113,6 +120,26 @@ def wrong_actions(
     return {"true": actions, "zero": np.zeros_like(actions), "opposite": -actions}[arm]
 
 
+def set_threshold(
+    model: WorldModel,
+    success: SuccessPairsRewardModel,
+    failures: Sequence[Episode],
+    config: TrialConfig,
+    seed: int,
+) -> None:
+    """Sets what counts as a success by what is dreamt of failures that were learnt from, at every depth."""
+    windows = trial_windows(failures, model, config, seed + 2)
+    dreams = dream(model, windows, windows.actions).frames
+    before = np.concatenate([windows.frames[:, None, model.spec.context - 1], dreams[:, :-1]], 1)
+    said = [
+        probabilities(success, before[:, d], dreams[:, d])[windows.valid[:, d]]
+        for d in range(dreams.shape[1])
+    ]
+    scores = np.concatenate(said)
+    least = judge.threshold(scores, np.zeros(len(scores), bool), config.false_positives)
+    success.config.threshold = float(np.clip(least, 0.5, 1 - 1e-6))
+
+
 def try_out(
     model: WorldModel,
     episodes: Sequence[Episode],
@@ -131,6 +158,9 @@ def try_out(
     windows = trial_windows(episodes, model, config, seed)
     rng = np.random.default_rng((seed, 1))
     failed = np.array([not episodes[e].success for e in windows.episode])
+    # Where there are episodes of the policy, it is their failures that must not be taken for successes.
+    online = np.array([episodes[e].source == "online" for e in windows.episode])
+    theirs = failed & online if (failed & online).any() else failed
     ends = held(windows.actions, cut_alike(windows.steps, windows.success, rng))
     arms = {
         arm: dream(model, windows, wrong_actions(windows, arm, rng, failed), ends if arm == "true" else None)
@@ -154,7 +184,7 @@ def try_out(
                 row["state_error_copy"] = float(np.abs(windows.state[fits, 0] - there).mean())
             row["uncertainty"] = float(arms["true"].uncertainty[fits, d].mean())
         if success is not None:
-            row |= _judged(success, arms, windows, failed, newest, d)
+            row |= _judged(success, arms, windows, theirs, newest, d)
         rows.append(row)
     gates = _gates(rows, config, success is not None)
     real_pairs = {} if success is None else {"auroc_real": _auroc_real(success, episodes, model, rng)}

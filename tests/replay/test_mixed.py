@@ -89,8 +89,12 @@ def test_it_is_exhausted_when_nothing_will_come():
     dreaming = mixed()
     dreaming.end_real()
     assert not dreaming.exhausted(8)
-    dreaming.share = 0.0  # the kill switch
+    dreaming.mix(0.0, awaited=True)  # the world model is being learnt
+    assert not dreaming.exhausted(8)
+    dreaming.mix(0.0, awaited=False)  # the kill switch
     assert dreaming.exhausted(8)
+    dreaming.mix(0.5, awaited=True)
+    assert not dreaming.exhausted(8)
 
 
 def test_what_is_too_old_for_one_part_costs_the_other_nothing():

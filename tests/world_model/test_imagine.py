@@ -28,7 +28,7 @@ from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Decision, Request, Segment
 from accerl_lerobot.world_model import imagine
-from accerl_lerobot.world_model.baselines import OracleModel
+from accerl_lerobot.world_model.baselines import OracleModel, ShuffledModel
 from accerl_lerobot.world_model.contract import Dream, History, State, WorldModel
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig, OnlineLearnConfig
 from accerl_lerobot.world_model.imagine import Imagination, check_fit
@@ -82,7 +82,10 @@ def imagination(
     model: WorldModel, success: Any = None, *, fails: bool = True, world: Any = WORLD_SPEC, **config: Any
 ) -> tuple[Imagination, list[Segment]]:
     kind = "oracle" if isinstance(model, OracleModel) else "learned"
-    fields: dict[str, Any] = {"share": 0.5, "path": "x", "dreams": 4, "horizon": 3, "model": kind}
+    fields: dict[str, Any] = {
+        "share": 0.5, "path": "x", "dreams": 4, "horizon": 3, "model": kind,
+        "learn": OnlineLearnConfig(steps_per_episode=0),
+    }  # fmt: skip
     made: list[Segment] = []
     dreams = Imagination(
         model, success, world, ImaginationConfig(**(fields | config)),
@@ -210,9 +213,24 @@ def test_dreams_that_are_too_good_are_switched_off_until_another_model_dreams(br
         play(dreams, 1)
         rounds += 1
         assert rounds < 50
-    assert dreams.switch.tripped and dreams.metrics()["off"] == 1 and dreams.metrics()["success"] > 0.5
+    assert dreams.switch.tripped and dreams.metrics()["on"] == 0 and dreams.metrics()["success"] > 0.5
     dreams.swap(Counting(), bright, version=12)
-    assert len(dreams.requests()) == 4 and dreams.version == 12 and dreams.metrics()["off"] == 0
+    assert len(dreams.requests()) == 4 and dreams.version == 12 and dreams.metrics()["on"] == 1
+
+
+def test_a_model_that_learns_dreams_once_it_has_passed(bright: Any):
+    dreams, _ = imagination(Counting(), bright, learn=OnlineLearnConfig(steps_per_episode=1))
+    dreams.remember(lived(3)[0])
+    assert dreams.requests() == [] and not dreams.on
+    dreams.swap(Counting(), bright, version=3)
+    assert dreams.on and len(dreams.requests()) == 4
+
+
+def test_a_placebo_stays_one_when_its_model_is_promoted(bright: Any):
+    dreams, _ = imagination(ShuffledModel(Counting()), bright)
+    promoted = Counting()
+    dreams.swap(promoted, bright, version=3)
+    assert isinstance(dreams.dreamer[0], ShuffledModel) and dreams.dreamer[0].model is promoted
 
 
 def test_pictures_have_the_world_s_size(bright: Any):
@@ -226,7 +244,7 @@ def test_pictures_have_the_world_s_size(bright: Any):
 @pytest.mark.parametrize(
     ("change", "executed", "history", "judged", "message"),
     [
-        ({"cameras": ("observation.images.wrist",)}, K, 1, True, "front.*world model observation.images.wrist"),
+        ({"cameras": ("observation.images.wrist",)}, K, 1, True, "front.*model observation.images.wrist"),
         ({"state_dim": 7}, K, 1, True, "=7: is the world model's state_dim, and the world's is 4"),
         ({"action_dim": 7}, K, 1, True, "action_dim"),
         ({"fps": 30}, K, 1, True, "imagination.path=30: is the world model's fps"),
@@ -276,5 +294,6 @@ def test_what_does_not_go_together():
     with pytest.raises(InputError, match="^imagination.path=None"):
         ImaginationConfig(share=0.5)
     ImaginationConfig(share=0.5, model="oracle")
-    with pytest.raises(InputError, match="copy has nothing to learn"):
-        ImaginationConfig(path="x", model="copy", learn=OnlineLearnConfig(steps_per_episode=1.0))
+    assert ImaginationConfig(share=0.5, path="x").learns
+    assert not ImaginationConfig(share=0.5, path="x", model="copy").learns
+    assert not ImaginationConfig(path="x").learns

@@ -30,7 +30,7 @@ from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model import offline
 from accerl_lerobot.world_model.config import WorldModelConfig
-from accerl_lerobot.world_model.store import load_world_model, save_world_model
+from accerl_lerobot.world_model.store import load_source, load_world_model, save_world_model
 from accerl_lerobot.world_model.success import new_success_model
 from tests.world_model.test_pixels import awake, dots, dream, model, windows
 
@@ -90,7 +90,14 @@ def test_a_saved_one_is_tried_on_another_dataset(
     told = [f"--path={path}", "--dataset.repo_id=a/b", f"--dataset.root={demos}", "--trial.depth=2"]
     code = cli.main(["world-model-eval", *told, f"--output_dir={tmp_path / 'again'}"])
     found = json.loads(capsys.readouterr().out)
-    assert code == (0 if found["passed"] else 1) and found["tried"]["episodes"] == 8
+    assert code == (0 if found["passed"] else 1)
+    source = load_source(path)
+    assert source is not None and sorted(source.learnt + source.held_out) == list(range(8))
+    assert found["tried"]["episodes"] == len(source.held_out) < 8, "it has learnt from the others"
+    save_world_model(tmp_path / "unknown", load_world_model(path)[0])
+    told[0] = f"--path={tmp_path / 'unknown'}"
+    cli.main(["world-model-eval", *told, f"--output_dir={tmp_path / 'all'}"])
+    assert json.loads(capsys.readouterr().out)["tried"]["episodes"] == 8
     assert {p.name for p in (tmp_path / "again").iterdir()} == {"config.yaml", "trial.json", "preview.mp4"}
     assert cli.main(["world-model-eval", "--path=nowhere", f"--output_dir={tmp_path / 'third'}"]) == 2
     assert "path='nowhere': not a world model" in capsys.readouterr().err

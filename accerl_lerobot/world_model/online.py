@@ -1,0 +1,235 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A world model that goes on learning from what the policy lives through.
+
+The loss is that of the pre-training. Batches are of real windows only: some from the dataset it began with,
+the others from the policy's episodes, the newest and the failed ones more often: there the policy is, and
+demonstrations do not show what goes wrong there. Some episodes are held out, and what it has become serves
+only once it has passed a trial on them.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from accerl_lerobot.experience import Segment
+from accerl_lerobot.world_model.config import LearnConfig, SuccessLearnConfig, TrialConfig
+from accerl_lerobot.world_model.contract import WorldModelSpec
+from accerl_lerobot.world_model.episodes import Episode, Place
+from accerl_lerobot.world_model.imagination_config import OnlineLearnConfig
+from accerl_lerobot.world_model.learn import Learner
+from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.starts import seen
+from accerl_lerobot.world_model.success import Examples, SuccessLearner
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+from accerl_lerobot.world_model.trial import set_threshold, try_out
+
+ENDLESS = 10**9
+"""Steps of a learning rate that never falls."""
+
+
+def episode_of(segment: Segment, spec: WorldModelSpec) -> Episode:
+    """A real segment as a stretch of experience, looked at when decisions were due."""
+    frames, robot = seen(segment, spec)
+    steps = segment.steps
+    made = [a[:n] for a, n in zip(segment.actions, steps, strict=True)]
+    actions = np.concatenate(made)
+    return Episode(
+        frames=frames,
+        times=np.concatenate([[0], np.cumsum(steps)]).astype(np.int64),
+        state=robot.astype(np.float32),
+        actions=actions,
+        success_at=len(actions) - 1 if segment.terminated and segment.success else -1,
+        task=segment.task,
+        source="online",
+    )
+
+
+class Promotion(NamedTuple):
+    """What has become of it, and what its trial found."""
+
+    model: PixelWorldModel
+    success: SuccessPairsRewardModel
+    version: int
+    """Gradient steps behind it, those before the run not counted."""
+    found: dict[str, Any]
+    """See `try_out`."""
+
+
+class OnlineLearner:
+    """Learns as real segments come in.
+
+    Example:
+        >>> learner.add(segment)
+        >>> while learner.owed >= 1:
+        ...     learner.step()
+        >>> if learner.due(last=False) and (promotion := learner.promote(last=False)):
+        ...     imagination.swap(promotion.model, promotion.success, promotion.version)
+
+    Args:
+        model: where it begins; not changed.
+        success: the same.
+        config: how it goes on.
+        trial: what it must pass.
+        offline: episodes of the dataset that it has learnt from.
+        held_out: others, which it is tried on beside the policy's.
+        seed: of everything random.
+    """
+
+    def __init__(
+        self,
+        model: PixelWorldModel,
+        success: SuccessPairsRewardModel,
+        config: OnlineLearnConfig,
+        trial: TrialConfig,
+        *,
+        offline: Sequence[Episode] = (),
+        held_out: Sequence[Episode] = (),
+        seed: int = 0,
+    ) -> None:
+        self.config, self.trial = config, trial
+        self.owed = 0.0
+        """Gradient steps that are due."""
+        self.promoted = self.refused = 0
+        self._seed = seed
+        self.found: dict[str, Any] = {}
+        """By the last trial."""
+        learn = LearnConfig(steps=ENDLESS, batch=config.batch, lr=config.lr)
+        self._learner = Learner(_trainable(model), learn, seed)
+        # The judge dreams in training, so it needs the model, and learns as fast as that.
+        judged = SuccessLearnConfig(steps=ENDLESS, lr=config.lr)
+        self._success = SuccessLearner(_trainable(success), judged, seed)
+        self._offline, self._held_offline = list(offline), list(held_out)
+        self._learnt: deque[Episode] = deque(maxlen=config.memory)
+        self._held: deque[Episode] = deque(maxlen=max(1, round(config.memory * config.held_out)))
+        self._rng = np.random.default_rng((seed, 4))
+        self._examples: Examples | None = None
+        self._ended = self._since = self._last_tries = 0
+
+    @property
+    def version(self) -> int:
+        """Gradient steps made."""
+        return self._learner.count
+
+    def due(self, last: bool) -> bool:
+        """Whether it is to be tried.
+
+        Args:
+            last: no real episode will come any more.
+        """
+        if self.owed >= 1 or not self.version:
+            return False
+        if not last:
+            return self._since >= self.config.try_every
+        return (self._since > 0 or not self.promoted) and self._last_tries < self.config.last_tries
+
+    def promising(self, last: bool) -> bool:
+        """Whether another version may be promoted; see `due`."""
+        return not last or self.owed >= 1 or self.due(last)
+
+    def add(self, segment: Segment) -> None:
+        """Takes a real segment; every so many of them are held out."""
+        episode = episode_of(segment, self._learner.model.spec)
+        share = self.config.held_out
+        before, self._ended = self._ended, self._ended + 1
+        held = int(self._ended * share) > int(before * share)
+        (self._held if held else self._learnt).append(episode)
+        self._examples = None
+        if segment.episode:
+            self._since += 1
+            self.owed += self.config.steps_per_episode
+
+    def step(self) -> dict[str, float]:
+        """One gradient step of either model, if there is anything to learn from."""
+        self.owed -= 1
+        if not self._learnt and not self._offline:
+            return {}
+        episodes = self._offline + list(self._learnt)
+        metrics = self._learner.step(self._learner.windows(episodes, self._draw()))
+        if self._examples is None and any(e.success for e in episodes):
+            self._examples = Examples(episodes, self._learner.model.spec.chunk)
+        if self._examples is not None:
+            judged = self._success.step(self._examples, self._learner.serving)
+            metrics |= {f"success_{k}": v for k, v in judged.items()}
+        return metrics
+
+    def promote(self, last: bool) -> Promotion | None:
+        """Tries what has become of it; None if it does not pass, and the old one goes on serving.
+
+        Args:
+            last: see `due`; if it does not pass then, it is to learn on all the same.
+        """
+        self._since = 0
+        self._last_tries += last
+        held = [*self._held_offline, *self._held]
+        if not held:
+            return None
+        model = copy.deepcopy(self._learner.serving)
+        success = copy.deepcopy(self._success.model).eval().requires_grad_(False)
+        failures = [e for e in (*self._offline, *self._learnt) if not e.success]
+        if failures:
+            set_threshold(model, success, failures[-100:], self.trial, self._seed)
+        found = self.found = try_out(model, held, self.trial, success, self._seed)
+        if not found["passed"]:
+            self.refused += 1
+            if last:
+                self.owed += self.config.try_every * self.config.steps_per_episode
+            return None
+        self.promoted += 1
+        return Promotion(model, success, self.version, found)
+
+    def metrics(self) -> dict[str, float]:
+        """What it has learnt from, and how its trials ended."""
+        return {
+            "learn_steps": float(self.version),
+            "learn_episodes": float(len(self._learnt)),
+            "promoted": float(self.promoted),
+            "refused": float(self.refused),
+        } | {f"gate_{name}": float(gate["value"]) for name, gate in self.found.get("gates", {}).items()}
+
+    def _draw(self) -> list[Place]:
+        """Places in the dataset's episodes, which come first, and in the policy's."""
+        count, known = self.config.batch, len(self._offline)
+        share = self.config.offline if self._learnt else 1.0
+        offline = round(share * count) if known else 0
+        chosen = self._rng.integers(known, size=offline).tolist() if offline else []
+        if count > offline:
+            weights = online_weights([e.success for e in self._learnt], self.config)
+            chosen += (known + self._rng.choice(len(weights), size=count - offline, p=weights)).tolist()
+        episodes = self._offline + list(self._learnt)
+        return [Place(e, int(self._rng.integers(len(episodes[e].frames) - 1))) for e in chosen]
+
+
+def online_weights(successes: Sequence[bool], config: OnlineLearnConfig) -> np.ndarray:
+    """How likely each of the policy's episodes, oldest first, is drawn; sums to 1."""
+    count = len(successes)
+    newest = np.arange(count) >= count - max(1, count // 4)
+    weights = np.where(newest, config.recent / newest.sum(), 0.0)
+    old = ~newest
+    weights[old] += (1 - config.recent) / max(1, old.sum())
+    failed = ~np.asarray(successes, bool)
+    if failed.any() and not failed.all():
+        for kind, share in ((failed, config.failures), (~failed, 1 - config.failures)):
+            weights[kind] *= share / weights[kind].sum() if weights[kind].sum() else 0.0
+    return np.asarray(weights / weights.sum())
+
+
+def _trainable(model: Any) -> Any:
+    made = copy.deepcopy(model)
+    return made.requires_grad_(True)
