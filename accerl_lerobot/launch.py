@@ -19,6 +19,10 @@
                           │      │
                           └──► trainer                          macro-asynchrony: no barrier, a measured lag
 
+    dreams ──requests──► inference ──decisions──► dreams ──segments──► replay        where any are imagined
+       ▲                                                                 │
+       └────── world models that have passed ◄── world learning ◄──real──┘
+
 The trainer is the clock: when it has made its updates the run is over. Another worker that ends is an event:
 a rollout worker is started again, a few times (with it go its unfinished segments and groups, nothing else);
 any other ends the run with its own traceback. The same goes for one that hangs: nothing here waits for an
@@ -28,6 +32,7 @@ answer without a limit. Workers get handles and never hold the conductor.
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -75,6 +80,10 @@ class _Seat:
     unsent: list[EpisodePlan] = field(default_factory=list)
     counters: dict[str, float] = field(default_factory=dict)
     in_world_s: float = 0.0
+    budget: int | None = None
+    """Exploring episodes that are still to be played; None: no end."""
+    spent: bool = False
+    """Whether all of them are in replay."""
 
 
 class RayEngine(Engine):
@@ -97,6 +106,10 @@ class RayEngine(Engine):
         self._updates: list[dict[str, float]] = []
         self._replay_metrics: dict[str, float] = {}
         self._inference_metrics: dict[str, float] = {}
+        self._imagination_metrics: dict[str, float] = {}
+        self._dreamer: Watched | None = None
+        self._learner: Watched | None = None
+        self._real_ended = False
         self._training = self._done = self._closed = False
         self._version = 0
         self._last_change = time.monotonic()
@@ -121,6 +134,10 @@ class RayEngine(Engine):
     def train(self) -> None:
         self._training, self._last_change = True, time.monotonic()
         self._trainer.work = self._trainer.actor.run.remote(self._replay.actor, [self._inference.actor])
+        if self._dreamer is not None:
+            self._dreamer.work = self._dreamer.actor.run.remote(self._inference.actor, self._replay.actor)
+        if self._learner is not None and self._dreamer is not None:
+            self._learner.work = self._learner.actor.run.remote(self._dreamer.actor, self._replay.actor)
 
     def poll(self) -> Progress:
         self._ask()
@@ -142,6 +159,7 @@ class RayEngine(Engine):
             rollout=totals,
             replay=self._replay_metrics,
             inference=self._inference_metrics,
+            imagination=self._imagination_metrics,
         )
         self._check_moving(progress)
         return progress
@@ -183,15 +201,31 @@ class RayEngine(Engine):
 
         c = self._config
         gpus = ray.available_resources().get("GPU", 0)
-        share = 0 if c.policy.device == "cpu" or not gpus else (1 if gpus > 1 else 0.5)
+        imagination = c.imagination
+        users = 2 + (imagination.share > 0) + imagination.learns
+        share = 0.0 if c.policy.device == "cpu" or not gpus else 1 / math.ceil(users / gpus)
         inference = ray.remote(InferenceWorker).options(num_cpus=0, num_gpus=share, max_concurrency=1000)
         self._inference = self._service("inference", inference.remote(c.policy, c.inference))
         replay = ray.remote(ReplayWorker).options(num_cpus=0, num_gpus=0, max_concurrency=1000)
-        self._replay = self._service("replay", replay.remote(c.replay, c.seed))
+        imagined = imagination.replay if imagination.share else None
+        self._replay = self._service("replay", replay.remote(c.replay, c.seed, imagined))
         trainer = ray.remote(TrainerWorker).options(num_cpus=0, num_gpus=share, max_concurrency=4)
         self._trainer = self._service("trainer", trainer.remote(c.policy, c.algorithm, c.trainer, c.seed))
-        for index in range(c.rollout.workers):
-            self._seats.append(_Seat(index=index, worker=self._new_rollout(index, 0)))
+        if imagination.share:
+            from accerl_lerobot.world_model.worker import DreamWorker, WorldLearningWorker
+
+            dreamer = ray.remote(DreamWorker).options(num_cpus=0, num_gpus=share, max_concurrency=4)
+            self._dreamer = self._service("dream", dreamer.remote(c))
+            if imagination.learns:
+                learner = ray.remote(WorldLearningWorker).options(
+                    num_cpus=0, num_gpus=share, max_concurrency=4
+                )
+                self._learner = self._service("world learning", learner.remote(c))
+        episodes, workers = c.rollout.episodes, c.rollout.workers
+        for index in range(workers):
+            budget = len(range(index, episodes, workers)) if episodes else None
+            worker = self._new_rollout(index, 0, budget)
+            self._seats.append(_Seat(index=index, worker=worker, budget=budget, spent=budget == 0))
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
         for worker, reference in ready:
             worker.result(reference, "ready", max(START_S, self._limit))
@@ -204,7 +238,7 @@ class RayEngine(Engine):
         self._services.append(Watched(name, actor))
         return self._services[-1]
 
-    def _new_rollout(self, index: int, incarnation: int) -> Watched:
+    def _new_rollout(self, index: int, incarnation: int, budget: int | None) -> Watched:
         from accerl_lerobot.rollout.worker import RolloutWorker
 
         c = self._config
@@ -212,7 +246,9 @@ class RayEngine(Engine):
         actor = ray.remote(RolloutWorker).options(num_cpus=0, num_gpus=0, max_concurrency=4)
         return Watched(
             f"rollout {index}",
-            actor.remote(c.env, c.rollout, self._tasks, c.seed, index, incarnation, film, self._history),
+            actor.remote(
+                c.env, c.rollout, self._tasks, c.seed, index, incarnation, film, self._history, budget
+            ),
         )
 
     def _set_to_work(self, seat: _Seat) -> None:
@@ -249,7 +285,7 @@ class RayEngine(Engine):
             raise RuntimeError(f"{worker.name} worker failed for good:\n{error}") from error
         if worker is self._trainer:
             self._finish(int(result))
-        elif not (worker is self._replay and self._done):
+        elif not (self._done and worker in (self._replay, self._dreamer, self._learner)):
             raise RuntimeError(f"{worker.name} worker ended without being asked to")
 
     def _blame(self) -> None:
@@ -273,6 +309,9 @@ class RayEngine(Engine):
         self._updates += self._hear(self._trainer) or []
         self._replay_metrics = self._hear(self._replay) or self._replay_metrics
         self._inference_metrics = self._hear(self._inference) or self._inference_metrics
+        for imaginer in (self._dreamer, self._learner):
+            if imaginer is not None:
+                self._imagination_metrics |= self._hear(imaginer) or {}
         episodes: list[EpisodeResult] = []
         for seat in self._seats:
             try:
@@ -283,10 +322,16 @@ class RayEngine(Engine):
                 raise RuntimeError(f"{seat.worker.name} worker failed to report:\n{error}") from error
             if report is not None:
                 seat.counters, seat.in_world_s = report.counters, report.in_world_s
+                seat.spent = report.spent
+                if seat.budget is not None:
+                    seat.budget -= sum(e.plan.explore for e in report.episodes)
                 for episode in report.episodes:
                     planned = seat.outstanding.pop(episode_key(episode.plan), None)
                     if episode.plan.explore or planned is not None:
                         episodes.append(episode)
+        if not self._real_ended and all(seat.spent for seat in self._seats):
+            self._real_ended = True
+            self._replay.call("end_real", timeout=self._limit)
         return episodes
 
     def _hear(self, worker: Watched, timeout: float = 0.0) -> Any:
@@ -313,7 +358,7 @@ class RayEngine(Engine):
             self._past[key] = self._past.get(key, 0.0) + value
         seat.counters, seat.in_world_s = {}, 0.0
         seat.incarnation += 1
-        seat.worker = self._new_rollout(seat.index, seat.incarnation)
+        seat.worker = self._new_rollout(seat.index, seat.incarnation, seat.budget)
         seat.unsent = list(seat.outstanding.values())
         self._set_to_work(seat)
 
@@ -339,7 +384,8 @@ class RayEngine(Engine):
         Raises:
             RuntimeError: neither decisions nor updates for `LaunchConfig.stall_s`.
         """
-        state = (progress.version, progress.rollout.get("decisions"), progress.rollout["restarts"])
+        imagined = tuple(progress.imagination.get(k) for k in ("decisions", "learn_steps"))
+        state = (progress.version, progress.rollout.get("decisions"), progress.rollout["restarts"], imagined)
         now = time.monotonic()
         waiting = any(seat.outstanding for seat in self._seats) or (self._training and not self._done)
         # Where one worker is to blame, `_check_hung` comes to it a moment later.

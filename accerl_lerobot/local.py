@@ -198,7 +198,7 @@ class LocalEngine(Engine):
         if learner.owed >= 1:
             learner.step()
         elif learner.due(last) and (promotion := learner.promote(last)):
-            self._dreams.swap(promotion.model, promotion.success, promotion.version)
+            self._dreams.swap(promotion)
 
     def _publish(self) -> None:
         """Hands weights to the policy that acts, which is the trainer's own unless they are held back."""

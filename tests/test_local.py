@@ -195,7 +195,7 @@ def test_a_group_that_comes_at_once_waits_at_the_door(tiny_checkpoint: Path):
     waiting, available = [], []
     for progress in polls(engine):
         waiting.append(len(engine._outbox))
-        available.append(engine._replay.pace.available)
+        available.append(engine._replay.real.pace.available)
         if progress.done:
             break
     engine.close()

@@ -13,7 +13,7 @@
 # limitations under the License.
 """The replay process: the door between collecting and learning.
 
-consumes    segments from rollout workers
+consumes    segments from rollout workers and from dreams
 produces    batches of segments for the trainer
 waits for   the pace: `insert` until rollouts are not too far ahead, `sample` for enough that is new
 unblocked   by the other side, or by `close`
@@ -24,12 +24,30 @@ from __future__ import annotations
 import asyncio
 import os
 import time
+from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 
-from accerl_lerobot.experience import Segment
-from accerl_lerobot.replay.buffer import Replay
+from accerl_lerobot.experience import REAL, Segment
+from accerl_lerobot.replay.mixed import MixedReplay
 from accerl_lerobot.replay.pacing import ReplayConfig
+
+IN_TRANSIT = 1024
+"""Newest real segments that are kept for those who dream, who ask for them several times a second."""
+
+
+class News(NamedTuple):
+    """What those who dream ask for."""
+
+    segments: list[Segment]
+    """Real ones that have come since."""
+    cursor: int
+    """To ask with the next time."""
+    ended: bool
+    """No more will come."""
+    closed: bool
+    """The run is over."""
 
 
 class ReplayWorker:
@@ -38,10 +56,15 @@ class ReplayWorker:
     Args:
         config: size and pace.
         seed: of the draw among segments used equally often.
+        imagined: size and pace of imagined experience; None: there is none.
     """
 
-    def __init__(self, config: ReplayConfig, seed: int) -> None:
-        self._replay = Replay(config)
+    def __init__(self, config: ReplayConfig, seed: int, imagined: ReplayConfig | None = None) -> None:
+        self._replay = MixedReplay(config, imagined or ReplayConfig(), share=0.0)
+        # Nothing is imagined until the dreamer says so.
+        self._replay.awaited = self._awaited = imagined is not None
+        self._real: deque[Segment] = deque(maxlen=IN_TRANSIT if imagined else 0)
+        self._real_count = 0
         self._rng = np.random.default_rng(seed)
         self._changed = asyncio.Condition()
         self._closed = False
@@ -58,32 +81,73 @@ class ReplayWorker:
             await self._changed.wait_for(lambda: self._closed)
 
     async def insert(self, segments: list[Segment]) -> bool:
-        """Stores segments once the pace allows it; False when the run is over and they were not stored."""
+        """Stores segments of one source once the pace allows it.
+
+        Returns:
+            False when the run is over and they were not stored.
+        """
+        source = segments[0].source
         started = time.monotonic()
         async with self._changed:
-            await self._changed.wait_for(lambda: self._closed or self._replay.may_insert())
-            self._insert_wait_s += time.monotonic() - started
+            await self._changed.wait_for(lambda: self._closed or self._replay.may_insert(source))
+            if source == REAL:
+                self._insert_wait_s += time.monotonic() - started
             if self._closed:
                 return False
             for segment in segments:
-                if self._replay.insert(segment) and segment.episode:
-                    self._episodes.append(segment.episode)
+                if self._replay.insert(segment) and source == REAL:
+                    self._real.append(segment)
+                    self._real_count += 1
+                    if segment.episode:
+                        self._episodes.append(segment.episode)
             self._changed.notify_all()
         return True
 
     async def sample(self, num_decisions: int, trainer_version: int) -> list[Segment]:
-        """A batch once the pace allows it; empty when the run is over."""
+        """A batch once the pace allows it; empty when the run is over, or nothing will come any more."""
         started = time.monotonic()
         async with self._changed:
             while True:
-                await self._changed.wait_for(lambda: self._closed or self._replay.may_sample(num_decisions))
-                if self._closed:
+                await self._changed.wait_for(
+                    lambda: (
+                        self._closed
+                        or self._replay.may_sample(num_decisions)
+                        or self._replay.exhausted(num_decisions)
+                    )
+                )
+                if self._closed or self._replay.exhausted(num_decisions):
                     return []
                 segments = self._replay.sample(num_decisions, trainer_version, self._rng)
                 self._changed.notify_all()
                 if segments:
                     self._sample_wait_s += time.monotonic() - started
                     return segments
+
+    async def news(self, cursor: int) -> News:
+        """Real segments since the `cursor`-th; those that nobody asked for in time are left out."""
+        new = min(self._real_count - cursor, len(self._real))
+        segments = list(self._real)[len(self._real) - new :]
+        return News(segments, self._real_count, self._replay.real_ended, self._closed)
+
+    async def mix(self, share: float) -> None:
+        """From now on so much of a batch is imagined."""
+        await self._mix(share, self._awaited)
+
+    async def expect(self, awaited: bool) -> None:
+        """Whether something may be imagined later on, although nothing is now."""
+        await self._mix(self._replay.share, awaited)
+
+    async def _mix(self, share: float, awaited: bool) -> None:
+        self._awaited = awaited
+        async with self._changed:
+            self._replay.mix(share, share > 0 or awaited)
+            self._changed.notify_all()
+
+    async def end_real(self) -> None:
+        """Every real episode has been played and stored."""
+        async with self._changed:
+            self._replay.end_real()
+            self._changed.notify_all()
 
     async def close(self) -> None:
         """Ends all waiting; nothing is stored or drawn any more."""

@@ -56,6 +56,8 @@ class Report:
     """Since this process began."""
     in_world_s: float
     """How long the world has been at what it does now, in seconds; 0 while none is stepped."""
+    spent: bool = False
+    """Every exploring episode that was paid for has been played, and replay has it."""
 
 
 class RolloutWorker:
@@ -70,6 +72,7 @@ class RolloutWorker:
         incarnation: how often it has been restarted; part of the segments' keys, and of the seeds.
         film: see `RolloutRunner`.
         history: env steps that an observation holds.
+        budget: exploring episodes at most; None: no end.
     """
 
     def __init__(
@@ -82,10 +85,18 @@ class RolloutWorker:
         incarnation: int,
         film: tuple[int, int],
         history: int = 1,
+        budget: int | None = None,
     ) -> None:
         self._plans = EpisodePlans(
-            config, tasks, seed=seed, worlds=config.worlds, worker=index, incarnation=incarnation
+            config,
+            tasks,
+            seed=seed,
+            worlds=config.worlds,
+            worker=index,
+            incarnation=incarnation,
+            budget=budget,
         )
+        self._spent = False
         # Shared by the two threads: appending to and popping from a deque is atomic.
         self._results: deque[EpisodeResult] = deque()
         self._training = threading.Event()
@@ -123,6 +134,7 @@ class RolloutWorker:
             episodes=episodes,
             counters={k: float(v) for k, v in vars(self._runner.counters).items()},
             in_world_s=0.0 if entered is None else time.monotonic() - entered,
+            spent=self._spent,
         )
 
     def run(self, inference: Any, replay: Any) -> None:
@@ -134,6 +146,7 @@ class RolloutWorker:
         size = max(1, len(self._runner) // PARTS)
         while True:
             door = _still_waiting(door)
+            self._spent = self._plans.spent and not self._runner.exploring and not door
             self._give_up(due, idle)
             idle = [slot for slot in idle if not self._begin(slot, due)]
             sendable = [slot for slot in due if len(door) < AT_THE_DOOR or not due[slot].explore]

@@ -126,7 +126,7 @@ def _dreamer(config: RunConfig, spec: WorldSpec, executed: int, history: int) ->
     if not getattr(config.env, "terminate_on_success", True):
         remedy = "use true with imagination.share: a success ends a dream, and so it must a real episode"
         raise InputError("env.terminate_on_success", False, remedy)
-    dreamer = make_dreamer(config.imagination, config.env, spec, executed)
+    dreamer = make_dreamer(config.imagination, config.env, spec, executed, config.policy.device)
     if config.imagination.learns and dreamer.success is None:
         remedy = "it has no success model to go on learning with; use imagination.learn.steps_per_episode=0"
         raise InputError("imagination.path", config.imagination.path, remedy)

@@ -26,6 +26,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -42,6 +43,9 @@ from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 from accerl_lerobot.world_model.starts import Start, StartPool
 from accerl_lerobot.world_model.success import probabilities
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+
+if TYPE_CHECKING:
+    from accerl_lerobot.world_model.online import Promotion
 
 
 def check_fit(spec: WorldModelSpec, world: WorldSpec, executed: int, history: int, judged: bool) -> None:
@@ -146,6 +150,7 @@ class Imagination:
         self.waits = config.learns
         """Whether no model has passed its trial yet."""
         self._model, self._success, self._world = model, success, world
+        self._device = torch.device("cpu") if success is None else success.out.weight.device
         self._cost, self._fails, self._name = decision_cost, fails, name
         self._on_segment = on_segment
         self._starts = StartPool(
@@ -170,14 +175,15 @@ class Imagination:
         """Dreams may begin in a real segment from now on."""
         self._starts.add(segment)
 
-    def swap(self, model: WorldModel, success: SuccessPairsRewardModel | None, version: int) -> None:
+    def swap(self, promotion: Promotion) -> None:
         """Another world model of the same world dreams from now on; dreams under way go on in it.
 
         A placebo goes on telling it the wrong actions.
         """
-        wrapped = isinstance(self._model, ShuffledModel)
-        self._model = ShuffledModel(model) if wrapped else model
-        self._success, self.version, self.waits = success, version, False
+        model: WorldModel = promotion.model.to(self._device)
+        self._model = ShuffledModel(model) if isinstance(self._model, ShuffledModel) else model
+        self._success = promotion.success.to(self._device)
+        self.version, self.waits = promotion.version, False
         self.switch.reset()
 
     @property

@@ -62,7 +62,7 @@ def episode_of(segment: Segment, spec: WorldModelSpec) -> Episode:
 
 
 class Promotion(NamedTuple):
-    """What has become of it, and what its trial found."""
+    """What has become of it, on the CPU, and what its trial found."""
 
     model: PixelWorldModel
     success: SuccessPairsRewardModel
@@ -80,7 +80,7 @@ class OnlineLearner:
         >>> while learner.owed >= 1:
         ...     learner.step()
         >>> if learner.due(last=False) and (promotion := learner.promote(last=False)):
-        ...     imagination.swap(promotion.model, promotion.success, promotion.version)
+        ...     imagination.swap(promotion)
 
     Args:
         model: where it begins; not changed.
@@ -192,7 +192,7 @@ class OnlineLearner:
                 self.owed += self.config.try_every * self.config.steps_per_episode
             return None
         self.promoted += 1
-        return Promotion(model, success, self.version, found)
+        return Promotion(model.cpu(), success.cpu(), self.version, found)
 
     def metrics(self) -> dict[str, float]:
         """What it has learnt from, and how its trials ended."""

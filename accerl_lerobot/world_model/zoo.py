@@ -21,9 +21,11 @@ from typing import NamedTuple
 
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.envs.base import WorldSpec
+from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model.baselines import CopyModel, OracleModel, ShuffledModel
 from accerl_lerobot.world_model.contract import WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
+from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.store import load_world_model
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
@@ -35,7 +37,9 @@ class Dreamer(NamedTuple):
     success: SuccessPairsRewardModel | None
 
 
-def make_dreamer(config: ImaginationConfig, env: EnvConfig, world: WorldSpec, executed: int) -> Dreamer:
+def make_dreamer(
+    config: ImaginationConfig, env: EnvConfig, world: WorldSpec, executed: int, device: str
+) -> Dreamer:
     """The one that `config` names.
 
     Args:
@@ -43,27 +47,21 @@ def make_dreamer(config: ImaginationConfig, env: EnvConfig, world: WorldSpec, ex
         env: the real world, for an oracle.
         world: what that shows.
         executed: actions that the policy executes per decision.
+        device: where it dreams, see `PolicyConfig.device`.
 
     Raises:
         InputError: it cannot be loaded.
     """
-    return _MODELS[config.model](config, env, world, executed)
-
-
-def _learned(config: ImaginationConfig, env: EnvConfig, world: WorldSpec, executed: int) -> Dreamer:
+    where = resolve_device(device)
+    if config.model == "oracle":
+        return _oracle(config, env, world, executed)
     assert config.path is not None  # ImaginationConfig has seen to that
     model, success = load_world_model(Path(config.path), "imagination.path")
-    return Dreamer(model.eval(), success)
-
-
-def _copy(config: ImaginationConfig, env: EnvConfig, world: WorldSpec, executed: int) -> Dreamer:
-    model, success = _learned(config, env, world, executed)
-    return Dreamer(CopyModel(model.spec), success)
-
-
-def _shuffled(config: ImaginationConfig, env: EnvConfig, world: WorldSpec, executed: int) -> Dreamer:
-    model, success = _learned(config, env, world, executed)
-    return Dreamer(ShuffledModel(model), success)
+    if success is not None:
+        success.config.device = str(where)
+    return Dreamer(
+        _LEARNED[config.model](model.eval().to(where)), None if success is None else success.to(where)
+    )
 
 
 def _oracle(config: ImaginationConfig, env: EnvConfig, world: WorldSpec, executed: int) -> Dreamer:
@@ -81,9 +79,8 @@ def _oracle(config: ImaginationConfig, env: EnvConfig, world: WorldSpec, execute
     return Dreamer(OracleModel(spec, lambda: make_world(env), config.dreams), None)
 
 
-_MODELS: dict[str, Callable[[ImaginationConfig, EnvConfig, WorldSpec, int], Dreamer]] = {
-    "learned": _learned,
-    "shuffled": _shuffled,
-    "copy": _copy,
-    "oracle": _oracle,
+_LEARNED: dict[str, Callable[[PixelWorldModel], WorldModel]] = {
+    "learned": lambda model: model,
+    "shuffled": ShuffledModel,
+    "copy": lambda model: CopyModel(model.spec),
 }

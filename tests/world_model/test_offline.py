@@ -96,6 +96,7 @@ def test_a_saved_one_is_tried_on_another_dataset(
     assert found["tried"]["episodes"] == len(source.held_out) < 8, "it has learnt from the others"
     save_world_model(tmp_path / "unknown", load_world_model(path)[0])
     told[0] = f"--path={tmp_path / 'unknown'}"
+    capsys.readouterr()  # LeRobot prints
     cli.main(["world-model-eval", *told, f"--output_dir={tmp_path / 'all'}"])
     assert json.loads(capsys.readouterr().out)["tried"]["episodes"] == 8
     assert {p.name for p in (tmp_path / "again").iterdir()} == {"config.yaml", "trial.json", "preview.mp4"}

@@ -1,0 +1,173 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The processes that imagine: one dreams, another learns what it dreams with.
+
+    Dreaming      consumes    decisions from inference, real segments from replay, promoted models
+                  produces    imagined segments for replay
+                  waits for   decisions; and replay, while what it imagined stands at the door
+    WorldLearning consumes    real segments from replay
+                  produces    world models that have passed their trial, for the dreamer
+                  waits for   real experience
+
+Both end with the process, or when replay says that the run is over. Neither holds up the trainer: until a
+model has passed, batches are real.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+import ray
+
+from accerl_lerobot.experience import Segment
+from accerl_lerobot.world_model.dreaming import make_imagination, make_learner
+from accerl_lerobot.world_model.online import Promotion
+
+if TYPE_CHECKING:
+    from accerl_lerobot.config import RunConfig
+
+AT_THE_DOOR = 2
+"""Insert calls that may be waiting before dreams pause."""
+PAUSE_S = 0.02
+"""How long a worker with nothing to do sleeps."""
+LOOK_S = 0.2
+"""How often replay is asked for new real segments."""
+
+
+class DreamWorker:
+    """Becomes a threaded Ray actor in `launch`: `run` on one thread, everything else beside it.
+
+    Args:
+        config: the run; its ``policy.path`` must be set.
+    """
+
+    def __init__(self, config: RunConfig) -> None:
+        import torch
+
+        torch.set_num_threads(config.trainer.num_threads)
+        self._share = config.imagination.share
+        self._outbox: list[Segment] = []
+        self._dreams = make_imagination(config, "dream", self._outbox.append)
+        self._lock = threading.Lock()
+        self._promoted: Promotion | None = None
+
+    def ready(self) -> int:
+        """Answers once the world model is loaded; returns this process's id."""
+        return os.getpid()
+
+    def promote(self, promotion: Promotion) -> None:
+        """Dreams of this model from the next chunk on."""
+        with self._lock:
+            self._promoted = promotion
+
+    def metrics(self) -> dict[str, float]:
+        """See `Imagination.metrics`."""
+        return self._dreams.metrics()
+
+    def run(self, inference: Any, replay: Any) -> None:
+        """Dreams until replay is closed."""
+        news, mixed = _News(replay), None
+        door: list[Any] = []
+        while not news.closed:
+            self._swap()
+            for segment in news.fresh():
+                self._dreams.remember(segment)
+            if mixed is not self._dreams.on:
+                mixed = self._dreams.on
+                ray.get(replay.mix.remote(self._share if mixed else 0.0))
+            done, door = ray.wait(door, num_returns=len(door), timeout=0) if door else ([], [])
+            if not all(ray.get(list(done))):
+                return
+            requests = [] if len(door) >= AT_THE_DOOR else self._dreams.requests()
+            if not requests:
+                time.sleep(PAUSE_S)
+                continue
+            self._dreams.advance(ray.get(inference.decide.remote(requests)))
+            if self._outbox:
+                door.append(replay.insert.remote(list(self._outbox)))
+                self._outbox.clear()
+
+    def _swap(self) -> None:
+        with self._lock:
+            promoted, self._promoted = self._promoted, None
+        if promoted is not None:
+            self._dreams.swap(promoted)
+
+
+class WorldLearningWorker:
+    """Becomes a threaded Ray actor in `launch`: `run` on one thread, everything else beside it.
+
+    Args:
+        config: the run; its ``policy.path`` must be set.
+    """
+
+    def __init__(self, config: RunConfig) -> None:
+        import torch
+
+        torch.set_num_threads(config.trainer.num_threads)
+        torch.manual_seed(config.seed)
+        self._learner = make_learner(config, make_imagination(config, "", lambda segment: None))
+
+    def ready(self) -> int:
+        """Answers once the world model and its dataset are loaded; returns this process's id."""
+        return os.getpid()
+
+    def metrics(self) -> dict[str, float]:
+        """See `OnlineLearner.metrics`."""
+        return self._learner.metrics()
+
+    def run(self, dreamer: Any, replay: Any) -> None:
+        """Learns until replay is closed."""
+        news, learner = _News(replay), self._learner
+        promising = None
+        while not news.closed:
+            for segment in news.fresh():
+                learner.add(segment)
+            last = news.ended
+            if promising is not learner.promising(last):
+                promising = learner.promising(last)
+                ray.get(replay.expect.remote(promising))
+            if learner.owed >= 1:
+                learner.step()
+            elif learner.due(last):
+                if promotion := learner.promote(last):
+                    ray.get(dreamer.promote.remote(promotion))
+            else:
+                time.sleep(PAUSE_S)
+
+
+class _News:
+    """What is new in replay, asked for every now and then and never waited for."""
+
+    def __init__(self, replay: Any) -> None:
+        self._replay, self._asked, self._next = replay, None, 0.0
+        self._cursor = 0
+        self.ended = self.closed = False
+
+    def fresh(self) -> list[Segment]:
+        """Real segments that have come since."""
+        if self._asked is None:
+            if time.monotonic() < self._next:
+                return []
+            self._asked = self._replay.news.remote(self._cursor)
+        done, _ = ray.wait([self._asked], timeout=0)
+        if not done:
+            return []
+        news = ray.get(self._asked)
+        self._asked, self._next = None, time.monotonic() + LOOK_S
+        self._cursor, self.ended, self.closed = news.cursor, news.ended, news.closed
+        return list(news.segments)
