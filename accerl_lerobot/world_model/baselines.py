@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.envs.base import ChunkResult, World
-from accerl_lerobot.world_model.contract import Dream, History, State, WorldModel, WorldModelSpec
+from accerl_lerobot.world_model.contract import Context, Dream, History, State, WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.frames import resized
 
 
@@ -43,14 +43,10 @@ class CopyModel(WorldModel):
         self.spec = replace(spec, provides=spec.provides - {"uncertainty"})
 
     def begin(
-        self,
-        frames: Tensor,
-        robot: Tensor,
-        tasks: Sequence[str],
-        histories: Sequence[History | None] | None = None,
+        self, context: Context, tasks: Sequence[str], histories: Sequence[History | None] | None = None
     ) -> State:
         """See the base class."""
-        return {"frames": frames[:, -1], "robot": robot}
+        return {"frames": context.frames[:, -1], "robot": context.robot[:, -1]}
 
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Dream:
         """See the base class."""
@@ -69,14 +65,10 @@ class ShuffledModel(WorldModel):
         self.model, self.spec = model, model.spec
 
     def begin(
-        self,
-        frames: Tensor,
-        robot: Tensor,
-        tasks: Sequence[str],
-        histories: Sequence[History | None] | None = None,
+        self, context: Context, tasks: Sequence[str], histories: Sequence[History | None] | None = None
     ) -> State:
         """See the base class."""
-        return self.model.begin(frames, robot, tasks, histories)
+        return self.model.begin(context, tasks, histories)
 
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Dream:
         """See the base class."""
@@ -104,11 +96,7 @@ class OracleModel(WorldModel):
         self._tasks: list[str] = []
 
     def begin(
-        self,
-        frames: Tensor,
-        robot: Tensor,
-        tasks: Sequence[str],
-        histories: Sequence[History | None] | None = None,
+        self, context: Context, tasks: Sequence[str], histories: Sequence[History | None] | None = None
     ) -> State:
         """See the base class.
 

@@ -13,7 +13,7 @@
 # limitations under the License.
 """What a world model is: it begins at what was seen, and goes one action chunk at a time.
 
-    state = model.begin(frames, robot, tasks)
+    state = model.begin(context, tasks)
     dream = model.step(state, actions, seeds)         # dream.frames, dream.robot; go on from dream.state
 
 States are dicts of tensors with the batch in front, so that rows can be replaced, repeated and sent away. A
@@ -75,6 +75,17 @@ class Dream:
     """float32 (B,), P(the task has been achieved); None: a success model has to tell."""
 
 
+class Context(NamedTuple):
+    """What was seen until a dream begins, a chunk apart, the newest last. It is the anchor too."""
+
+    frames: Tensor
+    """uint8 (B, L, V, H, W, 3)."""
+    robot: Tensor
+    """float32 (B, L, S)."""
+    actions: Tensor
+    """float32 (B, L − 1, K, A), made between these; zero where none was made."""
+
+
 class History(NamedTuple):
     """How to get to where a dream begins, for those that can go there."""
 
@@ -93,17 +104,12 @@ class WorldModel(ABC):
 
     @abstractmethod
     def begin(
-        self,
-        frames: Tensor,
-        robot: Tensor,
-        tasks: Sequence[str],
-        histories: Sequence[History | None] | None = None,
+        self, context: Context, tasks: Sequence[str], histories: Sequence[History | None] | None = None
     ) -> State:
         """Starts an imagination.
 
         Args:
-            frames: uint8 (B, L, V, H, W, 3), K env steps apart, the newest last; it is the anchor too.
-            robot: float32 (B, S), at the newest.
+            context: what was seen so far.
             tasks: B instructions.
             histories: what led to each, where that is known.
         """

@@ -97,7 +97,9 @@ class Windows:
     anchor: np.ndarray
     """uint8 (B, V, H, W, 3): a frame some chunks before the first, where imagination would have begun."""
     state: np.ndarray
-    """float32 (B, R + 1, S), from the first frame on."""
+    """float32 (B, L + R, S), at each of these."""
+    before: np.ndarray
+    """float32 (B, L − 1, K, A), actions between the frames of the context; zero where none was made."""
     actions: np.ndarray
     """float32 (B, R, K, A), zero where none was executed."""
     steps: np.ndarray
@@ -112,6 +114,11 @@ class Windows:
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    @property
+    def context(self) -> int:
+        """L."""
+        return self.before.shape[1] + 1
 
     def rows(self, chosen: Sequence[int]) -> Windows:
         """Some of them."""
@@ -178,6 +185,12 @@ def _window(
         return int(np.searchsorted(times, max(0, time), side="right")) - 1
 
     before = [frame(start - chunk * i) for i in range(context - 1, 0, -1)]
+    made_before = np.zeros((context - 1, chunk, episode.actions.shape[1]), np.float32)
+    for i in range(1, context):
+        then = start - chunk * i
+        known = episode.actions[max(0, then) : max(0, then + chunk)]
+        if len(known):
+            made_before[-i, -len(known) :] = known
     path, actions, steps, success = [first], [], [], []
     for r in range(chunks):
         then = start + chunk * r
@@ -194,7 +207,8 @@ def _window(
     return {
         "frames": episode.frames[before + path],
         "anchor": episode.frames[frame(start - chunk * anchor)],
-        "state": episode.state[path],
+        "state": episode.state[before + path],
+        "before": made_before,
         "actions": np.stack(actions),
         "steps": executed,
         "success": np.array(success),

@@ -36,7 +36,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, TASK, Decision, Observation, Request, Segment
 from accerl_lerobot.rollout.segments import SegmentBuilder
 from accerl_lerobot.world_model.baselines import ShuffledModel
-from accerl_lerobot.world_model.contract import Dream, State, WorldModel, WorldModelSpec
+from accerl_lerobot.world_model.contract import Context, Dream, State, WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.frames import resized
 from accerl_lerobot.world_model.guard import KillSwitch
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
@@ -271,20 +271,19 @@ class Imagination:
         if not rows:
             return
         starts = self._starts.draw(len(rows), self._rng)
-        context = np.stack([s.frames for s in starts])
+        parts = [np.stack([getattr(s, part) for s in starts]) for part in Context._fields]
         state = self._model.begin(
-            torch.from_numpy(context),
-            torch.from_numpy(np.stack([s.robot for s in starts])),
+            Context(*(torch.from_numpy(part) for part in parts)),
             [s.task for s in starts],
             [s.history for s in starts],
         )
         self._state = state if self._state is None else _replaced(self._state, rows, state)
-        newest = context[:, -1]
+        newest = parts[0][:, -1]
         said = np.zeros(len(rows))
         if self._success is not None and "success" not in self._model.spec.provides:
             said = probabilities(self._success, newest, newest)
         for i, start, frames, potential in zip(rows, starts, newest, said, strict=True):
-            observation = self._observation(frames, start.robot, start.task)
+            observation = self._observation(frames, start.robot[-1], start.task)
             self._rows[i] = _Row(
                 builder=SegmentBuilder(observation, self.config.horizon, start.origin, IMAGINED),
                 start=start,

@@ -35,7 +35,7 @@ from torch.nn import functional
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model import objectives
 from accerl_lerobot.world_model.config import PixelModelConfig
-from accerl_lerobot.world_model.contract import Dream, History, State, WorldModel, WorldModelSpec
+from accerl_lerobot.world_model.contract import Context, Dream, History, State, WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.episodes import Windows
 from accerl_lerobot.world_model.network import Denoiser
 
@@ -63,13 +63,15 @@ class PixelWorldModel(nn.Module, WorldModel):
             remedy = f"use sides that are multiples of {multiple}, or change world_model.model.network"
             raise InputError("world_model.image_size", spec.image_size, remedy)
         self.spec, self.config = spec, config
-        channels, chunk = 3 * len(spec.cameras), spec.chunk * (spec.action_dim + 1)
+        channels = 3 * len(spec.cameras)
+        chunk = spec.chunk * (spec.action_dim * spec.context + 1)
         self.network = Denoiser(
             channels, (spec.context + 1) * channels, chunk, spec.state_dim, config.network
         )
         look = channels * LOOK * LOOK
         self.heads = nn.ModuleList(
-            StateHead(spec.state_dim + chunk + look, spec.state_dim) for _ in range(config.heads)
+            StateHead(spec.state_dim * spec.context + chunk + look, spec.state_dim)
+            for _ in range(config.heads)
         )
         for name, size in (
             ("robot", spec.state_dim),
@@ -85,40 +87,35 @@ class PixelWorldModel(nn.Module, WorldModel):
 
     def fit_statistics(self, windows: Windows) -> None:
         """Means and sizes of states, actions, motions and changes, from many windows of real experience."""
-        valid = windows.valid[:, 0]
-        state = windows.state[:, 0]
-        motion = (windows.state[:, 1] - state)[valid]
+        valid, now = windows.valid[:, 0], windows.context - 1
+        state = windows.state[:, now]
+        motion = (windows.state[:, now + 1] - state)[valid]
         made = np.arange(self.spec.chunk) < windows.steps[:, 0, None]
         sizes = {"robot": state, "motion": motion, "action": windows.actions[:, 0][made]}
         for name, values in sizes.items():
             getattr(self, f"{name}_mean").copy_(torch.from_numpy(values.mean(0)))
             getattr(self, f"{name}_std").copy_(torch.from_numpy(values.std(0)).clamp(min=1e-3))
-        frames = windows.frames[valid, -windows.steps.shape[1] - 1 :][:, :2].astype(np.float32) / 127.5
+        frames = windows.frames[valid, now : now + 2].astype(np.float32) / 127.5
         change = float(np.sqrt(np.square(frames[:, 1] - frames[:, 0]).mean()))
         self.change.fill_(max(change, 1e-3))
 
     def begin(
-        self,
-        frames: Tensor,
-        robot: Tensor,
-        tasks: Sequence[str],
-        histories: Sequence[History | None] | None = None,
+        self, context: Context, tasks: Sequence[str], histories: Sequence[History | None] | None = None
     ) -> State:
         """See the base class."""
-        frames, robot = (x.to(self.change.device) for x in (frames, robot))
-        return {"frames": frames, "anchor": frames[:, -1], "robot": robot}
+        frames, robot, actions = (x.to(self.change.device) for x in context)
+        return {"frames": frames, "anchor": frames[:, -1], "robot": robot, "actions": actions}
 
     @torch.no_grad()
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Dream:
         """See the base class."""
         actions = actions.to(self.change.device)
         steps = torch.full(actions.shape[:1], self.spec.chunk, device=actions.device)
-        chunk = self._chunk(actions, steps)
-        newest = state["frames"][:, -1]
+        chunk = self._chunk(state, actions, steps)
         image = self._sample(state, chunk, self._noise(seeds, state["frames"]), self.config.steps)
         frames = _to_bytes(image, len(self.spec.cameras))
-        robot, doubt = self._robot(state["robot"], chunk, newest)
-        following = _following(state, frames, robot)
+        robot, doubt = self._robot(state, chunk)
+        following = _following(state, frames, robot, actions)
         return Dream(state=following, frames=frames, robot=robot, uncertainty=doubt / self.doubt)
 
     def loss(self, windows: Windows, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
@@ -130,24 +127,26 @@ class PixelWorldModel(nn.Module, WorldModel):
         device = self.change.device
         tensors = {
             key: torch.from_numpy(getattr(windows, key)).to(device)
-            for key in ("frames", "anchor", "state", "actions", "steps", "valid")
+            for key in ("frames", "anchor", "state", "before", "actions", "steps", "valid")
         }
         length, chunks = self.spec.context, tensors["steps"].shape[1]
         state = {
             "frames": tensors["frames"][:, :length],
             "anchor": tensors["anchor"],
-            "robot": tensors["state"][:, 0],
+            "robot": tensors["state"][:, :length],
+            "actions": tensors["before"],
         }
         images, robots, weights = [], [], []
         for r in range(chunks):
             valid = tensors["valid"][:, r].float()
-            chunk = self._chunk(tensors["actions"][:, r], tensors["steps"][:, r])
+            actions = tensors["actions"][:, r]
+            chunk = self._chunk(state, actions, tensors["steps"][:, r])
             wanted = _to_floats(tensors["frames"][:, length + r])
             images.append(self._image_loss(state, chunk, wanted, generator))
-            robots.append(self._robot_loss(state, chunk, tensors["state"][:, r + 1]))
+            robots.append(self._robot_loss(state, chunk, tensors["state"][:, length + r]))
             weights.append(valid)
             if r + 1 < chunks:
-                state = self._dreamt(state, chunk, generator)
+                state = self._dreamt(state, chunk, actions, generator)
         weight = torch.stack(weights)
         total = weight.sum().clamp(min=1)
         image, robot = ((torch.stack(part) * weight).sum() / total for part in (images, robots))
@@ -198,17 +197,17 @@ class PixelWorldModel(nn.Module, WorldModel):
             shown = shown + (level * torch.randn(shown.shape, generator=generator)).to(shown)
         robot = None
         if self.spec.state_dim:
-            robot = (state["robot"] - self.robot_mean) / self.robot_std
+            robot = (state["robot"][:, -1] - self.robot_mean) / self.robot_std
         return lambda x, label: self.network(x, label, shown, chunk, robot)[0]
 
-    def _dreamt(self, state: State, chunk: Tensor, generator: torch.Generator) -> State:
+    def _dreamt(self, state: State, chunk: Tensor, actions: Tensor, generator: torch.Generator) -> State:
         """Where the model itself believes to be after a chunk, for the next one to be learnt from there."""
         with torch.no_grad():
             b, side = len(chunk), state["frames"].shape[3:5]
             noise = torch.randn(b, 1, 3 * len(self.spec.cameras), *side, generator=generator).to(chunk)
             frames = _to_bytes(self._sample(state, chunk, noise, 1), len(self.spec.cameras))
-            robot, _ = self._robot(state["robot"], chunk, state["frames"][:, -1])
-        return _following(state, frames, robot)
+            robot, _ = self._robot(state, chunk)
+        return _following(state, frames, robot, actions)
 
     def _noise(self, seeds: Sequence[int], frames: Tensor) -> Tensor:
         """(B, steps, C, H, W), each row from its own seed."""
@@ -220,32 +219,38 @@ class PixelWorldModel(nn.Module, WorldModel):
 
     # How the robot moves.
 
-    def _robot(self, robot: Tensor, chunk: Tensor, newest: Tensor) -> tuple[Tensor, Tensor]:
+    def _robot(self, state: State, chunk: Tensor) -> tuple[Tensor, Tensor]:
         """Where it is after the chunk, (B, S), and how far the heads disagree, (B,)."""
-        motions = self._motions(robot, chunk, newest)
+        motions, robot = self._motions(state, chunk), state["robot"][:, -1]
         moved = robot + self.motion_mean + self.motion_std * motions.mean(0)
         return moved, motions.std(0).mean(-1) if self.spec.state_dim else robot.new_full(
             (len(robot),), torch.nan
         )
 
     def _robot_loss(self, state: State, chunk: Tensor, wanted: Tensor) -> Tensor:
-        motion = (wanted - state["robot"] - self.motion_mean) / self.motion_std
-        motions = self._motions(state["robot"], chunk, state["frames"][:, -1])
+        motion = (wanted - state["robot"][:, -1] - self.motion_mean) / self.motion_std
+        motions = self._motions(state, chunk)
         if not self.spec.state_dim:
             return motion.new_zeros(len(motion))
         return (motions - motion).square().mean((0, 2))
 
-    def _motions(self, robot: Tensor, chunk: Tensor, newest: Tensor) -> Tensor:
+    def _motions(self, state: State, chunk: Tensor) -> Tensor:
         """(heads, B, S), in units of usual motions."""
-        look = functional.adaptive_avg_pool2d(_to_floats(newest), LOOK).flatten(1)
-        seen = torch.cat([(robot - self.robot_mean) / self.robot_std, chunk, look], 1)
+        look = functional.adaptive_avg_pool2d(_to_floats(state["frames"][:, -1]), LOOK).flatten(1)
+        robot = (state["robot"][:, -1] - self.robot_mean) / self.robot_std
+        came = (state["robot"][:, 1:] - state["robot"][:, :-1]) / self.motion_std
+        seen = torch.cat([robot, came.flatten(1), chunk, look], 1)
         return torch.stack([head(seen) for head in self.heads])
 
-    def _chunk(self, actions: Tensor, steps: Tensor) -> Tensor:
-        """(B, K·(A + 1)): normalised actions, and which of them are executed."""
+    def _chunk(self, state: State, actions: Tensor, steps: Tensor) -> Tensor:
+        """(B, K·(A + 1) + (L − 1)·K·A): normalised actions, which of them are executed, and those before.
+
+        How fast the robot is moving is in no frame, but in what it was told last.
+        """
         made = torch.arange(self.spec.chunk, device=actions.device) < steps[:, None]
         normal = (actions - self.action_mean) / self.action_std * made[..., None]
-        return torch.cat([normal.flatten(1), made.float()], 1)
+        before = (state["actions"] - self.action_mean) / self.action_std
+        return torch.cat([normal.flatten(1), made.float(), before.flatten(1)], 1)
 
 
 class StateHead(nn.Module):
@@ -264,10 +269,11 @@ class StateHead(nn.Module):
         return out
 
 
-def _following(state: State, frames: Tensor, robot: Tensor) -> State:
+def _following(state: State, frames: Tensor, robot: Tensor, actions: Tensor) -> State:
     """The context rolls on to the newest frame; the anchor stays."""
-    rolled = torch.cat([state["frames"][:, 1:], frames[:, None]], 1)
-    return {"frames": rolled, "anchor": state["anchor"], "robot": robot}
+    newest = {"frames": frames, "robot": robot, "actions": actions}
+    rolled = {key: torch.cat([state[key], new[:, None]], 1)[:, 1:] for key, new in newest.items()}
+    return rolled | {"anchor": state["anchor"]}
 
 
 def _to_floats(frames: Tensor) -> Tensor:

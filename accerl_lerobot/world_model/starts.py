@@ -35,7 +35,9 @@ class Start:
     frames: np.ndarray
     """uint8 (L, V, H, W, 3), of the model's size, the newest last."""
     robot: np.ndarray
-    """float32 (S,)."""
+    """float32 (L, S)."""
+    actions: np.ndarray
+    """float32 (L − 1, K, A), made between these."""
     task: str
     """The instruction."""
     origin: Origin
@@ -112,12 +114,22 @@ class StartPool:
             achieved = segment.terminated and segment.success and left <= self.horizon
         return Start(
             frames=held.frames[context],
-            robot=held.robot[t],
+            robot=held.robot[context],
+            actions=_before(segment, t, spec.context),
             task=segment.task,
             origin=segment.origin._replace(decision=segment.origin.decision + t),
             history=history,
             achieved=achieved,
         )
+
+
+def _before(segment: Segment, t: int, context: int) -> np.ndarray:
+    """Chunks of the decisions before the t-th, zero before the segment began."""
+    made = np.zeros((context - 1, *segment.actions.shape[1:]), np.float32)
+    known = min(t, context - 1)
+    if known:
+        made[-known:] = segment.actions[t - known : t]
+    return made
 
 
 class _Held:

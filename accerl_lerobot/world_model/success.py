@@ -27,8 +27,8 @@ import numpy as np
 import torch
 
 from accerl_lerobot.world_model.config import SuccessLearnConfig
-from accerl_lerobot.world_model.contract import WorldModel
-from accerl_lerobot.world_model.episodes import Episode, Place, cut, held, places
+from accerl_lerobot.world_model.contract import Context, WorldModel
+from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, held, places
 from accerl_lerobot.world_model.success_plugin import SuccessPairsConfig
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
@@ -140,11 +140,7 @@ class SuccessLearner:
         windows = cut(examples.episodes, at, chunk=spec.chunk, context=spec.context, chunks=1)
         success = windows.success[:, 0]
         steps = cut_alike(windows.steps[:, :1], success[:, None], self.rng)
-        state = world.begin(
-            torch.from_numpy(windows.frames[:, : spec.context]),
-            torch.from_numpy(windows.state[:, 0]),
-            windows.task,
-        )
+        state = world.begin(context_of(windows), windows.task)
         actions = torch.from_numpy(held(windows.actions, steps)[:, 0])
         after = world.step(state, actions, self.rng.integers(2**31, size=count).tolist()).frames
         progress = np.array([examples.progress(p, spec.chunk) for p in at])
@@ -169,6 +165,13 @@ def cut_alike(steps: np.ndarray, success: np.ndarray, rng: np.random.Generator) 
             failed = ~success[:, d]
             cut_[failed, d] = np.minimum(steps[failed, d], rng.choice(of, int(failed.sum())))
     return cut_
+
+
+def context_of(windows: Windows, rows: slice = slice(None)) -> Context:
+    """What a world model is shown of some windows before they begin."""
+    known = windows.context
+    parts = (windows.frames[rows, :known], windows.state[rows, :known], windows.before[rows])
+    return Context(*(torch.from_numpy(part) for part in parts))
 
 
 def new_success_model(chunk: int) -> SuccessPairsRewardModel:

@@ -37,7 +37,7 @@ from accerl_lerobot.world_model import judge
 from accerl_lerobot.world_model.config import TrialConfig
 from accerl_lerobot.world_model.contract import WorldModel
 from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, held
-from accerl_lerobot.world_model.success import Examples, cut_alike, probabilities
+from accerl_lerobot.world_model.success import Examples, context_of, cut_alike, probabilities
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
 BATCH = 64
@@ -89,15 +89,14 @@ class Dreams(NamedTuple):
 
 def dream(model: WorldModel, windows: Windows, actions: np.ndarray, ends: np.ndarray | None = None) -> Dreams:
     """Dreams all windows with these actions (M, D, K, A), and with `ends`, other last chunks, if given."""
-    context = model.spec.context
     parts: list[list[np.ndarray]] = []
     for start in range(0, len(windows), BATCH):
         rows = slice(start, start + BATCH)
-        frames = torch.from_numpy(windows.frames[rows, :context])
-        state = model.begin(frames, torch.from_numpy(windows.state[rows, 0]), windows.task[rows])
+        state = model.begin(context_of(windows, rows), windows.task[rows])
+        count = len(windows.task[rows])
         dreams, last = [], []
         for depth in range(actions.shape[1]):
-            seeds = [start + i + 1_000_003 * depth for i in range(len(frames))]
+            seeds = [start + i + 1_000_003 * depth for i in range(count)]
             dreams.append(model.step(state, torch.from_numpy(actions[rows, depth]), seeds))
             if ends is not None:
                 last.append(model.step(state, torch.from_numpy(ends[rows, depth]), seeds).frames)
@@ -179,9 +178,9 @@ def try_out(
             row |= _pixels(arms, newest[fits], real[fits], fits, d, windows.episode[fits])
             robots = arms["true"].robot[fits, d]
             if robots.shape[1]:
-                there = windows.state[fits, d + 1]
+                there = windows.state[fits, context + d]
                 row["state_error"] = float(np.abs(robots - there).mean())
-                row["state_error_copy"] = float(np.abs(windows.state[fits, 0] - there).mean())
+                row["state_error_copy"] = float(np.abs(windows.state[fits, context - 1] - there).mean())
             row["uncertainty"] = float(arms["true"].uncertainty[fits, d].mean())
         if success is not None:
             row |= _judged(success, arms, windows, theirs, newest, d)

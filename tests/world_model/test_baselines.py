@@ -20,15 +20,15 @@ import torch
 
 from accerl_lerobot.envs import SimulatedWorld, World, make_world
 from accerl_lerobot.world_model.baselines import CopyModel, OracleModel, ShuffledModel
-from accerl_lerobot.world_model.contract import State, WorldModel
+from accerl_lerobot.world_model.contract import Context, State, WorldModel
 from accerl_lerobot.world_model.starts import Start, StartPool, seen
 from tests.world_model.lived import SPEC, WORLD, lived
 
 
 def begun(model: WorldModel, starts: list[Start]) -> State:
+    parts = [np.stack([getattr(s, part) for s in starts]) for part in Context._fields]
     return model.begin(
-        torch.from_numpy(np.stack([s.frames for s in starts])),
-        torch.from_numpy(np.stack([s.robot for s in starts])),
+        Context(*(torch.from_numpy(part) for part in parts)),
         [s.task for s in starts],
         [s.history for s in starts],
     )
@@ -93,7 +93,7 @@ def test_an_oracle_must_know_what_led_to_a_start():
     starts, _ = starts_of(1)
     oracle = OracleModel(SPEC, lambda: make_world(WORLD), 1)
     with pytest.raises(ValueError, match="history of every start"):
-        oracle.begin(torch.zeros(1), torch.zeros(1), ["go"], [None])
+        oracle.begin(Context(*torch.zeros(3, 1)), ["go"], [None])
 
 
 def test_a_copy_shows_the_last_frame_for_ever():
@@ -103,7 +103,7 @@ def test_a_copy_shows_the_last_frame_for_ever():
     for _ in range(2):
         dream = copy.step(state, torch.randn(12, 4, 2), [0] * 12)
         assert np.array_equal(dream.frames.numpy(), np.stack([s.frames[-1] for s in starts]))
-        assert np.array_equal(dream.robot.numpy(), np.stack([s.robot for s in starts]))
+        assert np.array_equal(dream.robot.numpy(), np.stack([s.robot[-1] for s in starts]))
         assert dream.uncertainty.isnan().all() and dream.success is None
         state = dream.state
 

@@ -46,7 +46,8 @@ def shown(frames: np.ndarray) -> list[int]:
 def test_a_window_inside_an_episode():
     windows = cut([an_episode(20)], [Place(0, 7)], chunk=K, context=3, chunks=2)
     assert shown(windows.frames[0]) == [1, 4, 7, 10, 13] and shown(windows.anchor) == [7]
-    assert windows.state[0, :, 0].tolist() == [7, 10, 13]
+    assert windows.state[0, :, 0].tolist() == [1, 4, 7, 10, 13] and windows.context == 3
+    assert windows.before[0, :, :, 0].tolist() == [[1, 2, 3], [4, 5, 6]]
     assert windows.actions[0, :, :, 0].tolist() == [[7, 8, 9], [10, 11, 12]]
     assert windows.steps.tolist() == [[3, 3]] and windows.valid.all() and not windows.success.any()
     assert windows.task == ("go",) and len(windows) == 1
@@ -55,6 +56,7 @@ def test_a_window_inside_an_episode():
 def test_context_and_anchor_stop_at_the_first_frame():
     windows = cut([an_episode(20)], [Place(0, 4)] * 3, chunk=K, context=3, chunks=1, anchors=[0, 1, 5])
     assert shown(windows.frames[0]) == [0, 1, 4, 7]
+    assert windows.before[0, :, :, 1].tolist() == [[0, 0, 0], [-1, -2, -3]]
     assert shown(windows.anchor) == [4, 1, 0]
 
 

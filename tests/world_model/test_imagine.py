@@ -29,9 +29,10 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Decision, Request, Segment
 from accerl_lerobot.world_model import imagine
 from accerl_lerobot.world_model.baselines import OracleModel, ShuffledModel
-from accerl_lerobot.world_model.contract import Dream, History, State, WorldModel
+from accerl_lerobot.world_model.contract import Context, Dream, History, State, WorldModel
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig, OnlineLearnConfig
 from accerl_lerobot.world_model.imagine import Imagination, check_fit
+from accerl_lerobot.world_model.online import Promotion
 from tests.world_model.lived import SPEC, WORLD, K, decided, lived
 
 WORLD_SPEC = make_world(WORLD).spec
@@ -48,14 +49,13 @@ class Counting(WorldModel):
         self.doubt = doubt
         self.seeds: list[list[int]] = []
 
+    def to(self, device: object) -> Counting:
+        return self
+
     def begin(
-        self,
-        frames: Tensor,
-        robot: Tensor,
-        tasks: Sequence[str],
-        histories: Sequence[History | None] | None = None,
+        self, context: Context, tasks: Sequence[str], histories: Sequence[History | None] | None = None
     ) -> State:
-        return {"frames": torch.zeros_like(frames[:, -1]), "robot": robot}
+        return {"frames": torch.zeros_like(context.frames[:, -1]), "robot": context.robot[:, -1]}
 
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Dream:
         self.seeds.append(list(seeds))
@@ -71,11 +71,19 @@ def brightness(success: object, before: np.ndarray, after: np.ndarray) -> np.nda
     return after.max((1, 2, 3, 4)) / 200
 
 
+class Bright(torch.nn.Module):
+    """Stands where a success model does; from 0.55, three chunks of full action, it is a success."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.out, self.config = torch.nn.Linear(1, 1), SimpleNamespace(threshold=0.55)
+
+
 @pytest.fixture
 def bright(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """A success model that looks at how bright it is; from 0.55, three chunks of full action, it is one."""
+    """A success model that looks at how bright it is."""
     monkeypatch.setattr(imagine, "probabilities", brightness)
-    return SimpleNamespace(config=SimpleNamespace(threshold=0.55))
+    return Bright()
 
 
 def imagination(
@@ -92,6 +100,10 @@ def imagination(
         decision_cost=0.01, fails=fails, seed=0, name="dream", on_segment=made.append,
     )  # fmt: skip
     return dreams, made
+
+
+def promotion(model: Any, success: Any, version: int) -> Promotion:
+    return Promotion(model, success, version, {})
 
 
 def act(requests: Sequence[Request], size: float = 1.0) -> list[Decision]:
@@ -214,7 +226,7 @@ def test_dreams_that_are_too_good_are_switched_off_until_another_model_dreams(br
         rounds += 1
         assert rounds < 50
     assert dreams.switch.tripped and dreams.metrics()["on"] == 0 and dreams.metrics()["success"] > 0.5
-    dreams.swap(Counting(), bright, version=12)
+    dreams.swap(promotion(Counting(), bright, 12))
     assert len(dreams.requests()) == 4 and dreams.version == 12 and dreams.metrics()["on"] == 1
 
 
@@ -222,14 +234,14 @@ def test_a_model_that_learns_dreams_once_it_has_passed(bright: Any):
     dreams, _ = imagination(Counting(), bright, learn=OnlineLearnConfig(steps_per_episode=1))
     dreams.remember(lived(3)[0])
     assert dreams.requests() == [] and not dreams.on
-    dreams.swap(Counting(), bright, version=3)
+    dreams.swap(promotion(Counting(), bright, 3))
     assert dreams.on and len(dreams.requests()) == 4
 
 
 def test_a_placebo_stays_one_when_its_model_is_promoted(bright: Any):
     dreams, _ = imagination(ShuffledModel(Counting()), bright)
     promoted = Counting()
-    dreams.swap(promoted, bright, version=3)
+    dreams.swap(promotion(promoted, bright, 3))
     assert isinstance(dreams.dreamer[0], ShuffledModel) and dreams.dreamer[0].model is promoted
 
 

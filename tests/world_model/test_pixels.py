@@ -28,6 +28,7 @@ from accerl_lerobot.world_model.episodes import Episode, Windows, cut, places
 from accerl_lerobot.world_model.judge import mean_error, sensitivity, shuffled, skill, squared_errors
 from accerl_lerobot.world_model.learn import Learner, pretrain
 from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.success import context_of
 
 SIZE, K = 16, 2
 SPEC = WorldModelSpec(
@@ -88,7 +89,7 @@ def dream(
 ) -> list[Dream]:
     """One dream after another, as many as the windows have chunks."""
     chosen = of.actions if actions is None else actions
-    state = made.begin(torch.from_numpy(of.frames[:, :2]), torch.from_numpy(of.state[:, 0]), of.task)
+    state = made.begin(context_of(of), of.task)
     dreams = []
     for r in range(chosen.shape[1]):
         seeds = [1000 * seed + 10 * i + r for i in range(len(of))]
@@ -132,7 +133,7 @@ def test_a_dream_depends_on_its_row_and_seed_alone(objective: Objective, steps: 
     made = awake(model(objective=objective, steps=steps))
     together = dream(made, of)
     assert torch.equal(together[1].frames, dream(made, of)[1].frames)
-    state = made.begin(torch.from_numpy(of.frames[3:4, :2]), torch.from_numpy(of.state[3:4, 0]), of.task[3:4])
+    state = made.begin(context_of(of, slice(3, 4)), of.task[3:4])
     alone = made.step(state, torch.from_numpy(of.actions[3:4, 0]), [30])
     assert (alone.frames.int() - together[0].frames[3:4].int()).abs().max() <= 1, "rounding"
     assert torch.allclose(alone.robot, together[0].robot[3:4], atol=1e-5)
@@ -143,7 +144,7 @@ def test_a_dream_depends_on_its_row_and_seed_alone(objective: Objective, steps: 
 def test_a_state_is_not_changed_by_going_on_from_it():
     of = windows(dots(1))
     made = awake(model())
-    state = made.begin(torch.from_numpy(of.frames[:, :2]), torch.from_numpy(of.state[:, 0]), of.task)
+    state = made.begin(context_of(of), of.task)
     before = {k: v.clone() for k, v in state.items()}
     first = made.step(state, torch.from_numpy(of.actions[:, 0]), range(len(of)))
     assert all(torch.equal(v, state[k]) for k, v in before.items())

@@ -39,7 +39,8 @@ def test_a_start_is_a_real_observation_with_what_led_there():
         t = start.origin.decision
         assert start.origin[:2] == ("match", 3) and start.task == segment.task
         assert np.array_equal(start.frames, frames[[max(0, t - 1), t]])
-        assert np.array_equal(start.robot, robot[t])
+        assert np.array_equal(start.robot, robot[[max(0, t - 1), t]])
+        assert np.array_equal(start.actions[0], segment.actions[t - 1] if t else np.zeros((K, 2)))
         assert start.history is not None and start.history[:2] == ("match", 3)
         assert np.array_equal(start.history.actions, segment.actions[:t].reshape(-1, 2))
 

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import SuccessLearnConfig, TrialConfig
-from accerl_lerobot.world_model.contract import Dream, State, WorldModel
+from accerl_lerobot.world_model.contract import Context, Dream, History, State, WorldModel
 from accerl_lerobot.world_model.episodes import Episode
 from accerl_lerobot.world_model.success import Examples, SuccessLearner, cut_alike, new_success_model
 from accerl_lerobot.world_model.trial import ARMS, dream, trial_windows, try_out, wrong_actions
@@ -41,9 +41,11 @@ class Deterministic(WorldModel):
         self.spec, self.kind = SPEC, kind
         self.calls: list[int] = []
 
-    def begin(self, frames: Tensor, robot: Tensor, tasks: Sequence[str]) -> State:
-        assert len(tasks) == len(frames)
-        return {"frames": frames[:, -1], "robot": robot}
+    def begin(
+        self, context: Context, tasks: Sequence[str], histories: Sequence[History | None] | None = None
+    ) -> State:
+        assert len(tasks) == len(context.frames)
+        return {"frames": context.frames[:, -1], "robot": context.robot[:, -1]}
 
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Dream:
         assert len(set(seeds)) == len(actions)
