@@ -74,7 +74,10 @@ class Episode:
 
         Demonstrations have no frame after their last step: the one before it counts.
         """
-        return self.times >= self.success_at if self.success else np.zeros(len(self.times), bool)
+        shown: np.ndarray = self.times > self.success_at if self.success else np.zeros(len(self.times), bool)
+        if self.success and not shown.any():
+            shown[-1] = True
+        return shown
 
     def __len__(self) -> int:
         """Env steps."""

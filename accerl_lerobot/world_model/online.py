@@ -151,7 +151,7 @@ class OnlineLearner:
         held = int(self._ended * share) > int(before * share)
         (self._held if held else self._learnt).append(episode)
         self._examples = None
-        if segment.episode:
+        if segment.terminated or segment.truncated:
             self._since += 1
             self.owed += self.config.steps_per_episode
 
@@ -188,7 +188,7 @@ class OnlineLearner:
         found = self.found = try_out(model, held, self.trial, success, self._seed)
         if not found["passed"]:
             self.refused += 1
-            if last:
+            if last and self._last_tries < self.config.last_tries:
                 self.owed += self.config.try_every * self.config.steps_per_episode
             return None
         self.promoted += 1

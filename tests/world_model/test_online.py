@@ -1,0 +1,185 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from accerl_lerobot.experience import Segment
+from accerl_lerobot.world_model import online
+from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, TrialConfig
+from accerl_lerobot.world_model.imagination_config import OnlineLearnConfig
+from accerl_lerobot.world_model.online import OnlineLearner, episode_of, online_weights
+from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.starts import seen
+from accerl_lerobot.world_model.success import new_success_model
+from tests.world_model.lived import SPEC, K, lived
+
+NETWORK = NetworkConfig(space_to_depth=2, channels=(8, 8), condition=8, planes=2)
+
+
+def learner(**config: Any) -> OnlineLearner:
+    torch.manual_seed(0)
+    options = {k: config.pop(k) for k in ("offline", "held_out_offline") if k in config}
+    options = {k.removesuffix("_offline"): v for k, v in options.items()}
+    fields = {"steps_per_episode": 2.0, "batch": 4, "try_every": 4, "held_out": 0.25}
+    return OnlineLearner(
+        PixelWorldModel(SPEC, PixelModelConfig(network=NETWORK)), new_success_model(K),
+        OnlineLearnConfig(**(fields | config)), TrialConfig(depth=2), seed=0, **options,
+    )  # fmt: skip
+
+
+def episodes(*outcomes: bool) -> list[Segment]:
+    return [lived(seed, solve_at=2 if success else 99)[0] for seed, success in enumerate(outcomes)]
+
+
+def test_a_segment_is_a_stretch_of_experience():
+    [segment] = lived(1, solve_at=2)
+    episode = episode_of(segment, SPEC)
+    frames, robot = seen(segment, SPEC)
+    assert segment.steps.tolist() == [4, 4, 4, 1] and episode.times.tolist() == [0, 4, 8, 12, 13]
+    assert np.array_equal(episode.frames, frames) and np.array_equal(episode.state, robot)
+    assert np.array_equal(episode.actions[:12], segment.actions[:3].reshape(12, 2))
+    assert (
+        len(episode) == 13 and episode.success_at == 12 and episode.achieved.tolist() == [False] * 4 + [True]
+    )
+    failure = episode_of(lived(1)[0], SPEC)
+    assert not failure.success and failure.source == "online"
+
+
+def test_some_episodes_are_held_out_and_steps_are_owed_for_all():
+    made = learner()
+    for segment in episodes(*[False] * 8):
+        made.add(segment)
+    assert len(made._held) == 2 and len(made._learnt) == 6 and made.owed == 16
+    kept = {e.frames.tobytes() for e in made._held}
+    assert not kept & {e.frames.tobytes() for e in made._learnt}
+    cut = lived(0, length=3)[0]
+    made.add(cut)
+    assert made.owed == 16, "an episode that goes on is not counted yet"
+
+
+def test_it_learns_from_real_windows_and_leaves_what_serves_alone():
+    made = learner()
+    serving = PixelWorldModel(SPEC, PixelModelConfig(network=NETWORK))
+    for segment in episodes(False, False, True, False):
+        made.add(segment)
+    before = {k: v.clone() for k, v in made._learner.serving.state_dict().items()}
+    while made.owed >= 1:
+        metrics = made.step()
+    assert made.version == 8 and made.owed < 1
+    assert {"image", "state", "success_loss"} <= set(metrics)
+    assert any(not torch.equal(v, before[k]) for k, v in made._learner.serving.state_dict().items())
+    assert all(torch.equal(v, serving.state_dict()[k]) for k, v in serving.state_dict().items())
+
+
+def test_without_a_success_only_the_world_is_learnt():
+    made = learner()
+    made.add(episodes(False)[0])
+    assert "image" in (metrics := made.step()) and not any(k.startswith("success") for k in metrics)
+    assert learner().step() == {}, "nothing to learn from"
+
+
+def test_a_share_of_every_batch_is_from_the_dataset_it_began_with():
+    offline = [episode_of(s, SPEC) for s in episodes(False, True)]
+    made = learner(offline=offline, batch=8)
+    assert {p.episode for p in made._draw()} <= {0, 1}, "nothing else is known yet"
+    for segment in episodes(*[False] * 4):
+        made.add(segment)
+    for _ in range(20):
+        drawn = [p.episode for p in made._draw()]
+        assert sum(e < 2 for e in drawn) == 4 and max(drawn) < 2 + 3
+
+
+def test_new_and_failed_episodes_are_drawn_more_often():
+    config = OnlineLearnConfig(recent=0.7, failures=0.6)
+    weights = online_weights([True, False] * 4, config)
+    assert weights.sum() == pytest.approx(1) and len(weights) == 8
+    assert weights[1::2].sum() == pytest.approx(0.6)
+    assert weights[6:].sum() == pytest.approx(0.7), "the newest quarter"
+    assert weights[0] == pytest.approx(0.4 * 0.3 / 3) and weights[6] == pytest.approx(0.4 * 0.7)
+    assert online_weights([False] * 4, config).tolist() == pytest.approx([0.1, 0.1, 0.1, 0.7])
+    assert online_weights([True], config).tolist() == [1]
+
+
+def passes(monkeypatch: pytest.MonkeyPatch, *outcomes: bool) -> list[list[str]]:
+    """Trials end so; gives the sources of the episodes they are on."""
+    results, tried = list(outcomes), []
+
+    def trial(model: Any, held: Any, *rest: Any) -> dict[str, Any]:
+        tried.append([e.source for e in held])
+        return {"passed": results.pop(0), "gates": {"auroc_last": {"value": 0.5}}}
+
+    monkeypatch.setattr(online, "try_out", trial)
+    return tried
+
+
+def test_what_passes_is_promoted_and_what_does_not_is_not(monkeypatch: pytest.MonkeyPatch):
+    demo = [replace(episode_of(s, SPEC), source="demo") for s in episodes(True)]
+    made = learner(held_out_offline=demo)
+    tried = passes(monkeypatch, False, True)
+    assert not made.due(last=False)
+    for number, segment in enumerate(episodes(*[False] * 8)):
+        made.add(segment)
+        while made.owed >= 1:
+            assert not made.due(last=False), "what it owes comes first"
+            made.step()
+        assert made.due(last=False) is (number in (3, 7))
+        if number == 3:
+            assert made.promote(last=False) is None and made.metrics()["refused"] == 1
+        if number == 7:
+            promotion = made.promote(last=False)
+            assert promotion is not None and promotion.version == made.version == 16
+            assert not any(p.requires_grad for p in promotion.model.parameters())
+            assert not promotion.success.training
+    assert tried == [["demo", "online"], ["demo", "online", "online"]]
+    assert made.metrics()["gate_auroc_last"] == 0.5 and made.metrics()["promoted"] == 1
+    assert made.owed == 0
+
+
+def test_after_the_last_episode_it_learns_on_until_it_passes_or_is_given_up(monkeypatch: pytest.MonkeyPatch):
+    made = learner(last_tries=3)
+    passes(monkeypatch, False, False, False)
+    for segment in episodes(False, True, False, False):
+        made.add(segment)
+    tries = 0
+    while made.promising(last=True):
+        if made.owed >= 1:
+            made.step()
+        else:
+            assert made.due(last=True)
+            made.promote(last=True)
+            tries += 1
+    assert tries == 3 and made.promising(last=False) and not made.due(last=True)
+    assert made.version == 8 + 2 * 8 and made.owed == 0, "as many steps as try_every episodes bring"
+
+
+def test_after_the_last_episode_one_that_serves_is_tried_once_more(monkeypatch: pytest.MonkeyPatch):
+    made = learner()
+    passes(monkeypatch, True, True)
+    for segment in episodes(*[False] * 4):
+        made.add(segment)
+    while made.owed >= 1:
+        made.step()
+    assert made.promote(last=False) is not None
+    assert not made.promising(last=True), "nothing is new"
+    made.add(episodes(False)[0])
+    while made.owed >= 1:
+        made.step()
+    assert made.due(last=True) and made.promote(last=True) is not None and not made.promising(last=True)
