@@ -62,7 +62,7 @@ class ReplayWorker:
     def __init__(self, config: ReplayConfig, seed: int, imagined: ReplayConfig | None = None) -> None:
         self._replay = MixedReplay(config, imagined or ReplayConfig(), share=0.0)
         # Nothing is imagined until the dreamer says so.
-        self._replay.awaited = self._awaited = imagined is not None
+        self._replay.awaited = imagined is not None
         self._real: deque[Segment] = deque(maxlen=IN_TRANSIT if imagined else 0)
         self._real_count = 0
         self._rng = np.random.default_rng(seed)
@@ -129,18 +129,10 @@ class ReplayWorker:
         segments = list(self._real)[len(self._real) - new :]
         return News(segments, self._real_count, self._replay.real_ended, self._closed)
 
-    async def mix(self, share: float) -> None:
-        """From now on so much of a batch is imagined."""
-        await self._mix(share, self._awaited)
-
-    async def expect(self, awaited: bool) -> None:
-        """Whether something may be imagined later on, although nothing is now."""
-        await self._mix(self._replay.share, awaited)
-
-    async def _mix(self, share: float, awaited: bool) -> None:
-        self._awaited = awaited
+    async def mix(self, share: float, awaited: bool) -> None:
+        """See `MixedReplay.mix`."""
         async with self._changed:
-            self._replay.mix(share, share > 0 or awaited)
+            self._replay.mix(share, awaited)
             self._changed.notify_all()
 
     async def end_real(self) -> None:

@@ -21,6 +21,7 @@ only once it has passed a trial on them.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from collections import deque
 from collections.abc import Sequence
@@ -120,6 +121,8 @@ class OnlineLearner:
         self._held: deque[Episode] = deque(maxlen=max(1, round(config.memory * config.held_out)))
         self._rng = np.random.default_rng((seed, 4))
         self._examples: Examples | None = None
+        self._new = True
+        """Whether there are episodes that `_examples` does not know."""
         self._ended = self._since = self._last_tries = 0
 
     @property
@@ -150,7 +153,7 @@ class OnlineLearner:
         before, self._ended = self._ended, self._ended + 1
         held = int(self._ended * share) > int(before * share)
         (self._held if held else self._learnt).append(episode)
-        self._examples = None
+        self._examples, self._new = None, True
         if segment.terminated or segment.truncated:
             self._since += 1
             self.owed += self.config.steps_per_episode
@@ -162,8 +165,10 @@ class OnlineLearner:
             return {}
         episodes = self._offline + list(self._learnt)
         metrics = self._learner.step(self._learner.windows(episodes, self._draw()))
-        if self._examples is None and any(e.success for e in episodes):
-            self._examples = Examples(episodes, self._learner.model.spec.chunk)
+        if self._examples is None and self._new:
+            self._new = False
+            with contextlib.suppress(ValueError):  # so far there may be only one kind of outcome
+                self._examples = Examples(episodes, self._learner.model.spec.chunk)
         if self._examples is not None:
             judged = self._success.step(self._examples, self._learner.serving)
             metrics |= {f"success_{k}": v for k, v in judged.items()}

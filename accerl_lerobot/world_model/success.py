@@ -41,7 +41,7 @@ class Examples:
         chunk: K.
 
     Raises:
-        ValueError: none of them succeeds, or nothing but successes is seen.
+        ValueError: there is no frame, or no chunk, of either kind.
     """
 
     def __init__(self, episodes: Sequence[Episode], chunk: int) -> None:
@@ -55,9 +55,9 @@ class Examples:
             episode = episodes[place.episode]
             start = int(episode.times[place.frame])
             self._chunks[start <= episode.success_at < start + chunk].append(place)
-        if not self._frames[True] or not self._frames[False]:
-            shown = {kind: len(frames) for kind, frames in self._frames.items()}
-            raise ValueError(f"{shown[True]} frames show a success and {shown[False]} do not")
+        for name, of in (("frames", self._frames), ("chunks", self._chunks)):
+            if not of[True] or not of[False]:
+                raise ValueError(f"{len(of[True])} {name} show a success and {len(of[False])} do not")
 
     def seen(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
         """Pairs of frames: half successes, then as many failures, as near to each other.
@@ -198,4 +198,4 @@ def probabilities(
         )
         for i in range(0, len(before), batch)
     ]
-    return torch.cat(parts).cpu().numpy()
+    return torch.cat(parts).cpu().numpy() if parts else np.zeros(0, np.float32)

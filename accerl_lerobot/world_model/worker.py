@@ -64,6 +64,7 @@ class DreamWorker:
         self._dreams = make_imagination(config, "dream", self._outbox.append)
         self._lock = threading.Lock()
         self._promoted: Promotion | None = None
+        self._promising = config.imagination.learns
 
     def ready(self) -> int:
         """Answers once the world model is loaded; returns this process's id."""
@@ -74,21 +75,27 @@ class DreamWorker:
         with self._lock:
             self._promoted = promotion
 
+    def expect(self, promising: bool) -> None:
+        """Whether another model may be promoted later on."""
+        with self._lock:
+            self._promising = promising
+
     def metrics(self) -> dict[str, float]:
         """See `Imagination.metrics`."""
         return self._dreams.metrics()
 
     def run(self, inference: Any, replay: Any) -> None:
         """Dreams until replay is closed."""
-        news, mixed = _News(replay), None
+        news, told = _News(replay), None
         door: list[Any] = []
         while not news.closed:
-            self._swap()
+            promising = self._swap()
             for segment in news.fresh():
                 self._dreams.remember(segment)
-            if mixed is not self._dreams.on:
-                mixed = self._dreams.on
-                ray.get(replay.mix.remote(self._share if mixed else 0.0))
+            # Both at once: a run in which nothing is imagined and nothing expected has nothing to wait for.
+            if told != (self._dreams.on, promising):
+                told = (self._dreams.on, promising)
+                ray.get(replay.mix.remote(self._share if self._dreams.on else 0.0, any(told)))
             done, door = ray.wait(door, num_returns=len(door), timeout=0) if door else ([], [])
             if not all(ray.get(list(done))):
                 return
@@ -101,11 +108,14 @@ class DreamWorker:
                 door.append(replay.insert.remote(list(self._outbox)))
                 self._outbox.clear()
 
-    def _swap(self) -> None:
+    def _swap(self) -> bool:
+        """Takes over what was promoted; whether more may come."""
         with self._lock:
             promoted, self._promoted = self._promoted, None
+            promising = self._promising
         if promoted is not None:
             self._dreams.swap(promoted)
+        return promising
 
 
 class WorldLearningWorker:
@@ -140,7 +150,7 @@ class WorldLearningWorker:
             last = news.ended
             if promising is not learner.promising(last):
                 promising = learner.promising(last)
-                ray.get(replay.expect.remote(promising))
+                ray.get(dreamer.expect.remote(promising))
             if learner.owed >= 1:
                 learner.step()
             elif learner.due(last):

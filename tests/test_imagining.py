@@ -1,0 +1,231 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Runs in which the policy learns from dreams too, through either engine."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from accerl_lerobot import cli
+from accerl_lerobot.config import RunConfig
+from accerl_lerobot.engine import Progress
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import IMAGINED, REAL, Segment
+from accerl_lerobot.local import LocalEngine
+from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.run import train
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, TrialConfig, WorldModelConfig
+from accerl_lerobot.world_model.imagination_config import ImaginationConfig, OnlineLearnConfig
+from accerl_lerobot.world_model.offline import world_spec
+from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.store import save_world_model
+from accerl_lerobot.world_model.success import new_success_model
+from tests.runs import drive, tiny_run
+
+# About half of all episodes succeed when it is acted at random.
+ENV = SimulatedConfig(max_steps=16, hold=8, tolerance=0.45)
+LOOSE = TrialConfig(
+    skill_first=-1e9, skill_last=-1e9, sensitivity=0.0, auroc=-1.0, false_success=1.0, every=4, most=40
+)
+DREAMS = ReplayConfig(capacity=64, min_decisions=1, ahead=16, samples_per_insert=1.0)
+
+
+@pytest.fixture(scope="module")
+def world_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A new one, which has learnt nothing."""
+    torch.manual_seed(0)
+    config = PixelModelConfig(network=NetworkConfig(channels=(8, 8), condition=8, planes=2))
+    spec = world_spec(WorldModelConfig(chunk=4, image_size=32, model=config), ENV)
+    folder = tmp_path_factory.mktemp("world") / "world_model"
+    save_world_model(folder, PixelWorldModel(spec, config), new_success_model(4))
+    return folder
+
+
+def dreaming(
+    checkpoint: Path, *, episodes: int = 6, rooms: dict[str, Any] | None = None, **config: Any
+) -> RunConfig:
+    fields: dict[str, Any] = {"share": 0.5, "dreams": 4, "horizon": 2, "replay": DREAMS, "window": 10_000}
+    return tiny_run(
+        checkpoint,
+        env=ENV,
+        imagination=ImaginationConfig(**(fields | config)),
+        rollout=RolloutConfig(worlds=4, segment_length=4, episodes=episodes, time_limit="fail"),
+        trainer=TrainerConfig(updates=12, batch_decisions=16, warmup_updates=2, value_warmup_updates=2),
+        **(rooms or {}),
+    )
+
+
+def lived(config: RunConfig) -> tuple[list[Progress], list[list[Segment]], LocalEngine]:
+    """A run in one process: what was reported, the batches that were learnt from, and the engine."""
+    engine = LocalEngine(config, ("match",))
+    batches: list[list[Segment]] = []
+    step = engine._update.step
+    engine._update.step = lambda segments: batches.append(segments) or step(segments)  # type: ignore
+    engine.train()
+    history = drive(engine)
+    engine.close()
+    return history, batches, engine
+
+
+def decisions(segments: list[Segment], source: str) -> int:
+    return sum(len(s) for s in segments if s.source == source)
+
+
+def test_half_of_what_is_learnt_from_is_dreamt(tiny_checkpoint: Path):
+    history, batches, _ = lived(dreaming(tiny_checkpoint, model="oracle", episodes=0))
+    assert len(batches) == 12
+    for batch in batches:
+        assert 8 <= decisions(batch, REAL) < 8 + 4 and 8 <= decisions(batch, IMAGINED) < 8 + 2
+        for segment in batch:
+            dreamt = segment.source == IMAGINED
+            assert segment.key.startswith("dream." if dreamt else "local.")
+            assert (segment.world_version is not None) is dreamt
+    assert history[-1].imagination["dreams"] > 20 and history[-1].imagination["on"] == 1
+
+
+def test_when_the_real_episodes_have_been_played_dreams_go_on(tiny_checkpoint: Path):
+    history, batches, engine = lived(dreaming(tiny_checkpoint, model="oracle"))
+    explored = [e for p in history for e in p.episodes if e.plan.explore]
+    assert len(explored) == 6 and history[-1].rollout["episodes"] == 6
+    real = [decisions(b, REAL) for b in batches]
+    assert len(batches) == 12 and real[-1] == 0 and real[0] >= 8
+    assert all(len(b) and decisions(b, REAL) + decisions(b, IMAGINED) >= 16 for b in batches)
+    books = history[-1].replay
+    assert books["trained_decisions"] == sum(real)
+    assert books["imagined_trained_decisions"] == sum(decisions(b, IMAGINED) for b in batches)
+    assert real and sum(real) <= 2 * books["inserted_decisions"], "as often as samples_per_insert says"
+    assert engine._replay.real_ended
+
+
+def test_without_dreams_a_run_ends_when_its_episodes_are_used_up(tiny_checkpoint: Path):
+    config = dreaming(tiny_checkpoint, share=0.0)
+    history, batches, _ = lived(config)
+    assert history[-1].done and 0 < len(batches) < 12
+    books = history[-1].replay
+    assert books["available_decisions"] < 16 and history[-1].imagination == {}
+
+
+def test_two_runs_are_equal_to_the_last_bit(tiny_checkpoint: Path, world_model: Path):
+    learn = OnlineLearnConfig(steps_per_episode=1.0, try_every=2, held_out=0.4, trial=LOOSE, batch=4)
+    config = dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12)
+    runs = [lived(config) for _ in range(2)]
+    one, other = ([u for p in history for u in p.updates] for history, _, _ in runs)
+    assert len(one) == 12 and one == other
+    assert runs[0][0][-1].imagination == runs[1][0][-1].imagination
+    for key, tensor in runs[0][2]._adapter.export_trainable().items():
+        np.testing.assert_array_equal(tensor, runs[1][2]._adapter.export_trainable()[key])
+
+
+def test_nothing_is_dreamt_before_the_model_has_passed(tiny_checkpoint: Path, world_model: Path):
+    learn = OnlineLearnConfig(steps_per_episode=1.0, try_every=2, held_out=0.4, trial=LOOSE, batch=4)
+    history, batches, _ = lived(dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12))
+    dreamt = [p.imagination["dreams"] for p in history]
+    passed = [p.imagination["promoted"] for p in history]
+    first = next(i for i, n in enumerate(passed) if n)
+    assert dreamt[first - 1] == 0 < dreamt[-1]
+    versions = {s.world_version for b in batches for s in b if s.source == IMAGINED}
+    assert versions and 0 not in versions, "the one it began with never dreamt"
+    strict = replace(learn, trial=replace(LOOSE, sensitivity=1e9), last_tries=2)
+    history, batches, _ = lived(dreaming(tiny_checkpoint, path=str(world_model), learn=strict))
+    assert history[-1].imagination["refused"] >= 2 and history[-1].imagination["dreams"] == 0
+    assert 0 < len(batches) < 12 and not any(decisions(b, IMAGINED) for b in batches)
+
+
+def test_dreams_of_a_copy_are_known_for_what_they_are(tiny_checkpoint: Path, world_model: Path):
+    _, batches, _ = lived(dreaming(tiny_checkpoint, model="copy", path=str(world_model)))
+    for segment in (s for b in batches for s in b if s.source == IMAGINED):
+        frames = segment.observations["observation.images.front"]
+        assert all(np.array_equal(f, frames[0]) for f in frames)
+
+
+def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path):
+    from accerl_lerobot.launch import RayEngine
+
+    learn = OnlineLearnConfig(steps_per_episode=1.0, try_every=2, held_out=0.4, trial=LOOSE, batch=4)
+    config = dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12)
+    config = replace(config, rollout=replace(config.rollout, workers=2))
+    engine = RayEngine(config, ("match",))
+    try:
+        assert {"dream", "world learning"} < set(engine.pids())
+        engine.train()
+        history = drive(engine)
+    finally:
+        engine.close()
+    last = history[-1]
+    assert last.version == 12 == len([u for p in history for u in p.updates])
+    assert sum(e.plan.explore for p in history for e in p.episodes) == 12
+    assert last.imagination["promoted"] >= 1 and last.imagination["dreams"] > 0
+    assert last.imagination["learn_episodes"] >= 5
+    assert last.replay["imagined_trained_decisions"] > 0 < last.replay["trained_decisions"]
+    assert last.replay["inserted_segments"] >= 12
+
+
+def test_asynchronously_a_run_ends_when_its_episodes_are_used_up(tiny_checkpoint: Path):
+    from accerl_lerobot.launch import RayEngine
+
+    config = dreaming(tiny_checkpoint, share=0.0, episodes=7)
+    engine = RayEngine(replace(config, rollout=replace(config.rollout, workers=2)), ("match",))
+    try:
+        engine.train()
+        history = drive(engine)
+    finally:
+        engine.close()
+    assert 0 < history[-1].version < 12
+    assert sum(e.plan.explore for p in history for e in p.episodes) == 7
+
+
+def test_what_does_not_fit_is_refused_before_the_run_begins(
+    tiny_checkpoint: Path, world_model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    def told(*options: str) -> str:
+        arguments = [
+            "train", "--env.type=simulated", f"--policy.path={tiny_checkpoint}", "--imagination.share=0.5",
+            f"--output_dir={tmp_path / 'out'}", *options,
+        ]  # fmt: skip
+        assert cli.main(arguments) == 2
+        return capsys.readouterr().err
+
+    assert "imagination.path=None: give the folder world_model" in told()
+    assert "imagination.path='nowhere': not a world model" in told("--imagination.path=nowhere")
+    wide = told(f"--imagination.path={world_model}", "--env.state_dim=6", "--env.action_dim=3")
+    assert "policy" in wide or "state_dim" in wide
+    passed_by = told(f"--imagination.path={world_model}", "--env.terminate_on_success=false")
+    assert "env.terminate_on_success=False" in passed_by
+    assert not (tmp_path / "out" / "checkpoints").exists()
+
+
+def test_rooms_that_do_not_go_together(tiny_checkpoint: Path):
+    with pytest.raises(InputError, match=r"^imagination\.replay\.ahead=4: use at least one batch, 8"):
+        dreaming(tiny_checkpoint, model="oracle", replay=replace(DREAMS, ahead=4))
+    with pytest.raises(InputError, match=r"^rollout\.episodes=7: use a multiple of rollout.group_size, 4"):
+        RolloutConfig(group_size=4, episodes=7)
+
+
+def test_the_summary_says_what_was_imagined(tiny_checkpoint: Path, tmp_path: Path):
+    from accerl_lerobot.console import Console
+
+    config = dreaming(tiny_checkpoint, model="oracle")
+    config = replace(config, launch=replace(config.launch, engine="local"))
+    summary = train(config, tmp_path, Console())
+    assert summary["episodes_explored"] == 6 and summary["imagination"]["decisions"] > 0
+    assert summary["updates"] == 12
