@@ -31,6 +31,7 @@ from typing import Any
 
 import yaml
 
+from accerl_lerobot.bench.dream import BenchDreamConfig
 from accerl_lerobot.bench.lag import BenchLagConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
@@ -293,7 +294,7 @@ def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Cons
 
 
 def bench(arguments: list[str]) -> int:
-    """``accerl bench world``, ``policy`` and ``lag``."""
+    """``accerl bench world``, ``policy``, ``lag`` and ``dream``."""
     name = arguments[0] if arguments else ""
     if f"bench {name}" not in CONFIGS:
         names = [verb.split()[1] for verb in CONFIGS if verb.startswith("bench ")]
@@ -318,6 +319,7 @@ CONFIGS: dict[str, type[Any]] = {
     "bench world": BenchWorldConfig,
     "bench policy": BenchPolicyConfig,
     "bench lag": BenchLagConfig,
+    "bench dream": BenchDreamConfig,
 }
 """Verb → what its command line is parsed into."""
 

@@ -20,8 +20,6 @@ are made, re-scored at equal weights, and learnt from, as inference and trainer 
 from __future__ import annotations
 
 import platform
-import resource
-import statistics
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -31,6 +29,7 @@ from typing import Any
 
 from rich.table import Table
 
+from accerl_lerobot.bench.measure import Memory, device_name, timed
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import TuningConfig
 
@@ -85,15 +84,15 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
     from accerl_lerobot.policies.loading import resolve_device
 
     device = resolve_device(config.device)
-    memory = _Memory(device)
+    memory = Memory(device)
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as directory:
         adapter = _adapter(config, device, Path(directory))
     built = time.perf_counter() - started
     memory.note("built")
     requests = _requests(config.batch)
-    one = _timed(lambda: adapter.decide(requests[:1], 0), config.repeats, device)
-    many = _timed(lambda: adapter.decide(requests, 0), config.repeats, device)
+    one = timed(lambda: adapter.decide(requests[:1], 0), config.repeats, device)
+    many = timed(lambda: adapter.decide(requests, 0), config.repeats, device)
     memory.note("decided")
     # One at a time, and re-scored together: rounding depends on the batch, and this is what a run does.
     decisions = [adapter.decide([request], 0)[0] for request in requests]
@@ -106,7 +105,7 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
         with torch.no_grad():
             return adapter.evaluate(*observations, latent).log_prob
 
-    scored = _timed(score, config.repeats, device)
+    scored = timed(score, config.repeats, device)
     change = (score() - old).sum(1)
     gap, ratio = change.abs(), change.exp()
     trainable = adapter.trainable()
@@ -119,7 +118,7 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
         (ratio.mean() + evaluation.value.error(torch.ones(len(old), device=device)).mean()).backward()
         optimizer.step()
 
-    updated = _timed(update, config.repeats, device)
+    updated = timed(update, config.repeats, device)
     memory.note("updated")
     return {
         "config": asdict(config),
@@ -135,7 +134,7 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
             "clip": float(((ratio > 1.2) | (ratio < 0.8)).float().mean()),
         },
         "host": {
-            "device": _device_name(device),
+            "device": device_name(device),
             "machine": platform.machine(),
             "threads": torch.get_num_threads(),
         },
@@ -269,41 +268,3 @@ def _requests(count: int) -> list[Any]:
         Request(observation={"observation.state": np.full(1, i, np.float32), TASK: "do it"}, noise_seed=i)
         for i in range(count)
     ]
-
-
-def _timed(work: Callable[[], Any], repeats: int, device: Any) -> dict[str, Any]:
-    import torch
-
-    seconds = []
-    for _ in range(repeats + 1):
-        started = time.perf_counter()
-        work()
-        if device.type == "cuda":
-            torch.cuda.synchronize()
-        seconds.append(time.perf_counter() - started)
-    counted = seconds[1:]
-    return {"median": statistics.median(counted), "min": min(counted), "max": max(counted), "all": counted}
-
-
-class _Memory:
-    """Peak memory of the device, in GB, at moments that have a name."""
-
-    def __init__(self, device: Any) -> None:
-        self.device = device
-        self.notes: dict[str, float] = {}
-
-    def note(self, stage: str) -> None:
-        """The peak since the last moment; on a CPU, of the whole process since it began."""
-        import torch
-
-        if self.device.type == "cuda":
-            self.notes[stage] = torch.cuda.max_memory_allocated() / 1e9
-            torch.cuda.reset_peak_memory_stats()
-        else:
-            self.notes[stage] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
-
-
-def _device_name(device: Any) -> str:
-    import torch
-
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"

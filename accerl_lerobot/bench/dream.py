@@ -1,0 +1,171 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What a world model costs here: dreaming a chunk, judging it, and learning from a batch.
+
+Weights are random and so is what is seen; a model that has learnt costs the same.
+"""
+
+from __future__ import annotations
+
+import platform
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from typing import Any
+
+from rich.table import Table
+
+from accerl_lerobot.bench.measure import Memory, device_name, timed
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model.config import WorldModelConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchDreamConfig:
+    """What is measured."""
+
+    world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
+    cameras: int = 1
+    """Pictures in an observation."""
+    state_dim: int = 4
+    action_dim: int = 4
+    batches: tuple[int, ...] = (1, 8, 32)
+    """Dreams at a time."""
+    device: str = "auto"
+    """cpu, cuda, or auto."""
+    num_threads: int = 1
+    """CPU threads."""
+    repeats: int = 5
+    """Times each part is measured after a first one that does not count."""
+
+    def __post_init__(self) -> None:
+        for name in ("cameras", "action_dim", "num_threads", "repeats"):
+            if getattr(self, name) < 1:
+                raise InputError(name, getattr(self, name), "use at least 1")
+        if self.state_dim < 0:
+            raise InputError("state_dim", self.state_dim, "use 0 (none) or more")
+        if not self.batches or min(self.batches) < 1:
+            raise InputError("batches", self.batches, "name sizes from 1 up")
+
+
+def bench_dream(config: BenchDreamConfig) -> dict[str, Any]:
+    """Dreams, judges and learns.
+
+    Returns:
+        ``parameters`` of world model and success model; ``seconds`` (median, min, max) of ``dream`` and
+        ``judge`` by batch size, and of a gradient step ``learn``; ``memory_gb``; ``config``; ``host``.
+    """
+    import numpy as np
+    import torch
+
+    from accerl_lerobot.policies.loading import resolve_device
+    from accerl_lerobot.world_model.contract import WorldModelSpec
+    from accerl_lerobot.world_model.learn import Learner
+    from accerl_lerobot.world_model.pixels import PixelWorldModel
+    from accerl_lerobot.world_model.success import context_of, new_success_model, probabilities
+
+    torch.set_num_threads(config.num_threads)
+    torch.manual_seed(0)
+    device, of = resolve_device(config.device), config.world_model
+    memory = Memory(device)
+    spec = WorldModelSpec(
+        cameras=tuple(f"observation.images.{i}" for i in range(config.cameras)),
+        image_size=(of.image_size, of.image_size),
+        state_dim=config.state_dim,
+        action_dim=config.action_dim,
+        chunk=of.chunk,
+        fps=10,
+        context=of.model.context,
+        provides=frozenset({"pixels"}),
+    )
+    model = PixelWorldModel(spec, of.model).to(device)
+    judge = new_success_model(of.chunk).to(device).eval()
+    seconds: dict[str, Any] = {"dream": {}, "judge": {}}
+    for batch in config.batches:
+        windows = _windows(spec, batch, of.learn.chunks)
+        state = model.begin(context_of(windows), windows.task)
+        step = partial(model.step, state, torch.from_numpy(windows.actions[:, 0]), list(range(batch)))
+        newest = windows.frames[:, spec.context - 1]
+        seconds["dream"][str(batch)] = timed(step, config.repeats, device)
+        seconds["judge"][str(batch)] = timed(
+            partial(probabilities, judge, newest, newest), config.repeats, device
+        )
+    memory.note("dreamt")
+    learner = Learner(model, of.learn, seed=0)
+    windows = _windows(spec, of.learn.batch, of.learn.chunks)
+    seconds["learn"] = timed(lambda: learner.step(windows), config.repeats, device)
+    memory.note("learnt")
+    return {
+        "config": asdict(config),
+        "parameters": {
+            name: sum(p.numel() for p in net.parameters())
+            for name, net in (("world", model), ("success", judge))
+        },
+        "seconds": seconds,
+        "memory_gb": memory.notes,
+        "host": {
+            "device": device_name(device),
+            "machine": platform.machine(),
+            "threads": torch.get_num_threads(),
+            "numpy": np.__version__,
+        },
+    }
+
+
+def table(result: dict[str, Any]) -> Table:
+    """`result` for people."""
+    of, parameters, host = result["config"]["world_model"], result["parameters"], result["host"]
+    shown = Table(
+        title=f"{of['model']['objective']}, {of['model']['steps']} step(s), {of['image_size']} px: "
+        f"{parameters['world'] / 1e6:.1f} M parameters, on {host['device']}, {host['threads']} thread(s)"
+    )
+    for heading in ("what", "ms", "range", "chunks/s"):
+        shown.add_column(heading, justify="left" if heading == "what" else "right")
+    rows = [
+        (f"{what} ({batch})", times, int(batch))
+        for what in ("dream", "judge")
+        for batch, times in result["seconds"][what].items()
+    ]
+    learnt = of["learn"]["batch"] * of["learn"]["chunks"]
+    rows.append(
+        (f"learn ({of['learn']['batch']} × {of['learn']['chunks']})", result["seconds"]["learn"], learnt)
+    )
+    for what, times, count in rows:
+        spread = f"{1000 * times['min']:.1f} to {1000 * times['max']:.1f}"
+        shown.add_row(what, f"{1000 * times['median']:.1f}", spread, f"{count / times['median']:.0f}")
+    for stage, size in result["memory_gb"].items():
+        shown.add_row(f"memory, {stage}", f"{size:.1f} GB", "", "")
+    return shown
+
+
+def _windows(spec: Any, count: int, chunks: int) -> Any:
+    """Made-up experience."""
+    import numpy as np
+
+    from accerl_lerobot.world_model.episodes import Windows
+
+    rng, length = np.random.default_rng(0), spec.context
+    cameras, (height, width) = len(spec.cameras), spec.image_size
+    frames = rng.integers(0, 256, (count, length + chunks, cameras, height, width, 3), dtype=np.uint8)
+    return Windows(
+        frames=frames,
+        anchor=frames[:, length - 1],
+        state=rng.standard_normal((count, length + chunks, spec.state_dim), dtype=np.float32),
+        before=rng.standard_normal((count, length - 1, spec.chunk, spec.action_dim), dtype=np.float32),
+        actions=rng.standard_normal((count, chunks, spec.chunk, spec.action_dim), dtype=np.float32),
+        steps=np.full((count, chunks), spec.chunk),
+        success=np.zeros((count, chunks), bool),
+        valid=np.ones((count, chunks), bool),
+        episode=np.arange(count),
+        task=("",) * count,
+    )
