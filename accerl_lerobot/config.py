@@ -114,11 +114,12 @@ class RunConfig:
             raise InputError("replay.max_lag", self.replay.max_lag, remedy)
         batch, imagination = self.trainer.batch_decisions, self.imagination
         if self.trainer.updates:
-            dreamt = imagination.dreamt(batch)
-            self.replay.check(batch_decisions=batch - dreamt, segment_decisions=self.rollout.segment_length)
+            # Of both, as a batch is all real before anything is imagined, and all imagined after the last
+            # real episode.
+            self.replay.check(batch_decisions=batch, segment_decisions=self.rollout.segment_length)
             if imagination.share:
                 imagination.replay.check(
-                    batch_decisions=dreamt, segment_decisions=imagination.horizon, field="imagination.replay"
+                    batch_decisions=batch, segment_decisions=imagination.horizon, field="imagination.replay"
                 )
         if imagination.share and self.algorithm.advantage == "group":
             remedy = "use algorithm.advantage=gae: dreams do not begin alike, so they are not compared"

@@ -45,6 +45,7 @@ from ray.exceptions import RayActorError, RayError, RayTaskError
 from accerl_lerobot.config import RunConfig
 from accerl_lerobot.engine import Engine, Progress, check_new, episode_key
 from accerl_lerobot.inference.worker import ServiceStoppedError
+from accerl_lerobot.rollout.plans import budgets, whole_groups
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.watched import Watched
 
@@ -221,9 +222,7 @@ class RayEngine(Engine):
                     num_cpus=0, num_gpus=share, max_concurrency=4
                 )
                 self._learner = self._service("world learning", learner.remote(c))
-        episodes, workers = c.rollout.episodes, c.rollout.workers
-        for index in range(workers):
-            budget = len(range(index, episodes, workers)) if episodes else None
+        for index, budget in enumerate(budgets(c.rollout)):
             worker = self._new_rollout(index, 0, budget)
             self._seats.append(_Seat(index=index, worker=worker, budget=budget, spent=budget == 0))
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
@@ -358,6 +357,8 @@ class RayEngine(Engine):
             self._past[key] = self._past.get(key, 0.0) + value
         seat.counters, seat.in_world_s = {}, 0.0
         seat.incarnation += 1
+        if seat.budget is not None:
+            seat.budget = whole_groups(seat.budget, self._config.rollout)
         seat.worker = self._new_rollout(seat.index, seat.incarnation, seat.budget)
         seat.unsent = list(seat.outstanding.values())
         self._set_to_work(seat)

@@ -145,6 +145,8 @@ class LocalEngine(Engine):
     def close(self) -> None:
         try:
             self._runner.close()
+            if self._dreams is not None:
+                self._dreams.close()
         except Exception:
             logger.exception("could not close all worlds")
 
@@ -202,11 +204,12 @@ class LocalEngine(Engine):
 
     def _publish(self) -> None:
         """Hands weights to the policy that acts, which is the trainer's own unless they are held back."""
-        version = self._update.version
+        version, updates = self._update.version, self._config.trainer.updates
         if self._acting is self._adapter:
             self._acting_version = version
             return
-        weights, last = self._adapter.export_trainable(), version == self._config.trainer.updates
+        last = version == updates or not self._exploring
+        weights = self._adapter.export_trainable()
         for number, tensors in self._held.push(version, weights, last=last):
             self._acting.load_trainable(tensors)
             self._acting_version = number
@@ -215,7 +218,8 @@ class LocalEngine(Engine):
         """Lets in what stands at the door, one segment at a time: a group's come all at once."""
         while self._outbox and self._replay.may_insert(REAL):
             segment = self._outbox.popleft()
-            self._replay.insert(segment)
+            if not self._replay.insert(segment):
+                continue
             if self._dreams is not None:
                 self._dreams.remember(segment)
             if self._world_learner is not None:

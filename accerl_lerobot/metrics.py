@@ -85,10 +85,10 @@ class MetricsLog:
             values: numbers; anything else goes to the JSON lines only. NaN and infinity become null there,
                 which JSON does not know, and are left out elsewhere.
         """
-        plain = _plain(values)
-        record = {"kind": kind, "wall_s": round(self.wall_s, 3), "update": update, **plain}
+        finite = plain(values)
+        record = {"kind": kind, "wall_s": round(self.wall_s, 3), "update": update, **finite}
         self._file.write(json.dumps(record) + "\n")
-        scalars = {k: float(v) for k, v in plain.items() if isinstance(v, (int, float))}
+        scalars = {k: float(v) for k, v in finite.items() if isinstance(v, (int, float))}
         summary = self._summary(
             value=[self._summary.Value(tag=f"{kind}/{k}", simple_value=v) for k, v in scalars.items()]
         )
@@ -104,12 +104,12 @@ class MetricsLog:
             self._wandb.finish()
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """JSON types: NumPy numbers become Python's, numbers that are not finite become None."""
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    return [_plain(v) for v in value] if isinstance(value, (list, tuple)) else value
+        return {k: plain(v) for k, v in value.items()}
+    return [plain(v) for v in value] if isinstance(value, (list, tuple)) else value

@@ -48,13 +48,15 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.evaluation.pictures import before_after, success_curve
 from accerl_lerobot.evaluation.summary import summarise
-from accerl_lerobot.metrics import MetricsLog
+from accerl_lerobot.metrics import MetricsLog, plain
 from accerl_lerobot.rollout.runner import EpisodeResult
 
 logger = logging.getLogger(__name__)
 
 FRUITLESS_GROUPS = 50
 """So many groups thrown away in a row are said aloud: no update is made of them."""
+DREAMT = 10
+"""Updates between two records of the workers' counters when no episode ends."""
 RECENT = 100
 """Exploring episodes over which the training success of the curve is averaged."""
 
@@ -237,7 +239,7 @@ class _Loop:
         success_curve(self.directory / "success_curve.png", self.evaluations, self.curve)
         times = (time.monotonic() - started, warm_s, rl_s)
         summary = self._summary(None if before is None else before[0], after[0], last, times)
-        (self.directory / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+        (self.directory / "summary.json").write_text(json.dumps(plain(summary), indent=2) + "\n")
         return summary
 
     def _summary(
@@ -315,6 +317,9 @@ class _Loop:
             # The first episodes to end are the short ones, which are successes.
             if len(self.recent) >= RECENT // 4:
                 self.curve.append((self._steps(progress), share))
+        # Once all real episodes have been played, dreams and the learning from them go on.
+        if explored or any(metrics["update"] % DREAMT == 0 for metrics in progress.updates):
+            share = float(np.mean(self.recent)) if self.recent else math.nan
             values = progress.rollout | {"success_exploring": share}
             values |= {f"replay_{k}": v for k, v in progress.replay.items()}
             values |= {f"inference_{k}": v for k, v in progress.inference.items()}

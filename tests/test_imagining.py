@@ -153,7 +153,9 @@ def test_nothing_is_dreamt_before_the_model_has_passed(tiny_checkpoint: Path, wo
 
 def test_dreams_of_a_copy_are_known_for_what_they_are(tiny_checkpoint: Path, world_model: Path):
     _, batches, _ = lived(dreaming(tiny_checkpoint, model="copy", path=str(world_model)))
-    for segment in (s for b in batches for s in b if s.source == IMAGINED):
+    dreamt = [s for b in batches for s in b if s.source == IMAGINED]
+    assert dreamt
+    for segment in dreamt:
         frames = segment.observations["observation.images.front"]
         assert all(np.array_equal(f, frames[0]) for f in frames)
 
@@ -207,15 +209,17 @@ def test_what_does_not_fit_is_refused_before_the_run_begins(
 
     assert "imagination.path=None: give the folder world_model" in told()
     assert "imagination.path='nowhere': not a world model" in told("--imagination.path=nowhere")
-    wide = told(f"--imagination.path={world_model}", "--env.state_dim=6", "--env.action_dim=3")
-    assert "policy" in wide or "state_dim" in wide
+    paid = told(f"--imagination.path={world_model}", "--env.reward=dense")
+    assert "env.reward='dense': use success with imagination.share" in paid
+    looks = told(f"--imagination.path={world_model}", "--env.image_size=32", "--policy.n_action_steps=2")
+    assert "executes 2 actions per decision; learn one with world_model.chunk=2" in looks
     passed_by = told(f"--imagination.path={world_model}", "--env.terminate_on_success=false")
     assert "env.terminate_on_success=False" in passed_by
     assert not (tmp_path / "out" / "checkpoints").exists()
 
 
 def test_rooms_that_do_not_go_together(tiny_checkpoint: Path):
-    with pytest.raises(InputError, match=r"^imagination\.replay\.ahead=4: use at least one batch, 8"):
+    with pytest.raises(InputError, match=r"^imagination\.replay\.ahead=4: use at least one batch, 16"):
         dreaming(tiny_checkpoint, model="oracle", replay=replace(DREAMS, ahead=4))
     with pytest.raises(InputError, match=r"^rollout\.episodes=7: use a multiple of rollout.group_size, 4"):
         RolloutConfig(group_size=4, episodes=7)

@@ -20,6 +20,7 @@ they start alike, and their exploration noise differs.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterable
 
@@ -30,6 +31,20 @@ from accerl_lerobot.seeds import train_seed
 
 STARTS_PER_INCARNATION = 1000
 """By how much a restarted worker skips ahead in its training seeds, so as not to repeat its episodes."""
+
+
+def budgets(config: RolloutConfig) -> list[int | None]:
+    """How many exploring episodes each worker plays, in whole groups; None: no end."""
+    if not config.episodes:
+        return [None] * config.workers
+    size = max(1, config.group_size)
+    return [size * len(range(w, config.episodes // size, config.workers)) for w in range(config.workers)]
+
+
+def whole_groups(episodes: int, config: RolloutConfig) -> int:
+    """At least so many: a group that was under way when its worker died is played anew."""
+    size = max(1, config.group_size)
+    return size * math.ceil(episodes / size)
 
 
 class EpisodePlans:

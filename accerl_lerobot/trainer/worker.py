@@ -95,6 +95,11 @@ class TrainerWorker:
                 "publish_s": time.monotonic() - updated,
             }
             self._history.append(metrics)
+        version = self._update.version
+        if version < config.updates and (config.hold_back or not config.publishes(version)):
+            # It has ended early, and what is evaluated is to be what is saved.
+            for due in held.push(version, self._export(), last=True):
+                publisher.publish(*due)
         publisher.flush()
         return self._update.version
 

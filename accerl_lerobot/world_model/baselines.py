@@ -142,6 +142,7 @@ class OracleModel(WorldModel):
             robot=torch.from_numpy(robot),
             uncertainty=torch.full((len(actions),), torch.nan),
             success=torch.tensor([float(r.success) for r in results]),
+            done=torch.tensor([r.done for r in results]),
         )
 
     def close(self) -> None:

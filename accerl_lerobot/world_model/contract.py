@@ -73,6 +73,8 @@ class Dream:
     """float32 (B,), ≥ 0; 1 is the 95th percentile on chunks it has learnt from. NaN where it has none."""
     success: Tensor | None = None
     """float32 (B,), P(the task has been achieved); None: a success model has to tell."""
+    done: Tensor | None = None
+    """bool (B,), whether the episode is over, with a success or without; None: only a success ends it."""
 
 
 class Context(NamedTuple):

@@ -26,8 +26,9 @@ from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.loading import load_lerobot_config
+from accerl_lerobot.preflight import check_sft_policy
 from accerl_lerobot.world_model.baselines import ShuffledModel
-from accerl_lerobot.world_model.dataset import fingerprint, load_episodes
+from accerl_lerobot.world_model.dataset import check_metadata, fingerprint, load_episodes
 from accerl_lerobot.world_model.episodes import Episode
 from accerl_lerobot.world_model.imagine import Imagination, check_fit
 from accerl_lerobot.world_model.online import OnlineLearner
@@ -81,7 +82,7 @@ def make_learner(config: RunConfig, dreams: Imagination) -> OnlineLearner:
     held_out: list[Episode] = []
     if learn.dataset.repo_id is not None:
         episodes = load_episodes(learn.dataset, model.spec)
-        source = load_source(Path(str(config.imagination.path)))
+        source = load_source(Path(str(config.imagination.path)), "imagination.path")
         if source is not None and source.fingerprint == fingerprint(open_metadata(learn.dataset)):
             offline, held_out = ([episodes[i] for i in part] for part in (source.learnt, source.held_out))
         else:
@@ -106,11 +107,16 @@ def check_imagination(config: RunConfig) -> None:
     if not config.imagination.share:
         return
     if config.policy.path is not None:
-        make_imagination(config, "", lambda segment: None)
+        policy = load_lerobot_config(config.policy)
+    elif config.sft.init_path is None:
+        policy = check_sft_policy(config.sft)
     else:
-        fields = config.sft.policy
-        executed = fields.get("n_action_steps", fields.get("chunk_size", 1))
-        _dreamer(config, _spec(config), executed, fields.get("n_obs_steps", 1))
+        return  # what is fine-tuned then is looked at when it is there
+    executed = getattr(policy, "n_action_steps", 1)
+    dreamer = _dreamer(config, _spec(config), executed, policy.n_obs_steps)
+    learn = config.imagination.learn
+    if config.imagination.learns and learn.dataset.repo_id is not None:
+        check_metadata(open_metadata(learn.dataset), learn.dataset.repo_id, dreamer.model.spec)
 
 
 def _spec(config: RunConfig) -> WorldSpec:
@@ -123,6 +129,9 @@ def _spec(config: RunConfig) -> WorldSpec:
 
 def _dreamer(config: RunConfig, spec: WorldSpec, executed: int, history: int) -> Dreamer:
     """The one that was asked for, checked."""
+    if (reward := getattr(config.env, "reward", "success")) != "success":
+        remedy = "use success with imagination.share: that is what dreams are rewarded for"
+        raise InputError("env.reward", reward, remedy)
     if not getattr(config.env, "terminate_on_success", True):
         remedy = "use true with imagination.share: a success ends a dream, and so it must a real episode"
         raise InputError("env.terminate_on_success", False, remedy)

@@ -33,27 +33,36 @@ class KillSwitch:
 
     def __init__(self, gap: float, window: int) -> None:
         self.gap = gap
-        self._seen: deque[tuple[bool, bool]] = deque(maxlen=window)
+        self._seen: deque[tuple[bool, bool]] = deque()
+        self._window = window
+        # Kept as numbers: they are also read on another thread.
+        self._imagined = self._real = self._count = 0
         self.tripped = False
 
     def add(self, imagined: bool, real: bool | None) -> None:
         """Takes note of a dream that has ended, and of what had happened; None is not counted."""
         if real is None:
             return
+        self._take(imagined, real, 1)
         self._seen.append((imagined, real))
+        if self._count > self._window:
+            self._take(*self._seen.popleft(), -1)
         dreamt, happened = self.shares
-        if len(self._seen) == self._seen.maxlen and dreamt - happened > self.gap:
+        if self._count == self._window and dreamt - happened > self.gap:
             self.tripped = True
 
     def reset(self) -> None:
         """Another world model dreams from now on."""
         self._seen.clear()
+        self._imagined = self._real = self._count = 0
         self.tripped = False
+
+    def _take(self, imagined: bool, real: bool, sign: int) -> None:
+        self._imagined, self._real = self._imagined + sign * imagined, self._real + sign * real
+        self._count += sign
 
     @property
     def shares(self) -> tuple[float, float]:
         """Of successes, imagined and real; NaN before anything was seen."""
-        count = len(self._seen)
-        if not count:
-            return float("nan"), float("nan")
-        return sum(i for i, _ in self._seen) / count, sum(r for _, r in self._seen) / count
+        count = self._count
+        return (self._imagined / count, self._real / count) if count else (float("nan"), float("nan"))

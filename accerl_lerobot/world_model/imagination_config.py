@@ -41,7 +41,7 @@ class OnlineLearnConfig:
     batch: int = 16
     """Windows in each, at least 2."""
     lr: float = 3e-4
-    """Constant."""
+    """Constant after the first 50 steps."""
     offline: float = 0.5
     """Share of windows, in [0, 1], from the dataset that it was pre-trained on, where `dataset` names it."""
     recent: float = 0.7
@@ -56,10 +56,11 @@ class OnlineLearnConfig:
     last_tries: int = 5
     """At least 1; after that, what has not passed never dreams."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    """What it was pre-trained on. Of the episodes that it was not, it keeps none to learn from; they are
-    added to those it is tried on."""
-    trial: TrialConfig = field(default_factory=lambda: TrialConfig(most=200))
-    """What it must pass to serve; its depth is `ImaginationConfig.horizon`."""
+    """What it was pre-trained on: of it, it learns from the episodes that it knows, and is tried on those
+    that were held out. Another dataset is learnt from whole."""
+    trial: TrialConfig = field(default_factory=lambda: TrialConfig(most=200, false_success=0.1))
+    """What it must pass to serve; its depth is `ImaginationConfig.horizon`. A dozen held-out episodes do not
+    tell 5 % of false successes from 6; beyond that, `gap` watches."""
     memory: int = 400
     """Real episodes kept to learn from, at least 2."""
 
@@ -98,11 +99,15 @@ class ImaginationConfig:
     """Decisions of a dream at most; V of its last observation stands for the rest."""
     keyframes: float = 0.5
     """Share of dreams, in [0, 1], that begin where the critic was surprised; the others begin anywhere."""
-    reward: Reward = "potential"
-    """potential: P(success) now less P(success) before, the start's own included. success: 1 where it exceeds
-    the success model's threshold. Either way that ends the dream, and decisions cost what they always do."""
+    reward: Reward = "success"
+    """success: 1 where P(success) exceeds the success model's threshold, which is what the world pays.
+    potential: P(success) now less P(success) before, the start's own included, as AcceRL has it. Its sum is
+    what a dream ended with less what it began with, while V, which stands for what follows the horizon, is
+    also learnt from rewards of the world: a near miss may be worth more than a success. Either way a success
+    ends the dream, and decisions cost what they always do."""
     doubt: float = 2.0
-    """A dream ends before what the model is more uncertain about, where 1 is the 95th percentile; > 0."""
+    """A dream ends before what the model is more uncertain about, where 1 is the 95th percentile; > 0. When
+    `window` dreams in a row end so at once, nothing is imagined any more."""
     memory: int = 4096
     """Newest real decisions that dreams begin from."""
     gap: float = 0.3
@@ -143,7 +148,3 @@ class ImaginationConfig:
     def learns(self) -> bool:
         """Whether the world model goes on learning."""
         return self.share > 0 and self.model in ("learned", "shuffled") and self.learn.steps_per_episode > 0
-
-    def dreamt(self, batch_decisions: int) -> int:
-        """How many decisions of a batch are imagined."""
-        return round(self.share * batch_decisions)

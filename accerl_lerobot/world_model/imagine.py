@@ -35,7 +35,7 @@ from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, TASK, Decision, Observation, Request, Segment
 from accerl_lerobot.rollout.segments import SegmentBuilder
-from accerl_lerobot.world_model.baselines import ShuffledModel
+from accerl_lerobot.world_model.baselines import OracleModel, ShuffledModel
 from accerl_lerobot.world_model.contract import Context, Dream, State, WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.frames import resized
 from accerl_lerobot.world_model.guard import KillSwitch
@@ -67,10 +67,14 @@ def check_fit(spec: WorldModelSpec, world: WorldSpec, executed: int, history: in
         return InputError("imagination.path", value, why)
 
     if missing := [camera for camera in world.images if camera not in spec.cameras]:
-        raise refuse(missing[0], f"the world shows this camera, the world model {', '.join(spec.cameras)}")
+        theirs = ", ".join(spec.cameras)
+        raise refuse(
+            missing[0], f"the world shows this camera, the world model {theirs}; learn one of this world"
+        )
     needed = {"pixels"} | ({"state"} if world.state_dim else set())
     if lacking := needed - spec.provides:
-        raise refuse(sorted(lacking)[0], "the policy reads it, and the world model does not provide it")
+        why = "the policy reads it, and the world model does not provide it"
+        raise refuse(sorted(lacking)[0], f"{why}; learn one with accerl world-model")
     for name in ("state_dim", "action_dim", "fps"):
         theirs, ours = getattr(spec, name), getattr(world, name)
         if theirs != ours:
@@ -80,10 +84,11 @@ def check_fit(spec: WorldModelSpec, world: WorldSpec, executed: int, history: in
         why = f"env steps to a dream's chunk, and the policy executes {executed} actions per decision"
         raise refuse(spec.chunk, f"{why}; learn one with world_model.chunk={executed}")
     if history > 1:
-        why = f"the policy looks back {history} env steps, and dreams show one frame per decision"
-        raise InputError("imagination.share", history, f"{why}; use a policy with n_obs_steps=1")
+        why = "the policy looks back so many env steps, and dreams show one frame per decision"
+        raise InputError("policy.n_obs_steps", history, f"{why}; use a policy with 1, or imagination.share=0")
     if not judged and "success" not in spec.provides:
-        raise refuse(None, "there is no success model beside the world model, and it cannot tell a success")
+        why = "there is no success model beside the world model, and it cannot tell a success"
+        raise refuse(None, f"{why}; learn both with accerl world-model")
 
 
 @dataclass
@@ -163,7 +168,7 @@ class Imagination:
         self._rng = np.random.default_rng((seed, 3))
         self._rows: list[_Row | None] = [None] * config.dreams
         self._state: State | None = None
-        self._sequence = 0
+        self._sequence = self._doubted_in_a_row = 0
         self._limit = math.ceil(world.max_steps / model.spec.chunk)
 
     @property
@@ -176,10 +181,12 @@ class Imagination:
         self._starts.add(segment)
 
     def swap(self, promotion: Promotion) -> None:
-        """Another world model of the same world dreams from now on; dreams under way go on in it.
+        """Another world model of the same world dreams from now on; dreams under way are dropped.
 
         A placebo goes on telling it the wrong actions.
         """
+        self._rows, self._state = [None] * len(self._rows), None
+        self._doubted_in_a_row = 0
         model: WorldModel = promotion.model.to(self._device)
         self._model = ShuffledModel(model) if isinstance(self._model, ShuffledModel) else model
         self._success = promotion.success.to(self._device)
@@ -189,7 +196,7 @@ class Imagination:
     @property
     def on(self) -> bool:
         """Whether anything is to be imagined now."""
-        return not self.waits and not self.switch.tripped
+        return not self.waits and not self.switch.tripped and self._doubted_in_a_row < self.config.window
 
     def requests(self) -> list[Request]:
         """What is to be decided, one for each dream; none before anything real was seen, or switched off."""
@@ -218,11 +225,19 @@ class Imagination:
             assert row is not None
             if doubt[i] > self.config.doubt:  # never true of a NaN
                 self.counters.doubted += 1
-                self._end(i, row, success=False, terminated=False)
+                self._doubted_in_a_row = 0 if row.depth else self._doubted_in_a_row + 1
+                self._end(i, row, terminated=False)
                 continue
+            self._doubted_in_a_row = 0
             observation = self._observation(frames[i], robot[i], row.start.task)
-            self._step(i, row, decision, actions[i], float(said[i]), observation)
+            over = dream.done is not None and bool(dream.done[i])
+            self._step(i, row, decision, actions[i], float(said[i]), observation, over)
             row.frames = frames[i]
+
+    def close(self) -> None:
+        """Ends simulators, if it is they that dream."""
+        if isinstance(self._model, OracleModel):
+            self._model.close()
 
     def metrics(self) -> dict[str, float]:
         """Counters, the model's version, and the shares of successes that `guard` compares."""
@@ -242,6 +257,7 @@ class Imagination:
         actions: np.ndarray,
         said: float,
         observation: Observation,
+        over: bool,
     ) -> None:
         achieved = said > self._threshold
         gained = said - row.potential if self.config.reward == "potential" else float(achieved)
@@ -249,14 +265,18 @@ class Imagination:
         row.potential, row.depth = said, row.depth + 1
         self.counters.decisions += 1
         late = row.depth >= row.ends_at
-        if achieved or late or row.depth >= self.config.horizon:
-            self._end(i, row, achieved, terminated=achieved or (late and self._fails), truncated=late)
+        over = over and not late
+        if achieved or late or over or row.depth >= self.config.horizon:
+            self.counters.successes += achieved
+            self.switch.add(achieved, row.start.achieved)
+            terminated = achieved or over or (late and self._fails)
+            self._end(i, row, terminated=terminated, truncated=late, success=achieved)
 
-    def _end(self, i: int, row: _Row, success: bool, *, terminated: bool, truncated: bool = False) -> None:
+    def _end(
+        self, i: int, row: _Row, *, terminated: bool, truncated: bool = False, success: bool = False
+    ) -> None:
         self._rows[i] = None
         self.counters.dreams += 1
-        self.counters.successes += success
-        self.switch.add(success, row.start.achieved)
         if not row.builder.decisions:
             return
         self._sequence += 1

@@ -50,6 +50,7 @@ from accerl_lerobot.world_model.success import Examples, SuccessLearner, new_suc
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 from accerl_lerobot.world_model.trial import (
     NEVER,
+    calibrate,
     dream,
     set_threshold,
     trial_windows,
@@ -122,7 +123,7 @@ def learn_from_dataset(
                 record("world_model", step, metrics)
 
             serving = pretrain(model, learn, config.learn, seed, config.shuffle_actions, on_step).serving
-        _calibrate(serving, learn, config, seed)
+        calibrate(serving, learn, config.trial, seed)
         success = new_success_model(config.chunk)
         learner = SuccessLearner(success, config.success, seed)
         with console.stage("success model", total=config.success.steps) as stage:
@@ -235,17 +236,6 @@ def gates(found: dict[str, Any]) -> list[str]:
         f"{gate['wanted']} wanted"
         for name, gate in found["gates"].items()
     ]
-
-
-def _calibrate(
-    model: PixelWorldModel, episodes: Sequence[Episode], config: WorldModelConfig, seed: int
-) -> None:
-    """Makes an uncertainty of 1 the 95th percentile after one whole chunk of real experience."""
-    windows = trial_windows(episodes, model, config.trial, seed + 1)
-    doubts = dream(model, windows, windows.actions[:, :1]).uncertainty[windows.steps[:, 0] == config.chunk, 0]
-    usual = float(np.quantile(doubts, 0.95)) if len(doubts) else math.nan
-    if math.isfinite(usual):  # a model without a state has no doubts
-        model.doubt.mul_(max(usual, 1e-6))
 
 
 def _check_held_out(

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -39,27 +39,58 @@ from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.starts import seen
 from accerl_lerobot.world_model.success import Examples, SuccessLearner
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
-from accerl_lerobot.world_model.trial import set_threshold, try_out
+from accerl_lerobot.world_model.trial import calibrate, set_threshold, try_out
 
 ENDLESS = 10**9
 """Steps of a learning rate that never falls."""
 
 
-def episode_of(segment: Segment, spec: WorldModelSpec) -> Episode:
-    """A real segment as a stretch of experience, looked at when decisions were due."""
-    frames, robot = seen(segment, spec)
-    steps = segment.steps
-    made = [a[:n] for a, n in zip(segment.actions, steps, strict=True)]
-    actions = np.concatenate(made)
+def episode_of(segments: Sequence[Segment], spec: WorldModelSpec) -> Episode:
+    """The segments of a whole episode, in order, as it was looked at when decisions were due."""
+    shown = [seen(segment, spec) for segment in segments]
+    # A segment begins with what the one before has ended with.
+    frames, robot = (np.concatenate([part[i][:-1] for part in shown[:-1]] + [shown[-1][i]]) for i in range(2))
+    steps = np.concatenate([segment.steps for segment in segments])
+    chunks = np.concatenate([segment.actions for segment in segments])
+    actions = np.concatenate([a[:n] for a, n in zip(chunks, steps, strict=True)])
     return Episode(
         frames=frames,
         times=np.concatenate([[0], np.cumsum(steps)]).astype(np.int64),
         state=robot.astype(np.float32),
         actions=actions,
-        success_at=len(actions) - 1 if segment.terminated and segment.success else -1,
-        task=segment.task,
+        success_at=len(actions) - 1 if segments[-1].success else -1,
+        task=segments[-1].task,
         source="online",
     )
+
+
+class Unfinished:
+    """Segments of episodes that have not ended, or of which some are still on their way.
+
+    What a worker that died has left behind is forgotten once there are `most` of them.
+    """
+
+    def __init__(self, most: int = 1024) -> None:
+        self._most = most
+        self._parts: OrderedDict[tuple[str, int], dict[int, Segment]] = OrderedDict()
+
+    def add(self, segment: Segment) -> list[Segment] | None:
+        """The whole episode, in order, if it is complete with this one."""
+        name = segment.origin[:2]
+        parts = self._parts.setdefault(name, {})
+        parts[segment.origin.decision] = segment
+        if len(self._parts) > self._most:
+            self._parts.popitem(last=False)
+        ordered = [parts[at] for at in sorted(parts)]
+        expected = 0
+        for part in ordered:
+            if part.origin.decision != expected:
+                return None
+            expected += len(part)
+        if not (ordered[-1].terminated or ordered[-1].truncated):
+            return None
+        self._parts.pop(name, None)
+        return ordered
 
 
 class Promotion(NamedTuple):
@@ -120,6 +151,7 @@ class OnlineLearner:
         self._learnt: deque[Episode] = deque(maxlen=config.memory)
         self._held: deque[Episode] = deque(maxlen=max(1, round(config.memory * config.held_out)))
         self._rng = np.random.default_rng((seed, 4))
+        self._unfinished = Unfinished()
         self._examples: Examples | None = None
         self._new = True
         """Whether there are episodes that `_examples` does not know."""
@@ -136,7 +168,7 @@ class OnlineLearner:
         Args:
             last: no real episode will come any more.
         """
-        if self.owed >= 1 or not self.version:
+        if not self.version or (last and self.owed >= 1):
             return False
         if not last:
             return self._since >= self.config.try_every
@@ -147,16 +179,22 @@ class OnlineLearner:
         return not last or self.owed >= 1 or self.due(last)
 
     def add(self, segment: Segment) -> None:
-        """Takes a real segment; every so many of them are held out."""
-        episode = episode_of(segment, self._learner.model.spec)
+        """Takes a real segment; of the episodes that it completes, some are held out."""
+        parts = self._unfinished.add(segment)
+        if parts is None:
+            return
+        episode = episode_of(parts, self._learner.model.spec)
+        if parts[-1].success and not parts[-1].terminated:
+            return  # when it succeeded is not known
         share = self.config.held_out
         before, self._ended = self._ended, self._ended + 1
         held = int(self._ended * share) > int(before * share)
         (self._held if held else self._learnt).append(episode)
         self._examples, self._new = None, True
-        if segment.terminated or segment.truncated:
-            self._since += 1
-            self.owed += self.config.steps_per_episode
+        self._since += 1
+        # Where episodes come faster than it can learn, what it owes is not to grow without end.
+        most = self.config.try_every * self.config.steps_per_episode
+        self.owed = min(self.owed + self.config.steps_per_episode, most)
 
     def step(self) -> dict[str, float]:
         """One gradient step of either model, if there is anything to learn from."""
@@ -187,6 +225,8 @@ class OnlineLearner:
             return None
         model = copy.deepcopy(self._learner.serving)
         success = copy.deepcopy(self._success.model).eval().requires_grad_(False)
+        known = [*self._offline, *self._learnt][-100:]
+        calibrate(model, known, self.trial, self._seed)
         failures = [e for e in (*self._offline, *self._learnt) if not e.success]
         if failures:
             set_threshold(model, success, failures[-100:], self.trial, self._seed)
@@ -232,7 +272,8 @@ def online_weights(successes: Sequence[bool], config: OnlineLearnConfig) -> np.n
     if failed.any() and not failed.all():
         for kind, share in ((failed, config.failures), (~failed, 1 - config.failures)):
             weights[kind] *= share / weights[kind].sum() if weights[kind].sum() else 0.0
-    return np.asarray(weights / weights.sum())
+    total = weights.sum()
+    return np.asarray(weights / total if total else np.full(count, 1 / count))
 
 
 def _trainable(model: Any) -> Any:

@@ -72,7 +72,7 @@ class StartPool:
 
     def add(self, segment: Segment) -> None:
         """Takes a real segment; the oldest ones leave."""
-        if self._whole and segment.origin.decision:
+        if segment.origin.decision and (self._whole or len(segment) < self.spec.context):
             return
         self._held.append(_Held(segment, self.spec))
         self._count += len(segment)
@@ -88,8 +88,9 @@ class StartPool:
         if not self._count:
             raise ValueError("no real experience to dream from yet")
         lengths = np.array([len(h.segment) for h in self._held])
-        surprise = np.concatenate([h.surprise for h in self._held])
-        even = np.full(self._count, 1 / self._count)
+        allowed = np.concatenate([h.allowed for h in self._held])
+        surprise = np.concatenate([h.surprise for h in self._held]) * allowed
+        even = allowed / max(1, allowed.sum())
         key = surprise / surprise.sum() if surprise.sum() > 0 else even
         chances = self.keyframes * key + (1 - self.keyframes) * even
         drawn = rng.choice(self._count, size=count, p=chances / chances.sum())
@@ -138,8 +139,13 @@ class _Held:
     def __init__(self, segment: Segment, spec: WorldModelSpec) -> None:
         self.segment = segment
         self.frames, self.robot = seen(segment, spec)
+        # V of a last observation that nothing was decided on is not known: the V before stands for it.
         following = np.append(segment.value[1:], 0.0 if segment.terminated else segment.value[-1])
         self.surprise = np.abs(segment.reward + following - segment.value).astype(np.float64)
+        # In mid-episode, what came before the first decisions of a segment is not known.
+        self.allowed = np.ones(len(segment), bool)
+        if segment.origin.decision:
+            self.allowed[: spec.context - 1] = False
 
 
 def seen(segment: Segment, spec: WorldModelSpec) -> tuple[np.ndarray, np.ndarray]:

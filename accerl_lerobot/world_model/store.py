@@ -69,8 +69,8 @@ def save_world_model(
         success.save_pretrained(directory / SUCCESS)
 
 
-def load_source(directory: Path) -> Source | None:
-    """What a saved world model has learnt from; None if it does not say.
+def load_source(directory: Path, field: str = "path") -> Source | None:
+    """What a saved world model has learnt from; None if it does not say. `field` is named in the error.
 
     Raises:
         InputError: it says something else.
@@ -87,7 +87,7 @@ def load_source(directory: Path) -> Source | None:
         )
     except UNREADABLE as error:
         raise InputError(
-            "path", str(directory), f"its {CONFIG} does not say what it learnt ({error})"
+            field, str(directory), f"its {CONFIG} does not say what it learnt ({error})"
         ) from error
 
 

@@ -26,6 +26,7 @@ Depths are counted in chunks, from 1. Shapes: M trials, D depths; see `episodes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -37,6 +38,7 @@ from accerl_lerobot.world_model import judge
 from accerl_lerobot.world_model.config import TrialConfig
 from accerl_lerobot.world_model.contract import WorldModel
 from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, held
+from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.success import Examples, context_of, cut_alike, probabilities
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
@@ -117,6 +119,16 @@ def wrong_actions(
         assert failed is not None
         return actions[judge.shuffled(len(windows), windows.episode.tolist(), rng, np.flatnonzero(failed))]
     return {"true": actions, "zero": np.zeros_like(actions), "opposite": -actions}[arm]
+
+
+def calibrate(model: PixelWorldModel, episodes: Sequence[Episode], config: TrialConfig, seed: int) -> None:
+    """Makes an uncertainty of 1 the 95th percentile after one whole chunk of these episodes."""
+    windows = trial_windows(episodes, model, config, seed + 1)
+    doubts = dream(model, windows, windows.actions[:, :1]).uncertainty[:, 0]
+    doubts = doubts[windows.steps[:, 0] == model.spec.chunk]
+    usual = float(np.quantile(doubts, 0.95)) if len(doubts) else math.nan
+    if math.isfinite(usual):  # a model without a state has no doubts
+        model.doubt.mul_(max(usual, 1e-6))
 
 
 def set_threshold(

@@ -20,8 +20,8 @@
                   produces    world models that have passed their trial, for the dreamer
                   waits for   real experience
 
-Both end with the process, or when replay says that the run is over. Neither holds up the trainer: until a
-model has passed, batches are real.
+Both end with the process, or when replay says that the run is over. Until a model has passed, batches are
+real; from then on the trainer waits for dreams as it does for real segments.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class DreamWorker:
         import torch
 
         torch.set_num_threads(config.trainer.num_threads)
-        self._share = config.imagination.share
+        self._share, self._batch = config.imagination.share, config.inference.max_batch
         self._outbox: list[Segment] = []
         self._dreams = make_imagination(config, "dream", self._outbox.append)
         self._lock = threading.Lock()
@@ -103,7 +103,9 @@ class DreamWorker:
             if not requests:
                 time.sleep(PAUSE_S)
                 continue
-            self._dreams.advance(ray.get(inference.decide.remote(requests)))
+            parts = [requests[i : i + self._batch] for i in range(0, len(requests), self._batch)]
+            answers = ray.get([inference.decide.remote(part) for part in parts])
+            self._dreams.advance([decision for answer in answers for decision in answer])
             if self._outbox:
                 door.append(replay.insert.remote(list(self._outbox)))
                 self._outbox.clear()

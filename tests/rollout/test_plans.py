@@ -20,7 +20,7 @@ import itertools
 import pytest
 
 from accerl_lerobot.rollout.groups import Outcome, Place
-from accerl_lerobot.rollout.plans import STARTS_PER_INCARNATION, EpisodePlans
+from accerl_lerobot.rollout.plans import STARTS_PER_INCARNATION, EpisodePlans, budgets, whole_groups
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
 from accerl_lerobot.seeds import train_seed
 from tests.rollout.worlds import evaluate
@@ -118,3 +118,12 @@ def test_no_more_episodes_than_were_paid_for(group_size: int):
     assert plans.next(exploring=True) == evaluate(index=0), "evaluations are not counted"
     endless = EpisodePlans(config, TASKS, seed=3, worlds=8)
     assert len(take(endless, 9)) >= 8 and not endless.spent
+
+
+def test_a_budget_is_shared_among_workers_in_whole_groups():
+    assert budgets(RolloutConfig(episodes=7, workers=3)) == [3, 2, 2]
+    assert budgets(RolloutConfig(episodes=64, workers=3, group_size=8)) == [24, 24, 16]
+    assert budgets(RolloutConfig(episodes=8, workers=2, group_size=8)) == [8, 0]
+    assert budgets(RolloutConfig(workers=2)) == [None, None]
+    assert [whole_groups(n, RolloutConfig(group_size=4)) for n in (0, 1, 4, 5)] == [0, 4, 4, 8]
+    assert whole_groups(5, RolloutConfig()) == 5

@@ -137,7 +137,7 @@ def test_a_dream_is_a_segment_like_any_other(bright: Any):
 
 
 def test_the_reward_is_what_the_probability_of_success_gained(bright: Any):
-    dreams, made = imagination(Counting(), bright, horizon=2, keyframes=0.0)
+    dreams, made = imagination(Counting(), bright, horizon=2, keyframes=0.0, reward="potential")
     [real] = lived(3)
     dreams.remember(real)
     play(dreams, 2)
@@ -238,6 +238,40 @@ def test_a_model_that_learns_dreams_once_it_has_passed(bright: Any):
     assert dreams.on and len(dreams.requests()) == 4
 
 
+def test_dreams_under_way_are_dropped_when_another_model_dreams(bright: Any):
+    dreams, made = imagination(Counting(), bright, horizon=2, world=ENDLESS)
+    dreams.remember(lived(3)[0])
+    play(dreams, 1, 0.1)
+    dreams.swap(promotion(Counting(), bright, 12))
+    play(dreams, 1, 0.1)
+    assert not made, "the second decision was the first of new dreams"
+    play(dreams, 1, 0.1)
+    assert {s.world_version for s in made} == {12} and all(len(s) == 2 for s in made)
+
+
+def test_a_model_that_doubts_everything_is_not_asked_for_ever(bright: Any):
+    model = Counting(doubt=9.0)
+    dreams, made = imagination(model, bright, dreams=1, doubt=2.0, window=5, world=ENDLESS)
+    dreams.remember(lived(3)[0])
+    play(dreams, 5)
+    assert dreams.requests() == [] and not dreams.on and not made and dreams.counters.doubted == 5
+    dreams.swap(promotion(Counting(), bright, 12))
+    assert dreams.on and dreams.requests()
+
+
+def test_an_episode_that_fails_ends_its_dream(bright: Any, monkeypatch: pytest.MonkeyPatch):
+    step = Counting.step
+
+    def broken(self: Any, state: State, actions: Tensor, seeds: Sequence[int]) -> Dream:
+        return replace(step(self, state, actions, seeds), done=torch.tensor([True, False]))
+
+    monkeypatch.setattr(Counting, "step", broken)
+    dreams, made = imagination(Counting(), bright, dreams=2, world=ENDLESS)
+    dreams.remember(lived(3)[0])
+    play(dreams, 1, 0.1)
+    assert len(made) == 1 and made[0].terminated and not made[0].success
+
+
 def test_a_placebo_stays_one_when_its_model_is_promoted(bright: Any):
     dreams, _ = imagination(ShuffledModel(Counting()), bright)
     promoted = Counting()
@@ -261,7 +295,7 @@ def test_pictures_have_the_world_s_size(bright: Any):
         ({"action_dim": 7}, K, 1, True, "action_dim"),
         ({"fps": 30}, K, 1, True, "imagination.path=30: is the world model's fps"),
         ({}, 5, 1, True, "executes 5 actions per decision; learn one with world_model.chunk=5"),
-        ({}, K, 2, True, "looks back 2 env steps"),
+        ({}, K, 2, True, "policy.n_obs_steps=2: the policy looks back"),
         ({}, K, 1, False, "no success model beside the world model"),
         ({"provides": frozenset({"pixels"})}, K, 1, True, "'state': the policy reads it"),
     ],

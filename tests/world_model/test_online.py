@@ -25,7 +25,7 @@ from accerl_lerobot.experience import Segment
 from accerl_lerobot.world_model import online
 from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, TrialConfig
 from accerl_lerobot.world_model.imagination_config import OnlineLearnConfig
-from accerl_lerobot.world_model.online import OnlineLearner, episode_of, online_weights
+from accerl_lerobot.world_model.online import OnlineLearner, Unfinished, episode_of, online_weights
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.starts import seen
 from accerl_lerobot.world_model.success import new_success_model
@@ -39,10 +39,13 @@ def learner(**config: Any) -> OnlineLearner:
     options = {k: config.pop(k) for k in ("offline", "held_out_offline") if k in config}
     options = {k.removesuffix("_offline"): v for k, v in options.items()}
     fields = {"steps_per_episode": 2.0, "batch": 4, "try_every": 4, "held_out": 0.25}
-    return OnlineLearner(
-        PixelWorldModel(SPEC, PixelModelConfig(network=NETWORK)), new_success_model(K),
-        OnlineLearnConfig(**(fields | config)), TrialConfig(depth=2), seed=0, **options,
+    model = PixelWorldModel(SPEC, PixelModelConfig(network=NETWORK))
+    made = OnlineLearner(
+        model, new_success_model(K), OnlineLearnConfig(**(fields | config)), TrialConfig(depth=2), seed=0,
+        **options,
     )  # fmt: skip
+    made.given = model  # type: ignore[attr-defined]
+    return made
 
 
 def episodes(*outcomes: bool) -> list[Segment]:
@@ -51,7 +54,7 @@ def episodes(*outcomes: bool) -> list[Segment]:
 
 def test_a_segment_is_a_stretch_of_experience():
     [segment] = lived(1, solve_at=2)
-    episode = episode_of(segment, SPEC)
+    episode = episode_of([segment], SPEC)
     frames, robot = seen(segment, SPEC)
     assert segment.steps.tolist() == [4, 4, 4, 1] and episode.times.tolist() == [0, 4, 8, 12, 13]
     assert np.array_equal(episode.frames, frames) and np.array_equal(episode.state, robot)
@@ -59,7 +62,7 @@ def test_a_segment_is_a_stretch_of_experience():
     assert (
         len(episode) == 13 and episode.success_at == 12 and episode.achieved.tolist() == [False] * 4 + [True]
     )
-    failure = episode_of(lived(1)[0], SPEC)
+    failure = episode_of(lived(1), SPEC)
     assert not failure.success and failure.source == "online"
 
 
@@ -67,17 +70,38 @@ def test_some_episodes_are_held_out_and_steps_are_owed_for_all():
     made = learner()
     for segment in episodes(*[False] * 8):
         made.add(segment)
-    assert len(made._held) == 2 and len(made._learnt) == 6 and made.owed == 16
+    assert len(made._held) == 2 and len(made._learnt) == 6 and made.owed == 8, "as try_every episodes bring"
     kept = {e.frames.tobytes() for e in made._held}
     assert not kept & {e.frames.tobytes() for e in made._learnt}
-    cut = lived(0, length=3)[0]
-    made.add(cut)
-    assert made.owed == 16, "an episode that goes on is not counted yet"
+
+
+def test_episodes_are_put_together_from_their_segments():
+    made, parts = learner(held_out=0.5), {seed: lived(seed, length=1) for seed in (1, 2)}
+    assert [len(p) for p in parts.values()] == [4, 4]
+    for order in ([0, 2, 1], [3, 0, 1]):
+        for seed in (1, 2):
+            made.add(parts[seed][order.pop(0)])
+    assert not made._learnt and not made._held and made.owed == 0, "neither is complete"
+    for i in range(4):
+        for seed in (1, 2):
+            made.add(parts[seed][i])
+    assert len(made._learnt) == len(made._held) == 1 and made.owed == 4
+    whole = episode_of(lived(1), SPEC)
+    for name in ("frames", "times", "state", "actions"):
+        assert np.array_equal(getattr(made._learnt[0], name), getattr(whole, name))
+
+
+def test_what_never_ends_is_forgotten():
+    unfinished = Unfinished(most=2)
+    first, second, third = (lived(seed, length=2) for seed in (1, 2, 3))
+    assert unfinished.add(first[0]) is unfinished.add(second[0]) is unfinished.add(third[0]) is None
+    assert unfinished.add(first[1]) is None and unfinished.add(third[1]) == third
 
 
 def test_it_learns_from_real_windows_and_leaves_what_serves_alone():
     made = learner()
-    serving = PixelWorldModel(SPEC, PixelModelConfig(network=NETWORK))
+    given = made.given  # type: ignore[attr-defined]
+    was = {k: v.clone() for k, v in given.state_dict().items()}
     for segment in episodes(False, False, True, False):
         made.add(segment)
     before = {k: v.clone() for k, v in made._learner.serving.state_dict().items()}
@@ -86,7 +110,7 @@ def test_it_learns_from_real_windows_and_leaves_what_serves_alone():
     assert made.version == 8 and made.owed < 1
     assert {"image", "state", "success_loss"} <= set(metrics)
     assert any(not torch.equal(v, before[k]) for k, v in made._learner.serving.state_dict().items())
-    assert all(torch.equal(v, serving.state_dict()[k]) for k, v in serving.state_dict().items())
+    assert all(torch.equal(v, was[k]) for k, v in given.state_dict().items())
 
 
 def test_without_a_success_only_the_world_is_learnt():
@@ -97,7 +121,7 @@ def test_without_a_success_only_the_world_is_learnt():
 
 
 def test_a_share_of_every_batch_is_from_the_dataset_it_began_with():
-    offline = [episode_of(s, SPEC) for s in episodes(False, True)]
+    offline = [episode_of([s], SPEC) for s in episodes(False, True)]
     made = learner(offline=offline, batch=8)
     assert {p.episode for p in made._draw()} <= {0, 1}, "nothing else is known yet"
     for segment in episodes(*[False] * 4):
@@ -116,6 +140,8 @@ def test_new_and_failed_episodes_are_drawn_more_often():
     assert weights[0] == pytest.approx(0.4 * 0.3 / 3) and weights[6] == pytest.approx(0.4 * 0.7)
     assert online_weights([False] * 4, config).tolist() == pytest.approx([0.1, 0.1, 0.1, 0.7])
     assert online_weights([True], config).tolist() == [1]
+    old_only = OnlineLearnConfig(recent=0.0)
+    assert online_weights([False], old_only).tolist() == [1], "there is nothing but the newest"
 
 
 def passes(monkeypatch: pytest.MonkeyPatch, *outcomes: bool) -> list[list[str]]:
@@ -131,14 +157,14 @@ def passes(monkeypatch: pytest.MonkeyPatch, *outcomes: bool) -> list[list[str]]:
 
 
 def test_what_passes_is_promoted_and_what_does_not_is_not(monkeypatch: pytest.MonkeyPatch):
-    demo = [replace(episode_of(s, SPEC), source="demo") for s in episodes(True)]
+    demo = [replace(episode_of([s], SPEC), source="demo") for s in episodes(True)]
     made = learner(held_out_offline=demo)
     tried = passes(monkeypatch, False, True)
     assert not made.due(last=False)
     for number, segment in enumerate(episodes(*[False] * 8)):
         made.add(segment)
         while made.owed >= 1:
-            assert not made.due(last=False), "what it owes comes first"
+            assert not made.due(last=True), "what it owes comes first, if there is time"
             made.step()
         assert made.due(last=False) is (number in (3, 7))
         if number == 3:
