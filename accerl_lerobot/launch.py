@@ -209,7 +209,9 @@ class RayEngine(Engine):
         self._inference = self._service("inference", inference.remote(c.policy, c.inference))
         replay = ray.remote(ReplayWorker).options(num_cpus=0, num_gpus=0, max_concurrency=1000)
         imagined = imagination.replay if imagination.share else None
-        self._replay = self._service("replay", replay.remote(c.replay, c.seed, imagined))
+        self._replay = self._service(
+            "replay", replay.remote(c.replay, c.seed, imagined, c.rollout.episodes > 0)
+        )
         trainer = ray.remote(TrainerWorker).options(num_cpus=0, num_gpus=share, max_concurrency=4)
         self._trainer = self._service("trainer", trainer.remote(c.policy, c.algorithm, c.trainer, c.seed))
         if imagination.share:

@@ -67,7 +67,9 @@ class LocalEngine(Engine):
             self._acting = load_adapter(config.policy)
             self._acting.load_trainable(self._adapter.export_trainable())
         imagination = config.imagination
-        self._replay = MixedReplay(config.replay, imagination.replay, imagination.share)
+        self._replay = MixedReplay(
+            config.replay, imagination.replay, imagination.share, config.rollout.episodes > 0
+        )
         self._dreams = self._world_learner = None
         if imagination.share:
             from accerl_lerobot.world_model.dreaming import make_imagination, make_learner

@@ -18,7 +18,9 @@ give. Two things end that:
 
 * the real episodes that were paid for have all been collected (`end_real`): from then on a batch takes what
   draws they have left, and imagined ones for the rest;
-* nothing is imagined, yet or any more (`share` is 0): a batch is real.
+* nothing is imagined, yet or any more (`share` is 0): a batch is real. But where real episodes are counted,
+  they are not used up while a world model is learnt that is to dream of them: as long as there is room for
+  more of them, they are let in and there is no batch.
 
 When neither can give, and neither ever will, the replay is *exhausted*.
 """
@@ -32,6 +34,10 @@ from accerl_lerobot.replay.buffer import Replay
 from accerl_lerobot.replay.pacing import ReplayConfig
 
 
+ROOM = 0.9
+"""Share of the real store up to which it is filled without anything being drawn."""
+
+
 class MixedReplay:
     """Segments in, batches of segments out.
 
@@ -39,9 +45,13 @@ class MixedReplay:
         real: size and pace of real experience.
         imagined: of imagined experience.
         share: of a batch's decisions, in [0, 1), that are imagined.
+        patient: whether real episodes are counted.
     """
 
-    def __init__(self, real: ReplayConfig, imagined: ReplayConfig, share: float) -> None:
+    def __init__(
+        self, real: ReplayConfig, imagined: ReplayConfig, share: float, patient: bool = False
+    ) -> None:
+        self._patient = patient
         self.real, self.imagined, self.share = Replay(real), Replay(imagined), share
         self.real_ended = False
         self.awaited = share > 0
@@ -49,7 +59,7 @@ class MixedReplay:
 
     def may_insert(self, source: str = REAL) -> bool:
         """Whether another segment of this source should be brought now."""
-        return self._of(source).may_insert()
+        return self._of(source).may_insert() or (source == REAL and self._waits)
 
     def insert(self, segment: Segment) -> bool:
         """See `Replay.insert`."""
@@ -89,11 +99,18 @@ class MixedReplay:
         imagined = {f"imagined_{k}": v for k, v in self.imagined.metrics().items()}
         return self.real.metrics() | imagined | {"imagined_share": self.share}
 
+    @property
+    def _waits(self) -> bool:
+        room = self.real.stored_decisions < ROOM * self.real.config.capacity
+        return self._patient and self.awaited and not self.share and room
+
     def _of(self, source: str) -> Replay:
         return self.real if source == REAL else self.imagined
 
     def _parts(self, batch: int) -> tuple[int, int] | None:
         """Decisions to draw from either store; None if one of them cannot give its part."""
+        if self._waits:
+            return None
         real = batch - round(self.share * batch)
         if self.real_ended:
             left = self.real.pace.available

@@ -57,10 +57,13 @@ class ReplayWorker:
         config: size and pace.
         seed: of the draw among segments used equally often.
         imagined: size and pace of imagined experience; None: there is none.
+        patient: see `MixedReplay`.
     """
 
-    def __init__(self, config: ReplayConfig, seed: int, imagined: ReplayConfig | None = None) -> None:
-        self._replay = MixedReplay(config, imagined or ReplayConfig(), share=0.0)
+    def __init__(
+        self, config: ReplayConfig, seed: int, imagined: ReplayConfig | None = None, patient: bool = False
+    ) -> None:
+        self._replay = MixedReplay(config, imagined or ReplayConfig(), share=0.0, patient=patient)
         # Nothing is imagined until the dreamer says so.
         self._replay.awaited = imagined is not None
         self._real: deque[Segment] = deque(maxlen=IN_TRANSIT if imagined else 0)

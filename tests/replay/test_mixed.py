@@ -23,10 +23,10 @@ from accerl_lerobot.replay import MixedReplay, ReplayConfig
 from tests.replay.segments import make_segment
 
 
-def mixed(share: float = 0.5, **imagined: Any) -> MixedReplay:
+def mixed(share: float = 0.5, patient: bool = False, **imagined: Any) -> MixedReplay:
     real = ReplayConfig(capacity=100, min_decisions=8, samples_per_insert=2.0, ahead=16, max_lag=5)
     config = {"capacity": 100, "min_decisions": 1, "samples_per_insert": 1.0, "ahead": 16, "max_lag": 5}
-    return MixedReplay(real, ReplayConfig(**(config | imagined)), share)
+    return MixedReplay(real, ReplayConfig(**(config | imagined)), share, patient)
 
 
 def fill(replay: MixedReplay, source: str, count: int, version: int = 0) -> None:
@@ -76,6 +76,32 @@ def test_once_all_real_episodes_are_in_they_are_used_up_and_dreams_go_on():
     assert drawn(replay, 8) == {REAL: 4, IMAGINED: 4}, "twice, as samples_per_insert says"
     assert drawn(replay, 8) == {REAL: 0, IMAGINED: 8}
     assert not replay.may_sample(8) and not replay.exhausted(8), "dreams will come"
+
+
+def test_where_real_episodes_are_counted_they_are_kept_for_when_there_are_dreams():
+    for patient in (False, True):
+        replay = mixed(patient=patient)
+        fill(replay, REAL, 4)
+        replay.mix(0.0, awaited=True)
+        assert replay.may_sample(16) is not patient and not replay.exhausted(16)
+        assert replay.may_insert(REAL) is patient, "more are let in meanwhile"
+        fill(replay, IMAGINED, 2)
+        replay.mix(0.5, awaited=True)
+        assert drawn(replay, 16) == {REAL: 8, IMAGINED: 8}
+        replay.mix(0.0, awaited=False)
+        assert drawn(replay, 16) == {REAL: 16, IMAGINED: 0}, "none will come"
+
+
+def test_patience_ends_when_there_is_no_room_for_more():
+    replay = mixed(patient=True)
+    replay.mix(0.0, awaited=True)
+    inserted = 0
+    while not replay.may_sample(16):
+        assert replay.may_insert(REAL) and inserted < 40
+        replay.insert(make_segment(f"{inserted}", 4))
+        inserted += 1
+    assert inserted == 23 and replay.real.counters.evicted_segments == 0
+    assert drawn(replay, 16) == {REAL: 16, IMAGINED: 0} and not replay.may_insert(REAL)
 
 
 def test_it_is_exhausted_when_nothing_will_come():
