@@ -33,7 +33,6 @@ from accerl_lerobot.experience import REAL, Segment
 from accerl_lerobot.replay.buffer import Replay
 from accerl_lerobot.replay.pacing import ReplayConfig
 
-
 ROOM = 0.9
 """Share of the real store up to which it is filled without anything being drawn."""
 
