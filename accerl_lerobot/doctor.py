@@ -92,7 +92,7 @@ def main(arguments: list[str]) -> int:
         sys.stdout.write(yaml.safe_dump(encode(config), sort_keys=False, allow_unicode=True) + "\n")
     checks += list(machine(config, history))
     if config is not None:
-        checks += list(pace(config))
+        checks += [*pace(config), *dreams(config)]
     for check in checks:
         sys.stdout.write(f"{check.status:5} {check.name:10} {check.text}\n")
     failed = sum(check.status == FAIL for check in checks)
@@ -270,6 +270,21 @@ def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
     short = disk < DISK_GIB
     text = f"{disk:.0f} GiB free here" + (f"; a run may need {DISK_GIB:.0f}" if short else "")
     yield Check(name="disk", status=WARN if short else OK, text=text)
+
+
+def dreams(config: RunConfig) -> Iterator[Check]:
+    """Whether what is to be imagined fits the world and the policy."""
+    if not config.imagination.share:
+        return
+    from accerl_lerobot.world_model.dreaming import check_imagination
+
+    try:
+        check_imagination(config)
+    except InputError as error:
+        yield Check(name="dreams", status=FAIL, text=str(error))
+    else:
+        kind, share = config.imagination.model, config.imagination.share
+        yield Check(name="dreams", status=OK, text=f"{share:.0%} of every batch; what dreams: {kind}")
 
 
 def memory_estimate_gib(config: RunConfig, history: int = 1) -> float:

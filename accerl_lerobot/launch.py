@@ -208,21 +208,17 @@ class RayEngine(Engine):
         inference = ray.remote(InferenceWorker).options(num_cpus=0, num_gpus=share, max_concurrency=1000)
         self._inference = self._service("inference", inference.remote(c.policy, c.inference))
         replay = ray.remote(ReplayWorker).options(num_cpus=0, num_gpus=0, max_concurrency=1000)
-        imagined = imagination.replay if imagination.share else None
-        self._replay = self._service(
-            "replay", replay.remote(c.replay, c.seed, imagined, c.rollout.episodes > 0)
-        )
-        trainer = ray.remote(TrainerWorker).options(num_cpus=0, num_gpus=share, max_concurrency=4)
+        imagined, counted = imagination.replay if imagination.share else None, c.rollout.episodes > 0
+        self._replay = self._service("replay", replay.remote(c.replay, c.seed, imagined, counted))
+        threads = {"num_cpus": 0, "num_gpus": share, "max_concurrency": 4}
+        trainer = ray.remote(TrainerWorker).options(**threads)
         self._trainer = self._service("trainer", trainer.remote(c.policy, c.algorithm, c.trainer, c.seed))
         if imagination.share:
             from accerl_lerobot.world_model.worker import DreamWorker, WorldLearningWorker
 
-            dreamer = ray.remote(DreamWorker).options(num_cpus=0, num_gpus=share, max_concurrency=4)
-            self._dreamer = self._service("dream", dreamer.remote(c))
+            self._dreamer = self._service("dream", ray.remote(DreamWorker).options(**threads).remote(c))
             if imagination.learns:
-                learner = ray.remote(WorldLearningWorker).options(
-                    num_cpus=0, num_gpus=share, max_concurrency=4
-                )
+                learner = ray.remote(WorldLearningWorker).options(**threads)
                 self._learner = self._service("world learning", learner.remote(c))
         for index, budget in enumerate(budgets(c.rollout)):
             worker = self._new_rollout(index, 0, budget)

@@ -259,3 +259,11 @@ class TestResources:
         check = doctor.cuda(self.recipe(policy={"device": "cuda"}))
         assert check.status == FAIL and "use auto or cpu" in check.text
         assert doctor.cuda(None).status == OK
+
+
+def test_dreams_are_checked_where_there_are_any(capsys: pytest.CaptureFixture[str]) -> None:
+    recipe = str(QUICKSTART.with_name("dreams.yaml"))
+    assert doctor.main([recipe, "--imagination.path=nowhere"]) == 1
+    assert "FAIL  dreams     imagination.path='nowhere': not a world model" in capsys.readouterr().out
+    doctor.main([recipe, "--imagination.model=oracle"])
+    assert "ok    dreams     80% of every batch; what dreams: oracle" in capsys.readouterr().out

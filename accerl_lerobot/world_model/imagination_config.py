@@ -117,7 +117,7 @@ class ImaginationConfig:
     """Dreams over which that is measured, at least 1."""
     replay: ReplayConfig = field(
         default_factory=lambda: ReplayConfig(
-            capacity=4096, min_decisions=1, samples_per_insert=2.0, ahead=1024
+            capacity=2048, min_decisions=1, samples_per_insert=4.0, ahead=512
         )
     )
     """Size and pace of what is imagined; its `max_lag` is the lag of the policy that dreamt."""
