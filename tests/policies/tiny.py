@@ -26,7 +26,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from accerl_lerobot.experience import TASK, Decision, Request, Segment
+from accerl_lerobot.experience import TASK, Decision, Origin, Request, Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import PolicyAdapter, stack_observations
 from accerl_lerobot.policies.config import PolicyConfig
@@ -78,9 +78,10 @@ def adapter_at(path: Path, sampler: SamplerConfig | None = None, **options: Any)
 
 def as_segment(asked: Sequence[Request], adapter: LeRobotAdapter, length: int) -> Segment:
     """Plays requests as one episode, in which each decision is made alone; it has been through a pickle."""
-    builder = SegmentBuilder(asked[0].observation, length)
+    builder = SegmentBuilder(asked[0].observation, length, Origin("task", seed=0, decision=0))
     for i in range(length):
-        builder.add(adapter.decide([asked[i]], 3)[0], 0.0, 3, asked[i + 1].observation)
+        decision = adapter.decide([asked[i]], 3)[0]
+        builder.add(decision, decision.chunk, 0.0, 3, asked[i + 1].observation)
     return pickle.loads(pickle.dumps(builder.cut("test")))
 
 
