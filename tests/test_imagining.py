@@ -180,6 +180,9 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path):
     assert last.imagination["learn_episodes"] >= 5
     assert last.replay["imagined_trained_decisions"] > 0 < last.replay["trained_decisions"]
     assert last.replay["inserted_segments"] >= 12
+    explained = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
+    for name in last.imagination:
+        assert f"`imagination_{name}`" in explained or name.startswith("gate_"), name
 
 
 def test_asynchronously_a_run_ends_when_its_episodes_are_used_up(tiny_checkpoint: Path):

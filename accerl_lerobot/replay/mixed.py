@@ -94,7 +94,11 @@ class MixedReplay:
         return drawn
 
     def metrics(self) -> dict[str, float]:
-        """Of the real store by their names, of the other one with ``imagined_`` before them."""
+        """Of the real store by their names; where anything is imagined, of the other one with ``imagined_``
+        before them, and its share.
+        """
+        if not (self.share or self.awaited or self.imagined.counters.inserted_segments):
+            return self.real.metrics()
         imagined = {f"imagined_{k}": v for k, v in self.imagined.metrics().items()}
         return self.real.metrics() | imagined | {"imagined_share": self.share}
 

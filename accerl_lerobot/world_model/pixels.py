@@ -111,7 +111,7 @@ class PixelWorldModel(nn.Module, WorldModel):
         """See the base class."""
         actions = actions.to(self.change.device)
         steps = torch.full(actions.shape[:1], self.spec.chunk, device=actions.device)
-        chunk = self._chunk(state, actions, steps)
+        chunk = self._chunk(state, actions, self._made(steps))
         image = self._sample(state, chunk, self._noise(seeds, state["frames"]), self.config.steps)
         frames = _to_bytes(image, len(self.spec.cameras))
         robot, doubt = self._robot(state, chunk)
@@ -139,8 +139,9 @@ class PixelWorldModel(nn.Module, WorldModel):
         images, robots, weights = [], [], []
         for r in range(chunks):
             valid = tensors["valid"][:, r].float()
-            actions = tensors["actions"][:, r]
-            chunk = self._chunk(state, actions, tensors["steps"][:, r])
+            made = self._made(tensors["steps"][:, r])
+            actions = tensors["actions"][:, r] * made[..., None]
+            chunk = self._chunk(state, actions, made)
             wanted = _to_floats(tensors["frames"][:, length + r])
             images.append(self._image_loss(state, chunk, wanted, generator))
             robots.append(self._robot_loss(state, chunk, tensors["state"][:, length + r]))
@@ -242,12 +243,15 @@ class PixelWorldModel(nn.Module, WorldModel):
         seen = torch.cat([robot, came.flatten(1), chunk, look], 1)
         return torch.stack([head(seen) for head in self.heads])
 
-    def _chunk(self, state: State, actions: Tensor, steps: Tensor) -> Tensor:
+    def _made(self, steps: Tensor) -> Tensor:
+        """bool (B, K), the first so many of a chunk."""
+        return torch.arange(self.spec.chunk, device=steps.device) < steps[:, None]
+
+    def _chunk(self, state: State, actions: Tensor, made: Tensor) -> Tensor:
         """(B, K·(A + 1) + (L − 1)·K·A): normalised actions, which of them are executed, and those before.
 
         How fast the robot is moving is in no frame, but in what it was told last.
         """
-        made = torch.arange(self.spec.chunk, device=actions.device) < steps[:, None]
         normal = (actions - self.action_mean) / self.action_std * made[..., None]
         before = (state["actions"] - self.action_mean) / self.action_std
         return torch.cat([normal.flatten(1), made.float(), before.flatten(1)], 1)

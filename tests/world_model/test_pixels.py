@@ -122,7 +122,7 @@ def test_a_new_model_s_robot_stays_about_where_it_is():
     made = model()
     made.fit_statistics(of)
     moved = dream(made, of)[0]
-    assert np.allclose(moved.robot, of.state[:, 0] + made.motion_mean.numpy(), atol=1e-5)
+    assert np.allclose(moved.robot, of.state[:, 1] + made.motion_mean.numpy(), atol=1e-5)
     assert moved.uncertainty.tolist() == [0.0] * len(of), "the heads still agree"
 
 
@@ -186,7 +186,7 @@ def test_statistics_by_hand():
     of = windows(dots(4))
     made = model()
     made.fit_statistics(of)
-    state, motion = of.state[:, 0], of.state[:, 1] - of.state[:, 0]
+    state, motion = of.state[:, 1], of.state[:, 2] - of.state[:, 1]
     assert np.allclose(made.robot_mean, state.mean(0))
     assert np.allclose(made.robot_std, state.std(0), rtol=1e-5)
     assert np.allclose(made.motion_std, motion.std(0), rtol=1e-5)
@@ -238,7 +238,7 @@ def test_it_learns_where_the_robot_goes(learnt: Learner):
     of = windows(dots(12, seed=5))
     dreams = dream(learnt.serving, of)
     for depth, most in ((0, 0.5), (2, 1.0)):
-        assert np.abs(dreams[depth].robot.numpy() - of.state[:, depth + 1]).mean() < most
+        assert np.abs(dreams[depth].robot.numpy() - of.state[:, depth + 2]).mean() < most
     strange = of.actions + 20
     assert dream(learnt.serving, of, strange)[0].uncertainty.mean() > 3 * dreams[0].uncertainty.mean()
 
