@@ -76,7 +76,7 @@ class LocalEngine(Engine):
 
             self._dreams = make_imagination(config, "dream", self._replay.insert)
             if imagination.learns:
-                self._world_learner = make_learner(config, self._dreams)
+                self._world_learner = make_learner(config, self._dreams.dreamer)
         self._rng = np.random.default_rng(config.seed)
         self._outstanding: set[tuple[str, int]] = set()
         self._episodes: list[EpisodeResult] = []

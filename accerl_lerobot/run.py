@@ -311,15 +311,13 @@ class _Loop:
             self.log.write("train", int(metrics["update"]), metrics)
         explored = [e for e in progress.episodes if e.plan.explore]
         self.explored += len(explored)
-        if explored:
-            self.recent = (self.recent + [e.success for e in explored])[-RECENT:]
-            share = float(np.mean(self.recent))
-            # The first episodes to end are the short ones, which are successes.
-            if len(self.recent) >= RECENT // 4:
-                self.curve.append((self._steps(progress), share))
+        self.recent = (self.recent + [e.success for e in explored])[-RECENT:]
+        share = float(np.mean(self.recent)) if self.recent else math.nan
+        # The first episodes to end are the short ones, which are successes.
+        if explored and len(self.recent) >= RECENT // 4:
+            self.curve.append((self._steps(progress), share))
         # Once all real episodes have been played, dreams and the learning from them go on.
         if explored or any(metrics["update"] % DREAMT == 0 for metrics in progress.updates):
-            share = float(np.mean(self.recent)) if self.recent else math.nan
             values = progress.rollout | {"success_exploring": share}
             values |= {f"replay_{k}": v for k, v in progress.replay.items()}
             values |= {f"inference_{k}": v for k, v in progress.inference.items()}

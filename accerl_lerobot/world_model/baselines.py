@@ -28,8 +28,9 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.envs.base import ChunkResult, World
+from accerl_lerobot.experience import TASK
 from accerl_lerobot.world_model.contract import Context, Dream, History, State, WorldModel, WorldModelSpec
-from accerl_lerobot.world_model.frames import resized
+from accerl_lerobot.world_model.frames import seen
 
 
 class CopyModel(WorldModel):
@@ -126,19 +127,12 @@ class OracleModel(WorldModel):
         played = torch.nn.functional.pad(state["played"], (0, 0, 0, max(0, room)))
         for i, n in enumerate(count.tolist()):
             played[i, n : n + chunk] = actions[i]
-        seen = [r.observation for r in results]
-        pictures = [
-            resized(np.stack([np.asarray(o[camera]) for o in seen]), self.spec.image_size)
-            for camera in self.spec.cameras
-        ]
-        robot = (
-            np.stack([np.asarray(o["observation.state"]) for o in seen])
-            if self.spec.state_dim
-            else np.zeros((len(seen), 0), np.float32)
-        )
+        names = [name for name in results[0].observation if name != TASK]
+        observations = {n: np.stack([np.asarray(r.observation[n]) for r in results]) for n in names}
+        frames, robot = seen(observations, self.spec)
         return Dream(
             state={**state, "count": count + chunk, "played": played},
-            frames=torch.from_numpy(np.stack(pictures, 1)),
+            frames=torch.from_numpy(frames),
             robot=torch.from_numpy(robot),
             uncertainty=torch.full((len(actions),), torch.nan),
             success=torch.tensor([float(r.success) for r in results]),

@@ -30,11 +30,11 @@ from accerl_lerobot.preflight import check_sft_policy
 from accerl_lerobot.world_model.baselines import ShuffledModel
 from accerl_lerobot.world_model.dataset import check_metadata, fingerprint, load_episodes
 from accerl_lerobot.world_model.episodes import Episode
-from accerl_lerobot.world_model.imagine import Imagination, check_fit
+from accerl_lerobot.world_model.imagine import Dreamer, Imagination, check_fit
 from accerl_lerobot.world_model.online import OnlineLearner
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.store import load_source
-from accerl_lerobot.world_model.zoo import Dreamer, make_dreamer
+from accerl_lerobot.world_model.zoo import make_dreamer
 
 if TYPE_CHECKING:
     from accerl_lerobot.config import RunConfig
@@ -51,9 +51,8 @@ def make_imagination(config: RunConfig, name: str, on_segment: Callable[[Segment
     Raises:
         InputError: the world model cannot be loaded, or does not fit world and policy.
     """
-    policy = load_lerobot_config(config.policy)
     spec = _spec(config)
-    dreamer = _dreamer(config, spec, getattr(policy, "n_action_steps", 1), policy.n_obs_steps)
+    dreamer = load_dreamer(config, spec)
     return Imagination(
         dreamer.model,
         dreamer.success,
@@ -67,14 +66,25 @@ def make_imagination(config: RunConfig, name: str, on_segment: Callable[[Segment
     )
 
 
-def make_learner(config: RunConfig, dreams: Imagination) -> OnlineLearner:
-    """What a run's world model goes on learning with; `dreams` are of the model it begins with.
+def load_dreamer(config: RunConfig, world: WorldSpec | None = None) -> Dreamer:
+    """What a run dreams with; its ``policy.path`` must be set. `world` is looked at anew if it is not given.
+
+    Raises:
+        InputError: see `make_imagination`.
+    """
+    policy = load_lerobot_config(config.policy)
+    executed = getattr(policy, "n_action_steps", 1)
+    return _dreamer(config, world or _spec(config), executed, policy.n_obs_steps)
+
+
+def make_learner(config: RunConfig, dreamer: Dreamer) -> OnlineLearner:
+    """What a run's world model goes on learning with, from `dreamer` on.
 
     Raises:
         InputError: the dataset it was pre-trained on cannot be read, or is of another world.
     """
     learn = config.imagination.learn
-    model, success = dreams.dreamer
+    model, success = dreamer
     if isinstance(model, ShuffledModel):
         model = model.model
     assert isinstance(model, PixelWorldModel) and success is not None  # as `check_imagination` has found
@@ -104,8 +114,6 @@ def check_imagination(config: RunConfig) -> None:
     Raises:
         InputError: see there.
     """
-    if not config.imagination.share:
-        return
     if config.policy.path is not None:
         policy = load_lerobot_config(config.policy)
     elif config.sft.init_path is None:

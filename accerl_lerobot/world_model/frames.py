@@ -11,11 +11,16 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Pictures in another size."""
+"""What was observed, as a world model knows it."""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from accerl_lerobot.world_model.contract import WorldModelSpec
 
 
 def resized(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -29,3 +34,18 @@ def resized(frames: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     tall = functional.interpolate(tall, size=size, mode="bilinear", antialias=True)
     shrunk: np.ndarray = tall.round().clamp(0, 255).byte().permute(0, 2, 3, 1).contiguous().numpy()
     return shrunk
+
+
+def seen(observations: dict[str, np.ndarray], spec: WorldModelSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Frames uint8 (N, V, H, W, 3) and states float32 (N, S) of N observations, as a model knows them."""
+    pictures = [resized(observations[camera], spec.image_size) for camera in spec.cameras]
+    robot = (
+        observations["observation.state"] if spec.state_dim else np.zeros((len(pictures[0]), 0), np.float32)
+    )
+    return np.stack(pictures, 1), robot
+
+
+def executed(chunks: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """The actions (t, A) of chunks (T, K, A) of which the first `steps` (T,) each were made."""
+    made: np.ndarray = chunks[np.arange(chunks.shape[1]) < steps[:, None]]
+    return made

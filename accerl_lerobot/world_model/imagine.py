@@ -26,7 +26,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -116,6 +116,13 @@ class _Row:
     depth: int = 0
 
 
+class Dreamer(NamedTuple):
+    """What dreams, and what tells successes, where that is another."""
+
+    model: WorldModel
+    success: SuccessPairsRewardModel | None
+
+
 class Imagination:
     """A batch of dreams, each of which begins anew when it has ended.
 
@@ -154,8 +161,8 @@ class Imagination:
         self.version = 0
         self.waits = config.learns
         """Whether no model has passed its trial yet."""
-        self._model, self._success, self._world = model, success, world
-        self._device = torch.device("cpu") if success is None else success.out.weight.device
+        self._model, self._world = model, world
+        self._success = None if "success" in model.spec.provides else success
         self._cost, self._fails, self._name = decision_cost, fails, name
         self._on_segment = on_segment
         self._starts = StartPool(
@@ -172,9 +179,9 @@ class Imagination:
         self._limit = math.ceil(world.max_steps / model.spec.chunk)
 
     @property
-    def dreamer(self) -> tuple[WorldModel, SuccessPairsRewardModel | None]:
+    def dreamer(self) -> Dreamer:
         """What dreams now, and what tells successes."""
-        return self._model, self._success
+        return Dreamer(self._model, self._success)
 
     def remember(self, segment: Segment) -> None:
         """Dreams may begin in a real segment from now on."""
@@ -187,9 +194,11 @@ class Imagination:
         """
         self._rows, self._state = [None] * len(self._rows), None
         self._doubted_in_a_row = 0
-        model: WorldModel = promotion.model.to(self._device)
+        assert self._success is not None  # or there would be nothing to promote
+        device = self._success.out.weight.device
+        model: WorldModel = promotion.model.to(device)
         self._model = ShuffledModel(model) if isinstance(self._model, ShuffledModel) else model
-        self._success = promotion.success.to(self._device)
+        self._success = promotion.success.to(device)
         self.version, self.waits = promotion.version, False
         self.switch.reset()
 
@@ -299,9 +308,8 @@ class Imagination:
         )
         self._state = state if self._state is None else _replaced(self._state, rows, state)
         newest = parts[0][:, -1]
-        said = np.zeros(len(rows))
-        if self._success is not None and "success" not in self._model.spec.provides:
-            said = probabilities(self._success, newest, newest)
+        judge = self._success
+        said = np.zeros(len(rows)) if judge is None else probabilities(judge, newest, newest)
         for i, start, frames, potential in zip(rows, starts, newest, said, strict=True):
             observation = self._observation(frames, start.robot[-1], start.task)
             self._rows[i] = _Row(
@@ -314,16 +322,14 @@ class Imagination:
 
     def _said(self, dream: Dream, frames: np.ndarray) -> np.ndarray:
         """P(success) of each row, (B,)."""
-        if dream.success is not None:
+        if self._success is None:
+            assert dream.success is not None  # as `check_fit` has found
             return dream.success.cpu().numpy()
-        assert self._success is not None
         return probabilities(self._success, np.stack([r.frames for r in self._rows if r is not None]), frames)
 
     @property
     def _threshold(self) -> float:
-        if self._success is None or "success" in self._model.spec.provides:
-            return 0.5
-        return self._success.config.threshold
+        return 0.5 if self._success is None else self._success.config.threshold
 
     def _observation(self, frames: np.ndarray, robot: np.ndarray, task: str) -> Observation:
         observation: Observation = {TASK: task}

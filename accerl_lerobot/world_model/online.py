@@ -33,10 +33,10 @@ from accerl_lerobot.experience import Segment
 from accerl_lerobot.world_model.config import LearnConfig, SuccessLearnConfig, TrialConfig
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.episodes import Episode, Place
+from accerl_lerobot.world_model.frames import executed, seen
 from accerl_lerobot.world_model.imagination_config import OnlineLearnConfig
 from accerl_lerobot.world_model.learn import Learner
 from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.starts import seen
 from accerl_lerobot.world_model.success import Examples, SuccessLearner
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 from accerl_lerobot.world_model.trial import calibrate, set_threshold, try_out
@@ -47,12 +47,12 @@ ENDLESS = 10**9
 
 def episode_of(segments: Sequence[Segment], spec: WorldModelSpec) -> Episode:
     """The segments of a whole episode, in order, as it was looked at when decisions were due."""
-    shown = [seen(segment, spec) for segment in segments]
+    shown = [seen(segment.observations, spec) for segment in segments]
     # A segment begins with what the one before has ended with.
     frames, robot = (np.concatenate([part[i][:-1] for part in shown[:-1]] + [shown[-1][i]]) for i in range(2))
     steps = np.concatenate([segment.steps for segment in segments])
     chunks = np.concatenate([segment.actions for segment in segments])
-    actions = np.concatenate([a[:n] for a, n in zip(chunks, steps, strict=True)])
+    actions = executed(chunks, steps)
     return Episode(
         frames=frames,
         times=np.concatenate([[0], np.cumsum(steps)]).astype(np.int64),

@@ -25,7 +25,7 @@ import numpy as np
 
 from accerl_lerobot.experience import Origin, Segment
 from accerl_lerobot.world_model.contract import History, WorldModelSpec
-from accerl_lerobot.world_model.frames import resized
+from accerl_lerobot.world_model.frames import executed, seen
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,9 +105,7 @@ class StartPool:
         context = [max(0, t - back) for back in range(spec.context - 1, -1, -1)]
         history = None
         if not segment.origin.decision:
-            made = [a[:n] for a, n in zip(segment.actions[:t], segment.steps[:t], strict=True)]
-            dims = segment.actions.shape[2]
-            actions = np.concatenate(made) if made else np.zeros((0, dims), np.float32)
+            actions = executed(segment.actions[:t], segment.steps[:t])
             history = History(segment.origin.task, segment.origin.seed, actions)
         left = len(segment) - t
         achieved: bool | None = None
@@ -138,7 +136,7 @@ class _Held:
 
     def __init__(self, segment: Segment, spec: WorldModelSpec) -> None:
         self.segment = segment
-        self.frames, self.robot = seen(segment, spec)
+        self.frames, self.robot = seen(segment.observations, spec)
         # V of a last observation that nothing was decided on is not known: the V before stands for it.
         following = np.append(segment.value[1:], 0.0 if segment.terminated else segment.value[-1])
         self.surprise = np.abs(segment.reward + following - segment.value).astype(np.float64)
@@ -146,14 +144,3 @@ class _Held:
         self.allowed = np.ones(len(segment), bool)
         if segment.origin.decision:
             self.allowed[: spec.context - 1] = False
-
-
-def seen(segment: Segment, spec: WorldModelSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Frames uint8 (T + 1, V, H, W, 3) and states float32 (T + 1, S) of a segment, as a model knows them."""
-    pictures = [resized(segment.observations[camera], spec.image_size) for camera in spec.cameras]
-    robot = (
-        segment.observations["observation.state"]
-        if spec.state_dim
-        else np.zeros((len(segment) + 1, 0), np.float32)
-    )
-    return np.stack(pictures, 1), robot

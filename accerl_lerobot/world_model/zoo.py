@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.envs.base import WorldSpec
@@ -25,16 +24,9 @@ from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model.baselines import CopyModel, OracleModel, ShuffledModel
 from accerl_lerobot.world_model.contract import WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
+from accerl_lerobot.world_model.imagine import Dreamer
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.store import load_world_model
-from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
-
-
-class Dreamer(NamedTuple):
-    """What dreams, and what tells successes, where that is another."""
-
-    model: WorldModel
-    success: SuccessPairsRewardModel | None
 
 
 def make_dreamer(

@@ -21,7 +21,8 @@ import torch
 from accerl_lerobot.envs import SimulatedWorld, World, make_world
 from accerl_lerobot.world_model.baselines import CopyModel, OracleModel, ShuffledModel
 from accerl_lerobot.world_model.contract import Context, State, WorldModel
-from accerl_lerobot.world_model.starts import Start, StartPool, seen
+from accerl_lerobot.world_model.frames import seen
+from accerl_lerobot.world_model.starts import Start, StartPool
 from tests.world_model.lived import SPEC, WORLD, lived
 
 
@@ -63,7 +64,7 @@ def test_the_oracle_lives_through_what_happened(simulators: int):
         actions = np.stack([of[i].actions[at[i]] for i in rows])
         dream = oracle.step(state, torch.from_numpy(actions), list(range(len(rows))))
         for n, i in enumerate(rows):
-            frames, robot = seen(of[i], SPEC)
+            frames, robot = seen(of[i].observations, SPEC)
             assert np.array_equal(dream.frames[n].numpy(), frames[at[i] + 1])
             assert np.array_equal(dream.robot[n].numpy(), robot[at[i] + 1])
             assert bool(dream.success[n]) is (at[i] + 1 == len(of[i]) and of[i].success)

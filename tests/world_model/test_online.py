@@ -24,10 +24,10 @@ import torch
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.world_model import online
 from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, TrialConfig
+from accerl_lerobot.world_model.frames import seen
 from accerl_lerobot.world_model.imagination_config import OnlineLearnConfig
 from accerl_lerobot.world_model.online import OnlineLearner, Unfinished, episode_of, online_weights
 from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.starts import seen
 from accerl_lerobot.world_model.success import new_success_model
 from tests.world_model.lived import SPEC, K, lived
 
@@ -55,7 +55,7 @@ def episodes(*outcomes: bool) -> list[Segment]:
 def test_a_segment_is_a_stretch_of_experience():
     [segment] = lived(1, solve_at=2)
     episode = episode_of([segment], SPEC)
-    frames, robot = seen(segment, SPEC)
+    frames, robot = seen(segment.observations, SPEC)
     assert segment.steps.tolist() == [4, 4, 4, 1] and episode.times.tolist() == [0, 4, 8, 12, 13]
     assert np.array_equal(episode.frames, frames) and np.array_equal(episode.state, robot)
     assert np.array_equal(episode.actions[:12], segment.actions[:3].reshape(12, 2))

@@ -20,7 +20,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from accerl_lerobot.world_model.starts import StartPool, seen
+from accerl_lerobot.world_model.frames import seen
+from accerl_lerobot.world_model.starts import StartPool
 from tests.world_model.lived import SPEC, K, lived
 
 
@@ -33,7 +34,7 @@ def test_a_start_is_a_real_observation_with_what_led_there():
     [segment] = lived(3)
     held = pool()
     held.add(segment)
-    frames, robot = seen(segment, SPEC)
+    frames, robot = seen(segment.observations, SPEC)
     assert len(segment) == len(held) == 4
     for start in held.draw(50, np.random.default_rng(0)):
         t = start.origin.decision
@@ -109,8 +110,8 @@ def test_the_newest_are_kept():
 
 def test_pictures_have_the_model_s_size():
     [segment] = lived(3)
-    frames, robot = seen(segment, replace(SPEC, image_size=(8, 8), state_dim=0))
+    frames, robot = seen(segment.observations, replace(SPEC, image_size=(8, 8), state_dim=0))
     assert frames.shape == (5, 1, 8, 8, 3) and frames.dtype == np.uint8 and robot.shape == (5, 0)
-    full, _ = seen(segment, SPEC)
+    full, _ = seen(segment.observations, SPEC)
     assert abs(frames.astype(float).mean() - full.mean()) < 2
     assert full.shape == (5, 1, 16, 16, 3) and K == 4
