@@ -118,8 +118,10 @@ class RunConfig:
             # real episode.
             self.replay.check(batch_decisions=batch, segment_decisions=self.rollout.segment_length)
             if imagination.share:
+                # A whole dream is as long as the world lets it be: `world_model.dreaming` looks at that.
+                longest = imagination.horizon or 1
                 imagination.replay.check(
-                    batch_decisions=batch, segment_decisions=imagination.horizon, field="imagination.replay"
+                    batch_decisions=batch, segment_decisions=longest, field="imagination.replay"
                 )
         if imagination.share and self.algorithm.advantage == "group":
             remedy = "use algorithm.advantage=gae: dreams do not begin alike, so they are not compared"

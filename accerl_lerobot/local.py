@@ -203,6 +203,7 @@ class LocalEngine(Engine):
             learner.step()
         elif learner.due(last) and (promotion := learner.promote(last)):
             self._dreams.swap(promotion)
+        self._replay.hold(learner.due(last=False) and not last)
 
     def _publish(self) -> None:
         """Hands weights to the policy that acts, which is the trainer's own unless they are held back."""

@@ -32,6 +32,7 @@ from typing import Any
 import yaml
 
 from accerl_lerobot.bench.dream import BenchDreamConfig
+from accerl_lerobot.bench.efficiency import BenchEfficiencyConfig
 from accerl_lerobot.bench.lag import BenchLagConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
@@ -294,7 +295,7 @@ def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Cons
 
 
 def bench(arguments: list[str]) -> int:
-    """``accerl bench world``, ``policy``, ``lag`` and ``dream``."""
+    """``accerl bench world``, ``policy``, ``lag``, ``dream`` and ``efficiency``."""
     name = arguments[0] if arguments else ""
     if f"bench {name}" not in CONFIGS:
         names = [verb.split()[1] for verb in CONFIGS if verb.startswith("bench ")]
@@ -320,6 +321,7 @@ CONFIGS: dict[str, type[Any]] = {
     "bench policy": BenchPolicyConfig,
     "bench lag": BenchLagConfig,
     "bench dream": BenchDreamConfig,
+    "bench efficiency": BenchEfficiencyConfig,
 }
 """Verb → what its command line is parsed into."""
 

@@ -72,7 +72,8 @@ def bench_dream(config: BenchDreamConfig) -> dict[str, Any]:
     from accerl_lerobot.world_model.contract import WorldModelSpec
     from accerl_lerobot.world_model.learn import Learner
     from accerl_lerobot.world_model.pixels import PixelWorldModel
-    from accerl_lerobot.world_model.success import context_of, new_success_model, probabilities
+    from accerl_lerobot.world_model.replayed import context_of
+    from accerl_lerobot.world_model.success import new_success_model, probabilities
 
     torch.set_num_threads(config.num_threads)
     torch.manual_seed(0)
@@ -162,6 +163,8 @@ def _windows(spec: Any, count: int, chunks: int) -> Any:
         anchor=frames[:, length - 1],
         state=rng.standard_normal((count, length + chunks, spec.state_dim), dtype=np.float32),
         before=rng.standard_normal((count, length - 1, spec.chunk, spec.action_dim), dtype=np.float32),
+        told=rng.standard_normal((count, spec.action_dim), dtype=np.float32),
+        first=rng.standard_normal((count, spec.state_dim), dtype=np.float32),
         actions=rng.standard_normal((count, chunks, spec.chunk, spec.action_dim), dtype=np.float32),
         steps=np.full((count, chunks), spec.chunk),
         success=np.zeros((count, chunks), bool),

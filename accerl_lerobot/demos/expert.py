@@ -78,7 +78,9 @@ def make_expert(config: EnvConfig, world: World, task: str) -> Expert:
     return _EXPERTS[type(config)](world, task)
 
 
-def play(world: World, expert: Expert, *, task: str, seed: int, noise: float, fail: bool) -> Episode:
+def play(
+    world: World, expert: Expert, *, task: str, seed: int, noise: float, push: float, fail: bool
+) -> Episode:
     """Plays one episode to its end; equal arguments give equal episodes.
 
     Args:
@@ -87,10 +89,12 @@ def play(world: World, expert: Expert, *, task: str, seed: int, noise: float, fa
         task: Name of the task.
         seed: Of the world and of the noise.
         noise: Standard deviation of the Gaussian added to each action.
+        push: Largest length of the constant vector that is added to what the expert wants.
         fail: Whether to let go of the task: from a random early step on, actions are a random drift.
     """
     rng = np.random.default_rng((seed, 1))
     low, high = world.spec.action_low, world.spec.action_high
+    pushed = _push(world.spec.action_dim, push, seed)
     drift_from = int(rng.integers(0, _DRIFT_FROM)) if fail else world.spec.max_steps
     drift: np.ndarray = np.zeros(world.spec.action_dim)
     observation: Observation | None = world.reset(seed, task)
@@ -100,11 +104,11 @@ def play(world: World, expert: Expert, *, task: str, seed: int, noise: float, fa
     rewards: list[float] = []
     while not done:
         if len(actions) < drift_from:
-            wanted = np.asarray(expert(), np.float64)
+            wanted = np.clip(np.asarray(expert(), np.float64), low, high) + pushed
         else:
             drift = _DRIFT_MEMORY * drift + _DRIFT_SCALE * rng.standard_normal(len(drift))
-            wanted = drift
-        action = np.clip(wanted, low, high) + noise * rng.standard_normal(len(wanted))
+            wanted = np.clip(drift, low, high)
+        action = wanted + noise * rng.standard_normal(len(wanted))
         action = np.clip(action, low, high).astype(np.float32)
         result = world.step_chunk(action[None])
         assert observation is not None
@@ -123,6 +127,14 @@ def play(world: World, expert: Expert, *, task: str, seed: int, noise: float, fa
         success_at=success_at,
         seed=seed,
     )
+
+
+def _push(size: int, longest: float, seed: int) -> np.ndarray:
+    """In any direction, and of any length up to the longest."""
+    rng = np.random.default_rng((seed, 2))
+    direction = rng.standard_normal(size)
+    pushed: np.ndarray = longest * rng.random() * direction / np.linalg.norm(direction)
+    return pushed
 
 
 def _metaworld_expert(world: World, task: str) -> Expert:

@@ -68,6 +68,10 @@ class DemosConfig:
     action_noise: float = 0.1
     """Standard deviation of the Gaussian added to the expert's action before clipping, 0 to 1. The noisy
     action is executed and recorded, so the dataset also shows how to recover."""
+    push: float = 0.0
+    """Largest length of a constant vector, drawn anew for each episode, that is added to the expert's action
+    before the noise, 0 to 2. An expert that is pushed aside misses narrowly, as a policy does, and drifting
+    does not; use it with `keep_failures`, for success and world models."""
     failure_share: float = 0.0
     """Share of episodes that drift at random from early on and fail, 0 to 1; for success and world models."""
     keep_failures: bool = False
@@ -88,6 +92,8 @@ class DemosConfig:
             raise InputError("demos.episodes", self.episodes, f"use 1 to {_MAX_EPISODES}")
         if not 0 <= self.action_noise <= 1:
             raise InputError("demos.action_noise", self.action_noise, "use 0 to 1")
+        if not 0 <= self.push <= 2:
+            raise InputError("demos.push", self.push, "use 0 to 2")
         if not 0 <= self.failure_share <= 1:
             raise InputError("demos.failure_share", self.failure_share, "use a share between 0 and 1")
         if self.max_steps < 1:
@@ -249,6 +255,7 @@ def _record_one(slot: int) -> tuple[Episode, int]:
             task=task,
             seed=demo_seed(_config.seed, slot + attempt * _MAX_EPISODES),
             noise=_config.action_noise,
+            push=_config.push,
             fail=fail,
         )
         if episode.success != fail or (_config.keep_failures and not fail):

@@ -55,9 +55,13 @@ class MixedReplay:
         self.real_ended = False
         self.awaited = share > 0
         """Whether anything may be imagined later on, although nothing is now."""
+        self.held = False
+        """Whether real episodes, if they are counted, are to wait."""
 
     def may_insert(self, source: str = REAL) -> bool:
         """Whether another segment of this source should be brought now."""
+        if source == REAL and self.held and self._patient:
+            return False
         return self._of(source).may_insert() or (source == REAL and self._waits)
 
     def insert(self, segment: Segment) -> bool:
@@ -80,6 +84,10 @@ class MixedReplay:
     def mix(self, share: float, awaited: bool) -> None:
         """From now on, so much of a batch is imagined; `awaited`: or may be later on."""
         self.share, self.awaited = share, awaited
+
+    def hold(self, held: bool) -> None:
+        """From now on real episodes are to wait, or not: what is here is to be learnt from first."""
+        self.held = held
 
     def sample(self, num_decisions: int, trainer_version: int, rng: np.random.Generator) -> list[Segment]:
         """See `Replay.sample`: empty, with nothing counted as used, if a part cannot be had."""

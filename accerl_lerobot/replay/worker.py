@@ -138,6 +138,12 @@ class ReplayWorker:
             self._replay.mix(share, awaited)
             self._changed.notify_all()
 
+    async def hold(self, held: bool) -> None:
+        """See `MixedReplay.hold`."""
+        async with self._changed:
+            self._replay.hold(held)
+            self._changed.notify_all()
+
     async def end_real(self) -> None:
         """Every real episode has been played and stored."""
         async with self._changed:

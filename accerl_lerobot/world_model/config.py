@@ -106,7 +106,7 @@ class PixelModelConfig:
 class LearnConfig:
     """How a world model is trained."""
 
-    steps: int = 2000
+    steps: int = 1500
     """Gradient steps of the pre-training, at least 1."""
     batch: int = 16
     """Windows in each, at least 2."""
@@ -121,7 +121,7 @@ class LearnConfig:
     """[0, 1): how slowly the weights that serve follow those that are trained."""
     chunks: int = 2
     """Length of a window. From its second chunk on, the model learns from its own dream."""
-    anchors: int = 8
+    anchors: int = 15
     """The anchor lies up to so many chunks back, as far as dreams will go."""
 
     def __post_init__(self) -> None:
@@ -157,10 +157,18 @@ class SuccessLearnConfig:
     lr: float = 1e-3
     weight_decay: float = 1e-2
     dreamt: float = 0.5
-    """Share of pairs, in [0, 1], whose second frame is dreamt from the first."""
+    """Share of pairs, in [0, 1], that are dreamt: real episodes, with the actions that were made in them."""
+    depth: int = 15
+    """Chunks of such a dream at most."""
+    episodes: int = 48
+    """Episodes that are dreamt at a time,"""
+    every: int = 50
+    """and gradient steps until others are."""
 
     def __post_init__(self) -> None:
-        for name, least in (("steps", 1), ("batch", 2), ("weight_decay", 0)):
+        for name, least in (
+            ("steps", 1), ("batch", 2), ("weight_decay", 0), ("depth", 1), ("episodes", 2), ("every", 1),
+        ):  # fmt: skip
             if not getattr(self, name) >= least:
                 raise InputError(f"world_model.success.{name}", getattr(self, name), f"use at least {least}")
         if not 0 < self.lr < 1:
@@ -179,6 +187,9 @@ class TrialConfig:
     """A trial begins every so many env steps of an episode."""
     most: int = 400
     """Trials at most, drawn at random."""
+    whole: bool = True
+    """Outcomes are tried on whole episodes, dreamt from beginning to end; false: on dreams of `depth` chunks
+    that begin anywhere."""
     skill_first: float = 0.3
     """Least skill on changed pixels after one chunk,"""
     skill_last: float = 0.0
@@ -186,13 +197,15 @@ class TrialConfig:
     sensitivity: float = 1.2
     """What the lower end of the sensitivity's interval after one chunk must exceed."""
     auroc: float = 0.9
-    """What the lower end of the interval of AUROC on dreams must exceed at the horizon."""
-    false_success: float = 0.05
-    """Largest share of dreams at the horizon that may be taken for a success although they cannot be one:
-    with the true actions of episodes that failed, and with none."""
-    false_positives: float = 0.02
-    """[0, 1). The success model's threshold is the least at which no larger share of the failures it learns
-    from is taken for a success in a dream."""
+    """What the lower end of the interval of the AUROC of dreams' outcomes must exceed."""
+    false_success: float = 0.1
+    """Largest share of dreams that may be taken for a success although they cannot be one: with the true
+    actions of episodes that failed, and with none."""
+    false_positives: float = 0.05
+    """[0, 1). The success model's threshold is the least at which no larger share of failures that were not
+    learnt from is taken for a success in a dream."""
+    recall: float = 0.3
+    """What the share of successes must exceed that are dreamt, and taken, for such."""
 
     def __post_init__(self) -> None:
         for name in ("depth", "every", "most"):

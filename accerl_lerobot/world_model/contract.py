@@ -86,6 +86,11 @@ class Context(NamedTuple):
     """float32 (B, L, S)."""
     actions: Tensor
     """float32 (B, L − 1, K, A), made between these; zero where none was made."""
+    told: Tensor
+    """float32 (B, A), the sum of all actions since the episode began: where a robot that is told how far to
+    move is to be, and may not have got to. Zero where that is not known."""
+    first: Tensor
+    """float32 (B, S), where it was then, or as early as is known."""
 
 
 class History(NamedTuple):

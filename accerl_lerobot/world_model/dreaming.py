@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -28,8 +29,10 @@ from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.loading import load_lerobot_config
 from accerl_lerobot.preflight import check_sft_policy
 from accerl_lerobot.world_model.baselines import ShuffledModel
+from accerl_lerobot.world_model.config import TrialConfig
 from accerl_lerobot.world_model.dataset import check_metadata, fingerprint, load_episodes
 from accerl_lerobot.world_model.episodes import Episode
+from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 from accerl_lerobot.world_model.imagine import Dreamer, Imagination, check_fit
 from accerl_lerobot.world_model.online import OnlineLearner
 from accerl_lerobot.world_model.pixels import PixelWorldModel
@@ -101,7 +104,7 @@ def make_learner(config: RunConfig, dreamer: Dreamer) -> OnlineLearner:
         model,
         success,
         learn,
-        replace(learn.trial, depth=config.imagination.horizon),
+        _trial(config.imagination),
         offline=offline,
         held_out=held_out,
         seed=config.seed,
@@ -127,6 +130,14 @@ def check_imagination(config: RunConfig) -> None:
         check_metadata(open_metadata(learn.dataset), learn.dataset.repo_id, dreamer.model.spec)
 
 
+def _trial(config: ImaginationConfig) -> TrialConfig:
+    """What is tried is what will be dreamt."""
+    trial = config.learn.trial
+    if config.horizon is None:
+        return replace(trial, whole=True)
+    return replace(trial, whole=False, depth=config.horizon)
+
+
 def _spec(config: RunConfig) -> WorldSpec:
     world = make_world(config.env)
     try:
@@ -148,4 +159,8 @@ def _dreamer(config: RunConfig, spec: WorldSpec, executed: int, history: int) ->
         remedy = "it has no success model to go on learning with; use imagination.learn.steps_per_episode=0"
         raise InputError("imagination.path", config.imagination.path, remedy)
     check_fit(dreamer.model.spec, spec, executed, history, dreamer.success is not None)
+    longest = config.imagination.horizon or math.ceil(spec.max_steps / executed)
+    config.imagination.replay.check(
+        batch_decisions=config.trainer.batch_decisions, segment_decisions=longest, field="imagination.replay"
+    )
     return dreamer

@@ -103,6 +103,10 @@ class Windows:
     """float32 (B, L + R, S), at each of these."""
     before: np.ndarray
     """float32 (B, L − 1, K, A), actions between the frames of the context; zero where none was made."""
+    told: np.ndarray
+    """float32 (B, A), the sum of the actions before the window's first frame."""
+    first: np.ndarray
+    """float32 (B, S), where the robot was when its episode began."""
     actions: np.ndarray
     """float32 (B, R, K, A), zero where none was executed."""
     steps: np.ndarray
@@ -212,6 +216,8 @@ def _window(
         "anchor": episode.frames[frame(start - chunk * anchor)],
         "state": episode.state[before + path],
         "before": made_before,
+        "told": episode.actions[:start].sum(0, dtype=np.float32),
+        "first": episode.state[0],
         "actions": np.stack(actions),
         "steps": executed,
         "success": np.array(success),

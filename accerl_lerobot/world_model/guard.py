@@ -11,11 +11,10 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""When not to believe in dreams.
+"""What dreams promise, against what happens: the kill switch.
 
-A dream begins in a real episode, and for most of them it is known whether that achieved the task in as many
-decisions as the dream has. So the two shares are of the same starts, and differ by what the policy has learnt
-since, and by what the world model makes up.
+Each real outcome is held against the share of dreams that succeed at that time, so that both are of nearly
+the same policy: one that has learnt since the last real episode is not taken for a world model that flatters.
 """
 
 from __future__ import annotations
@@ -28,41 +27,46 @@ class KillSwitch:
 
     Args:
         gap: largest difference of the two shares of successes.
-        window: dreams over which they are taken; before there are so many, nothing is said.
+        window: dreams over which theirs is taken; before there are so many, nothing is said.
+        outcomes: real ones, over which the difference is taken; nor is it before there are so many.
     """
 
-    def __init__(self, gap: float, window: int) -> None:
-        self.gap = gap
-        self._seen: deque[tuple[bool, bool]] = deque()
-        self._window = window
+    def __init__(self, gap: float, window: int, outcomes: int) -> None:
+        self.gap, self.tripped = gap, False
+        self._dreams: deque[bool] = deque(maxlen=window)
+        self._pairs: deque[tuple[float, bool]] = deque(maxlen=outcomes)
         # Kept as numbers: they are also read on another thread.
-        self._imagined = self._real = self._count = 0
-        self.tripped = False
+        self._share = self._imagined = self._real = float("nan")
 
-    def add(self, imagined: bool, real: bool | None) -> None:
-        """Takes note of a dream that has ended, and of what had happened; None is not counted."""
-        if real is None:
+    def dreamt(self, success: bool) -> None:
+        """Takes note of how a dream has ended."""
+        self._dreams.append(success)
+        self._share = sum(self._dreams) / len(self._dreams)
+
+    def lived(self, success: bool) -> None:
+        """Takes note of a real outcome; one that no dreams stand beside is not counted."""
+        if len(self._dreams) < (self._dreams.maxlen or 0):
             return
-        self._take(imagined, real, 1)
-        self._seen.append((imagined, real))
-        if self._count > self._window:
-            self._take(*self._seen.popleft(), -1)
-        dreamt, happened = self.shares
-        if self._count == self._window and dreamt - happened > self.gap:
+        self._pairs.append((self._share, success))
+        count = len(self._pairs)
+        self._imagined = sum(share for share, _ in self._pairs) / count
+        self._real = sum(real for _, real in self._pairs) / count
+        if count == self._pairs.maxlen and self._imagined - self._real > self.gap:
             self.tripped = True
 
     def reset(self) -> None:
         """Another world model dreams from now on."""
-        self._seen.clear()
-        self._imagined = self._real = self._count = 0
+        self._dreams.clear()
+        self._pairs.clear()
+        self._share = self._imagined = self._real = float("nan")
         self.tripped = False
 
-    def _take(self, imagined: bool, real: bool, sign: int) -> None:
-        self._imagined, self._real = self._imagined + sign * imagined, self._real + sign * real
-        self._count += sign
+    @property
+    def share(self) -> float:
+        """Of successes among the newest dreams; NaN before there are any."""
+        return self._share
 
     @property
     def shares(self) -> tuple[float, float]:
-        """Of successes, imagined and real; NaN before anything was seen."""
-        count = self._count
-        return (self._imagined / count, self._real / count) if count else (float("nan"), float("nan"))
+        """Of successes, imagined and real, at the same times; NaN before there are any."""
+        return self._imagined, self._real

@@ -13,10 +13,10 @@
 # limitations under the License.
 """Experience that is imagined: the policy acts, and a world model says what is seen then.
 
-A dream begins at a real observation and lasts a few decisions. What comes of it is a segment like any other,
-but for its source: a success ends it, the world's time limit ends it, and otherwise V of its last observation
-stands for the rest. Nothing that follows a success is imagined, and nothing that the model is too uncertain
-about is kept.
+A dream begins at a real observation, where an episode began if it is to be whole. What comes of it is a
+segment like any other, but for its source: a success ends it, the world's time limit ends it, and where it is
+to be short, or the model becomes too uncertain, V of its last observation stands for the rest. Nothing that
+follows a success is imagined.
 
 Knows no process: whoever drives it asks for `requests`, has them decided, and hands that to `advance`.
 """
@@ -157,7 +157,8 @@ class Imagination:
         on_segment: Callable[[Segment], object],
     ) -> None:
         self.config, self.counters = config, Counters()
-        self.switch = KillSwitch(config.gap, config.window)
+        whole = config.horizon is None
+        self.switch = KillSwitch(config.gap, config.window, config.witnesses if whole else config.window)
         self.version = 0
         self.waits = config.learns
         """Whether no model has passed its trial yet."""
@@ -177,6 +178,7 @@ class Imagination:
         self._state: State | None = None
         self._sequence = self._doubted_in_a_row = 0
         self._limit = math.ceil(world.max_steps / model.spec.chunk)
+        self._longest = config.horizon or self._limit
 
     @property
     def dreamer(self) -> Dreamer:
@@ -186,6 +188,8 @@ class Imagination:
     def remember(self, segment: Segment) -> None:
         """Dreams may begin in a real segment from now on."""
         self._starts.add(segment)
+        if self.config.horizon is None and self.on and (segment.terminated or segment.truncated):
+            self.switch.lived(segment.terminated and segment.success)
 
     def swap(self, promotion: Promotion) -> None:
         """Another world model of the same world dreams from now on; dreams under way are dropped.
@@ -250,10 +254,11 @@ class Imagination:
 
     def metrics(self) -> dict[str, float]:
         """Counters, the model's version, and the shares of successes that `guard` compares."""
-        dreamt, real = self.switch.shares
+        beside, real = self.switch.shares
         return {k: float(v) for k, v in asdict(self.counters).items()} | {
             "version": float(self.version),
-            "success": dreamt,
+            "success": self.switch.share,
+            "success_beside": beside,
             "success_real": real,
             "on": float(self.on),
         }
@@ -275,9 +280,11 @@ class Imagination:
         self.counters.decisions += 1
         late = row.depth >= row.ends_at
         over = over and not late
-        if achieved or late or over or row.depth >= self.config.horizon:
+        if achieved or late or over or row.depth == self.config.horizon:
             self.counters.successes += achieved
-            self.switch.add(achieved, row.start.achieved)
+            self.switch.dreamt(achieved)
+            if self.config.horizon is not None and row.start.achieved is not None:
+                self.switch.lived(row.start.achieved)
             terminated = achieved or over or (late and self._fails)
             self._end(i, row, terminated=terminated, truncated=late, success=achieved)
 
@@ -313,7 +320,7 @@ class Imagination:
         for i, start, frames, potential in zip(rows, starts, newest, said, strict=True):
             observation = self._observation(frames, start.robot[-1], start.task)
             self._rows[i] = _Row(
-                builder=SegmentBuilder(observation, self.config.horizon, start.origin, IMAGINED),
+                builder=SegmentBuilder(observation, self._longest, start.origin, IMAGINED),
                 start=start,
                 frames=frames,
                 potential=float(potential),

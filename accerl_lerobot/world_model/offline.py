@@ -45,14 +45,13 @@ from accerl_lerobot.world_model.dataset import fingerprint, load_episodes
 from accerl_lerobot.world_model.episodes import Episode, split
 from accerl_lerobot.world_model.learn import pretrain
 from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.store import Source, load_source, load_world_model, save_world_model
+from accerl_lerobot.world_model.replayed import dream
+from accerl_lerobot.world_model.store import SUCCESS, Source, load_source, load_world_model, save_world_model
 from accerl_lerobot.world_model.success import Examples, SuccessLearner, new_success_model
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 from accerl_lerobot.world_model.trial import (
     NEVER,
     calibrate,
-    dream,
-    set_threshold,
     trial_windows,
     try_out,
     wrong_actions,
@@ -133,7 +132,6 @@ def learn_from_dataset(
                 stage.update(step, f"loss {metrics['loss']:.3f}")
                 record("success_model", step, metrics)
         success.eval()
-        set_threshold(serving, success, [e for e in learn if not e.success], config.trial, seed)
     seconds = time.monotonic() - started
     source = Source(
         repo_id=dataset.repo_id or "",
@@ -143,7 +141,9 @@ def learn_from_dataset(
     )
     save_world_model(directory / "world_model", serving, success, source)
     amounts = {"seconds": seconds, "learnt": _amount(learn), "held_out": _amount(held)}
-    return _trial(serving, success, held, config.trial, directory, seed, console, amounts)
+    found = _trial(serving, success, held, config.trial, directory, seed, console, amounts, fresh=True)
+    success.save_pretrained(directory / "world_model" / SUCCESS)  # with its threshold
+    return found
 
 
 def try_on_dataset(
@@ -180,10 +180,11 @@ def _trial(
     seed: int,
     console: Console,
     amounts: dict[str, Any],
+    fresh: bool = False,
 ) -> dict[str, Any]:
     """Tries, films and writes down."""
     with console.stage("trial"):
-        found = try_out(model, episodes, trial, success, seed) | amounts
+        found = try_out(model, episodes, trial, success, seed, fresh) | amounts
         film(directory / "preview.mp4", model, episodes, trial, seed)
     (directory / "trial.json").write_text(json.dumps(found, indent=2) + "\n")
     return found

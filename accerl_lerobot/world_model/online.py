@@ -39,7 +39,7 @@ from accerl_lerobot.world_model.learn import Learner
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.success import Examples, SuccessLearner
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
-from accerl_lerobot.world_model.trial import calibrate, set_threshold, try_out
+from accerl_lerobot.world_model.trial import calibrate, try_out
 
 ENDLESS = 10**9
 """Steps of a learning rate that never falls."""
@@ -227,10 +227,7 @@ class OnlineLearner:
         success = copy.deepcopy(self._success.model).eval().requires_grad_(False)
         known = [*self._offline, *self._learnt][-100:]
         calibrate(model, known, self.trial, self._seed)
-        failures = [e for e in (*self._offline, *self._learnt) if not e.success]
-        if failures:
-            set_threshold(model, success, failures[-100:], self.trial, self._seed)
-        found = self.found = try_out(model, held, self.trial, success, self._seed)
+        found = self.found = try_out(model, held, self.trial, success, self._seed, fresh=True)
         if not found["passed"]:
             self.refused += 1
             if last and self._last_tries < self.config.last_tries:

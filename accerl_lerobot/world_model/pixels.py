@@ -64,7 +64,7 @@ class PixelWorldModel(nn.Module, WorldModel):
             raise InputError("world_model.image_size", spec.image_size, remedy)
         self.spec, self.config = spec, config
         channels = 3 * len(spec.cameras)
-        chunk = spec.chunk * (spec.action_dim * spec.context + 1)
+        chunk = spec.chunk * (spec.action_dim * spec.context + 1) + spec.action_dim + spec.state_dim
         self.network = Denoiser(
             channels, (spec.context + 1) * channels, chunk, spec.state_dim, config.network
         )
@@ -77,6 +77,7 @@ class PixelWorldModel(nn.Module, WorldModel):
             ("robot", spec.state_dim),
             ("action", spec.action_dim),
             ("motion", spec.state_dim),
+            ("told", spec.action_dim),
         ):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
@@ -91,7 +92,12 @@ class PixelWorldModel(nn.Module, WorldModel):
         state = windows.state[:, now]
         motion = (windows.state[:, now + 1] - state)[valid]
         made = np.arange(self.spec.chunk) < windows.steps[:, 0, None]
-        sizes = {"robot": state, "motion": motion, "action": windows.actions[:, 0][made]}
+        sizes = {
+            "robot": state,
+            "motion": motion,
+            "action": windows.actions[:, 0][made],
+            "told": windows.told,
+        }
         for name, values in sizes.items():
             getattr(self, f"{name}_mean").copy_(torch.from_numpy(values.mean(0)))
             getattr(self, f"{name}_std").copy_(torch.from_numpy(values.std(0)).clamp(min=1e-3))
@@ -103,8 +109,8 @@ class PixelWorldModel(nn.Module, WorldModel):
         self, context: Context, tasks: Sequence[str], histories: Sequence[History | None] | None = None
     ) -> State:
         """See the base class."""
-        frames, robot, actions = (x.to(self.change.device) for x in context)
-        return {"frames": frames, "anchor": frames[:, -1], "robot": robot, "actions": actions}
+        state = {name: x.to(self.change.device) for name, x in context._asdict().items()}
+        return state | {"anchor": state["frames"][:, -1]}
 
     @torch.no_grad()
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Dream:
@@ -127,7 +133,7 @@ class PixelWorldModel(nn.Module, WorldModel):
         device = self.change.device
         tensors = {
             key: torch.from_numpy(getattr(windows, key)).to(device)
-            for key in ("frames", "anchor", "state", "before", "actions", "steps", "valid")
+            for key in ("frames", "anchor", "state", "before", "told", "first", "actions", "steps", "valid")
         }
         length, chunks = self.spec.context, tensors["steps"].shape[1]
         state = {
@@ -135,6 +141,8 @@ class PixelWorldModel(nn.Module, WorldModel):
             "anchor": tensors["anchor"],
             "robot": tensors["state"][:, :length],
             "actions": tensors["before"],
+            "told": tensors["told"],
+            "first": tensors["first"],
         }
         images, robots, weights = [], [], []
         for r in range(chunks):
@@ -248,13 +256,16 @@ class PixelWorldModel(nn.Module, WorldModel):
         return torch.arange(self.spec.chunk, device=steps.device) < steps[:, None]
 
     def _chunk(self, state: State, actions: Tensor, made: Tensor) -> Tensor:
-        """(B, K·(A + 1) + (L − 1)·K·A): normalised actions, which of them are executed, and those before.
+        """(B, K·(A + 1) + (L − 1)·K·A + A + S): normalised actions, which of them are executed, those before,
+        and how far the robot was told to go since the beginning and has gone.
 
-        How fast the robot is moving is in no frame, but in what it was told last.
+        How fast it is moving is in no frame, but in what it was told last; nor is how far it has still to go.
         """
         normal = (actions - self.action_mean) / self.action_std * made[..., None]
         before = (state["actions"] - self.action_mean) / self.action_std
-        return torch.cat([normal.flatten(1), made.float(), before.flatten(1)], 1)
+        told = (state["told"] - self.told_mean) / self.told_std
+        gone = (state["robot"][:, -1] - state["first"]) / self.robot_std
+        return torch.cat([normal.flatten(1), made.float(), before.flatten(1), told, gone], 1)
 
 
 class StateHead(nn.Module):
@@ -277,7 +288,8 @@ def _following(state: State, frames: Tensor, robot: Tensor, actions: Tensor) -> 
     """The context rolls on to the newest frame; the anchor stays."""
     newest = {"frames": frames, "robot": robot, "actions": actions}
     rolled = {key: torch.cat([state[key], new[:, None]], 1)[:, 1:] for key, new in newest.items()}
-    return rolled | {"anchor": state["anchor"]}
+    kept = {key: state[key] for key in ("anchor", "first")}
+    return rolled | kept | {"told": state["told"] + actions.sum(1)}
 
 
 def _to_floats(frames: Tensor) -> Tensor:

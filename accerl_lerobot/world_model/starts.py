@@ -27,6 +27,9 @@ from accerl_lerobot.experience import Origin, Segment
 from accerl_lerobot.world_model.contract import History, WorldModelSpec
 from accerl_lerobot.world_model.frames import executed, seen
 
+Name = tuple[str, int]
+"""Of an episode: its task and its seed."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
@@ -38,13 +41,17 @@ class Start:
     """float32 (L, S)."""
     actions: np.ndarray
     """float32 (L − 1, K, A), made between these."""
+    told: np.ndarray
+    """float32 (A,), see `Context`,"""
+    first: np.ndarray
+    """and this, (S,), too."""
     task: str
     """The instruction."""
     origin: Origin
     history: History | None
     """None: where the segment began in mid-episode, what came before is not known."""
     achieved: bool | None
-    """Whether the real episode achieved the task within the horizon; None: it is not known."""
+    """Whether the real episode achieved the task within the horizon; None: it is not known, or not yet."""
 
 
 class StartPool:
@@ -53,17 +60,26 @@ class StartPool:
     Args:
         spec: of the world model.
         memory: decisions held at least, as long as there were so many.
-        horizon: decisions of a dream.
-        keyframes: share of dreams that begin where |r + V(next) − V| was large.
+        horizon: decisions of a dream; None: to the end, and dreams begin where episodes began.
+        keyframes: share of the others that begin where |r + V(next) − V| was large.
         whole: whether only starts are given whose history is known.
     """
 
     def __init__(
-        self, spec: WorldModelSpec, *, memory: int, horizon: int, keyframes: float, whole: bool = False
+        self,
+        spec: WorldModelSpec,
+        *,
+        memory: int,
+        horizon: int | None,
+        keyframes: float,
+        whole: bool = False,
     ) -> None:
-        self.spec, self.memory, self.horizon, self.keyframes = spec, memory, horizon, keyframes
+        self.spec, self.memory, self.horizon = spec, memory, horizon
+        self.keyframes = 0.0 if horizon is None else keyframes
         self._whole = whole
         self._held: deque[_Held] = deque()
+        self._outcomes: dict[Name, bool] = {}
+        """Of episodes whose first segment is held, once they have ended."""
         self._count = 0
 
     def __len__(self) -> int:
@@ -72,12 +88,20 @@ class StartPool:
 
     def add(self, segment: Segment) -> None:
         """Takes a real segment; the oldest ones leave."""
-        if segment.origin.decision and (self._whole or len(segment) < self.spec.context):
+        name = segment.origin[:2]
+        known = not segment.origin.decision or any(h.segment.origin[:2] == name for h in self._held)
+        if known and (segment.terminated or segment.truncated):
+            self._outcomes[name] = segment.terminated and segment.success
+        if segment.origin.decision and (
+            self._whole or self.horizon is None or len(segment) < self.spec.context
+        ):
             return
-        self._held.append(_Held(segment, self.spec))
+        self._held.append(_Held(segment, self.spec, only_first=self.horizon is None))
         self._count += len(segment)
         while self._count - len(self._held[0].segment) >= self.memory:
-            self._count -= len(self._held.popleft().segment)
+            gone = self._held.popleft().segment
+            self._count -= len(gone)
+            self._outcomes.pop(gone.origin[:2], None)
 
     def draw(self, count: int, rng: np.random.Generator) -> list[Start]:
         """So many starts, with repetition.
@@ -109,12 +133,16 @@ class StartPool:
             history = History(segment.origin.task, segment.origin.seed, actions)
         left = len(segment) - t
         achieved: bool | None = None
-        if left >= self.horizon or segment.terminated or segment.truncated:
+        if self.horizon is None:
+            achieved = self._outcomes.get(segment.origin[:2])
+        elif left >= self.horizon or segment.terminated or segment.truncated:
             achieved = segment.terminated and segment.success and left <= self.horizon
         return Start(
             frames=held.frames[context],
             robot=held.robot[context],
             actions=_before(segment, t, spec.context),
+            told=history.actions.sum(0) if history else np.zeros_like(segment.actions[0, 0]),
+            first=held.robot[0],
             task=segment.task,
             origin=segment.origin._replace(decision=segment.origin.decision + t),
             history=history,
@@ -134,7 +162,7 @@ def _before(segment: Segment, t: int, context: int) -> np.ndarray:
 class _Held:
     """A segment, as the model sees it."""
 
-    def __init__(self, segment: Segment, spec: WorldModelSpec) -> None:
+    def __init__(self, segment: Segment, spec: WorldModelSpec, only_first: bool) -> None:
         self.segment = segment
         self.frames, self.robot = seen(segment.observations, spec)
         # V of a last observation that nothing was decided on is not known: the V before stands for it.
@@ -144,3 +172,5 @@ class _Held:
         self.allowed = np.ones(len(segment), bool)
         if segment.origin.decision:
             self.allowed[: spec.context - 1] = False
+        if only_first:
+            self.allowed[1:] = False

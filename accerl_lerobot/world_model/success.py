@@ -27,10 +27,14 @@ import numpy as np
 import torch
 
 from accerl_lerobot.world_model.config import SuccessLearnConfig
-from accerl_lerobot.world_model.contract import Context, WorldModel
-from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, held, places
+from accerl_lerobot.world_model.contract import WorldModel
+from accerl_lerobot.world_model.episodes import Episode, Place, places
+from accerl_lerobot.world_model.replayed import replay
 from accerl_lerobot.world_model.success_plugin import SuccessPairsConfig
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+
+EASY = 0.1
+"""How often a failure is drawn that nobody takes for a success, beside one that everybody does."""
 
 
 class Examples:
@@ -48,9 +52,12 @@ class Examples:
         self.episodes, self.chunk = episodes, chunk
         self._frames: dict[bool, list[Place]] = {True: [], False: []}
         self._chunks: dict[bool, list[Place]] = {True: [], False: []}
+        self._near: list[Place] = []
         for e, episode in enumerate(episodes):
             for f, achieved in enumerate(episode.achieved):
                 self._frames[bool(achieved)].append(Place(e, f))
+                if not achieved and episode.success and episode.success_at - episode.times[f] < 2 * chunk:
+                    self._near.append(Place(e, f))
         for place in places(episodes):
             episode = episodes[place.episode]
             start = int(episode.times[place.frame])
@@ -60,13 +67,16 @@ class Examples:
                 raise ValueError(f"{len(of[True])} {name} show a success and {len(of[False])} do not")
 
     def seen(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-        """Pairs of frames: half successes, then as many failures, as near to each other.
+        """Pairs of frames: half successes, then as many failures, as near to each other; of these, half
+        are of the last two chunks before a success, if there are any.
 
         Returns:
             The frames before and after, uint8 (count, V, H, W, 3) each; whether the latter shows a success,
             bool (count,); and the progress by then, float (count,).
         """
         later = self._halves(self._frames, count, rng)
+        if self._near:
+            later[-(count // 4) :] = [self._near[i] for i in rng.integers(len(self._near), size=count // 4)]
         earlier = []
         for place in later:
             times = self.episodes[place.episode].times
@@ -94,6 +104,49 @@ class Examples:
         return [of[k][i] for k, n in sizes.items() for i in rng.integers(len(of[k]), size=n)]
 
 
+class Dreamt:
+    """Dreams of episodes to their ends, and what had come of them: so looks what a success model will judge.
+
+    Args:
+        examples: whose episodes are dreamt.
+        world: dreams them.
+        judge: of failures, those are drawn most that it takes for successes.
+        count: how many, half of them successes where there are enough.
+        depth: chunks of a dream at most.
+        rng: of which, and of where they begin: half of them where the episode did.
+    """
+
+    def __init__(
+        self,
+        examples: Examples,
+        world: WorldModel,
+        judge: SuccessPairsRewardModel,
+        count: int,
+        depth: int,
+        rng: np.random.Generator,
+    ) -> None:
+        at = [Place(e, 0 if rng.random() < 0.5 else f) for e, f in examples.chunks(count, rng)]
+        replayed = replay(world, examples.episodes, at, depth, rng)
+        windows = replayed.windows
+        rows, depths = np.nonzero(replayed.made)
+        self._success = windows.success[rows, depths]
+        self._before = np.stack([replayed.before(d)[m] for m, d in zip(rows, depths, strict=True)])
+        self._after = replayed.dreams.ends[rows, depths]
+        self._progress = np.array(
+            [examples.progress(at[m], (d + 1) * world.spec.chunk) for m, d in zip(rows, depths, strict=True)]
+        )
+        self._chances = np.where(self._success, 1.0, EASY + probabilities(judge, self._before, self._after))
+
+    def seen(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+        """As `Examples.seen`, but dreamt."""
+        chosen = []
+        for kind, size in ((self._success, count // 2), (~self._success, count - count // 2)):
+            if kind.any():
+                chances = self._chances * kind
+                chosen += rng.choice(len(kind), size=size, p=chances / chances.sum()).tolist()
+        return self._before[chosen], self._after[chosen], self._success[chosen], self._progress[chosen]
+
+
 class SuccessLearner:
     """The optimiser around a success model.
 
@@ -107,6 +160,8 @@ class SuccessLearner:
         self.model, self.config = model.train(), config
         self.rng = np.random.default_rng((seed, 2))
         self._generator = torch.Generator().manual_seed(seed)
+        self._dreamt: Dreamt | None = None
+        self._count = 0
         self._optimizer = torch.optim.AdamW(
             model.parameters(), lr=config.lr, weight_decay=config.weight_decay
         )
@@ -118,7 +173,11 @@ class SuccessLearner:
         if dreamt < self.config.batch:
             parts.append(examples.seen(self.config.batch - dreamt, self.rng))
         if dreamt:
-            parts.append(self._dreamt(examples, world, dreamt))
+            if self._dreamt is None or self._count % self.config.every == 0:
+                config = self.config
+                self._dreamt = Dreamt(examples, world, self.model, config.episodes, config.depth, self.rng)
+            parts.append(self._dreamt.seen(dreamt, self.rng))
+        self._count += 1
         before, after, success, progress = (np.concatenate(x) for x in zip(*parts, strict=True))
         device = self.model.out.weight.device
         loss, metrics = self.model.loss(
@@ -133,45 +192,6 @@ class SuccessLearner:
         torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
         self._optimizer.step()
         return metrics
-
-    def _dreamt(self, examples: Examples, world: WorldModel, count: int) -> tuple[np.ndarray, ...]:
-        spec = world.spec
-        at = examples.chunks(count, self.rng)
-        windows = cut(examples.episodes, at, chunk=spec.chunk, context=spec.context, chunks=1)
-        success = windows.success[:, 0]
-        steps = cut_alike(windows.steps[:, :1], success[:, None], self.rng)
-        state = world.begin(context_of(windows), windows.task)
-        actions = torch.from_numpy(held(windows.actions, steps)[:, 0])
-        after = world.step(state, actions, self.rng.integers(2**31, size=count).tolist()).frames
-        progress = np.array([examples.progress(p, spec.chunk) for p in at])
-        return windows.frames[:, -2], after.cpu().numpy(), success, progress
-
-
-def cut_alike(steps: np.ndarray, success: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """How many actions of a chunk to believe in, so that successes and failures are cut short equally often.
-
-    Args:
-        steps: (M, D) actions that were executed.
-        success: bool (M, D), whether that achieved the task.
-        rng: draws, for each failure of a column, the steps of one of its successes.
-
-    Returns:
-        (M, D), never more than were executed.
-    """
-    cut_ = steps.copy()
-    for d in range(steps.shape[1]):
-        of = steps[success[:, d], d]
-        if len(of):
-            failed = ~success[:, d]
-            cut_[failed, d] = np.minimum(steps[failed, d], rng.choice(of, int(failed.sum())))
-    return cut_
-
-
-def context_of(windows: Windows, rows: slice = slice(None)) -> Context:
-    """What a world model is shown of some windows before they begin."""
-    known = windows.context
-    parts = (windows.frames[rows, :known], windows.state[rows, :known], windows.before[rows])
-    return Context(*(torch.from_numpy(part) for part in parts))
 
 
 def new_success_model(chunk: int) -> SuccessPairsRewardModel:

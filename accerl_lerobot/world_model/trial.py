@@ -29,21 +29,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import torch
 
 from accerl_lerobot.world_model import judge
 from accerl_lerobot.world_model.config import TrialConfig
 from accerl_lerobot.world_model.contract import WorldModel
 from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, held
+from accerl_lerobot.world_model.outcomes import judged, scores, spaced, threshold
 from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.success import Examples, context_of, cut_alike, probabilities
+from accerl_lerobot.world_model.replayed import Dreams, cut_alike, dream
+from accerl_lerobot.world_model.success import Examples, probabilities
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
-BATCH = 64
-"""Trials that are dreamt at once."""
 ARMS = ("true", "shuffled", "zero", "opposite", "failed")
 """Which actions are dreamt with."""
 PAIRS = 400
@@ -57,55 +56,12 @@ def trial_windows(episodes: Sequence[Episode], model: WorldModel, config: TrialC
 
     Their actions are whole chunks all the same, see `held`.
     """
-    at = [
-        Place(e, f) for e, episode in enumerate(episodes) for f in _spaced(episode.times[:-1], config.every)
-    ]
+    at = [Place(e, f) for e, episode in enumerate(episodes) for f in spaced(episode.times, config.every)]
     rng = np.random.default_rng(seed)
     if len(at) > config.most:
         at = [at[i] for i in sorted(rng.choice(len(at), config.most, replace=False))]
     windows = cut(episodes, at, chunk=model.spec.chunk, context=model.spec.context, chunks=config.depth)
     return replace(windows, actions=held(windows.actions, windows.steps))
-
-
-def _spaced(times: np.ndarray, every: int) -> list[int]:
-    """Frames, each at least so many env steps after the one before."""
-    chosen: list[int] = []
-    for frame, time in enumerate(times):
-        if not chosen or time >= times[chosen[-1]] + every:
-            chosen.append(frame)
-    return chosen
-
-
-class Dreams(NamedTuple):
-    """Of M trials."""
-
-    frames: np.ndarray
-    """uint8 (M, D, V, H, W, 3)."""
-    robot: np.ndarray
-    """float32 (M, D, S)."""
-    uncertainty: np.ndarray
-    """float32 (M, D)."""
-    ends: np.ndarray
-    """uint8 (M, D, V, H, W, 3): what the chunk at a depth would show with the actions of `ends` instead."""
-
-
-def dream(model: WorldModel, windows: Windows, actions: np.ndarray, ends: np.ndarray | None = None) -> Dreams:
-    """Dreams all windows with these actions (M, D, K, A), and with `ends`, other last chunks, if given."""
-    parts: list[list[np.ndarray]] = []
-    for start in range(0, len(windows), BATCH):
-        rows = slice(start, start + BATCH)
-        state = model.begin(context_of(windows, rows), windows.task[rows])
-        count = len(windows.task[rows])
-        dreams, last = [], []
-        for depth in range(actions.shape[1]):
-            seeds = [start + i + 1_000_003 * depth for i in range(count)]
-            dreams.append(model.step(state, torch.from_numpy(actions[rows, depth]), seeds))
-            if ends is not None:
-                last.append(model.step(state, torch.from_numpy(ends[rows, depth]), seeds).frames)
-            state = dreams[-1].state
-        shown = [[getattr(d, k) for d in dreams] for k in ("frames", "robot", "uncertainty")]
-        parts.append([np.stack([x.cpu().numpy() for x in of], 1) for of in (*shown, last or shown[0])])
-    return Dreams(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def wrong_actions(
@@ -131,43 +87,43 @@ def calibrate(model: PixelWorldModel, episodes: Sequence[Episode], config: Trial
         model.doubt.mul_(max(usual, 1e-6))
 
 
-def set_threshold(
-    model: WorldModel,
-    success: SuccessPairsRewardModel,
-    failures: Sequence[Episode],
-    config: TrialConfig,
-    seed: int,
-) -> None:
-    """Sets what counts as a success by what is dreamt of failures that were learnt from, at every depth."""
-    windows = trial_windows(failures, model, config, seed + 2)
-    dreams = dream(model, windows, windows.actions).frames
-    before = np.concatenate([windows.frames[:, None, model.spec.context - 1], dreams[:, :-1]], 1)
-    said = [
-        probabilities(success, before[:, d], dreams[:, d])[windows.valid[:, d]]
-        for d in range(dreams.shape[1])
-    ]
-    scores = np.concatenate(said)
-    least = judge.threshold(scores, np.zeros(len(scores), bool), config.false_positives)
-    success.config.threshold = float(np.clip(least, 0.5, 1 - 1e-6))
-
-
 def try_out(
     model: WorldModel,
     episodes: Sequence[Episode],
     config: TrialConfig,
     success: SuccessPairsRewardModel | None = None,
     seed: int = 0,
+    fresh: bool = False,
 ) -> dict[str, Any]:
     """Tries a model on episodes it has not learnt from.
 
+    Args:
+        model: in inference.
+        episodes: to try it on.
+        config: what is tried, and what it takes to pass.
+        success: what tells successes, if anything does.
+        seed: of what is drawn.
+        fresh: whether the success model has just been learnt: its threshold is set, on these episodes.
+
     Returns:
         ``depths``: a row per depth with `judge`'s estimates of skill and sensitivity, errors in pixels, state
-        and, with a success model, AUROC on dreams and the share of them taken for a success under each arm's
-        actions; ``auroc_real``, of the success model on real pairs; ``gates``: each with its value and
-        whether it holds; ``passed``; ``trials``, of so many ``episodes``.
+        and, with a success model, AUROC on the chunk dreamt there and the share of them taken for a success
+        under each arm's actions; ``auroc_real``, of the success model on real pairs, its ``threshold``, and
+        ``outcomes``, see `outcomes.judged`; ``gates``: each with its value and whether it holds; ``passed``;
+        ``trials``, of so many ``episodes``.
     """
-    windows = trial_windows(episodes, model, config, seed)
     rng = np.random.default_rng((seed, 1))
+    ended: dict[str, Any] = {}
+    if success is not None:
+        found = scores(model, success, episodes, config, seed)
+        of_policy = np.array([episodes[e].source == "online" for e in found.episode])
+        if fresh:
+            success.config.threshold = threshold(found, of_policy, config) or 0.5
+        given = None if fresh else success.config.threshold
+        ended["outcomes"] = judged(found, of_policy, config, given)
+        ended["threshold"] = success.config.threshold
+        ended["auroc_real"] = _auroc_real(success, episodes, model, rng)
+    windows = trial_windows(episodes, model, config, seed)
     failed = np.array([not episodes[e].success for e in windows.episode])
     # Where there are episodes of the policy, it is their failures that must not be taken for successes.
     online = np.array([episodes[e].source == "online" for e in windows.episode])
@@ -197,9 +153,8 @@ def try_out(
         if success is not None:
             row |= _judged(success, arms, windows, theirs, newest, d)
         rows.append(row)
-    gates = _gates(rows, config, success is not None)
-    real_pairs = {} if success is None else {"auroc_real": _auroc_real(success, episodes, model, rng)}
-    return real_pairs | {
+    gates = _gates(rows, config, ended.get("outcomes"))
+    return ended | {
         "trials": len(windows),
         "episodes": len(np.unique(windows.episode)),
         "depths": rows,
@@ -275,7 +230,9 @@ def _auroc_real(
     return judge.auroc(probabilities(success, before, after), labels)
 
 
-def _gates(rows: list[dict[str, Any]], config: TrialConfig, judged: bool) -> dict[str, dict[str, Any]]:
+def _gates(
+    rows: list[dict[str, Any]], config: TrialConfig, outcomes: dict[str, Any] | None
+) -> dict[str, dict[str, Any]]:
     first, last = rows[0], rows[-1]
 
     def at(row: dict[str, Any], key: str, part: str = "value") -> float:
@@ -287,10 +244,11 @@ def _gates(rows: list[dict[str, Any]], config: TrialConfig, judged: bool) -> dic
         "skill_last": (at(last, "skill"), "above", config.skill_last),
         "sensitivity_low": (at(first, "sensitivity_shuffled", "low"), "above", config.sensitivity),
     }
-    if judged:
-        wanted["auroc_last"] = (at(last, "auroc_dreamt", "low"), "above", config.auroc)
-        false = [last[f"false_success_{arm}"] for arm in NEVER if f"false_success_{arm}" in last]
-        wanted["false_success_last"] = (float(np.max(false)), "at most", config.false_success)
+    if outcomes is not None:
+        wanted["auroc"] = (float(outcomes["auroc"]["low"]), "above", config.auroc)
+        for name in ("false_success", "false_success_still"):
+            wanted[name] = (outcomes[name], "at most", config.false_success)
+        wanted["recall"] = (outcomes["recall"], "above", config.recall)
     # A number that could not be had passes nothing.
     return {
         name: {

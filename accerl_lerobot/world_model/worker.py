@@ -145,11 +145,14 @@ class WorldLearningWorker:
     def run(self, dreamer: Any, replay: Any) -> None:
         """Learns until replay is closed."""
         news, learner = _News(replay), self._learner
-        promising = None
+        promising, held = None, False
         while not news.closed:
             for segment in news.fresh():
                 learner.add(segment)
             last = news.ended
+            if held is not (learner.due(last=False) and not last):
+                held = not held
+                ray.get(replay.hold.remote(held))
             if promising is not learner.promising(last):
                 promising = learner.promising(last)
                 ray.get(dreamer.expect.remote(promising))

@@ -29,7 +29,9 @@ import pytest
 import yaml
 
 from accerl_lerobot.bench import lag as bench
-from accerl_lerobot.bench.lag import BenchLagConfig, Cell, Study
+from accerl_lerobot.bench import study as studies
+from accerl_lerobot.bench.lag import BenchLagConfig, cells
+from accerl_lerobot.bench.study import Results, Study
 from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.errors import InputError
 from tests.runs import tiny_run
@@ -68,13 +70,12 @@ def result(tmp_path: Path, tiny_checkpoint: Path) -> dict[str, Any]:
         "gipo": {0: (0.9, 1.0), 2: (0.5, 0.6)},
         "ppo": {0: (0.8, 0.7), 2: (0.0, 0.1)},
     }
-    runs = [
-        (Cell(algorithm=a, lag=lag, seed=seed), a_summary(share, env_steps=97 + seed, lag=lag + seed - 3))
-        for a, by_lag in success.items()
-        for lag, shares in by_lag.items()
-        for seed, share in zip((3, 4), shares, strict=True)
-    ]
-    return bench.compare(config, {3: a_summary(0.4), 4: a_summary(0.5)}, runs)
+    runs = []
+    for cell in cells(config):
+        seed, lag = cell.seed, cell.of["lag"]
+        share = success[cell.of["algorithm"]][lag][seed - 3]
+        runs.append((cell, a_summary(share, env_steps=97 + seed, lag=lag + seed - 3)))
+    return bench.compare(config, Results({3: a_summary(0.4), 4: a_summary(0.5)}, runs))
 
 
 def test_seeds_are_counted_together(result: dict[str, Any]):
@@ -121,7 +122,7 @@ def test_a_study_is_run_and_goes_on_where_it_was_stopped(
         (folder / "config.yaml").write_text(yaml.safe_dump(encode(run)))
         (folder / "summary.json").write_text(json.dumps(a_summary(0.5)))
 
-    monkeypatch.setattr(bench._Runner, "_one", fake)
+    monkeypatch.setattr(studies._Runner, "_one", fake)
     again = bench.bench_lag(small(tmp_path, tiny_checkpoint, lags=(2,), seeds=(3,)))
     assert ran == ["ppo-lag2-seed3"] and again["cells"][0] == cell
     with pytest.raises(InputError, match="gipo-lag2-seed3 in it was run with other settings; choose another"):
@@ -133,10 +134,11 @@ def test_a_study_is_run_and_goes_on_where_it_was_stopped(
 
 
 def test_cells_differ_from_the_recipe_in_what_is_studied(tmp_path: Path, tiny_checkpoint: Path):
-    study = Study(small(tmp_path, tiny_checkpoint))
+    config = small(tmp_path, tiny_checkpoint)
+    study = Study(config, cells(config))
     assert [c.name for c in study.cells][:3] == ["gipo-lag0-seed3", "ppo-lag0-seed3", "gipo-lag2-seed3"]
     assert len(study.cells) == 8
-    made = study.runs[Cell(algorithm="ppo", lag=2, seed=4)]
+    made = study.runs[-1]
     assert (made.algorithm.type, made.trainer.hold_back, made.seed) == ("ppo", 2, 4)
     assert (made.trainer.updates, made.launch.engine, made.policy.path) == (4, "local", str(tiny_checkpoint))
     assert (made.evaluation.episodes, made.evaluation.before) == (4, False)
@@ -146,8 +148,9 @@ def test_cells_differ_from_the_recipe_in_what_is_studied(tmp_path: Path, tiny_ch
 
 
 def test_without_a_checkpoint_cells_begin_at_their_seed_s_warm_start(tmp_path: Path):
-    study = Study(BenchLagConfig(output_dir=str(tmp_path), lags=(4,), seeds=(1, 2)))
-    for cell, run in study.runs.items():
+    config = BenchLagConfig(output_dir=str(tmp_path), lags=(4,), seeds=(1, 2))
+    study = Study(config, cells(config))
+    for cell, run in zip(study.cells, study.runs, strict=True):
         start = tmp_path / f"start-seed{cell.seed}"
         assert run.policy.path == str(start / "checkpoints" / "last" / "pretrained_model")
         assert run.sft.steps == 0 < study.starts[cell.seed].sft.steps
@@ -177,7 +180,7 @@ def failing(*, during: Callable[[], None] = lambda: None) -> Callable[..., subpr
 def test_a_run_that_fails_ends_the_study_with_its_last_lines(
     tmp_path: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(bench.subprocess, "Popen", failing())
+    monkeypatch.setattr(studies.subprocess, "Popen", failing())
     with pytest.raises(RuntimeError, match="the run start-seed. failed, see .*\\none\\nit broke"):
         bench.bench_lag(small(tmp_path, tiny_checkpoint))
 
@@ -193,7 +196,7 @@ def test_one_study_at_a_time_writes_into_a_folder(
             bench.bench_lag(config)
         seen.append(caught.value)
 
-    monkeypatch.setattr(bench.subprocess, "Popen", failing(during=another))
+    monkeypatch.setattr(studies.subprocess, "Popen", failing(during=another))
     with pytest.raises(RuntimeError, match="it broke"):
         bench.bench_lag(config)
     assert seen
@@ -214,8 +217,8 @@ def test_a_study_that_is_stopped_ends_its_runs(
         time.sleep(0.2)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(bench.subprocess, "Popen", start)
-    monkeypatch.setattr(bench, "as_completed", interrupted)
+    monkeypatch.setattr(studies.subprocess, "Popen", start)
+    monkeypatch.setattr(studies, "as_completed", interrupted)
     with pytest.raises(KeyboardInterrupt):
         bench.bench_lag(small(tmp_path, tiny_checkpoint))
     assert len(started) == 2 and all(p.returncode == -signal.SIGTERM for p in started)

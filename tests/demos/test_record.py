@@ -114,12 +114,33 @@ def test_noise_is_in_the_recorded_action_and_seeded():
     world = make_world(config)
     expert = make_expert(config, world, "match")
     one, again, clean = (
-        play(world, expert, task="match", seed=5, noise=noise, fail=False) for noise in (0.1, 0.1, 0.0)
+        play(world, expert, task="match", seed=5, noise=noise, push=0.0, fail=False)
+        for noise in (0.1, 0.1, 0.0)
     )
     assert np.array_equal(one.actions, again.actions) and one.actions.dtype == np.float32
     assert clean.success_at == 3 and np.ptp(clean.actions, axis=0).max() == 0
     assert 0.05 < (one.actions - clean.actions[0]).std() < 0.2
     assert np.abs(one.actions).max() <= 1
+
+
+def test_an_expert_that_is_pushed_misses_by_more_the_more_it_is_pushed():
+    config = SimulatedConfig(tolerance=0.01, max_steps=20)
+    world = make_world(config)
+    clean, *pushed = (
+        play(
+            world, make_expert(config, world, "match"), task="match", seed=5, noise=0.0, push=push, fail=False
+        )
+        for push in (0.0, 0.1, 0.2)
+    )
+    aside = [episode.actions[0] - clean.actions[0] for episode in pushed]
+    assert all(np.ptp(episode.actions, axis=0).max() == 0 for episode in pushed), "the same all the way"
+    assert 0 < np.linalg.norm(aside[0]) <= 0.1 and aside[1] == pytest.approx(2 * aside[0], abs=1e-6)
+    other = play(
+        world, make_expert(config, world, "match"), task="match", seed=6, noise=0.0, push=0.2, fail=False
+    )
+    assert not np.allclose(other.actions[0] - clean.actions[0], aside[1], atol=1e-3)
+    with pytest.raises(InputError, match="demos.push=3"):
+        DemosConfig(push=3)
 
 
 def test_an_expert_that_cannot_succeed_is_reported_and_leaves_nothing(tmp_path: Path):

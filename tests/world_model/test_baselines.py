@@ -94,7 +94,7 @@ def test_an_oracle_must_know_what_led_to_a_start():
     starts, _ = starts_of(1)
     oracle = OracleModel(SPEC, lambda: make_world(WORLD), 1)
     with pytest.raises(ValueError, match="history of every start"):
-        oracle.begin(Context(*torch.zeros(3, 1)), ["go"], [None])
+        oracle.begin(Context(*torch.zeros(5, 1)), ["go"], [None])
 
 
 def test_a_copy_shows_the_last_frame_for_ever():

@@ -19,25 +19,51 @@ import math
 from accerl_lerobot.world_model.guard import KillSwitch
 
 
+def dream(switch: KillSwitch, *outcomes: int) -> None:
+    for outcome in outcomes:
+        switch.dreamt(bool(outcome))
+
+
 def test_dreams_that_succeed_too_often_trip_it():
-    switch = KillSwitch(gap=0.3, window=10)
-    assert all(math.isnan(share) for share in switch.shares)
-    for i in range(10):
-        assert not switch.tripped, "not before the window is full"
-        switch.add(i < 5, i < 1)
-    assert switch.shares == (0.5, 0.1) and switch.tripped
+    switch = KillSwitch(gap=0.3, window=4, outcomes=5)
+    assert math.isnan(switch.share) and all(math.isnan(share) for share in switch.shares)
+    dream(switch, 1, 0, 1, 0)
+    assert switch.share == 0.5
+    for i in range(5):
+        assert not switch.tripped, "not before there are so many real outcomes"
+        switch.lived(i < 0)
+    assert switch.shares == (0.5, 0.0) and switch.tripped
     switch.reset()
-    assert not switch.tripped and all(math.isnan(share) for share in switch.shares)
+    assert not switch.tripped and math.isnan(switch.share) and all(math.isnan(x) for x in switch.shares)
 
 
-def test_equal_and_unknown_outcomes_do_not():
-    switch = KillSwitch(gap=0.3, window=4)
-    for _ in range(20):
-        switch.add(True, True)
-        switch.add(True, None)
-        switch.add(False, True)
-    assert switch.shares == (0.5, 1.0) and not switch.tripped
-    exact = KillSwitch(gap=0.5, window=2)
-    exact.add(True, False)
-    exact.add(False, False)
-    assert not exact.tripped, "more than the gap, not as much"
+def test_what_no_dreams_stand_beside_is_not_counted():
+    switch = KillSwitch(gap=0.3, window=4, outcomes=2)
+    dream(switch, 1, 1, 1)
+    for _ in range(5):
+        switch.lived(False)
+    assert math.isnan(switch.shares[0]) and not switch.tripped
+    dream(switch, 1)
+    switch.lived(False)
+    switch.lived(True)
+    assert switch.shares == (1.0, 0.5) and switch.tripped
+
+
+def test_a_policy_that_learns_is_not_taken_for_a_world_model_that_flatters():
+    """Reality is held against what was dreamt when it happened, not against what is dreamt now."""
+    switch = KillSwitch(gap=0.3, window=2, outcomes=4)
+    for promised, happened in ((0, 0), (0, 0), (1, 1), (1, 1)):
+        dream(switch, promised, promised)
+        switch.lived(bool(happened))
+    assert switch.share == 1.0 and switch.shares == (0.5, 0.5) and not switch.tripped
+
+
+def test_more_than_the_gap_not_as_much():
+    exact = KillSwitch(gap=0.5, window=2, outcomes=1)
+    dream(exact, 1, 0)
+    exact.lived(False)
+    assert exact.shares == (0.5, 0.0) and not exact.tripped
+    better = KillSwitch(gap=0.1, window=1, outcomes=1)
+    dream(better, 0)
+    better.lived(True)
+    assert not better.tripped, "reality may be as good as it likes"

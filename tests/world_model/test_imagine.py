@@ -230,6 +230,30 @@ def test_dreams_that_are_too_good_are_switched_off_until_another_model_dreams(br
     assert len(dreams.requests()) == 4 and dreams.version == 12 and dreams.metrics()["on"] == 1
 
 
+def test_whole_dreams_are_held_against_real_episodes(bright: Any):
+    dreams, made = imagination(
+        Counting(), bright, dreams=4, window=4, witnesses=3, gap=0.5, horizon=None, world=ENDLESS
+    )
+    for seed in range(4):
+        dreams.remember(lived(seed)[0])
+    play(dreams, 3)
+    assert {(s.origin.decision, len(s), s.success, s.terminated) for s in made} == {(0, 3, True, True)}
+    for seed in range(3):
+        assert dreams.requests(), "what happened before anything was dreamt does not count"
+        dreams.remember(lived(seed)[0])
+    assert dreams.switch.shares == (1.0, 0.0) and not dreams.on and not dreams.requests()
+    dreams.swap(promotion(Counting(), bright, 12))
+    assert dreams.requests()
+
+
+@pytest.mark.parametrize("fails", [True, False])
+def test_a_whole_dream_lasts_as_long_as_the_world_lets_it(bright: Any, fails: bool):
+    dreams, made = imagination(Counting(), bright, horizon=None, fails=fails)
+    dreams.remember(lived(3)[0])
+    play(dreams, 4, size=0.0)
+    assert {(len(s), s.terminated, s.truncated, s.success) for s in made} == {(4, fails, not fails, False)}
+
+
 def test_a_model_that_learns_dreams_once_it_has_passed(bright: Any):
     dreams, _ = imagination(Counting(), bright, learn=OnlineLearnConfig(steps_per_episode=1))
     dreams.remember(lived(3)[0])

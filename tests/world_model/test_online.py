@@ -148,9 +148,10 @@ def passes(monkeypatch: pytest.MonkeyPatch, *outcomes: bool) -> list[list[str]]:
     """Trials end so; gives the sources of the episodes they are on."""
     results, tried = list(outcomes), []
 
-    def trial(model: Any, held: Any, *rest: Any) -> dict[str, Any]:
+    def trial(model: Any, held: Any, *rest: Any, fresh: bool) -> dict[str, Any]:
+        assert fresh, "its threshold is to be set"
         tried.append([e.source for e in held])
-        return {"passed": results.pop(0), "gates": {"auroc_last": {"value": 0.5}}}
+        return {"passed": results.pop(0), "gates": {"auroc": {"value": 0.5}}}
 
     monkeypatch.setattr(online, "try_out", trial)
     return tried
@@ -175,7 +176,7 @@ def test_what_passes_is_promoted_and_what_does_not_is_not(monkeypatch: pytest.Mo
             assert not any(p.requires_grad for p in promotion.model.parameters())
             assert not promotion.success.training
     assert tried == [["demo", "online"], ["demo", "online", "online"]]
-    assert made.metrics()["gate_auroc_last"] == 0.5 and made.metrics()["promoted"] == 1
+    assert made.metrics()["gate_auroc"] == 0.5 and made.metrics()["promoted"] == 1
     assert made.owed == 0
 
 

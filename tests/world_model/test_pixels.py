@@ -28,7 +28,7 @@ from accerl_lerobot.world_model.episodes import Episode, Windows, cut, places
 from accerl_lerobot.world_model.judge import mean_error, sensitivity, shuffled, skill, squared_errors
 from accerl_lerobot.world_model.learn import Learner, pretrain
 from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.success import context_of
+from accerl_lerobot.world_model.replayed import context_of
 
 SIZE, K = 16, 2
 SPEC = WorldModelSpec(

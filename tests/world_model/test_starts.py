@@ -43,6 +43,8 @@ def test_a_start_is_a_real_observation_with_what_led_there():
         assert np.array_equal(start.robot, robot[[max(0, t - 1), t]])
         assert np.array_equal(start.actions[0], segment.actions[t - 1] if t else np.zeros((K, 2)))
         assert start.history is not None and start.history[:2] == ("match", 3)
+        assert start.told == pytest.approx(segment.actions[:t].sum((0, 1)), abs=1e-5)
+        assert np.array_equal(start.first, robot[0])
         assert np.array_equal(start.history.actions, segment.actions[:t].reshape(-1, 2))
 
 
@@ -72,10 +74,30 @@ def test_where_a_segment_was_cut_the_outcome_or_the_history_is_not_known():
     assert set(starts) == {0, 1, 3}
     assert starts[3].history is None and starts[3].achieved is False
     assert np.array_equal(starts[3].actions[0], second.actions[0])
+    assert not starts[3].told.any(), "nor is what it was told before"
     whole = pool(whole=True)
     for segment in (first, second):
         whole.add(segment)
     assert len(whole) == 2
+
+
+def test_whole_dreams_begin_where_episodes_began_and_end_as_they_did():
+    first, second = lived(5, length=2)
+    [failure], [success] = lived(6), lived(7, solve_at=2)
+    held = pool(horizon=None, keyframes=1.0)
+    for segment in (first, failure, success):
+        held.add(segment)
+    starts = held.draw(600, np.random.default_rng(0))
+    counts = Counter((s.origin.seed, s.origin.decision, s.achieved) for s in starts)
+    assert set(counts) == {(5, 0, None), (6, 0, False), (7, 0, True)} and min(counts.values()) > 150
+    assert not any(s.told.any() or (s.first != s.robot[-1]).any() for s in starts)
+    held.add(replace(second, success=True, terminated=True, truncated=False))
+    assert {s.achieved for s in held.draw(100, np.random.default_rng(0)) if s.origin.seed == 5} == {True}
+    # What is known of an episode goes when its beginning does.
+    short = pool(horizon=None, memory=1)
+    for segment in (first, failure, second):
+        short.add(segment)
+    assert {s.origin.seed for s in short.draw(100, np.random.default_rng(0))} == {6}
 
 
 def test_keyframes_are_where_the_critic_was_surprised():

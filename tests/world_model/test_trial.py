@@ -27,8 +27,9 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import SuccessLearnConfig, TrialConfig
 from accerl_lerobot.world_model.contract import Context, Dream, History, State, WorldModel
 from accerl_lerobot.world_model.episodes import Episode
-from accerl_lerobot.world_model.success import Examples, SuccessLearner, cut_alike, new_success_model
-from accerl_lerobot.world_model.trial import ARMS, dream, trial_windows, try_out, wrong_actions
+from accerl_lerobot.world_model.replayed import cut_alike, dream
+from accerl_lerobot.world_model.success import Examples, SuccessLearner, new_success_model
+from accerl_lerobot.world_model.trial import ARMS, trial_windows, try_out, wrong_actions
 from tests.world_model.test_pixels import SIZE, SPEC, K, dots
 
 CONFIG = TrialConfig(depth=3, every=2)
@@ -160,9 +161,10 @@ def test_the_success_model_is_judged_on_what_was_dreamt():
         metrics = learner.step(examples, world)
     assert set(metrics) == {"loss", "accuracy", "progress"}
     success.eval()
-    config = replace(CONFIG, every=1, most=5000, auroc=0.7, false_success=0.3)
-    exact = try_out(world, held, config, success)
-    assert exact["passed"] and exact["gates"]["auroc_last"]["value"] > 0.7
+    config = replace(CONFIG, every=1, most=5000, auroc=0.7, false_success=0.3, whole=False)
+    exact = try_out(world, held, config, success, fresh=True)
+    assert exact["passed"] and exact["gates"]["auroc"]["value"] > 0.7
+    assert exact["threshold"] == success.config.threshold >= 0.5
     first = exact["depths"][0]
     assert first["successes"] > 10 < first["failures"] and exact["auroc_real"] > 0.85
     assert {f"false_success_{arm}" for arm in ARMS} < set(first)
@@ -179,7 +181,9 @@ def test_what_is_taken_for_a_success_depends_on_the_threshold():
     for success.config.threshold in (0.0, 1.0):
         found = try_out(Deterministic("exact"), episodes, CONFIG, success)
         shares.append(found["depths"][-1]["false_success_zero"])
-        assert found["gates"]["false_success_last"]["holds"] is (shares[-1] == 0)
+        assert found["gates"]["false_success_still"]["value"] == shares[-1]
+        assert found["gates"]["false_success"]["holds"] is (shares[-1] == 0)
+        assert found["threshold"] == success.config.threshold, "it is not fresh"
     assert shares == [1, 0]
 
 

@@ -1,0 +1,214 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""How many real episodes a policy needs, with and without a world model.
+
+    accerl bench efficiency --recipe=recipes/dreams.yaml --budgets=16,64,256
+
+Every cell may collect so many real episodes and makes the same number of updates; where nothing is imagined,
+each real decision is learnt from so much more often. What was real before, the demonstrations of the warm
+start and the episodes of the pre-training, is the same for all cells and is reported beside them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from accerl_lerobot.bench.study import Cell, Results, Study, StudyConfig, named, together
+from accerl_lerobot.config import RunConfig, parse
+from accerl_lerobot.console import Console
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.stats import Rate
+
+ARMS = {
+    "none": ("--imagination.share=0",),
+    "learned": ("--imagination.model=learned",),
+    "frozen": ("--imagination.model=learned", "--imagination.learn.steps_per_episode=0"),
+    "copy": ("--imagination.model=copy",),
+    "shuffled": ("--imagination.model=shuffled",),
+    "oracle": ("--imagination.model=oracle",),
+}
+"""What each dreams with."""
+SPARE = 1.25
+"""Draws that a budget of real episodes gives, beside what the updates of a cell need: nobody knows before how
+long the episodes are."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchEfficiencyConfig(StudyConfig):
+    """What is compared."""
+
+    recipe: str = "recipes/dreams.yaml"
+    """The run that every cell is a variation of; read once, when the study starts."""
+    output_dir: str = "outputs/efficiency"
+    """Folder of the runs and of efficiency.json, .md and .png; finished cells in it are kept."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Each a warm start of its own."""
+    arms: tuple[str, ...] = tuple(ARMS)
+    """Of none, learned (goes on learning), frozen (does not), oracle (a simulator), and the placebos copy
+    (nothing moves) and shuffled (is told other actions)."""
+    budgets: tuple[int, ...] = (16, 64, 256)
+    """Real episodes of a cell, ``rollout.episodes``."""
+    decisions: int = 15
+    """Of a real episode, about; from it follows how often each is learnt from, for the updates to be made."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("arms", "budgets"):
+            named(self, name)
+        for arm in self.arms:
+            if arm not in ARMS:
+                raise InputError("arms", arm, f"use some of {', '.join(ARMS)}")
+        if min(self.budgets) < 1:
+            raise InputError("budgets", min(self.budgets), "use at least 1 episode")
+        if self.decisions < 1:
+            raise InputError("decisions", self.decisions, "use at least 1")
+
+
+def cells(config: BenchEfficiencyConfig, recipe: RunConfig) -> list[Cell]:
+    """Of all arms, budgets and seeds; seeds outermost, so that what is stopped has compared everything on the
+    first ones.
+    """
+    updates = recipe.trainer.updates if config.updates is None else config.updates
+    made = []
+    for seed in config.seeds:
+        for budget in config.budgets:
+            for arm in config.arms:
+                share = 0.0 if arm == "none" else recipe.imagination.share
+                drawn = SPARE * updates * recipe.trainer.batch_decisions * (1 - share)
+                uses = max(1, math.ceil(drawn / (budget * config.decisions)))
+                chosen = (
+                    *ARMS[arm],
+                    f"--rollout.episodes={budget}",
+                    f"--replay.samples_per_insert={uses}",
+                    f"--replay.max_lag={max(updates, recipe.replay.max_lag)}",
+                )
+                made.append(
+                    Cell(
+                        name=f"{arm}-{budget}-seed{seed}",
+                        seed=seed,
+                        of={"arm": arm, "budget": budget, "uses": uses},
+                        chosen=chosen,
+                    )
+                )
+    return made
+
+
+def bench_efficiency(config: BenchEfficiencyConfig) -> dict[str, Any]:
+    """Runs the cells that are missing, and compares all of them.
+
+    Returns:
+        ``starts`` (success of each seed's warm start), ``cells`` (of each run success, n, real episodes and
+        env steps, updates, and what was dreamt) and ``groups``: arm, budget, successes and episodes over the
+        seeds, and the mean of real episodes.
+
+    Raises:
+        InputError: see `Study.run`.
+        RuntimeError: see there.
+    """
+    from accerl_lerobot.world_model.dreaming import check_imagination
+
+    recipe = parse(RunConfig, [f"--config_path={config.recipe}"])
+    study, console = Study(config, cells(config, recipe)), Console()
+    for run in study.runs[: len(config.arms)]:
+        if run.imagination.share:
+            check_imagination(replace(study.starts[run.seed], imagination=run.imagination))
+    result = compare(config, study.run(console))
+    (study.root / "efficiency.json").write_text(json.dumps(result, indent=2) + "\n")
+    (study.root / "efficiency.md").write_text(markdown(result))
+    draw(study.root / "efficiency.png", result)
+    console.say(f"wrote efficiency.json, .md and .png into {study.root}")
+    return result
+
+
+def compare(config: BenchEfficiencyConfig, results: Results) -> dict[str, Any]:
+    """The study's numbers from the summaries of its runs; see `bench_efficiency`."""
+    rows = results.table(("episodes_explored", "env_steps", "updates", "rl_s", "imagination"))
+    groups = []
+    for arm in config.arms:
+        for budget in config.budgets:
+            of = [row for row in rows if (row["arm"], row["budget"]) == (arm, budget)]
+            explored = sum(row["episodes_explored"] for row in of) / len(of)
+            groups.append({"arm": arm, "budget": budget, **together(of), "episodes_explored": explored})
+    return {"config": asdict(config), "starts": results.before, "groups": groups, "cells": rows}
+
+
+def table(result: dict[str, Any]) -> Table:
+    """`result` for people: one row per arm, one column per budget."""
+    starts = ", ".join(f"{s:.0%}" for s in result["starts"].values())
+    shown = Table(title=f"success after so many real episodes; before them {starts}")
+    for column in _columns(result):
+        shown.add_column(column)
+    for row in _rows(result):
+        shown.add_row(*row)
+    return shown
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """`table` for the docs."""
+    columns = _columns(result)
+    lines = [columns, ["---"] * len(columns), *_rows(result)]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def draw(path: Path, result: dict[str, Any]) -> None:
+    """Success over real episodes: one line per arm with its 95 % Wilson interval, one dot per seed."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    budgets, arms = result["config"]["budgets"], result["config"]["arms"]
+    figure, axes = plt.subplots(figsize=(7, 4), dpi=120)
+    for i, arm in enumerate(arms):
+        groups = [g for g in result["groups"] if g["arm"] == arm]
+        rates = [Rate(successes=g["successes"], n=g["n"]) for g in groups]
+        x = [budget * 1.04 ** (i - (len(arms) - 1) / 2) for budget in budgets]
+        y = [r.value for r in rates]
+        low = [max(0.0, r.value - r.interval().low) for r in rates]
+        high = [max(0.0, r.interval().high - r.value) for r in rates]
+        axes.errorbar(x, y, yerr=[low, high], marker="o", capsize=3, color=f"C{i}", label=arm)
+        for place, group in zip(x, groups, strict=True):
+            axes.scatter([place] * len(group["by_seed"]), group["by_seed"], s=10, color=f"C{i}", alpha=0.4)
+    start = sum(result["starts"].values()) / len(result["starts"])
+    axes.axhline(start, color="0.6", ls="--", lw=1, label="before")
+    axes.set_xscale("log")
+    axes.set_xticks(budgets, [str(b) for b in budgets], minor=False)
+    axes.minorticks_off()
+    axes.set(xlabel="real episodes", ylabel="success", ylim=(-0.02, 1.02))
+    axes.grid(alpha=0.3)
+    axes.legend(loc="best", ncols=2)
+    figure.tight_layout()
+    figure.savefig(path)
+    plt.close(figure)
+
+
+def _columns(result: dict[str, Any]) -> list[str]:
+    return ["imagined", *(f"{budget} real episodes" for budget in result["config"]["budgets"])]
+
+
+def _rows(result: dict[str, Any]) -> list[list[str]]:
+    rows = []
+    for arm in result["config"]["arms"]:
+        row = [arm]
+        for g in (g for g in result["groups"] if g["arm"] == arm):
+            seeds = " ".join(f"{100 * s:.0f}" for s in g["by_seed"])
+            row.append(f"{Rate(successes=g['successes'], n=g['n'])} ({seeds})")
+        rows.append(row)
+    return rows

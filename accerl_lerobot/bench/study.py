@@ -1,0 +1,293 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Many runs of one recipe, to be compared: every seed is warm-started once, and each cell begins there.
+
+Runs are in the single-process engine, each on one thread, where lag is what settings make it and not what
+else the machine is doing. What is finished is kept: the same command goes on where it was stopped.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from accerl_lerobot.checkpoint import PRETRAINED
+from accerl_lerobot.config import RunConfig, encode, parse
+from accerl_lerobot.console import Console
+from accerl_lerobot.errors import InputError
+
+CONFIG, SUMMARY, LOCK = "config.yaml", "summary.json", ".lock"
+LOG_LINES = 12
+"""Of a run that failed, shown in the error."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyConfig:
+    """What all studies have."""
+
+    recipe: str = "recipes/quickstart.yaml"
+    """The run that every cell is a variation of; read once, when the study starts."""
+    output_dir: str = "outputs/study"
+    """Folder of the runs and of what they say together; finished runs in it are kept."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Each a warm start of its own."""
+    updates: int | None = None
+    """Of each cell; None: the recipe's."""
+    episodes: int = 100
+    """Of the evaluation after each cell."""
+    jobs: int = 2
+    """Cells that run at the same time, each on one thread."""
+
+    def __post_init__(self) -> None:
+        named(self, "seeds")
+        for name in ("episodes", "jobs"):
+            if getattr(self, name) < 1:
+                raise InputError(name, getattr(self, name), "use at least 1")
+
+
+def named(config: Any, name: str) -> None:
+    """Refuses a list that is empty, or names something twice."""
+    values = getattr(config, name)
+    if not values or len(set(values)) < len(values):
+        raise InputError(name, values, "name at least one, none of them twice")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """One run of a study."""
+
+    name: str
+    """Of its folder."""
+    seed: int
+    of: dict[str, Any]
+    """What tells it from the others of its seed, for people."""
+    chosen: tuple[str, ...]
+    """What it adds to the command line."""
+
+
+class Results(NamedTuple):
+    """What runs said of themselves."""
+
+    starts: dict[int, dict[str, Any]]
+    """Summary of each seed's warm start."""
+    cells: list[tuple[Cell, dict[str, Any]]]
+    """Each with its summary."""
+
+    @property
+    def before(self) -> dict[str, float]:
+        """Success of each seed's warm start."""
+        return {str(seed): summary["success_after"] for seed, summary in self.starts.items()}
+
+    def table(self, shown: Sequence[str]) -> list[dict[str, Any]]:
+        """What each cell is of, its seed, success and n, and these fields of its summary."""
+        return [
+            cell.of
+            | {"seed": cell.seed, "success": summary["success_after"], "n": summary["n_after"]}
+            | {key: summary[key] for key in shown}
+            for cell, summary in self.cells
+        ]
+
+
+def together(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Successes and episodes of some rows of `Results.table`, and the success of each, seed by seed."""
+    return {
+        "successes": sum(round(row["success"] * row["n"]) for row in rows),
+        "n": sum(row["n"] for row in rows),
+        "by_seed": [row["success"] for row in rows],
+    }
+
+
+class Study:
+    """The runs of a study, all of them settled before the first one starts.
+
+    Args:
+        config: what they have in common.
+        cells: what they have not.
+
+    Raises:
+        InputError: the recipe, or a cell's settings, are wrong.
+    """
+
+    def __init__(self, config: StudyConfig, cells: Sequence[Cell]) -> None:
+        self.config, self.root = config, Path(config.output_dir).expanduser().resolve()
+        self.cells = list(cells)
+        self.starts = {
+            seed: self._parse(seed, ["--trainer.updates=0", "--imagination.share=0"], self.start(seed))
+            for seed in config.seeds
+        }
+        self.runs = [self._of(cell) for cell in self.cells]
+
+    def start(self, seed: int) -> Path:
+        """The folder of a seed's warm start."""
+        return self.root / f"start-seed{seed}"
+
+    def folder(self, cell: Cell) -> Path:
+        """The folder of a cell's run."""
+        return self.root / cell.name
+
+    def run(self, console: Console) -> Results:
+        """Does the runs that are missing.
+
+        Raises:
+            InputError: the settings of a cell are wrong, which is found before the first run as far as a run
+                itself finds it before it begins; the folder holds runs of other settings, or is in use.
+            RuntimeError: a run failed; those that were under way have ended, and what is finished is kept.
+        """
+        from accerl_lerobot.preflight import check_start
+
+        for start in self.starts.values():
+            check_start(start)
+        with _locked(self.root) as lock:
+            runner = _Runner(self.config.jobs, lock, console)
+            runner.run("warm starts", {self.start(seed): start for seed, start in self.starts.items()})
+            for cell in self.cells:
+                _check_newer(self.folder(cell), self.start(cell.seed))
+            folders = [self.folder(cell) for cell in self.cells]
+            runner.run("cells", dict(zip(folders, self.runs, strict=True)))
+        return Results(
+            {seed: _summary(self.start(seed)) for seed in self.config.seeds},
+            [(cell, _summary(folder)) for cell, folder in zip(self.cells, folders, strict=True)],
+        )
+
+    def _of(self, cell: Cell) -> RunConfig:
+        chosen = list(cell.chosen)
+        if self.config.updates is not None:
+            chosen.append(f"--trainer.updates={self.config.updates}")
+        if self.starts[cell.seed].policy.path is None:
+            checkpoint = self.start(cell.seed) / "checkpoints" / "last" / PRETRAINED
+            chosen += ["--sft.steps=0", f"--policy.path={checkpoint}"]
+        return self._parse(cell.seed, chosen, self.folder(cell))
+
+    def _parse(self, seed: int, chosen: list[str], folder: Path) -> RunConfig:
+        config: RunConfig = parse(
+            RunConfig,
+            [
+                f"--config_path={self.config.recipe}",
+                f"--seed={seed}",
+                "--launch.engine=local",
+                "--trainer.num_threads=1",
+                "--sft.num_threads=1",
+                "--evaluation.before=false",
+                f"--evaluation.episodes={self.config.episodes}",
+                "--evaluation.every_updates=0",
+                "--evaluation.videos=0",
+                f"--output_dir={folder}",
+                *chosen,
+            ],
+        )
+        return config
+
+
+@contextmanager
+def _locked(root: Path) -> Iterator[int]:
+    """Creates the study's folder and keeps others out, for as long as one of its runs is alive."""
+    root.mkdir(parents=True, exist_ok=True)
+    with (root / LOCK).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            remedy = "a study, or a run of one that was killed, still writes there; wait for it or end it"
+            raise InputError("output_dir", str(root), remedy) from error
+        yield file.fileno()
+
+
+class _Runner:
+    """Runs ``accerl train`` in processes of their own.
+
+    Args:
+        jobs: how many at a time.
+        lock: a file descriptor that they inherit.
+        console: progress for people.
+    """
+
+    def __init__(self, jobs: int, lock: int, console: Console) -> None:
+        self._jobs, self._lock, self._console = jobs, lock, console
+        self._processes: set[subprocess.Popen[bytes]] = set()
+        self._stopped = False
+
+    def run(self, name: str, runs: dict[Path, RunConfig]) -> None:
+        """Does those that have no summary yet."""
+        missing = {folder: config for folder, config in runs.items() if not (folder / SUMMARY).is_file()}
+        for folder, config in runs.items():
+            if folder not in missing:
+                _check_same(folder, config)
+        done = len(runs) - len(missing)
+        with self._console.stage(name, total=len(runs)) as stage, ThreadPoolExecutor(self._jobs) as pool:
+            stage.update(done)
+            under_way = [pool.submit(self._one, folder, config) for folder, config in missing.items()]
+            try:
+                for future in as_completed(under_way):
+                    future.result()
+                    done += 1
+                    stage.update(done)
+            except BaseException as error:
+                for future in under_way:
+                    future.cancel()
+                if not isinstance(error, Exception):  # asked to stop: nothing must train on alone
+                    self._stopped = True
+                    for process in list(self._processes):
+                        process.terminate()
+                raise
+
+    def _one(self, folder: Path, config: RunConfig) -> None:
+        if folder.exists():  # a run that was stopped on its way
+            shutil.rmtree(folder)
+        recipe, log = folder.with_suffix(".yaml"), folder.with_suffix(".log")
+        recipe.write_text(yaml.safe_dump(encode(config), sort_keys=False))
+        command = [sys.executable, "-m", "accerl_lerobot.cli", "train", f"--config_path={recipe}"]
+        threads = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
+        with log.open("wb") as out:
+            process = subprocess.Popen(
+                command, stdout=out, stderr=out, env=os.environ | threads, pass_fds=(self._lock,)
+            )
+        self._processes.add(process)
+        if self._stopped:
+            process.terminate()
+        code = process.wait()
+        self._processes.discard(process)
+        if code:
+            tail = "\n".join(log.read_text().splitlines()[-LOG_LINES:])
+            raise RuntimeError(f"the run {folder.name} failed, see {log}:\n{tail}")
+
+
+def _check_same(folder: Path, config: RunConfig) -> None:
+    """Refuses to count a finished run of other settings."""
+    if parse(RunConfig, [f"--config_path={folder / CONFIG}"]) != config:
+        remedy = f"{folder.name} in it was run with other settings; choose another folder or remove it"
+        raise InputError("output_dir", str(folder.parent), remedy)
+
+
+def _check_newer(folder: Path, start: Path) -> None:
+    """Refuses to count a run from a warm start that has been replaced."""
+    summary = folder / SUMMARY
+    if summary.is_file() and summary.stat().st_mtime < (start / SUMMARY).stat().st_mtime:
+        remedy = f"{folder.name} in it is older than {start.name}, where it would have begun; remove it"
+        raise InputError("output_dir", str(folder.parent), remedy)
+
+
+def _summary(folder: Path) -> dict[str, Any]:
+    summary: dict[str, Any] = json.loads((folder / SUMMARY).read_text())
+    return summary

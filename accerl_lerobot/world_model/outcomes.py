@@ -1,0 +1,167 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Whether dreams end as reality did, with the actions that were really made.
+
+An episode is dreamt from its beginning to its end, and the highest P(success) on the way is its *score*: a
+dream that is once taken for a success ends there. One chunk in thirty that is wrongly taken for a success may
+pass a trial of single chunks, and still be half of all long dreams that should have failed.
+
+Shapes: M dreams, D depths in chunks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from accerl_lerobot.world_model import judge
+from accerl_lerobot.world_model.config import TrialConfig
+from accerl_lerobot.world_model.contract import WorldModel
+from accerl_lerobot.world_model.episodes import Episode, Place
+from accerl_lerobot.world_model.replayed import dream, replay
+from accerl_lerobot.world_model.success import probabilities
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+
+FOLDS = 4
+"""Parts of the episodes, see `judged`."""
+
+
+class Scores(NamedTuple):
+    """Of M dreams."""
+
+    dreamt: np.ndarray
+    """Highest P(success) on the way, until the task was really achieved."""
+    still: np.ndarray
+    """The same, had nothing been done."""
+    seen: np.ndarray
+    """The same, of the frames that were really seen."""
+    achieved: np.ndarray
+    """bool, whether the task really was."""
+    episode: np.ndarray
+    """int64, which each is of."""
+
+
+def scores(
+    model: WorldModel,
+    success: SuccessPairsRewardModel,
+    episodes: Sequence[Episode],
+    config: TrialConfig,
+    seed: int,
+) -> Scores:
+    """Dreams the episodes, or parts of them if `TrialConfig.whole` is false; at most `TrialConfig.most`."""
+    rng = np.random.default_rng((seed, 5))
+    chunk, context = model.spec.chunk, model.spec.context
+    if config.whole:
+        at = [Place(e, 0) for e in range(len(episodes))]
+        depth = max(-(-int(e.times[-1]) // chunk) for e in episodes)
+    else:
+        at = [Place(e, f) for e, episode in enumerate(episodes) for f in spaced(episode.times, config.every)]
+        depth = config.depth
+    if len(at) > config.most:
+        at = [at[i] for i in sorted(rng.choice(len(at), config.most, replace=False))]
+    replayed = replay(model, episodes, at, depth)
+    windows, made = replayed.windows, replayed.made
+    still = dream(model, windows, np.zeros_like(windows.actions)).frames
+    best = {name: np.zeros(len(at)) for name in ("dreamt", "still", "seen")}
+    for d in range(depth):
+        before = {
+            "dreamt": replayed.before(d),
+            "still": replayed.newest if d == 0 else still[:, d - 1],
+            "seen": windows.frames[:, context - 1 + d],
+        }
+        after = {
+            "dreamt": replayed.dreams.frames[:, d],
+            "still": still[:, d],
+            "seen": windows.frames[:, context + d],
+        }
+        for name, highest in best.items():
+            rows = np.flatnonzero(made[:, d])
+            said = probabilities(success, before[name][rows], after[name][rows])
+            highest[rows] = np.maximum(highest[rows], said)
+    achieved = (windows.success & made).any(1)
+    return Scores(**best, achieved=achieved, episode=windows.episode)
+
+
+def threshold(found: Scores, theirs: np.ndarray, config: TrialConfig) -> float | None:
+    """What counts as a success, so that few dreams of failures do; see `TrialConfig.false_positives`.
+
+    Args:
+        found: of episodes that were not learnt from, what was learnt is no measure of that.
+        theirs: bool (M,), dreams of the policy's own episodes, whose failures count if there are any.
+        config: see there.
+
+    Returns:
+        None if there is no failure.
+    """
+    failed = _failures(found, theirs)
+    if not failed.any():
+        return None
+    least = judge.threshold(found.dreamt[failed], np.zeros(int(failed.sum()), bool), config.false_positives)
+    return float(np.clip(least, 0.5, 1 - 1e-6))
+
+
+def judged(
+    found: Scores, theirs: np.ndarray, config: TrialConfig, given: float | None = None
+) -> dict[str, Any]:
+    """What becomes of dreams.
+
+    Args:
+        given: what counts as a success. None: what each part of the episodes is judged by is set on the
+            others, as it cannot be set and tried on the same.
+        found: of the dreams.
+        theirs: bool (M,), see `threshold`.
+        config: see there.
+
+    Returns:
+        How many ``successes`` and ``failures`` there are, ``auroc`` and ``auroc_real`` (of frames that were
+        seen), ``false_success`` (failures taken for successes), ``false_success_still`` (of all, had nothing
+        been done), and ``recall`` (successes that are taken for such).
+    """
+    failed = _failures(found, theirs)
+    least = np.full(len(found.achieved), 0.5 if given is None else given)
+    fold = np.unique(found.episode, return_inverse=True)[1] % FOLDS
+    for i in range(FOLDS if given is None else 0):
+        others = Scores(*(part[fold != i] for part in found))
+        least[fold == i] = threshold(others, theirs[fold != i], config) or 0.5
+
+    def share(scores: np.ndarray, of: np.ndarray) -> float:
+        return float((scores[of] > least[of]).mean()) if of.any() else float("nan")
+
+    return {
+        "dreams": len(found.achieved),
+        "successes": int(found.achieved.sum()),
+        "failures": int(failed.sum()),
+        "auroc": judge.separation(found.dreamt, found.achieved, found.episode)._asdict(),
+        "auroc_real": judge.auroc(found.seen, found.achieved),
+        "false_success": share(found.dreamt, failed),
+        "false_success_still": share(found.still, np.ones(len(failed), bool)),
+        "recall": share(found.dreamt, found.achieved),
+    }
+
+
+def _failures(found: Scores, theirs: np.ndarray) -> np.ndarray:
+    """Where the policy has failed, or else where anybody has."""
+    failed = ~found.achieved
+    return failed & theirs if (failed & theirs).any() else failed
+
+
+def spaced(times: np.ndarray, every: int) -> list[int]:
+    """Frames that something follows, each at least so many env steps after the one before."""
+    chosen: list[int] = []
+    for frame, time in enumerate(times[:-1]):
+        if not chosen or time >= times[chosen[-1]] + every:
+            chosen.append(frame)
+    return chosen

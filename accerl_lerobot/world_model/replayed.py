@@ -1,0 +1,159 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What has happened, dreamt again: real frames to begin at, real actions, and what really came of them.
+
+No policy decides anything here, so what is dreamt can be held against what was seen: by a trial, and by a
+success model that is to learn how a dream looks that goes wrong.
+
+Shapes: M dreams, D depths in chunks; see `episodes.py` for the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from accerl_lerobot.world_model.contract import Context, Dream, State, WorldModel
+from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, held
+
+BATCH = 64
+"""Dreams at once."""
+
+
+class Dreams(NamedTuple):
+    """Of M windows."""
+
+    frames: np.ndarray
+    """uint8 (M, D, V, H, W, 3)."""
+    robot: np.ndarray
+    """float32 (M, D, S)."""
+    uncertainty: np.ndarray
+    """float32 (M, D)."""
+    ends: np.ndarray
+    """uint8 (M, D, V, H, W, 3): what the chunk at a depth would show with the actions of `ends` instead."""
+
+
+def context_of(windows: Windows, rows: slice = slice(None)) -> Context:
+    """What a world model is shown of some windows before they begin."""
+    known = windows.context
+    return Context(
+        frames=torch.from_numpy(windows.frames[rows, :known]),
+        robot=torch.from_numpy(windows.state[rows, :known]),
+        actions=torch.from_numpy(windows.before[rows]),
+        told=torch.from_numpy(windows.told[rows]),
+        first=torch.from_numpy(windows.first[rows]),
+    )
+
+
+def cut_alike(steps: np.ndarray, success: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """How many actions of a chunk to believe in, so that successes and failures are cut short equally often.
+
+    Args:
+        steps: (M, D) actions that were executed.
+        success: bool (M, D), whether that achieved the task.
+        rng: draws, for each failure of a column, the steps of one of its successes.
+
+    Returns:
+        (M, D), never more than were executed.
+    """
+    cut_ = steps.copy()
+    for d in range(steps.shape[1]):
+        of = steps[success[:, d], d]
+        if len(of):
+            failed = ~success[:, d]
+            cut_[failed, d] = np.minimum(steps[failed, d], rng.choice(of, int(failed.sum())))
+    return cut_
+
+
+def dream(model: WorldModel, windows: Windows, actions: np.ndarray, ends: np.ndarray | None = None) -> Dreams:
+    """Dreams all windows with these actions (M, D, K, A), and with `ends`, other last chunks, if given."""
+    parts: list[list[np.ndarray]] = []
+    for start in range(0, len(windows), BATCH):
+        rows = slice(start, start + BATCH)
+        state = model.begin(context_of(windows, rows), windows.task[rows])
+        count = len(windows.task[rows])
+        dreams, last = [], []
+        for depth in range(actions.shape[1]):
+            seeds = [start + i + 1_000_003 * depth for i in range(count)]
+            dreams.append(model.step(state, torch.from_numpy(actions[rows, depth]), seeds))
+            if ends is not None:
+                last.append(
+                    _instead(model, state, actions[rows, depth], ends[rows, depth], seeds, dreams[-1])
+                )
+            state = dreams[-1].state
+        shown = [[getattr(d, k) for d in dreams] for k in ("frames", "robot", "uncertainty")]
+        parts.append([np.stack([x.cpu().numpy() for x in of], 1) for of in (*shown, last or shown[0])])
+    return Dreams(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _instead(
+    model: WorldModel, state: State, actions: np.ndarray, ends: np.ndarray, seeds: list[int], dreamt: Dream
+) -> torch.Tensor:
+    """The frames of a chunk with `ends`; only where they differ from the actions it is dreamt again."""
+    differ = np.flatnonzero((actions != ends).any((1, 2)))
+    frames = dreamt.frames.clone()
+    if len(differ):
+        of = {key: tensor[differ] for key, tensor in state.items()}
+        again = model.step(of, torch.from_numpy(ends[differ]), [seeds[i] for i in differ])
+        frames[differ] = again.frames
+    return frames
+
+
+class Replayed(NamedTuple):
+    """Windows, and what was dreamt of them with the actions that were made."""
+
+    windows: Windows
+    dreams: Dreams
+    newest: np.ndarray
+    """uint8 (M, V, H, W, 3), where they begin."""
+    made: np.ndarray
+    """bool (M, D), chunks that were really made, until the task was achieved or the episode ended."""
+
+    def before(self, d: int) -> np.ndarray:
+        """uint8 (M, V, H, W, 3), the frame before the chunk at a depth, counted from 0."""
+        return self.newest if d == 0 else self.dreams.frames[:, d - 1]
+
+
+def replay(
+    model: WorldModel,
+    episodes: Sequence[Episode],
+    at: Sequence[Place],
+    depth: int,
+    rng: np.random.Generator | None = None,
+) -> Replayed:
+    """Dreams these episodes from there on, whole chunks at a time, until each has ended.
+
+    Args:
+        model: that dreams.
+        episodes: of which
+        at: these begin,
+        depth: and last so many chunks at most.
+        rng: with it `Dreams.ends` are of chunks that are cut short alike, whether they succeed or not.
+    """
+    spec = model.spec
+    windows = cut(episodes, at, chunk=spec.chunk, context=spec.context, chunks=depth)
+    ends = None
+    if rng is not None:
+        ends = held(windows.actions, cut_alike(windows.steps, windows.success, rng))
+    dreams = dream(model, windows, held(windows.actions, windows.steps), ends)
+    return Replayed(windows, dreams, windows.frames[:, spec.context - 1], made(windows))
+
+
+def made(windows: Windows) -> np.ndarray:
+    """See `Replayed.made`."""
+    before = np.cumsum(windows.success, axis=1) - windows.success
+    return (windows.valid | windows.success) & (before == 0)

@@ -1,0 +1,138 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from accerl_lerobot.bench import efficiency as bench
+from accerl_lerobot.bench.efficiency import ARMS, BenchEfficiencyConfig, cells
+from accerl_lerobot.bench.study import Results, Study
+from accerl_lerobot.config import RunConfig, encode, parse
+from accerl_lerobot.errors import InputError
+from tests.runs import tiny_run
+
+
+def recipe(tmp_path: Path, checkpoint: Path) -> str:
+    path = tmp_path / "recipe.yaml"
+    content = encode(tiny_run(checkpoint))
+    content["imagination"] |= {"share": 0.5, "path": "nowhere"}
+    path.write_text(yaml.safe_dump(content))
+    return str(path)
+
+
+def small(tmp_path: Path, checkpoint: Path, **options: Any) -> BenchEfficiencyConfig:
+    defaults = {
+        "recipe": recipe(tmp_path, checkpoint),
+        "output_dir": str(tmp_path / "study"),
+        "arms": ("none", "oracle"),
+        "budgets": (4, 8),
+        "seeds": (3, 4),
+        "updates": 4,
+        "episodes": 4,
+        "decisions": 4,
+    }
+    return BenchEfficiencyConfig(**{**defaults, **options})
+
+
+def a_summary(success: float, explored: int = 4) -> dict[str, Any]:
+    return {
+        "success_after": success, "n_after": 10, "env_steps": 100, "updates": 4, "rl_s": 1.0,
+        "episodes_explored": explored, "imagination": {"dreams": 3.0},
+    }  # fmt: skip
+
+
+@pytest.fixture
+def result(tmp_path: Path, tiny_checkpoint: Path) -> dict[str, Any]:
+    config = small(tmp_path, tiny_checkpoint)
+    made = cells(config, parse(RunConfig, [f"--config_path={config.recipe}"]))
+    success = {("none", 4): 0.1, ("none", 8): 0.5, ("oracle", 4): 0.8, ("oracle", 8): 1.0}
+    runs = [
+        (cell, a_summary(success[cell.of["arm"], cell.of["budget"]], cell.of["budget"] - (cell.seed == 4)))
+        for cell in made
+    ]
+    return bench.compare(config, Results({3: a_summary(0.2), 4: a_summary(0.4)}, runs))
+
+
+def test_seeds_are_counted_together(result: dict[str, Any]):
+    first, *_, last = result["groups"]
+    assert (first["arm"], first["budget"], first["successes"], first["n"]) == ("none", 4, 2, 20)
+    assert (last["arm"], last["budget"], last["successes"], last["by_seed"]) == ("oracle", 8, 20, [1.0, 1.0])
+    assert first["episodes_explored"] == 3.5 and result["starts"] == {"3": 0.2, "4": 0.4}
+    assert result["cells"][0]["imagination"] == {"dreams": 3.0}
+    json.dumps(result)
+
+
+def test_the_table_and_the_picture(result: dict[str, Any], tmp_path: Path):
+    lines = bench.markdown(result).splitlines()
+    assert lines[0] == "| imagined | 4 real episodes | 8 real episodes |"
+    assert lines[2].startswith("| none | 10.0 % [2.8, 30.1] n=20 (10 10) | 50.0 % [")
+    assert bench.table(result).row_count == 2
+    bench.draw(tmp_path / "efficiency.png", result)
+    assert (tmp_path / "efficiency.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_cells_differ_in_what_is_imagined_and_in_the_real_episodes(tmp_path: Path, tiny_checkpoint: Path):
+    config = small(tmp_path, tiny_checkpoint, arms=tuple(ARMS))
+    base = parse(RunConfig, [f"--config_path={config.recipe}"])
+    study = Study(config, cells(config, base))
+    assert len(study.cells) == 6 * 2 * 2 and study.cells[0].name == "none-4-seed3"
+    runs = {cell.name: run for cell, run in zip(study.cells, study.runs, strict=True)}
+    none, learned, frozen = (runs[f"{arm}-4-seed3"] for arm in ("none", "learned", "frozen"))
+    assert (none.imagination.share, learned.imagination.share) == (0, 0.5)
+    assert learned.imagination.learns and not frozen.imagination.learns
+    kinds = {arm: runs[f"{arm}-4-seed3"].imagination.model for arm in ("copy", "shuffled", "oracle")}
+    assert kinds == {arm: arm for arm in kinds}
+    assert {run.rollout.episodes for run in study.runs} == {4, 8}
+    assert {run.trainer.updates for run in study.runs} == {4}
+    # Where half of a batch is imagined, the other half asks half as much of what is real.
+    drawn = 1.25 * 4 * base.trainer.batch_decisions / (4 * 4)
+    assert none.replay.samples_per_insert == pytest.approx(drawn, abs=1)
+    assert learned.replay.samples_per_insert == pytest.approx(drawn / 2, abs=1)
+
+
+def test_a_study_is_run(tmp_path: Path, tiny_checkpoint: Path):
+    config = small(tmp_path, tiny_checkpoint, arms=("none",), budgets=(8,), seeds=(3,))
+    (cell,) = bench.bench_efficiency(config)["cells"]
+    assert (cell["arm"], cell["budget"], cell["n"], cell["updates"]) == ("none", 8, 4, 4)
+    assert 0 < cell["episodes_explored"] <= 8
+    made = {p.name for p in (tmp_path / "study").iterdir()}
+    assert {"efficiency.json", "efficiency.md", "efficiency.png", "none-8-seed3"} < made
+
+
+def test_a_world_model_that_is_missing_is_found_before_anything_runs(tmp_path: Path, tiny_checkpoint: Path):
+    with pytest.raises(InputError, match="imagination.path='nowhere'"):
+        bench.bench_efficiency(small(tmp_path, tiny_checkpoint, arms=("none", "learned")))
+    assert not (tmp_path / "study").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("arms", ("none", "dreams"), "arms='dreams'.*use some of none, learned"),
+        ("arms", (), "arms="),
+        ("budgets", (4, 4), "budgets="),
+        ("budgets", (0,), "budgets=0"),
+        ("decisions", 0, "decisions=0"),
+        ("seeds", (), "seeds="),
+    ],
+)
+def test_bad_values_name_their_field(name: str, value: object, message: str):
+    with pytest.raises(InputError, match=message):
+        BenchEfficiencyConfig(**{name: value})

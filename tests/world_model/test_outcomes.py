@@ -1,0 +1,140 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.world_model import outcomes, success
+from accerl_lerobot.world_model.config import TrialConfig
+from accerl_lerobot.world_model.episodes import Episode
+from accerl_lerobot.world_model.outcomes import Scores, judged, scores, spaced, threshold
+from accerl_lerobot.world_model.success import Dreamt, Examples
+from tests.world_model.test_pixels import SIZE, K, dots
+from tests.world_model.test_trial import Deterministic
+
+CONFIG = TrialConfig(false_positives=0.0)
+
+
+def ending_on_the_right(count: int) -> list[Episode]:
+    """Episodes that end one step after the picture shows the dot there."""
+    made = []
+    for episode in dots(count, steps=30, seed=2):
+        there = np.flatnonzero(episode.state[:, 1].round() > SIZE / 2)
+        t = int(there[0]) + 1 if len(there) else 30
+        cut = {k: getattr(episode, k)[:t] for k in ("frames", "times", "state", "actions")}
+        if t > 2:
+            made.append(replace(episode, **cut, success_at=t - 1 if len(there) else -1))
+    return made
+
+
+def on_the_right(model: object, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """What a perfect success model says of the dot."""
+    x = (after[:, 0, :, :, 0] > 200).any(1).argmax(1)
+    said: np.ndarray = 0.1 + 0.8 * (x > SIZE / 2 + 0.5)
+    return said
+
+
+@pytest.fixture(autouse=True)
+def perfect(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (outcomes, success):
+        monkeypatch.setattr(module, "probabilities", on_the_right)
+
+
+def found(model: str, **options: Any) -> Scores:
+    episodes = ending_on_the_right(60)
+    return scores(Deterministic(model), SimpleNamespace(), episodes, replace(CONFIG, **options), seed=0)  # type: ignore[arg-type]
+
+
+def test_an_exact_world_ends_as_reality_did():
+    ended = found("exact")
+    assert 10 < ended.achieved.sum() < len(ended.achieved) - 10
+    assert len(set(ended.episode)) == len(ended.episode), "each from its beginning"
+    assert ended.seen[~ended.achieved] == pytest.approx(0.1)
+    assert ended.seen[ended.achieved] == pytest.approx(0.9)
+    # A chunk that is held at its last action may go further than the episode did.
+    assert ((ended.dreamt > 0.5) == ended.achieved).mean() > 0.9
+    assert ended.still == pytest.approx(0.1), "nobody gets there by doing nothing"
+
+
+def test_where_nothing_moves_nothing_succeeds():
+    still = found("copy")
+    assert still.achieved.any() and still.dreamt == pytest.approx(0.1)
+    result = judged(still, np.zeros(len(still.achieved), bool), CONFIG)
+    assert result["auroc"]["value"] == 0.5 and result["recall"] == 0 == result["false_success"]
+
+
+def test_parts_of_episodes_begin_anywhere_and_end_soon():
+    parts = found("exact", whole=False, depth=2, every=2)
+    whole = found("exact")
+    assert len(parts.achieved) > 5 * len(whole.achieved)
+    assert parts.achieved.sum() > whole.achieved.sum(), "several begin shortly before a success"
+    few = found("exact", whole=False, depth=2, every=2, most=20)
+    assert len(few.achieved) == 20
+    assert spaced(np.array([0, 1, 4, 6, 7, 9]), 3) == [0, 2, 4]
+
+
+def made(dreamt: list[float], achieved: list[int]) -> Scores:
+    count = len(dreamt)
+    return Scores(
+        dreamt=np.array(dreamt), still=np.zeros(count), seen=np.array(achieved, float),
+        achieved=np.array(achieved, bool), episode=np.arange(count),
+    )  # fmt: skip
+
+
+def test_the_threshold_lets_few_failures_through_those_of_the_policy_first():
+    of = made([0.95, 0.9, 0.6, 0.2, 0.99], [0, 0, 0, 0, 1])
+    nobody, theirs = np.zeros(5, bool), np.array([False, False, True, True, True])
+    assert threshold(of, nobody, CONFIG) == pytest.approx(0.95) and threshold(of, nobody, CONFIG) > 0.95
+    quarter = TrialConfig(false_positives=0.25)
+    assert threshold(of, nobody, quarter) == pytest.approx(0.9)
+    assert threshold(of, theirs, CONFIG) == pytest.approx(0.6)
+    assert threshold(of, theirs, TrialConfig(false_positives=0.5)) == 0.5, "never below one half"
+    assert threshold(made([0.9], [1]), np.ones(1, bool), CONFIG) is None
+
+
+def test_what_is_judged_was_not_used_to_set_the_threshold():
+    # Folds are i mod 4. Whichever failure is left out, the highest of the others is what it is judged by.
+    of = made([0.9, 0.8, 0.7, 0.6, 0.95, 0.85], [0, 0, 0, 0, 1, 1])
+    result = judged(of, np.zeros(6, bool), CONFIG)
+    assert result["failures"] == 4 and result["successes"] == 2
+    assert result["false_success"] == 0.25, "only the highest exceeds all others"
+    # Of the successes one is judged without the 0.9 (same fold), by 0.8; the other by 0.9.
+    assert result["recall"] == 0.5
+    assert result["auroc"]["value"] == 7 / 8 and result["auroc_real"] == 1
+    given = judged(of, np.zeros(6, bool), CONFIG, 0.65)
+    assert given["false_success"] == 0.75 and given["recall"] == 1
+    theirs = judged(of, np.array([False, False, True, True, False, False]), CONFIG, 0.65)
+    assert theirs["false_success"] == 0.5 and theirs["failures"] == 2
+
+
+def test_a_success_model_learns_how_dreams_end():
+    """Pairs are of dreams, the label is what really came of it, and near misses are drawn most."""
+    episodes = ending_on_the_right(60)
+    examples, rng = Examples(episodes, K), np.random.default_rng(0)
+    dreamt = Dreamt(examples, Deterministic("copy"), SimpleNamespace(), 20, 9, rng)  # type: ignore[arg-type]
+    before, after, achieved, progress = dreamt.seen(8, rng)
+    assert np.array_equal(before, after), "nothing moves in its dreams"
+    assert achieved.tolist() == [True] * 4 + [False] * 4 and before.shape == (8, 1, SIZE, SIZE, 3)
+    assert (progress[:4] == 1).all()
+    exact = Dreamt(examples, Deterministic("exact"), SimpleNamespace(), 40, 9, rng)  # type: ignore[arg-type]
+    pairs = exact.seen(400, rng)
+    assert on_the_right(None, pairs[0], pairs[1])[pairs[2]].mean() > 0.7
+    hard = exact._chances[~exact._success]
+    assert set(np.round(np.unique(hard), 6)) <= {0.2, 1.0}
