@@ -188,8 +188,8 @@ class TrialConfig:
     most: int = 400
     """Trials at most, drawn at random."""
     whole: bool = True
-    """Outcomes are tried on whole episodes, dreamt from beginning to end; false: on dreams of `depth` chunks
-    that begin anywhere."""
+    """Outcomes are tried on episodes dreamt to their ends, from the beginning and from one later place each;
+    false: on dreams of `depth` chunks that begin anywhere."""
     skill_first: float = 0.3
     """Least skill on changed pixels after one chunk,"""
     skill_last: float = 0.0
@@ -201,9 +201,9 @@ class TrialConfig:
     false_success: float = 0.1
     """Largest share of dreams that may be taken for a success although they cannot be one: with the true
     actions of episodes that failed, and with none."""
-    false_positives: float = 0.05
-    """[0, 1). The success model's threshold is the least at which no larger share of failures that were not
-    learnt from is taken for a success in a dream."""
+    false_positives: float = 0.1
+    """[0, 1). The success model's threshold is the least at which no larger share of failures is taken for a
+    success in a dream: failures that were held out, or in a run all of the policy's newest."""
     recall: float = 0.3
     """What the share of successes must exceed that are dreamt, and taken, for such."""
 

@@ -157,8 +157,9 @@ class Imagination:
         on_segment: Callable[[Segment], object],
     ) -> None:
         self.config, self.counters = config, Counters()
-        whole = config.horizon is None
-        self.switch = KillSwitch(config.gap, config.window, config.witnesses if whole else config.window)
+        self.switch = KillSwitch(config.gap, config.window, config.witnesses)
+        # Whether there are dreams of whole episodes, which real ones can be held against.
+        self._beside = config.horizon is None and config.beginnings > 0
         self.version = 0
         self.waits = config.learns
         """Whether no model has passed its trial yet."""
@@ -170,6 +171,7 @@ class Imagination:
             model.spec,
             memory=config.memory,
             horizon=config.horizon,
+            beginnings=config.beginnings,
             keyframes=config.keyframes,
             whole=config.model == "oracle",
         )
@@ -188,7 +190,7 @@ class Imagination:
     def remember(self, segment: Segment) -> None:
         """Dreams may begin in a real segment from now on."""
         self._starts.add(segment)
-        if self.config.horizon is None and self.on and (segment.terminated or segment.truncated):
+        if self._beside and self.on and (segment.terminated or segment.truncated):
             self.switch.lived(segment.terminated and segment.success)
 
     def swap(self, promotion: Promotion) -> None:
@@ -282,11 +284,18 @@ class Imagination:
         over = over and not late
         if achieved or late or over or row.depth == self.config.horizon:
             self.counters.successes += achieved
-            self.switch.dreamt(achieved)
-            if self.config.horizon is not None and row.start.achieved is not None:
-                self.switch.lived(row.start.achieved)
+            self._compare(row.start, achieved)
             terminated = achieved or over or (late and self._fails)
             self._end(i, row, terminated=terminated, truncated=late, success=achieved)
+
+    def _compare(self, start: Start, achieved: bool) -> None:
+        """Lets the kill switch know of a dream that has ended; `remember` lets it know of real episodes."""
+        if self._beside:
+            if not start.origin.decision:
+                self.switch.dreamt(achieved)
+        elif start.achieved is not None:
+            self.switch.dreamt(achieved)
+            self.switch.lived(start.achieved)
 
     def _end(
         self, i: int, row: _Row, *, terminated: bool, truncated: bool = False, success: bool = False

@@ -13,9 +13,9 @@
 # limitations under the License.
 """Whether dreams end as reality did, with the actions that were really made.
 
-An episode is dreamt from its beginning to its end, and the highest P(success) on the way is its *score*: a
-dream that is once taken for a success ends there. One chunk in thirty that is wrongly taken for a success may
-pass a trial of single chunks, and still be half of all long dreams that should have failed.
+An episode is dreamt to its end, and the highest P(success) on the way is the dream's *score*: one that is
+once taken for a success ends there. One chunk in thirty that is wrongly taken for a success may pass a trial
+of single chunks, and still be half of all long dreams that should have failed.
 
 Shapes: M dreams, D depths in chunks.
 """
@@ -61,11 +61,14 @@ def scores(
     config: TrialConfig,
     seed: int,
 ) -> Scores:
-    """Dreams the episodes, or parts of them if `TrialConfig.whole` is false; at most `TrialConfig.most`."""
+    """Dreams the episodes to their ends, from the beginning and from one later place each, or only parts of
+    them, as `TrialConfig.whole` says; at most `TrialConfig.most`.
+    """
     rng = np.random.default_rng((seed, 5))
     chunk, context = model.spec.chunk, model.spec.context
     if config.whole:
-        at = [Place(e, 0) for e in range(len(episodes))]
+        last = [len(episode.frames) - 1 for episode in episodes]
+        at = [Place(e, f) for e, n in enumerate(last) if n for f in {0, int(rng.integers(n))}]
         depth = max(-(-int(e.times[-1]) // chunk) for e in episodes)
     else:
         at = [Place(e, f) for e, episode in enumerate(episodes) for f in spaced(episode.times, config.every)]

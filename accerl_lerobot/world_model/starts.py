@@ -60,7 +60,8 @@ class StartPool:
     Args:
         spec: of the world model.
         memory: decisions held at least, as long as there were so many.
-        horizon: decisions of a dream; None: to the end, and dreams begin where episodes began.
+        horizon: decisions of a dream; None: to the end.
+        beginnings: share of dreams that begin where an episode began.
         keyframes: share of the others that begin where |r + V(next) − V| was large.
         whole: whether only starts are given whose history is known.
     """
@@ -71,15 +72,16 @@ class StartPool:
         *,
         memory: int,
         horizon: int | None,
+        beginnings: float,
         keyframes: float,
         whole: bool = False,
     ) -> None:
         self.spec, self.memory, self.horizon = spec, memory, horizon
-        self.keyframes = 0.0 if horizon is None else keyframes
+        self.beginnings, self.keyframes = beginnings, keyframes
         self._whole = whole
         self._held: deque[_Held] = deque()
         self._outcomes: dict[Name, bool] = {}
-        """Of episodes whose first segment is held, once they have ended."""
+        """Of episodes that have ended, and of which something is held."""
         self._count = 0
 
     def __len__(self) -> int:
@@ -88,20 +90,19 @@ class StartPool:
 
     def add(self, segment: Segment) -> None:
         """Takes a real segment; the oldest ones leave."""
+        if not segment.origin.decision or not (self._whole or len(segment) < self.spec.context):
+            self._held.append(_Held(segment, self.spec))
+            self._count += len(segment)
+        names = [held.name for held in self._held]
         name = segment.origin[:2]
-        known = not segment.origin.decision or any(h.segment.origin[:2] == name for h in self._held)
-        if known and (segment.terminated or segment.truncated):
+        if (segment.terminated or segment.truncated) and name in names:
             self._outcomes[name] = segment.terminated and segment.success
-        if segment.origin.decision and (
-            self._whole or self.horizon is None or len(segment) < self.spec.context
-        ):
-            return
-        self._held.append(_Held(segment, self.spec, only_first=self.horizon is None))
-        self._count += len(segment)
-        while self._count - len(self._held[0].segment) >= self.memory:
-            gone = self._held.popleft().segment
-            self._count -= len(gone)
-            self._outcomes.pop(gone.origin[:2], None)
+        while self._held and self._count - len(self._held[0].segment) >= self.memory:
+            gone = self._held.popleft()
+            self._count -= len(gone.segment)
+            names.pop(0)
+            if gone.name not in names:
+                self._outcomes.pop(gone.name, None)
 
     def draw(self, count: int, rng: np.random.Generator) -> list[Start]:
         """So many starts, with repetition.
@@ -117,6 +118,9 @@ class StartPool:
         even = allowed / max(1, allowed.sum())
         key = surprise / surprise.sum() if surprise.sum() > 0 else even
         chances = self.keyframes * key + (1 - self.keyframes) * even
+        first = np.concatenate([h.first for h in self._held])
+        if first.any():
+            chances = self.beginnings * first / first.sum() + (1 - self.beginnings) * chances
         drawn = rng.choice(self._count, size=count, p=chances / chances.sum())
         ends = np.cumsum(lengths)
         of = np.searchsorted(ends, drawn, side="right")
@@ -162,8 +166,9 @@ def _before(segment: Segment, t: int, context: int) -> np.ndarray:
 class _Held:
     """A segment, as the model sees it."""
 
-    def __init__(self, segment: Segment, spec: WorldModelSpec, only_first: bool) -> None:
-        self.segment = segment
+    def __init__(self, segment: Segment, spec: WorldModelSpec) -> None:
+        self.segment, self.name = segment, segment.origin[:2]
+        self.first = segment.origin.decision + np.arange(len(segment)) == 0
         self.frames, self.robot = seen(segment.observations, spec)
         # V of a last observation that nothing was decided on is not known: the V before stands for it.
         following = np.append(segment.value[1:], 0.0 if segment.terminated else segment.value[-1])
@@ -172,5 +177,3 @@ class _Held:
         self.allowed = np.ones(len(segment), bool)
         if segment.origin.decision:
             self.allowed[: spec.context - 1] = False
-        if only_first:
-            self.allowed[1:] = False

@@ -36,7 +36,7 @@ def begun(model: WorldModel, starts: list[Start]) -> State:
 
 
 def starts_of(*seeds: int, solve_at: int = 99) -> tuple[list[Start], dict[int, object]]:
-    pool = StartPool(SPEC, memory=1000, horizon=2, keyframes=0.0)
+    pool = StartPool(SPEC, memory=1000, horizon=2, beginnings=0.0, keyframes=0.0)
     segments = {seed: lived(seed, solve_at=solve_at)[0] for seed in seeds}
     for segment in segments.values():
         pool.add(segment)

@@ -91,7 +91,7 @@ def imagination(
 ) -> tuple[Imagination, list[Segment]]:
     kind = "oracle" if isinstance(model, OracleModel) else "learned"
     fields: dict[str, Any] = {
-        "share": 0.5, "path": "x", "dreams": 4, "horizon": 3, "model": kind,
+        "share": 0.5, "path": "x", "dreams": 4, "horizon": 3, "beginnings": 0.0, "model": kind,
         "learn": OnlineLearnConfig(steps_per_episode=0),
     }  # fmt: skip
     made: list[Segment] = []
@@ -216,7 +216,7 @@ def test_dreams_begin_anew_beside_those_that_go_on():
 
 def test_dreams_that_are_too_good_are_switched_off_until_another_model_dreams(bright: Any):
     dreams, _ = imagination(
-        Counting(), bright, dreams=4, window=4, gap=0.5, horizon=4, keyframes=0.0, world=ENDLESS
+        Counting(), bright, dreams=4, window=4, witnesses=4, gap=0.5, horizon=4, keyframes=0.0, world=ENDLESS
     )
     for seed in range(8):
         dreams.remember(lived(seed)[0])  # failures, all of them
@@ -232,7 +232,15 @@ def test_dreams_that_are_too_good_are_switched_off_until_another_model_dreams(br
 
 def test_whole_dreams_are_held_against_real_episodes(bright: Any):
     dreams, made = imagination(
-        Counting(), bright, dreams=4, window=4, witnesses=3, gap=0.5, horizon=None, world=ENDLESS
+        Counting(),
+        bright,
+        dreams=4,
+        window=4,
+        witnesses=3,
+        gap=0.5,
+        horizon=None,
+        beginnings=1.0,
+        world=ENDLESS,
     )
     for seed in range(4):
         dreams.remember(lived(seed)[0])
@@ -248,7 +256,7 @@ def test_whole_dreams_are_held_against_real_episodes(bright: Any):
 
 @pytest.mark.parametrize("fails", [True, False])
 def test_a_whole_dream_lasts_as_long_as_the_world_lets_it(bright: Any, fails: bool):
-    dreams, made = imagination(Counting(), bright, horizon=None, fails=fails)
+    dreams, made = imagination(Counting(), bright, horizon=None, beginnings=1.0, fails=fails)
     dreams.remember(lived(3)[0])
     play(dreams, 4, size=0.0)
     assert {(len(s), s.terminated, s.truncated, s.success) for s in made} == {(4, fails, not fails, False)}

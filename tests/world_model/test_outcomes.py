@@ -65,7 +65,8 @@ def found(model: str, **options: Any) -> Scores:
 def test_an_exact_world_ends_as_reality_did():
     ended = found("exact")
     assert 10 < ended.achieved.sum() < len(ended.achieved) - 10
-    assert len(set(ended.episode)) == len(ended.episode), "each from its beginning"
+    counts = np.unique(ended.episode, return_counts=True)[1]
+    assert set(counts) == {1, 2} and (counts == 2).mean() > 0.8, "from the beginning, and from later on"
     assert ended.seen[~ended.achieved] == pytest.approx(0.1)
     assert ended.seen[ended.achieved] == pytest.approx(0.9)
     # A chunk that is held at its last action may go further than the episode did.
@@ -83,8 +84,10 @@ def test_where_nothing_moves_nothing_succeeds():
 def test_parts_of_episodes_begin_anywhere_and_end_soon():
     parts = found("exact", whole=False, depth=2, every=2)
     whole = found("exact")
-    assert len(parts.achieved) > 5 * len(whole.achieved)
-    assert parts.achieved.sum() > whole.achieved.sum(), "several begin shortly before a success"
+    assert len(parts.achieved) > 2 * len(whole.achieved)
+    assert whole.achieved.mean() > 0.3 and 0 < parts.achieved.mean() < 0.2, (
+        "few are long enough for a success"
+    )
     few = found("exact", whole=False, depth=2, every=2, most=20)
     assert len(few.achieved) == 20
     assert spaced(np.array([0, 1, 4, 6, 7, 9]), 3) == [0, 2, 4]

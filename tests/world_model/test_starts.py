@@ -26,7 +26,7 @@ from tests.world_model.lived import SPEC, K, lived
 
 
 def pool(**options: object) -> StartPool:
-    defaults = {"memory": 1000, "horizon": 2, "keyframes": 0.0}
+    defaults = {"memory": 1000, "horizon": 2, "beginnings": 0.0, "keyframes": 0.0}
     return StartPool(SPEC, **(defaults | options))  # type: ignore[arg-type]
 
 
@@ -81,23 +81,44 @@ def test_where_a_segment_was_cut_the_outcome_or_the_history_is_not_known():
     assert len(whole) == 2
 
 
-def test_whole_dreams_begin_where_episodes_began_and_end_as_they_did():
+def test_some_begin_where_episodes_began():
+    held = pool(beginnings=0.5, keyframes=0.0)
+    for seed in range(3):
+        held.add(lived(seed)[0])
+    held.add(lived(9, length=2)[1])  # a later part
+    starts = held.draw(4000, np.random.default_rng(0))
+    first = Counter(s.origin.seed for s in starts if not s.origin.decision)
+    # Of 13 decisions that may be chosen, three are the first of an episode.
+    assert set(first) == {0, 1, 2} and sum(first.values()) == pytest.approx(
+        4000 * (0.5 + 0.5 * 3 / 13), abs=150
+    )
+    only = pool(beginnings=1.0, keyframes=1.0)
+    for seed in range(3):
+        only.add(lived(seed)[0])
+    assert {s.origin.decision for s in only.draw(100, np.random.default_rng(0))} == {0}
+    assert not any(
+        s.told.any() or (s.first != s.robot[-1]).any() for s in only.draw(9, np.random.default_rng(0))
+    )
+
+
+def test_to_the_end_it_is_how_the_episode_ended_that_counts():
     first, second = lived(5, length=2)
     [failure], [success] = lived(6), lived(7, solve_at=2)
-    held = pool(horizon=None, keyframes=1.0)
+    held = pool(horizon=None)
     for segment in (first, failure, success):
         held.add(segment)
-    starts = held.draw(600, np.random.default_rng(0))
-    counts = Counter((s.origin.seed, s.origin.decision, s.achieved) for s in starts)
-    assert set(counts) == {(5, 0, None), (6, 0, False), (7, 0, True)} and min(counts.values()) > 150
-    assert not any(s.told.any() or (s.first != s.robot[-1]).any() for s in starts)
+
+    def found(of: StartPool) -> set[tuple[int, bool | None]]:
+        return {(s.origin.seed, s.achieved) for s in of.draw(200, np.random.default_rng(0))}
+
+    assert found(held) == {(5, None), (6, False), (7, True)}
     held.add(replace(second, success=True, terminated=True, truncated=False))
-    assert {s.achieved for s in held.draw(100, np.random.default_rng(0)) if s.origin.seed == 5} == {True}
-    # What is known of an episode goes when its beginning does.
+    assert found(held) == {(5, True), (6, False), (7, True)}
+    # What is known of an episode goes when the last of it does.
     short = pool(horizon=None, memory=1)
-    for segment in (first, failure, second):
+    for segment in (first, second, failure):
         short.add(segment)
-    assert {s.origin.seed for s in short.draw(100, np.random.default_rng(0))} == {6}
+    assert found(short) == {(6, False)} and set(short._outcomes) == {("match", 6)}
 
 
 def test_keyframes_are_where_the_critic_was_surprised():
