@@ -60,7 +60,7 @@ class OnlineLearnConfig:
     """What it was pre-trained on: of it, it learns from the episodes that it knows, and is tried on those
     that were held out. Another dataset is learnt from whole."""
     trial: TrialConfig = field(
-        default_factory=lambda: TrialConfig(most=80, depth=4, auroc=0.6, false_success=0.3)
+        default_factory=lambda: TrialConfig(most=120, depth=4, auroc=0.6, false_success=0.3, recall=0.2)
     )
     """What it must pass to serve. Outcomes are tried on what `ImaginationConfig.horizon` says is dreamt. A
     dozen held-out episodes tell little; beyond that, `gap` watches."""
@@ -103,11 +103,11 @@ class ImaginationConfig:
     most, and V of the last observation stands for the rest.
 
     Dreams to the end ask more of the world model and nothing of the critic. On door-open short ones of 4
-    decisions taught a policy nothing even in a simulator, those to the end brought it from 39 to 88 %.
+    decisions taught a policy nothing, not even in a simulator.
     """
-    beginnings: float = 0.5
-    """Share of dreams, in [0, 1], that begin where an episode began. The later they begin, the less is dreamt,
-    and the truer is how they end."""
+    beginnings: float = 0.0
+    """Share of dreams, in [0, 1], that begin where an episode began. The later one begins, the less of it is
+    dreamt, and the truer is how it ends."""
     keyframes: float = 0.5
     """Share of the others, in [0, 1], that begin where the critic was surprised; the rest begin anywhere."""
     reward: Reward = "success"
@@ -121,11 +121,11 @@ class ImaginationConfig:
     `window` dreams in a row end so at once, nothing is imagined any more."""
     memory: int = 4096
     """Newest real decisions that dreams begin at."""
-    gap: float = 0.4
-    """Nothing is imagined any more once dreams succeed so much more often, as a share of 1, than reality; > 0.
-    Dreams of episodes from beginning to end are held against real episodes of the same time; where there are
-    none, all are held against the episodes they begin in. A world model that was promoted since gets another
-    chance."""
+    gap: float = 0.5
+    """Nothing is imagined any more once dreams succeed so much more often, of 1, than reality does; > 0.
+    Dreams of episodes from beginning to end are held against real episodes of the same time; where
+    `beginnings` is 0, dreams are held against the episodes they begin in, and may be ahead by what the policy
+    has learnt since. A world model that was promoted since gets another chance."""
     window: int = 100
     """Dreams over which that is measured, at least 1,"""
     witnesses: int = 16

@@ -77,7 +77,7 @@ def scores(
         at = [at[i] for i in sorted(rng.choice(len(at), config.most, replace=False))]
     replayed = replay(model, episodes, at, depth)
     windows, made = replayed.windows, replayed.made
-    still = dream(model, windows, np.zeros_like(windows.actions)).frames
+    still = dream(model, windows, np.zeros_like(windows.actions), lengths=made.sum(1)).frames
     best = {name: np.zeros(len(at)) for name in ("dreamt", "still", "seen")}
     for d in range(depth):
         before = {

@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from accerl_lerobot.world_model.contract import Context, Dream, State, WorldModel
+from accerl_lerobot.world_model.contract import Context, State, WorldModel
 from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, held
 
 BATCH = 64
@@ -79,38 +79,66 @@ def cut_alike(steps: np.ndarray, success: np.ndarray, rng: np.random.Generator) 
     return cut_
 
 
-def dream(model: WorldModel, windows: Windows, actions: np.ndarray, ends: np.ndarray | None = None) -> Dreams:
-    """Dreams all windows with these actions (M, D, K, A), and with `ends`, other last chunks, if given."""
-    parts: list[list[np.ndarray]] = []
+def dream(
+    model: WorldModel,
+    windows: Windows,
+    actions: np.ndarray,
+    ends: np.ndarray | None = None,
+    lengths: np.ndarray | None = None,
+) -> Dreams:
+    """Dreams windows on.
+
+    Args:
+        model: that dreams.
+        windows: where dreams begin.
+        actions: (M, D, K, A), what is done.
+        ends: (M, D, K, A), other last chunks; None: the same.
+        lengths: int (M,), chunks after which each dream ends, and nothing but zeros follows; None: D.
+    """
+    depth = actions.shape[1]
+    lengths = np.full(len(windows), depth) if lengths is None else lengths
+    parts = []
     for start in range(0, len(windows), BATCH):
         rows = slice(start, start + BATCH)
         state = model.begin(context_of(windows, rows), windows.task[rows])
-        count = len(windows.task[rows])
-        dreams, last = [], []
-        for depth in range(actions.shape[1]):
-            seeds = [start + i + 1_000_003 * depth for i in range(count)]
-            dreams.append(model.step(state, torch.from_numpy(actions[rows, depth]), seeds))
+        part = _blank(model, len(windows.task[rows]), depth)
+        alive = np.arange(len(part.frames))
+        for d in range(depth):
+            going = lengths[start + alive] > d
+            if not going.all():
+                state, alive = _rows(state, np.flatnonzero(going)), alive[going]
+            if not len(alive):
+                break
+            seeds = [int(start + i + 1_000_003 * d) for i in alive]
+            made = actions[start + alive, d]
+            dreamt = model.step(state, torch.from_numpy(made), seeds)
+            for name in ("frames", "robot", "uncertainty"):
+                getattr(part, name)[alive, d] = getattr(dreamt, name).cpu().numpy()
+            part.ends[alive, d] = part.frames[alive, d]
             if ends is not None:
-                last.append(
-                    _instead(model, state, actions[rows, depth], ends[rows, depth], seeds, dreams[-1])
-                )
-            state = dreams[-1].state
-        shown = [[getattr(d, k) for d in dreams] for k in ("frames", "robot", "uncertainty")]
-        parts.append([np.stack([x.cpu().numpy() for x in of], 1) for of in (*shown, last or shown[0])])
+                other = ends[start + alive, d]
+                differ = np.flatnonzero((made != other).any((1, 2)))
+                if len(differ):
+                    chosen = [seeds[i] for i in differ]
+                    again = model.step(_rows(state, differ), torch.from_numpy(other[differ]), chosen)
+                    part.ends[alive[differ], d] = again.frames.cpu().numpy()
+            state = dreamt.state
+        parts.append(part)
     return Dreams(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _instead(
-    model: WorldModel, state: State, actions: np.ndarray, ends: np.ndarray, seeds: list[int], dreamt: Dream
-) -> torch.Tensor:
-    """The frames of a chunk with `ends`; only where they differ from the actions it is dreamt again."""
-    differ = np.flatnonzero((actions != ends).any((1, 2)))
-    frames = dreamt.frames.clone()
-    if len(differ):
-        of = {key: tensor[differ] for key, tensor in state.items()}
-        again = model.step(of, torch.from_numpy(ends[differ]), [seeds[i] for i in differ])
-        frames[differ] = again.frames
-    return frames
+def _blank(model: WorldModel, count: int, depth: int) -> Dreams:
+    shape = (count, depth, len(model.spec.cameras), *model.spec.image_size, 3)
+    return Dreams(
+        frames=np.zeros(shape, np.uint8),
+        robot=np.zeros((count, depth, model.spec.state_dim), np.float32),
+        uncertainty=np.zeros((count, depth), np.float32),
+        ends=np.zeros(shape, np.uint8),
+    )
+
+
+def _rows(state: State, chosen: np.ndarray) -> State:
+    return {key: tensor[chosen] for key, tensor in state.items()}
 
 
 class Replayed(NamedTuple):
@@ -149,8 +177,9 @@ def replay(
     ends = None
     if rng is not None:
         ends = held(windows.actions, cut_alike(windows.steps, windows.success, rng))
-    dreams = dream(model, windows, held(windows.actions, windows.steps), ends)
-    return Replayed(windows, dreams, windows.frames[:, spec.context - 1], made(windows))
+    happened = made(windows)
+    dreams = dream(model, windows, held(windows.actions, windows.steps), ends, happened.sum(1))
+    return Replayed(windows, dreams, windows.frames[:, spec.context - 1], happened)
 
 
 def made(windows: Windows) -> np.ndarray:
