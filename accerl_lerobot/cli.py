@@ -36,7 +36,7 @@ VERBS = {
     "world-model": ("verbs:world_model", "learn to dream a world from a LeRobotDataset, and be tried on it"),
     "world-model-eval": ("verbs:world_model_eval", "try a world model on another dataset"),
     "doctor": ("doctor:main", "resolve a recipe and check this machine"),
-    "bench": ("verbs:bench", "measure: accerl bench world, policy, lag, dream, efficiency"),
+    "bench": ("verbs:bench", "measure: accerl bench world, policy, lag, dream, ranking, …"),
 }
 
 

@@ -35,6 +35,7 @@ from accerl_lerobot.bench.dream import BenchDreamConfig
 from accerl_lerobot.bench.efficiency import BenchEfficiencyConfig
 from accerl_lerobot.bench.lag import BenchLagConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
+from accerl_lerobot.bench.ranking import BenchRankingConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
 from accerl_lerobot.config import DatasetConfig, LaunchConfig, RunConfig, check_chunk, encode, parse
 from accerl_lerobot.console import Console
@@ -295,7 +296,7 @@ def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Cons
 
 
 def bench(arguments: list[str]) -> int:
-    """``accerl bench world``, ``policy``, ``lag``, ``dream`` and ``efficiency``."""
+    """``accerl bench world``, ``policy``, ``lag``, ``dream``, ``efficiency`` and ``ranking``."""
     name = arguments[0] if arguments else ""
     if f"bench {name}" not in CONFIGS:
         names = [verb.split()[1] for verb in CONFIGS if verb.startswith("bench ")]
@@ -322,6 +323,7 @@ CONFIGS: dict[str, type[Any]] = {
     "bench lag": BenchLagConfig,
     "bench dream": BenchDreamConfig,
     "bench efficiency": BenchEfficiencyConfig,
+    "bench ranking": BenchRankingConfig,
 }
 """Verb → what its command line is parsed into."""
 

@@ -19,7 +19,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from accerl_lerobot.experience import TASK, Observation
+
 if TYPE_CHECKING:
+    from accerl_lerobot.envs.base import WorldSpec
     from accerl_lerobot.world_model.contract import WorldModelSpec
 
 
@@ -43,6 +46,19 @@ def seen(observations: dict[str, np.ndarray], spec: WorldModelSpec) -> tuple[np.
         observations["observation.state"] if spec.state_dim else np.zeros((len(pictures[0]), 0), np.float32)
     )
     return np.stack(pictures, 1), robot
+
+
+def observed(
+    frames: np.ndarray, robot: np.ndarray, task: str, spec: WorldModelSpec, world: WorldSpec
+) -> Observation:
+    """What a policy is shown of frames (V, H, W, 3) and a state (S,), in the sizes of its world."""
+    observation: Observation = {TASK: task}
+    for v, camera in enumerate(spec.cameras):
+        if camera in world.images:
+            observation[camera] = resized(frames[v : v + 1], world.images[camera][:2])[0]
+    if world.state_dim:
+        observation["observation.state"] = robot
+    return observation
 
 
 def executed(chunks: np.ndarray, steps: np.ndarray) -> np.ndarray:

@@ -33,11 +33,11 @@ import torch
 
 from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import IMAGINED, TASK, Decision, Observation, Request, Segment
+from accerl_lerobot.experience import IMAGINED, Decision, Observation, Request, Segment
 from accerl_lerobot.rollout.segments import SegmentBuilder
 from accerl_lerobot.world_model.baselines import OracleModel, ShuffledModel
 from accerl_lerobot.world_model.contract import Context, Dream, State, WorldModel, WorldModelSpec
-from accerl_lerobot.world_model.frames import resized
+from accerl_lerobot.world_model.frames import observed
 from accerl_lerobot.world_model.guard import KillSwitch
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 from accerl_lerobot.world_model.starts import Start, StartPool
@@ -348,14 +348,7 @@ class Imagination:
         return 0.5 if self._success is None else self._success.config.threshold
 
     def _observation(self, frames: np.ndarray, robot: np.ndarray, task: str) -> Observation:
-        observation: Observation = {TASK: task}
-        for v, camera in enumerate(self._model.spec.cameras):
-            if camera in self._world.images:
-                size = self._world.images[camera][:2]
-                observation[camera] = resized(frames[v : v + 1], size)[0]
-        if self._world.state_dim:
-            observation["observation.state"] = robot
-        return observation
+        return observed(frames, robot, task, self._model.spec, self._world)
 
 
 def _replaced(state: State, rows: list[int], fresh: State) -> State:

@@ -1,0 +1,172 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Does a world model know which policy is better?
+
+    accerl bench ranking --path=outputs/door_model/world_model --env.task=door-open-v3 --env.image_size=64 \\
+      --env.max_steps=150 --policies=RUN_A/checkpoints/last/pretrained_model,RUN_B/…
+
+Every policy plays the same episodes, in the world and in dreams that begin at the same observations.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from accerl_lerobot.console import Console
+from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.stats import Rate
+
+LEAST = 3
+"""Policies; of two there is no rank correlation to speak of."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchRankingConfig:
+    """Which policies, in which world, and in dreams of what."""
+
+    path: str | None = None
+    """The folder named world_model that ``accerl world-model`` wrote."""
+    policies: tuple[str, ...] = ()
+    """Checkpoints, at least 3; 12 and more say something."""
+    env: EnvConfig = field(default_factory=MetaWorldConfig)
+    """The world."""
+    episodes: int = 50
+    """Of each policy, in the world and in dreams."""
+    worlds: int = 8
+    """Episodes at a time in the world."""
+    device: str = "auto"
+    """cpu, cuda, or auto."""
+    num_threads: int = 1
+    """CPU threads."""
+    output_dir: str | None = None
+    """Folder to create, for ranking.json and ranking.png. None: only prints."""
+
+    def __post_init__(self) -> None:
+        if len(set(self.policies)) < LEAST:
+            raise InputError("policies", self.policies, f"name at least {LEAST} different checkpoints")
+        if self.path is None:
+            raise InputError("path", None, "give the folder world_model that accerl world-model has written")
+        for name in ("episodes", "worlds", "num_threads"):
+            if getattr(self, name) < 1:
+                raise InputError(name, getattr(self, name), "use at least 1")
+        if self.output_dir is not None and Path(self.output_dir).expanduser().exists():
+            raise InputError("output_dir", self.output_dir, "the folder exists; choose another or remove it")
+
+
+def bench_ranking(config: BenchRankingConfig) -> dict[str, Any]:
+    """Plays and dreams.
+
+    Returns:
+        ``policies``: path, real and dreamt successes of each; ``agreement``, see `agreement.agreement`;
+        ``outcomes``: bools by policy and start; ``config``.
+
+    Raises:
+        InputError: the world model, or a policy, cannot be loaded or does not fit the world.
+    """
+    import numpy as np
+    import torch
+
+    from accerl_lerobot.envs import make_world
+    from accerl_lerobot.evaluation.config import evaluation_plans
+    from accerl_lerobot.policies.config import PolicyConfig
+    from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, resolve_device
+    from accerl_lerobot.world_model.agreement import agreement
+    from accerl_lerobot.world_model.imagine import Dreamer, check_fit
+    from accerl_lerobot.world_model.side_by_side import dreamt, lived
+    from accerl_lerobot.world_model.store import load_world_model
+
+    torch.set_num_threads(config.num_threads)
+    device, console = resolve_device(config.device), Console()
+    model, judge = load_world_model(Path(str(config.path)).expanduser())
+    dreamer = Dreamer(model.to(device), None if judge is None else judge.to(device))
+    of = [PolicyConfig(path=path, device=config.device) for path in config.policies]
+    worlds = [make_world(config.env) for _ in range(min(config.worlds, config.episodes))]
+    try:
+        spec = worlds[0].spec
+        for policy in of:
+            settings = load_lerobot_config(policy)
+            executed = getattr(settings, "n_action_steps", 1)
+            check_fit(model.spec, spec, executed, settings.n_obs_steps, judge is not None)
+        starts = [(plan.task, plan.seed) for plan in evaluation_plans(spec.tasks, config.episodes, "ranking")]
+        real, imagined = [], []
+        for number, policy in enumerate(of, 1):
+            adapter = load_adapter(policy)
+            with console.stage(f"policy {number} of {len(of)}", total=len(starts)) as stage:
+                real.append(lived(adapter, worlds, starts, stage.update))
+                imagined.append(dreamt(adapter, dreamer, worlds[0], starts))
+    finally:
+        for world in worlds:
+            world.close()
+    outcomes = np.stack(real), np.stack(imagined)
+    result = {
+        "config": asdict(config),
+        "policies": [
+            {"path": path, "real": int(r.sum()), "dreamt": int(d.sum()), "n": len(starts)}
+            for path, r, d in zip(config.policies, *outcomes, strict=True)
+        ],
+        "agreement": agreement(*outcomes),
+        "outcomes": {name: rows.tolist() for name, rows in zip(("real", "dreamt"), outcomes, strict=True)},
+    }
+    if config.output_dir is not None:
+        folder = Path(config.output_dir).expanduser()
+        folder.mkdir(parents=True)
+        (folder / "ranking.json").write_text(json.dumps(result, indent=2) + "\n")
+        draw(folder / "ranking.png", result)
+        console.say(f"wrote ranking.json and ranking.png into {folder}")
+    return result
+
+
+def table(result: dict[str, Any]) -> Table:
+    """`result` for people."""
+    found = result["agreement"]
+
+    def said(name: str) -> str:
+        return f"{found[name]['value']:.2f} [{found[name]['low']:.2f}, {found[name]['high']:.2f}]"
+
+    shown = Table(
+        title=f"{len(result['policies'])} policies: Spearman {said('spearman')}, Pearson {said('pearson')}, "
+        f"MMRV {said('mmrv')}, dreams less reality {said('bias')}, start by start {said('mcc')}"
+    )
+    for column in ("policy", "real", "dreamt"):
+        shown.add_column(column)
+    for row in result["policies"]:
+        rates = (Rate(successes=row[kind], n=row["n"]) for kind in ("real", "dreamt"))
+        shown.add_row(row["path"], *map(str, rates))
+    return shown
+
+
+def draw(path: Path, result: dict[str, Any]) -> None:
+    """Real over dreamt success, a dot with 95 % Wilson intervals per policy."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(4.5, 4.5), dpi=120)
+    axes.plot([0, 1], [0, 1], color="0.7", lw=1, ls="--")
+    for row in result["policies"]:
+        real, dreamt = (Rate(successes=row[kind], n=row["n"]) for kind in ("real", "dreamt"))
+        ends = [[[r.value - r.interval().low], [r.interval().high - r.value]] for r in (dreamt, real)]
+        axes.errorbar(dreamt.value, real.value, xerr=ends[0], yerr=ends[1], fmt="o", color="C0", alpha=0.7)
+    axes.set(xlabel="success in dreams", ylabel="success", xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
+    axes.grid(alpha=0.3)
+    figure.tight_layout()
+    figure.savefig(path)
+    plt.close(figure)

@@ -1,0 +1,115 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Whether dreams say of policies what reality says of them.
+
+Two things are asked. Between policies: does the one that succeeds more often in dreams succeed more often in
+reality? Within one: do dreams and reality agree, start by start? The first is what choosing between policies
+needs, the second what learning does.
+
+NumPy only. P policies, N starts, the same for all of them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from accerl_lerobot.world_model.judge import Estimate
+
+DRAWS = 1000
+
+
+def agreement(real: np.ndarray, dreamt: np.ndarray, seed: int = 0) -> dict[str, Any]:
+    """Everything, with 95 % percentile bootstraps over policies and starts, both drawn again.
+
+    Args:
+        real: bool (P, N), outcomes.
+        dreamt: bool (P, N), of the same policies from the same starts.
+        seed: of the resampling.
+
+    Returns:
+        Estimates as dicts: ``pearson`` and ``spearman`` of the P rates; ``mmrv``, see there; ``bias``, the
+        mean of dreamt less real rates; ``slope`` of the real rate over the dreamt one; ``mcc``, the mean over
+        policies of `matthews`. A number that cannot be had is NaN.
+
+    Raises:
+        ValueError: the arrays are not of the same policies and starts, or there are none.
+    """
+    if real.shape != dreamt.shape or real.ndim != 2 or not real.size:
+        raise ValueError(f"outcomes {real.shape} and {dreamt.shape}: both must be (P, N)")
+    rng = np.random.default_rng(seed)
+    found = _all(real, dreamt)
+    policies, starts = real.shape
+    draws = []
+    for _ in range(DRAWS):
+        rows, columns = rng.integers(policies, size=policies), rng.integers(starts, size=starts)
+        draws.append(_all(real[rows][:, columns], dreamt[rows][:, columns]))
+    return {name: _estimate(value, [draw[name] for draw in draws])._asdict() for name, value in found.items()}
+
+
+def pearson(x: np.ndarray, y: np.ndarray) -> float:
+    """Correlation; NaN where one of them does not vary."""
+    x, y = x - x.mean(), y - y.mean()
+    size = float(np.sqrt((x * x).sum() * (y * y).sum()))
+    return float((x * y).sum() / size) if size > 1e-12 else float("nan")
+
+
+def spearman(x: np.ndarray, y: np.ndarray) -> float:
+    """Correlation of ranks; ties have their mean rank."""
+    return pearson(_ranks(x), _ranks(y))
+
+
+def mmrv(real: np.ndarray, dreamt: np.ndarray) -> float:
+    """Mean maximum rank violation, of rates (P,) (Li et al. 2024, SIMPLER, arXiv 2405.05941); 0 is best.
+
+    For each policy, by how much the most different one that dreams put on the wrong side of it differs in
+    reality.
+    """
+    apart = np.abs(real[:, None] - real[None])
+    wrong = (real[:, None] < real[None]) != (dreamt[:, None] < dreamt[None])
+    return float((apart * wrong).max(1).mean())
+
+
+def matthews(real: np.ndarray, dreamt: np.ndarray) -> float:
+    """Matthews' correlation of outcomes (N,); NaN where one of them does not vary."""
+    return pearson(real.astype(np.float64), dreamt.astype(np.float64))
+
+
+def _all(real: np.ndarray, dreamt: np.ndarray) -> dict[str, float]:
+    happened, promised = real.mean(1), dreamt.mean(1)
+    within = [matthews(r, d) for r, d in zip(real, dreamt, strict=True)]
+    known = [x for x in within if not np.isnan(x)]
+    spread = float(np.square(promised - promised.mean()).sum())
+    joint = float(((promised - promised.mean()) * (happened - happened.mean())).sum())
+    return {
+        "pearson": pearson(promised, happened),
+        "spearman": spearman(promised, happened),
+        "mmrv": mmrv(happened, promised),
+        "bias": float((promised - happened).mean()),
+        "slope": joint / spread if spread > 1e-12 else float("nan"),
+        "mcc": float(np.mean(known)) if known else float("nan"),
+    }
+
+
+def _ranks(x: np.ndarray) -> np.ndarray:
+    _, places, counts = np.unique(x, return_inverse=True, return_counts=True)
+    ranks: np.ndarray = (np.cumsum(counts) - (counts - 1) / 2)[places]
+    return ranks
+
+
+def _estimate(value: float, draws: list[float]) -> Estimate:
+    known = np.array([x for x in draws if not np.isnan(x)])
+    low, high = np.quantile(known, [0.025, 0.975]) if len(known) else (np.nan, np.nan)
+    return Estimate(value, float(low), float(high))

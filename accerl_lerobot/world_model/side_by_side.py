@@ -1,0 +1,133 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A policy in a world and in dreams of it, from the same starts and with the same noise.
+
+Shapes: N starts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+
+from accerl_lerobot.envs.base import World
+from accerl_lerobot.experience import Observation, Request
+from accerl_lerobot.policies.base import PolicyAdapter
+from accerl_lerobot.seeds import noise_seed
+from accerl_lerobot.world_model.contract import Context
+from accerl_lerobot.world_model.frames import observed, seen
+from accerl_lerobot.world_model.imagine import Dreamer
+from accerl_lerobot.world_model.success import probabilities
+
+Start = tuple[str, int]
+"""Task and seed of `World.reset`."""
+
+
+def lived(
+    policy: PolicyAdapter,
+    worlds: Sequence[World],
+    starts: Sequence[Start],
+    on_episode: Callable[[int], object] = lambda ended: None,
+) -> np.ndarray:
+    """Success of each start in reality, bool (N,), with LeRobot's own sampler.
+
+    Args:
+        policy: decides for all worlds at once.
+        worlds: as many episodes at a time.
+        starts: of the episodes.
+        on_episode: told how many have ended.
+    """
+    success = np.zeros(len(starts), bool)
+    waiting = list(range(len(starts)))[::-1]
+    playing: dict[int, tuple[int, int, Observation]] = {}
+    while waiting or playing:
+        for slot, world in enumerate(worlds):
+            if slot not in playing and waiting:
+                i = waiting.pop()
+                playing[slot] = (i, 0, world.reset(starts[i][1], starts[i][0]))
+        requests = [_request(o, starts[i], made) for i, made, o in playing.values()]
+        decisions = policy.decide(requests, 0)
+        for (slot, (i, made, _)), decision in zip(list(playing.items()), decisions, strict=True):
+            result = worlds[slot].step_chunk(decision.chunk)
+            playing[slot] = (i, made + 1, result.observation)
+            if result.done:
+                success[i] = result.success
+                del playing[slot]
+                on_episode(len(starts) - len(waiting) - len(playing))
+    return success
+
+
+def dreamt(
+    policy: PolicyAdapter, dreamer: Dreamer, world: World, starts: Sequence[Start], batch: int = 32
+) -> np.ndarray:
+    """Success of each start in dreams, bool (N,).
+
+    Args:
+        policy: decides, as in `lived`.
+        dreamer: dreams, and tells successes.
+        world: shows the first observations; nothing is done in it.
+        starts: of the dreams.
+        batch: dreams at a time.
+    """
+    parts = [starts[i : i + batch] for i in range(0, len(starts), batch)]
+    return np.concatenate([_dreamt(policy, dreamer, world, part) for part in parts])
+
+
+def _dreamt(policy: PolicyAdapter, dreamer: Dreamer, world: World, starts: Sequence[Start]) -> np.ndarray:
+    model, judge = dreamer
+    assert judge is not None
+    spec, count = model.spec, len(starts)
+    observations = [world.reset(seed, task) for task, seed in starts]
+    tasks = [str(o["task"]) for o in observations]
+    keys = [k for k in observations[0] if k != "task"]
+    frames, robot = seen({k: np.stack([np.asarray(o[k]) for o in observations]) for k in keys}, spec)
+    state = model.begin(
+        Context(
+            frames=torch.from_numpy(frames)[:, None].repeat(1, spec.context, 1, 1, 1, 1),
+            robot=torch.from_numpy(robot)[:, None].repeat(1, spec.context, 1),
+            actions=torch.zeros(count, spec.context - 1, spec.chunk, spec.action_dim),
+            told=torch.zeros(count, spec.action_dim),
+            first=torch.from_numpy(robot),
+        ),
+        tasks,
+    )
+    low, high = world.spec.action_low, world.spec.action_high
+    success = np.zeros(count, bool)
+    alive: list[int] = list(range(count))
+    for made in range(math.ceil(world.spec.max_steps / spec.chunk)):
+        requests = [_request(observations[i], starts[i], made) for i in alive]
+        decisions = policy.decide(requests, 0)
+        actions = np.stack([np.clip(d.chunk, low, high) for d in decisions]).astype(np.float32)
+        dream = model.step(
+            state, torch.from_numpy(actions), [noise_seed(starts[i][1], 1, made) for i in alive]
+        )
+        after = dream.frames.cpu().numpy()
+        achieved = probabilities(judge, frames, after) > judge.config.threshold
+        success[[alive[row] for row in np.flatnonzero(achieved)]] = True
+        on = np.flatnonzero(~achieved).tolist()
+        if not on:
+            break
+        robots = dream.robot.cpu().numpy()
+        for row in on:
+            observations[alive[row]] = observed(after[row], robots[row], tasks[alive[row]], spec, world.spec)
+        state, frames = {k: x[on] for k, x in dream.state.items()}, after[on]
+        alive = [alive[row] for row in on]
+    return success
+
+
+def _request(observation: Observation, start: Start, made: int) -> Request:
+    return Request(observation=observation, noise_seed=noise_seed(start[1], 0, made), explore=False)

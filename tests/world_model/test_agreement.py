@@ -1,0 +1,82 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.world_model.agreement import agreement, matthews, mmrv, pearson, spearman
+
+
+def outcomes(rates: list[float], count: int = 20) -> np.ndarray:
+    """Of each policy, the first so many succeed."""
+    return np.arange(count)[None] < np.array(rates)[:, None] * count
+
+
+def test_dreams_that_are_reality_agree_in_everything():
+    real = outcomes([0.1, 0.3, 0.5, 0.9])
+    found = {name: estimate["value"] for name, estimate in agreement(real, real).items()}
+    assert found == pytest.approx(
+        {"pearson": 1, "spearman": 1, "mmrv": 0, "bias": 0, "slope": 1, "mcc": 1}, abs=1e-12
+    )
+
+
+def test_dreams_that_flatter_keep_the_order():
+    real, dreamt = outcomes([0.1, 0.2, 0.3]), outcomes([0.6, 0.8, 1.0])
+    found = {name: estimate["value"] for name, estimate in agreement(real, dreamt).items()}
+    assert found["spearman"] == pytest.approx(1) and found["mmrv"] == 0
+    assert found["bias"] == pytest.approx(0.6) and found["slope"] == pytest.approx(0.5)
+    # 2 of 20 succeed in reality, 12 in dreams, the 2 among them: (2·8 − 0·10)/√(12·8·2·18).
+    first = matthews(real[0], dreamt[0])
+    assert first == pytest.approx(16 / math.sqrt(12 * 8 * 2 * 18))
+    # Of the last policy dreams never fail: it is left out.
+    assert found["mcc"] == pytest.approx((first + matthews(real[1], dreamt[1])) / 2)
+
+
+def test_correlations_by_hand():
+    x, y = np.array([1.0, 2, 3, 4]), np.array([2.0, 1, 4, 3])
+    assert pearson(x, y) == pytest.approx(0.6) == spearman(x, y)
+    assert spearman(np.array([1.0, 10, 100]), np.array([1.0, 2, 3])) == pytest.approx(1)
+    # Ranks 1.5, 1.5, 3 beside 1, 2, 3.
+    assert spearman(np.array([5.0, 5, 7]), np.array([1.0, 2, 3])) == pytest.approx(math.sqrt(3) / 2)
+    assert math.isnan(pearson(np.ones(3), np.arange(3.0)))
+
+
+def test_violations_weigh_what_they_cost():
+    """Dreams swap the first two of 0.1, 0.2 and 0.9: each is wrong by 0.1, the third by nothing."""
+    assert mmrv(np.array([0.1, 0.2, 0.9]), np.array([0.5, 0.4, 0.8])) == pytest.approx(0.2 / 3)
+    assert mmrv(np.array([0.1, 0.2, 0.9]), np.array([0.9, 0.4, 0.1])) == pytest.approx((0.8 + 0.7 + 0.8) / 3)
+
+
+def test_intervals_are_wide_when_there_are_few_policies():
+    rng = np.random.default_rng(0)
+    rates = rng.uniform(0, 1, 30)
+    real, dreamt = (rng.random((30, 40)) < rates[:, None] for _ in range(2))
+    many, few = agreement(real, dreamt)["pearson"], agreement(real[:4], dreamt[:4])["pearson"]
+    assert many["low"] <= many["value"] <= many["high"] and many["low"] > 0.8
+    assert few["high"] - few["low"] > many["high"] - many["low"]
+    assert agreement(real, dreamt) == agreement(real, dreamt), "of the same seed"
+
+
+def test_other_shapes_are_refused():
+    for real, dreamt in (
+        (np.ones((2, 3)), np.ones((3, 2))),
+        (np.ones(3), np.ones(3)),
+        (np.ones((0, 3)),) * 2,
+    ):
+        with pytest.raises(ValueError, match="both must be"):
+            agreement(real, dreamt)
