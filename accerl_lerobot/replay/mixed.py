@@ -33,6 +33,8 @@ from accerl_lerobot.experience import REAL, Segment
 from accerl_lerobot.replay.buffer import Replay
 from accerl_lerobot.replay.pacing import ReplayConfig
 
+LEAST = 0.5
+"""Share of a batch that is one, when no more will come."""
 ROOM = 0.9
 """Share of the real store up to which it is filled without anything being drawn."""
 
@@ -125,9 +127,10 @@ class MixedReplay:
         real = batch - round(self.share * batch)
         if self.real_ended:
             left = self.real.pace.available
-            real = min(real, left) if self.share else (batch if left >= batch else 0)
-            if not real and not self.share:
-                return None
+            if not self.share:
+                # Few episodes may be less than a batch: then they are one.
+                return (min(batch, left), 0) if left >= LEAST * batch else None
+            real = min(real, left)
         elif real and not self.real.may_sample(real):
             return None
         imagined = batch - real

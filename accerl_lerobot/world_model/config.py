@@ -198,12 +198,13 @@ class TrialConfig:
     """What the lower end of the sensitivity's interval after one chunk must exceed."""
     auroc: float = 0.9
     """What the lower end of the interval of the AUROC of dreams' outcomes must exceed."""
-    false_success: float = 0.1
+    false_success: float = 0.25
     """Largest share of dreams that may be taken for a success although they cannot be one: with the true
     actions of episodes that failed, and with none."""
     false_positives: float = 0.1
-    """[0, 1). The success model's threshold is the least at which no larger share of failures is taken for a
-    success in a dream: failures that were held out, or in a run all of the policy's newest."""
+    """[0, 1). The success model's threshold lets no larger share of failures be taken for a success in a
+    dream: failures that were held out, or in a run all of the policy's newest. Of all that do not, it is the
+    one that tells most successes from failures."""
     recall: float = 0.3
     """What the share of successes must exceed that are dreamt, and taken, for such."""
 

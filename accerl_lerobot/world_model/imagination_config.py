@@ -60,7 +60,9 @@ class OnlineLearnConfig:
     """What it was pre-trained on: of it, it learns from the episodes that it knows, and is tried on those
     that were held out. Another dataset is learnt from whole."""
     trial: TrialConfig = field(
-        default_factory=lambda: TrialConfig(most=120, depth=4, auroc=0.6, false_success=0.3, recall=0.2)
+        default_factory=lambda: TrialConfig(
+            most=120, depth=4, auroc=0.6, false_success=0.5, recall=0.3, false_positives=0.3
+        )
     )
     """What it must pass to serve. Outcomes are tried on what `ImaginationConfig.horizon` says is dreamt. A
     dozen held-out episodes tell little; beyond that, `gap` watches."""

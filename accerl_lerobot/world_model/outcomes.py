@@ -99,21 +99,34 @@ def scores(
 
 
 def threshold(found: Scores, theirs: np.ndarray, config: TrialConfig) -> float | None:
-    """What counts as a success, so that few dreams of failures do; see `TrialConfig.false_positives`.
+    """What counts as a success.
+
+    Of the thresholds that let no larger share of failures through than `TrialConfig.false_positives`, the one
+    at which most successes, less failures, are taken for successes. The strictest would be safe, and a policy
+    that is never told of a success learns nothing.
 
     Args:
-        found: of episodes that were not learnt from, what was learnt is no measure of that.
+        found: dreams; of episodes that were not learnt from, as what was learnt flatters.
         theirs: bool (M,), dreams of the policy's own episodes, whose failures count if there are any.
         config: see there.
 
     Returns:
-        None if there is no failure.
+        At least 0.5; None if there is no failure.
     """
     failed = _failures(found, theirs)
     if not failed.any():
         return None
-    least = judge.threshold(found.dreamt[failed], np.zeros(int(failed.sum()), bool), config.false_positives)
-    return float(np.clip(least, 0.5, 1 - 1e-6))
+    failures = found.dreamt[failed]
+    least = judge.threshold(failures, np.zeros(len(failures), bool), config.false_positives)
+    least = float(np.clip(least, 0.5, 1 - 1e-6))
+    of_policy = found.achieved & theirs
+    successes = found.dreamt[of_policy if of_policy.any() else found.achieved]
+    if not len(successes):
+        return least
+    # Only just above a failure is a threshold worth trying.
+    tried = sorted({least, *np.nextafter(failures[failures >= least], np.inf).tolist()})
+    gained = [(successes > t).mean() - (failures > t).mean() for t in tried]
+    return min(float(tried[int(np.argmax(gained))]), 1 - 1e-6)
 
 
 def judged(

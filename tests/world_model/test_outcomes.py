@@ -102,7 +102,7 @@ def made(dreamt: list[float], achieved: list[int]) -> Scores:
 
 
 def test_the_threshold_lets_few_failures_through_those_of_the_policy_first():
-    of = made([0.95, 0.9, 0.6, 0.2, 0.99], [0, 0, 0, 0, 1])
+    of = made([0.95, 0.9, 0.6, 0.2, 0.92], [0, 0, 0, 0, 1])
     nobody, theirs = np.zeros(5, bool), np.array([False, False, True, True, True])
     assert threshold(of, nobody, CONFIG) == pytest.approx(0.95) and threshold(of, nobody, CONFIG) > 0.95
     quarter = TrialConfig(false_positives=0.25)
@@ -110,6 +110,18 @@ def test_the_threshold_lets_few_failures_through_those_of_the_policy_first():
     assert threshold(of, theirs, CONFIG) == pytest.approx(0.6)
     assert threshold(of, theirs, TrialConfig(false_positives=0.5)) == 0.5, "never below one half"
     assert threshold(made([0.9], [1]), np.ones(1, bool), CONFIG) is None
+
+
+def test_of_thresholds_that_are_strict_enough_the_one_that_tells_most_is_taken():
+    # From 0.6 on three of four successes are told at the price of one failure of five; from 0.9 on only one.
+    of = made([0.55, 0.52, 0.3, 0.2, 0.8, 0.6, 0.7, 0.75, 0.95], [0, 0, 0, 0, 0, 1, 1, 1, 1])
+    nobody = np.zeros(9, bool)
+    loose = TrialConfig(false_positives=0.4)
+    assert threshold(of, nobody, loose) == pytest.approx(0.55) and threshold(of, nobody, loose) > 0.55
+    assert threshold(of, nobody, TrialConfig(false_positives=0.0)) == pytest.approx(0.8)
+    # The policy's own: its failure is at 0.8, and its successes are above and below.
+    theirs = np.array([0, 0, 0, 0, 1, 0, 0, 1, 1], bool)
+    assert threshold(of, theirs, TrialConfig(false_positives=0.9)) == pytest.approx(0.8)
 
 
 def test_what_is_judged_was_not_used_to_set_the_threshold():
