@@ -383,7 +383,7 @@ class RayEngine(Engine):
         Raises:
             RuntimeError: neither decisions nor updates for `LaunchConfig.stall_s`.
         """
-        imagined = tuple(progress.imagination.get(k) for k in ("decisions", "learn_steps"))
+        imagined = tuple(progress.imagination.get(k) for k in ("decisions", "learn_steps", "trial_s"))
         state = (progress.version, progress.rollout.get("decisions"), progress.rollout["restarts"], imagined)
         now = time.monotonic()
         waiting = any(seat.outstanding for seat in self._seats) or (self._training and not self._done)

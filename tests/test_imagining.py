@@ -144,6 +144,24 @@ def test_two_runs_are_equal_to_the_last_bit(tiny_checkpoint: Path, world_model: 
         np.testing.assert_array_equal(tensor, runs[1][2]._adapter.export_trainable()[key])
 
 
+def test_whole_dreams_of_a_model_that_learns_are_watched(tiny_checkpoint: Path, world_model: Path):
+    learn = OnlineLearnConfig(steps_per_episode=1.0, try_every=8, held_out=0.5, trial=LOOSE, batch=4)
+    config = dreaming(
+        tiny_checkpoint, path=str(world_model), learn=learn, episodes=24, horizon=None, beginnings=0.5,
+        window=4, witnesses=2, gap=2.0,
+    )  # fmt: skip
+    history, batches, engine = lived(config)
+    dreamt = [s for batch in batches for s in batch if s.source == IMAGINED]
+    assert len(batches) == 12 and dreamt
+    # A dream begins anywhere in the sixteen env steps that there are, and goes on to their end or a success.
+    assert {s.origin.decision + len(s) for s in dreamt if not s.success} == {4}
+    assert {s.origin.decision for s in dreamt} > {0}
+    assert all(s.terminated for s in dreamt)
+    last = history[-1].imagination
+    assert last["promoted"] >= 1 and last["success_real"] == last["success_real"], "not NaN"
+    assert engine._world_learner is not None and engine._world_learner.trial.whole
+
+
 def test_nothing_is_dreamt_before_the_model_has_passed(tiny_checkpoint: Path, world_model: Path):
     learn = OnlineLearnConfig(steps_per_episode=1.0, try_every=2, held_out=0.4, trial=LOOSE, batch=4)
     history, batches, _ = lived(dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12))

@@ -15,9 +15,9 @@
 
     accerl bench efficiency --recipe=recipes/dreams.yaml --budgets=16,64,256
 
-Every cell may collect so many real episodes and makes the same number of updates; where nothing is imagined,
-each real decision is learnt from so much more often. What was real before, the demonstrations of the warm
-start and the episodes of the pre-training, is the same for all cells and is reported beside them.
+Every cell may collect so many real episodes, and makes as many updates as any other unless its dreams are
+switched off; where nothing is imagined, each real decision is learnt from so much more often. What was real
+before, the demonstrations of the warm start and the episodes of the pre-training, comes on top in all cells.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def bench_efficiency(config: BenchEfficiencyConfig) -> dict[str, Any]:
     Returns:
         ``starts`` (success of each seed's warm start), ``cells`` (of each run success, n, real episodes and
         env steps, updates, and what was dreamt) and ``groups``: arm, budget, successes and episodes over the
-        seeds, and the mean of real episodes.
+        seeds, and means of real episodes and env steps and of updates.
 
     Raises:
         InputError: see `Study.run`.
@@ -144,8 +144,11 @@ def compare(config: BenchEfficiencyConfig, results: Results) -> dict[str, Any]:
     for arm in config.arms:
         for budget in config.budgets:
             of = [row for row in rows if (row["arm"], row["budget"]) == (arm, budget)]
-            explored = sum(row["episodes_explored"] for row in of) / len(of)
-            groups.append({"arm": arm, "budget": budget, **together(of), "episodes_explored": explored})
+            means = {
+                name: sum(row[name] for row in of) / len(of)
+                for name in ("episodes_explored", "env_steps", "updates")
+            }
+            groups.append({"arm": arm, "budget": budget, **together(of), **means})
     return {"config": asdict(config), "starts": results.before, "groups": groups, "cells": rows}
 
 
@@ -209,6 +212,7 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
         row = [arm]
         for g in (g for g in result["groups"] if g["arm"] == arm):
             seeds = " ".join(f"{100 * s:.0f}" for s in g["by_seed"])
-            row.append(f"{Rate(successes=g['successes'], n=g['n'])} ({seeds})")
+            made = f"{g['episodes_explored']:.0f} episodes, {g['updates']:.0f} updates"
+            row.append(f"{Rate(successes=g['successes'], n=g['n'])} ({seeds}), {made}")
         rows.append(row)
     return rows

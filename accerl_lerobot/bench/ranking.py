@@ -59,7 +59,7 @@ class BenchRankingConfig:
     """Folder to create, for ranking.json and ranking.png. None: only prints."""
 
     def __post_init__(self) -> None:
-        if len(set(self.policies)) < LEAST:
+        if len(set(self.policies)) < max(LEAST, len(self.policies)):
             raise InputError("policies", self.policies, f"name at least {LEAST} different checkpoints")
         if self.path is None:
             raise InputError("path", None, "give the folder world_model that accerl world-model has written")

@@ -87,10 +87,10 @@ class Context(NamedTuple):
     actions: Tensor
     """float32 (B, L − 1, K, A), made between these; zero where none was made."""
     told: Tensor
-    """float32 (B, A), the sum of all actions since the episode began: where a robot that is told how far to
-    move is to be, and may not have got to. Zero where that is not known."""
+    """float32 (B, A), the sum of all actions since the episode began, or since they are known: where a robot
+    that is told how far to move is to be, and may not have got to."""
     first: Tensor
-    """float32 (B, S), where it was then, or as early as is known."""
+    """float32 (B, S), where it was then."""
 
 
 class History(NamedTuple):

@@ -88,6 +88,7 @@ def make_learner(config: RunConfig, dreamer: Dreamer) -> OnlineLearner:
     """
     learn = config.imagination.learn
     model, success = dreamer
+    longest = config.imagination.horizon or math.ceil(_spec(config).max_steps / model.spec.chunk)
     if isinstance(model, ShuffledModel):
         model = model.model
     assert isinstance(model, PixelWorldModel) and success is not None  # as `check_imagination` has found
@@ -104,9 +105,10 @@ def make_learner(config: RunConfig, dreamer: Dreamer) -> OnlineLearner:
         model,
         success,
         learn,
-        _trial(config.imagination),
+        _trial(config.imagination, longest),
         offline=offline,
         held_out=held_out,
+        longest=longest,
         seed=config.seed,
     )
 
@@ -130,11 +132,11 @@ def check_imagination(config: RunConfig) -> None:
         check_metadata(open_metadata(learn.dataset), learn.dataset.repo_id, dreamer.model.spec)
 
 
-def _trial(config: ImaginationConfig) -> TrialConfig:
-    """What is tried is what will be dreamt."""
+def _trial(config: ImaginationConfig, longest: int) -> TrialConfig:
+    """What is tried is what will be dreamt, in so many chunks at most."""
     trial = config.learn.trial
     if config.horizon is None:
-        return replace(trial, whole=True)
+        return replace(trial, whole=True, depth=min(trial.depth, longest))
     return replace(trial, whole=False, depth=config.horizon)
 
 

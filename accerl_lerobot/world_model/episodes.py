@@ -79,6 +79,14 @@ class Episode:
             shown[-1] = True
         return shown
 
+    @property
+    def starts(self) -> int:
+        """How many frames, from the first on, show a task that is still to be achieved, and are followed."""
+        followed = len(self.frames) - 1
+        if not self.success:
+            return followed
+        return min(followed, int(np.searchsorted(self.times, self.success_at, side="right")))
+
     def __len__(self) -> int:
         """Env steps."""
         return len(self.actions)

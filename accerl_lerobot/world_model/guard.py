@@ -13,8 +13,9 @@
 # limitations under the License.
 """What dreams promise, against what happens: the kill switch.
 
-Each real outcome is held against the share of dreams that succeed at that time, so that both are of nearly
-the same policy: one that has learnt since the last real episode is not taken for a world model that flatters.
+Each real outcome is held against the share of dreams that succeed when it is told. Of a real episode that has
+just ended, both are of nearly the same policy, and one that has learnt is not taken for a world model that
+flatters; the outcome of the episode that a dream began in may be older.
 """
 
 from __future__ import annotations
@@ -55,10 +56,12 @@ class KillSwitch:
             self.tripped = True
 
     def reset(self) -> None:
-        """Another world model dreams from now on."""
+        """Another world model dreams now; what the last one promised counts on, unless that was too much."""
         self._dreams.clear()
-        self._pairs.clear()
-        self._share = self._imagined = self._real = float("nan")
+        self._share = float("nan")
+        if self.tripped:
+            self._pairs.clear()
+            self._imagined = self._real = float("nan")
         self.tripped = False
 
     @property

@@ -102,14 +102,14 @@ class ImaginationConfig:
     """Dreams at a time, decided and dreamt as one batch."""
     horizon: int | None = None
     """None: dreams last until a success or the world's time limit. A number: they last so many decisions at
-    most, and V of the last observation stands for the rest.
+    most, and V of the last observation stands for the rest. Either way they end before what is too uncertain.
 
     Dreams to the end ask more of the world model and nothing of the critic. On door-open short ones of 4
     decisions taught a policy nothing, not even in a simulator.
     """
     beginnings: float = 0.0
-    """Share of dreams, in [0, 1], that begin where an episode began. The later one begins, the less of it is
-    dreamt, and the truer is how it ends."""
+    """Share of dreams, in [0, 1], that begin where an episode began; others may, too. The later one begins,
+    the less of it is dreamt, and the truer is how it ends."""
     keyframes: float = 0.5
     """Share of the others, in [0, 1], that begin where the critic was surprised; the rest begin anywhere."""
     reward: Reward = "success"
@@ -127,11 +127,12 @@ class ImaginationConfig:
     """Nothing is imagined any more once dreams succeed so much more often, of 1, than reality does; > 0.
     Dreams of episodes from beginning to end are held against real episodes of the same time; where
     `beginnings` is 0, dreams are held against the episodes they begin in, and may be ahead by what the policy
-    has learnt since. A world model that was promoted since gets another chance."""
+    has learnt since. A world model that was promoted since gets another chance. With `beginnings`, nothing is
+    compared any more once all real episodes have been played."""
     window: int = 100
     """Dreams over which that is measured, at least 1,"""
     witnesses: int = 16
-    """and real outcomes, at least 1."""
+    """and, with `beginnings`, real episodes, at least 1."""
     replay: ReplayConfig = field(
         default_factory=lambda: ReplayConfig(
             capacity=2048, min_decisions=1, samples_per_insert=4.0, ahead=512

@@ -157,9 +157,10 @@ class Imagination:
         on_segment: Callable[[Segment], object],
     ) -> None:
         self.config, self.counters = config, Counters()
-        self.switch = KillSwitch(config.gap, config.window, config.witnesses)
         # Whether there are dreams of whole episodes, which real ones can be held against.
         self._beside = config.horizon is None and config.beginnings > 0
+        outcomes = config.witnesses if self._beside else config.window
+        self.switch = KillSwitch(config.gap, config.window, outcomes)
         self.version = 0
         self.waits = config.learns
         """Whether no model has passed its trial yet."""

@@ -139,7 +139,7 @@ def learn_from_dataset(
         learnt=tuple(learnt),
         held_out=tuple(held_out),
     )
-    save_world_model(directory / "world_model", serving, success, source)
+    save_world_model(directory / "world_model", serving, None, source)
     amounts = {"seconds": seconds, "learnt": _amount(learn), "held_out": _amount(held)}
     found = _trial(serving, success, held, config.trial, directory, seed, console, amounts, fresh=True)
     success.save_pretrained(directory / "world_model" / SUCCESS)  # with its threshold
@@ -168,7 +168,9 @@ def try_on_dataset(
     with console.stage("episodes"):
         episodes = load_episodes(dataset, model.spec, both=success is not None, only=only)
     amounts = {"tried": _amount(episodes)}
-    return _trial(model, success, episodes, trial, directory, seed, console, amounts)
+    # Its threshold was set on these very episodes: here it is set on some of them and tried on others.
+    fresh = only is not None
+    return _trial(model, success, episodes, trial, directory, seed, console, amounts, fresh)
 
 
 def _trial(

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import time
 from collections import OrderedDict, deque
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -36,12 +37,14 @@ from accerl_lerobot.world_model.episodes import Episode, Place
 from accerl_lerobot.world_model.frames import executed, seen
 from accerl_lerobot.world_model.imagination_config import OnlineLearnConfig
 from accerl_lerobot.world_model.learn import Learner
-from accerl_lerobot.world_model.outcomes import scores, threshold
+from accerl_lerobot.world_model.outcomes import Scores, scores, threshold, together
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.success import Examples, SuccessLearner
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 from accerl_lerobot.world_model.trial import calibrate, try_out
 
+LONGEST_TRIAL_S = 3600.0
+"""Until then a trial that is going on counts as something that moves, see `launch`."""
 ENDLESS = 10**9
 """Steps of a learning rate that never falls."""
 
@@ -122,6 +125,7 @@ class OnlineLearner:
         trial: what it must pass.
         offline: episodes of the dataset that it has learnt from.
         held_out: others, which it is tried on beside the policy's.
+        longest: chunks of a dream at most.
         seed: of everything random.
     """
 
@@ -134,6 +138,7 @@ class OnlineLearner:
         *,
         offline: Sequence[Episode] = (),
         held_out: Sequence[Episode] = (),
+        longest: int = 15,
         seed: int = 0,
     ) -> None:
         self.config, self.trial = config, trial
@@ -143,10 +148,10 @@ class OnlineLearner:
         self._seed = seed
         self.found: dict[str, Any] = {}
         """By the last trial."""
-        learn = LearnConfig(steps=ENDLESS, batch=config.batch, lr=config.lr)
+        learn = LearnConfig(steps=ENDLESS, batch=config.batch, lr=config.lr, anchors=longest)
         self._learner = Learner(_trainable(model), learn, seed)
         # The judge dreams in training, so it needs the model, and learns as fast as that.
-        judged = SuccessLearnConfig(steps=ENDLESS, lr=config.lr)
+        judged = SuccessLearnConfig(steps=ENDLESS, lr=config.lr, depth=longest)
         self._success = SuccessLearner(_trainable(success), judged, seed)
         self._offline, self._held_offline = list(offline), list(held_out)
         self._learnt: deque[Episode] = deque(maxlen=config.memory)
@@ -157,6 +162,8 @@ class OnlineLearner:
         self._new = True
         """Whether there are episodes that `_examples` does not know."""
         self._ended = self._since = self._last_tries = 0
+        self._trying: float | None = None
+        """When the trial began that is going on; read on another thread."""
 
     @property
     def version(self) -> int:
@@ -219,6 +226,13 @@ class OnlineLearner:
         Args:
             last: see `due`; if it does not pass then, it is to learn on all the same.
         """
+        self._trying = time.monotonic()
+        try:
+            return self._promote(last)
+        finally:
+            self._trying = None
+
+    def _promote(self, last: bool) -> Promotion | None:
         self._since = 0
         self._last_tries += last
         held = [*self._held_offline, *self._held]
@@ -228,11 +242,13 @@ class OnlineLearner:
         success = copy.deepcopy(self._success.model).eval().requires_grad_(False)
         known = [*self._offline, *self._learnt][-100:]
         calibrate(model, known, self.trial, self._seed)
-        # A dozen held-out episodes set no threshold: those that were learnt from help, though they flatter.
-        if theirs := [*self._learnt, *self._held][-self.trial.most :]:
-            ended = scores(model, success, theirs, self.trial, self._seed)
-            least = threshold(ended, np.ones(len(ended.achieved), bool), self.trial)
-            success.config.threshold = least or success.config.threshold
+        # A dozen held-out episodes set no threshold. Those that were learnt from do, though they flatter; the
+        # trial is on the others; and what serves knows both.
+        learnt, others = (
+            [scores(model, success, part, self.trial, self._seed)] if part else []
+            for part in (list(self._learnt)[-self.trial.most :], list(self._held))
+        )
+        self._set_threshold(success, learnt)
         found = self.found = try_out(model, held, self.trial, success, self._seed)
         if not found["passed"]:
             self.refused += 1
@@ -240,15 +256,25 @@ class OnlineLearner:
                 self.owed += self.config.try_every * self.config.steps_per_episode
             return None
         self.promoted += 1
+        self._set_threshold(success, learnt + others)
         return Promotion(model.cpu(), success.cpu(), self.version, found)
+
+    def _set_threshold(self, success: SuccessPairsRewardModel, dreams: list[Scores]) -> None:
+        """By dreams of the policy's own episodes; without a failure among them it stays."""
+        if dreams:
+            found = together(*dreams)
+            least = threshold(found, np.ones(len(found.achieved), bool), self.trial)
+            success.config.threshold = least or success.config.threshold
 
     def metrics(self) -> dict[str, float]:
         """What it has learnt from, and how its trials ended."""
+        trying = self._trying
         return {
             "learn_steps": float(self.version),
             "learn_episodes": float(len(self._learnt)),
             "promoted": float(self.promoted),
             "refused": float(self.refused),
+            "trial_s": min(LONGEST_TRIAL_S, time.monotonic() - trying) if trying is not None else 0.0,
         } | {f"gate_{name}": float(gate["value"]) for name, gate in self.found.get("gates", {}).items()}
 
     def _draw(self) -> list[Place]:

@@ -45,7 +45,7 @@ class Scores(NamedTuple):
     dreamt: np.ndarray
     """Highest P(success) on the way, until the task was really achieved."""
     still: np.ndarray
-    """The same, had nothing been done."""
+    """The same, had nothing been done until the longest episode's end."""
     seen: np.ndarray
     """The same, of the frames that were really seen."""
     achieved: np.ndarray
@@ -66,18 +66,23 @@ def scores(
     """
     rng = np.random.default_rng((seed, 5))
     chunk, context = model.spec.chunk, model.spec.context
+    shown = [episode.times[: episode.starts + 1] for episode in episodes]
     if config.whole:
-        last = [len(episode.frames) - 1 for episode in episodes]
-        at = [Place(e, f) for e, n in enumerate(last) if n for f in {0, int(rng.integers(n))}]
-        depth = max(-(-int(e.times[-1]) // chunk) for e in episodes)
+        at = [
+            Place(e, f) for e, t in enumerate(shown) if len(t) > 1 for f in {0, int(rng.integers(len(t) - 1))}
+        ]
+        depth = max(-(-len(episode) // chunk) for episode in episodes)
     else:
-        at = [Place(e, f) for e, episode in enumerate(episodes) for f in spaced(episode.times, config.every)]
+        at = [Place(e, f) for e, times in enumerate(shown) for f in spaced(times, config.every)]
         depth = config.depth
     if len(at) > config.most:
         at = [at[i] for i in sorted(rng.choice(len(at), config.most, replace=False))]
     replayed = replay(model, episodes, at, depth)
     windows, made = replayed.windows, replayed.made
-    still = dream(model, windows, np.zeros_like(windows.actions), lengths=made.sum(1)).frames
+    # Who does nothing has as much time as anybody.
+    begun = np.array([int(episodes[e].times[f]) // chunk if config.whole else 0 for e, f in at])
+    left = np.arange(depth) < (depth - begun)[:, None]
+    still = dream(model, windows, np.zeros_like(windows.actions), lengths=left.sum(1)).frames
     best = {name: np.zeros(len(at)) for name in ("dreamt", "still", "seen")}
     for d in range(depth):
         before = {
@@ -91,11 +96,20 @@ def scores(
             "seen": windows.frames[:, context + d],
         }
         for name, highest in best.items():
-            rows = np.flatnonzero(made[:, d])
+            rows = np.flatnonzero((left if name == "still" else made)[:, d])
             said = probabilities(success, before[name][rows], after[name][rows])
             highest[rows] = np.maximum(highest[rows], said)
     achieved = (windows.success & made).any(1)
     return Scores(**best, achieved=achieved, episode=windows.episode)
+
+
+def together(*parts: Scores) -> Scores:
+    """Scores of different episodes, in one."""
+    count, columns = 0, []
+    for part in parts:
+        columns.append(part._replace(episode=part.episode + count))
+        count += int(part.episode.max(initial=-1)) + 1
+    return Scores(*(np.concatenate(column) for column in zip(*columns, strict=True)))
 
 
 def threshold(found: Scores, theirs: np.ndarray, config: TrialConfig) -> float | None:

@@ -131,9 +131,8 @@ class StartPool:
     def _start(self, held: _Held, t: int) -> Start:
         segment, spec = held.segment, self.spec
         context = [max(0, t - back) for back in range(spec.context - 1, -1, -1)]
-        history = None
+        history, actions = None, executed(segment.actions[:t], segment.steps[:t])
         if not segment.origin.decision:
-            actions = executed(segment.actions[:t], segment.steps[:t])
             history = History(segment.origin.task, segment.origin.seed, actions)
         left = len(segment) - t
         achieved: bool | None = None
@@ -145,7 +144,7 @@ class StartPool:
             frames=held.frames[context],
             robot=held.robot[context],
             actions=_before(segment, t, spec.context),
-            told=history.actions.sum(0) if history else np.zeros_like(segment.actions[0, 0]),
+            told=actions.sum(0),
             first=held.robot[0],
             task=segment.task,
             origin=segment.origin._replace(decision=segment.origin.decision + t),

@@ -28,7 +28,7 @@ import torch
 
 from accerl_lerobot.world_model.config import SuccessLearnConfig
 from accerl_lerobot.world_model.contract import WorldModel
-from accerl_lerobot.world_model.episodes import Episode, Place, places
+from accerl_lerobot.world_model.episodes import Episode, Place
 from accerl_lerobot.world_model.replayed import replay
 from accerl_lerobot.world_model.success_plugin import SuccessPairsConfig
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
@@ -58,10 +58,10 @@ class Examples:
                 self._frames[bool(achieved)].append(Place(e, f))
                 if not achieved and episode.success and episode.success_at - episode.times[f] < 2 * chunk:
                     self._near.append(Place(e, f))
-        for place in places(episodes):
-            episode = episodes[place.episode]
-            start = int(episode.times[place.frame])
-            self._chunks[start <= episode.success_at < start + chunk].append(place)
+        for e, episode in enumerate(episodes):
+            for f in range(episode.starts):
+                start = int(episode.times[f])
+                self._chunks[start <= episode.success_at < start + chunk].append(Place(e, f))
         for name, of in (("frames", self._frames), ("chunks", self._chunks)):
             if not of[True] or not of[False]:
                 raise ValueError(f"{len(of[True])} {name} show a success and {len(of[False])} do not")
@@ -75,8 +75,9 @@ class Examples:
             bool (count,); and the progress by then, float (count,).
         """
         later = self._halves(self._frames, count, rng)
-        if self._near:
-            later[-(count // 4) :] = [self._near[i] for i in rng.integers(len(self._near), size=count // 4)]
+        near = count // 4 if self._near else 0
+        if near:
+            later[-near:] = [self._near[i] for i in rng.integers(len(self._near), size=near)]
         earlier = []
         for place in later:
             times = self.episodes[place.episode].times

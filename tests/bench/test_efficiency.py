@@ -82,7 +82,7 @@ def test_seeds_are_counted_together(result: dict[str, Any]):
 def test_the_table_and_the_picture(result: dict[str, Any], tmp_path: Path):
     lines = bench.markdown(result).splitlines()
     assert lines[0] == "| imagined | 4 real episodes | 8 real episodes |"
-    assert lines[2].startswith("| none | 10.0 % [2.8, 30.1] n=20 (10 10) | 50.0 % [")
+    assert lines[2].startswith("| none | 10.0 % [2.8, 30.1] n=20 (10 10), 4 episodes, 4 updates | 50.0 % [")
     assert bench.table(result).row_count == 2
     bench.draw(tmp_path / "efficiency.png", result)
     assert (tmp_path / "efficiency.png").read_bytes().startswith(b"\x89PNG")

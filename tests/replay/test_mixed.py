@@ -136,3 +136,28 @@ def test_a_segment_goes_where_it_belongs():
     segment: Segment = make_segment("a", 4, source=IMAGINED)
     assert replay.insert(segment) and not replay.insert(segment)
     assert replay.imagined.stored_decisions == 4 and replay.real.stored_decisions == 0
+
+
+def test_real_episodes_that_are_counted_wait_for_what_has_to_learn_from_those_before():
+    for patient in (False, True):
+        replay = mixed(patient=patient)
+        fill(replay, REAL, 1)
+        assert replay.may_insert(REAL)
+        replay.hold(True)
+        assert replay.may_insert(REAL) is not patient and replay.may_insert(IMAGINED)
+        replay.hold(False)
+        assert replay.may_insert(REAL)
+
+
+def test_the_last_of_few_real_episodes_are_a_batch_although_a_smaller_one():
+    replay = mixed(share=0.0)
+    fill(replay, REAL, 3)
+    assert not replay.may_sample(16), "more may come"
+    replay.end_real()
+    assert replay.may_sample(16) and drawn(replay, 16) == {REAL: 12, IMAGINED: 0}
+    assert drawn(replay, 16) == {REAL: 12, IMAGINED: 0}, "twice, as samples_per_insert says"
+    assert replay.exhausted(16)
+    least = mixed(share=0.0)
+    fill(least, REAL, 1)
+    least.end_real()
+    assert not least.may_sample(16) and least.exhausted(16), "a quarter is none"

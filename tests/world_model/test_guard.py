@@ -16,6 +16,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from accerl_lerobot.world_model.guard import KillSwitch
 
 
@@ -35,6 +37,28 @@ def test_dreams_that_succeed_too_often_trip_it():
     assert switch.shares == (0.5, 0.0) and switch.tripped
     switch.reset()
     assert not switch.tripped and math.isnan(switch.share) and all(math.isnan(x) for x in switch.shares)
+
+
+def test_promotions_do_not_make_it_forget():
+    """Else a model that flatters would not be found out where its successors come before enough outcomes."""
+    switch = KillSwitch(gap=0.3, window=2, outcomes=6)
+    for _ in range(3):
+        assert not switch.tripped
+        dream(switch, 1, 1)
+        switch.lived(False)
+        switch.lived(False)
+        switch.reset() if not switch.tripped else None
+    assert switch.tripped
+
+
+def test_one_that_does_not_flatter_is_left_alone():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        switch = KillSwitch(gap=0.5, window=100, outcomes=100)
+        for _ in range(1500):
+            switch.dreamt(bool(rng.random() < 0.6))
+            switch.lived(bool(rng.random() < 0.5))
+        assert not switch.tripped
 
 
 def test_what_no_dreams_stand_beside_is_not_counted():

@@ -20,11 +20,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from accerl_lerobot.world_model import outcomes, success
 from accerl_lerobot.world_model.config import TrialConfig
 from accerl_lerobot.world_model.episodes import Episode
-from accerl_lerobot.world_model.outcomes import Scores, judged, scores, spaced, threshold
+from accerl_lerobot.world_model.outcomes import Scores, judged, scores, spaced, threshold, together
 from accerl_lerobot.world_model.success import Dreamt, Examples
 from tests.world_model.test_pixels import SIZE, K, dots
 from tests.world_model.test_trial import Deterministic
@@ -91,6 +92,44 @@ def test_parts_of_episodes_begin_anywhere_and_end_soon():
     few = found("exact", whole=False, depth=2, every=2, most=20)
     assert len(few.achieved) == 20
     assert spaced(np.array([0, 1, 4, 6, 7, 9]), 3) == [0, 2, 4]
+
+
+def test_what_follows_a_success_is_no_failure():
+    [episode] = dots(1, steps=40)
+    after = replace(episode, success_at=19)
+    assert (after.starts, episode.starts, replace(episode, success_at=39).starts) == (20, 39, 39)
+    model: Any = Deterministic("exact")
+    for seed in range(20):
+        assert scores(model, SimpleNamespace(), [after], CONFIG, seed).achieved.all()  # type: ignore[arg-type]
+    chunks = Examples([after, episode], K).chunks(400, np.random.default_rng(0))
+    assert max(p.frame for p in chunks if p.episode == 0) == 19
+
+
+def test_who_does_nothing_has_as_much_time_as_anybody():
+    """The dot drifts to the right by itself, slower than the successes went there."""
+
+    class Drifting(Deterministic):
+        def step(self, state: Any, actions: Any, seeds: Any) -> Any:
+            return super().step(state, actions + torch.tensor([0.0, 0.25]), seeds)
+
+    episodes = ending_on_the_right(60)
+    model: Any = Drifting("exact")
+    still = scores(model, SimpleNamespace(), episodes, CONFIG, seed=0)  # type: ignore[arg-type]
+    short = np.array([len(episodes[e]) < 10 for e in still.episode])
+    assert short.sum() > 5 and (still.still[short] > 0.5).mean() > 0.8
+
+
+def test_scores_of_different_episodes_are_put_together():
+    one, other = made([0.9, 0.1], [1, 0]), made([0.3], [0])
+    both = together(one, other)
+    assert both.dreamt.tolist() == [0.9, 0.1, 0.3] and both.episode.tolist() == [0, 1, 2]
+    assert together(one) is not one and together(one).episode.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 8])
+def test_pairs_may_be_few(count: int):
+    before, _, success, _ = Examples(ending_on_the_right(20), K).seen(count, np.random.default_rng(0))
+    assert len(before) == count and success.sum() == count // 2
 
 
 def made(dreamt: list[float], achieved: list[int]) -> Scores:
