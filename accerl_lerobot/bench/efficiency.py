@@ -22,7 +22,6 @@ before, the demonstrations of the warm start and the episodes of the pre-trainin
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -30,11 +29,22 @@ from typing import Any
 
 from rich.table import Table
 
-from accerl_lerobot.bench.study import Cell, Results, Study, StudyConfig, named, together
+from accerl_lerobot.bench.study import (
+    Cell,
+    Results,
+    Study,
+    StudyConfig,
+    as_markdown,
+    draw_lines,
+    named,
+    rated,
+    tabled,
+    together,
+    write,
+)
 from accerl_lerobot.config import RunConfig, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.stats import Rate
 
 ARMS = {
     "none": ("--imagination.share=0",),
@@ -130,9 +140,7 @@ def bench_efficiency(config: BenchEfficiencyConfig) -> dict[str, Any]:
         if run.imagination.share:
             check_imagination(replace(study.starts[run.seed], imagination=run.imagination))
     result = compare(config, study.run(console))
-    (study.root / "efficiency.json").write_text(json.dumps(result, indent=2) + "\n")
-    (study.root / "efficiency.md").write_text(markdown(result))
-    draw(study.root / "efficiency.png", result)
+    write(study.root, "efficiency", result, markdown(result), draw)
     console.say(f"wrote efficiency.json, .md and .png into {study.root}")
     return result
 
@@ -154,52 +162,29 @@ def compare(config: BenchEfficiencyConfig, results: Results) -> dict[str, Any]:
 
 def table(result: dict[str, Any]) -> Table:
     """`result` for people: one row per arm, one column per budget."""
-    starts = ", ".join(f"{s:.0%}" for s in result["starts"].values())
-    shown = Table(title=f"success after so many real episodes; before them {starts}")
-    for column in _columns(result):
-        shown.add_column(column)
-    for row in _rows(result):
-        shown.add_row(*row)
-    return shown
+    return tabled("success after so many real episodes; before them", result, _columns(result), _rows(result))
 
 
 def markdown(result: dict[str, Any]) -> str:
     """`table` for the docs."""
-    columns = _columns(result)
-    lines = [columns, ["---"] * len(columns), *_rows(result)]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    return as_markdown(_columns(result), _rows(result))
 
 
 def draw(path: Path, result: dict[str, Any]) -> None:
     """Success over real episodes: one line per arm with its 95 % Wilson interval, one dot per seed."""
-    import matplotlib as mpl
+    budgets = result["config"]["budgets"]
 
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
+    def dress(axes: Any) -> None:
+        axes.set_xscale("log")
+        axes.set_xticks(budgets, [str(b) for b in budgets], minor=False)
+        axes.minorticks_off()
+        axes.set(xlabel="real episodes")
+        axes.legend(loc="best", ncols=2)
 
-    budgets, arms = result["config"]["budgets"], result["config"]["arms"]
-    figure, axes = plt.subplots(figsize=(7, 4), dpi=120)
-    for i, arm in enumerate(arms):
-        groups = [g for g in result["groups"] if g["arm"] == arm]
-        rates = [Rate(successes=g["successes"], n=g["n"]) for g in groups]
-        x = [budget * 1.04 ** (i - (len(arms) - 1) / 2) for budget in budgets]
-        y = [r.value for r in rates]
-        low = [max(0.0, r.value - r.interval().low) for r in rates]
-        high = [max(0.0, r.interval().high - r.value) for r in rates]
-        axes.errorbar(x, y, yerr=[low, high], marker="o", capsize=3, color=f"C{i}", label=arm)
-        for place, group in zip(x, groups, strict=True):
-            axes.scatter([place] * len(group["by_seed"]), group["by_seed"], s=10, color=f"C{i}", alpha=0.4)
-    start = sum(result["starts"].values()) / len(result["starts"])
-    axes.axhline(start, color="0.6", ls="--", lw=1, label="before")
-    axes.set_xscale("log")
-    axes.set_xticks(budgets, [str(b) for b in budgets], minor=False)
-    axes.minorticks_off()
-    axes.set(xlabel="real episodes", ylabel="success", ylim=(-0.02, 1.02))
-    axes.grid(alpha=0.3)
-    axes.legend(loc="best", ncols=2)
-    figure.tight_layout()
-    figure.savefig(path)
-    plt.close(figure)
+    def places(i: float) -> list[float]:
+        return [budget * 1.04**i for budget in budgets]
+
+    draw_lines(path, result, "arm", result["config"]["arms"], places, dress)
 
 
 def _columns(result: dict[str, Any]) -> list[str]:
@@ -211,8 +196,7 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
     for arm in result["config"]["arms"]:
         row = [arm]
         for g in (g for g in result["groups"] if g["arm"] == arm):
-            seeds = " ".join(f"{100 * s:.0f}" for s in g["by_seed"])
             made = f"{g['episodes_explored']:.0f} episodes, {g['updates']:.0f} updates"
-            row.append(f"{Rate(successes=g['successes'], n=g['n'])} ({seeds}), {made}")
+            row.append(f"{rated(g)}, {made}")
         rows.append(row)
     return rows

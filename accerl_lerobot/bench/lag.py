@@ -20,16 +20,26 @@ Lag is what `trainer.hold_back` and replay make it; see `study.py`.
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from rich.table import Table
 
-from accerl_lerobot.bench.study import Cell, Results, Study, StudyConfig, named, together
+from accerl_lerobot.bench.study import (
+    Cell,
+    Results,
+    Study,
+    StudyConfig,
+    as_markdown,
+    draw_lines,
+    named,
+    rated,
+    tabled,
+    together,
+    write,
+)
 from accerl_lerobot.console import Console
-from accerl_lerobot.evaluation.stats import Rate
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,9 +89,7 @@ def bench_lag(config: BenchLagConfig) -> dict[str, Any]:
     """
     study, console = Study(config, cells(config)), Console()
     result = compare(config, study.run(console))
-    (study.root / "lag.json").write_text(json.dumps(result, indent=2) + "\n")
-    (study.root / "lag.md").write_text(markdown(result))
-    draw(study.root / "lag.png", result)
+    write(study.root, "lag", result, markdown(result), draw)
     console.say(f"wrote lag.json, lag.md and lag.png into {study.root}")
     return result
 
@@ -113,51 +121,27 @@ def compare(config: BenchLagConfig, results: Results) -> dict[str, Any]:
 
 def table(result: dict[str, Any]) -> Table:
     """`result` for people: one row per algorithm, one column per lag."""
-    starts = ", ".join(f"{s:.0%}" for s in result["starts"].values())
-    shown = Table(title=f"success after training at forced lag; before it {starts}")
-    for column in _columns(result):
-        shown.add_column(column)
-    for row in _rows(result):
-        shown.add_row(*row)
-    return shown
+    return tabled("success after training at forced lag; before it", result, _columns(result), _rows(result))
 
 
 def markdown(result: dict[str, Any]) -> str:
     """`table` for the docs."""
-    columns = _columns(result)
-    lines = [columns, ["---"] * len(columns), *_rows(result)]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    return as_markdown(_columns(result), _rows(result))
 
 
 def draw(path: Path, result: dict[str, Any]) -> None:
     """Success over lag: one line per algorithm with its 95 % Wilson interval, one dot per seed."""
-    import matplotlib as mpl
+    lags = result["config"]["lags"]
 
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
+    def dress(axes: Any) -> None:
+        axes.set_xticks(range(len(lags)), [str(lag) for lag in lags])
+        axes.set(xlabel="weights held back, in updates")
+        axes.legend(loc="lower left")
 
-    lags, names = result["config"]["lags"], result["config"]["algorithms"]
-    figure, axes = plt.subplots(figsize=(7, 4), dpi=120)
-    for i, name in enumerate(names):
-        groups = [g for g in result["groups"] if g["algorithm"] == name]
-        rates = [Rate(successes=g["successes"], n=g["n"]) for g in groups]
-        x = [place + 0.08 * (i - (len(names) - 1) / 2) for place in range(len(lags))]
-        y = [r.value for r in rates]
-        low = [max(0.0, r.value - r.interval().low) for r in rates]
-        high = [max(0.0, r.interval().high - r.value) for r in rates]
-        axes.errorbar(x, y, yerr=[low, high], marker="o", capsize=3, color=f"C{i}", label=name)
-        for place, group in zip(x, groups, strict=True):
-            seeds = group["by_seed"]
-            axes.scatter([place] * len(seeds), seeds, s=12, color=f"C{i}", alpha=0.4, linewidths=0)
-    start = sum(result["starts"].values()) / len(result["starts"])
-    axes.axhline(start, color="0.6", ls="--", lw=1, label="before")
-    axes.set_xticks(range(len(lags)), [str(lag) for lag in lags])
-    axes.set(xlabel="weights held back, in updates", ylabel="success", ylim=(-0.02, 1.02))
-    axes.grid(alpha=0.3)
-    axes.legend(loc="lower left")
-    figure.tight_layout()
-    figure.savefig(path)
-    plt.close(figure)
+    def places(i: float) -> list[float]:
+        return [place + 0.08 * i for place in range(len(lags))]
+
+    draw_lines(path, result, "algorithm", result["config"]["algorithms"], places, dress)
 
 
 def _columns(result: dict[str, Any]) -> list[str]:
@@ -174,7 +158,6 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
     for name in result["config"]["algorithms"]:
         row = [name]
         for g in (g for g in result["groups"] if g["algorithm"] == name):
-            seeds = " ".join(f"{100 * s:.0f}" for s in g["by_seed"])
-            row.append(f"{Rate(successes=g['successes'], n=g['n'])} ({seeds})")
+            row.append(rated(g))
         rows.append(row)
     return rows

@@ -25,7 +25,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -33,11 +33,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
+from rich.table import Table
 
 from accerl_lerobot.checkpoint import PRETRAINED
 from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.stats import Rate
 
 CONFIG, SUMMARY, LOCK = "config.yaml", "summary.json", ".lock"
 LOG_LINES = 12
@@ -118,6 +120,90 @@ def together(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "n": sum(row["n"] for row in rows),
         "by_seed": [row["success"] for row in rows],
     }
+
+
+def rated(group: dict[str, Any]) -> str:
+    """Rate, interval and n of what `together` gives, and each seed's success."""
+    seeds = " ".join(f"{100 * s:.0f}" for s in group["by_seed"])
+    return f"{Rate(successes=group['successes'], n=group['n'])} ({seeds})"
+
+
+def tabled(
+    title: str, result: dict[str, Any], columns: Sequence[str], rows: Sequence[Sequence[str]]
+) -> Table:
+    """Rows for people; the title ends with the success of each warm start."""
+    starts = ", ".join(f"{s:.0%}" for s in result["starts"].values())
+    shown = Table(title=f"{title} {starts}")
+    for column in columns:
+        shown.add_column(column)
+    for row in rows:
+        shown.add_row(*row)
+    return shown
+
+
+def as_markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Rows for the docs."""
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def draw_lines(
+    path: Path,
+    result: dict[str, Any],
+    key: str,
+    names: Sequence[str],
+    places: Callable[[float], list[float]],
+    dress: Callable[[Any], object],
+) -> None:
+    """Success, one line per name with its 95 % Wilson interval, one dot per seed.
+
+    Args:
+        path: of the picture.
+        result: with ``groups``, of which each has its name under `key`, and ``starts``.
+        key: see there.
+        names: of the lines.
+        places: x of a line's groups, which lie a little apart from the other lines': so many lines from the
+            middle one.
+        dress: gives the axes their ticks, x label and legend.
+    """
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7, 4), dpi=120)
+    for i, name in enumerate(names):
+        groups = [g for g in result["groups"] if g[key] == name]
+        rates = [Rate(successes=g["successes"], n=g["n"]) for g in groups]
+        x = places(i - (len(names) - 1) / 2)
+        y = [r.value for r in rates]
+        low = [max(0.0, r.value - r.interval().low) for r in rates]
+        high = [max(0.0, r.interval().high - r.value) for r in rates]
+        axes.errorbar(x, y, yerr=[low, high], marker="o", capsize=3, color=f"C{i}", label=name)
+        for place, group in zip(x, groups, strict=True):
+            seeds = group["by_seed"]
+            axes.scatter([place] * len(seeds), seeds, s=12, color=f"C{i}", alpha=0.4, linewidths=0)
+    start = sum(result["starts"].values()) / len(result["starts"])
+    axes.axhline(start, color="0.6", ls="--", lw=1, label="before")
+    axes.set(ylabel="success", ylim=(-0.02, 1.02))
+    axes.grid(alpha=0.3)
+    dress(axes)
+    figure.tight_layout()
+    figure.savefig(path)
+    plt.close(figure)
+
+
+def write(
+    root: Path,
+    name: str,
+    result: dict[str, Any],
+    markdown: str,
+    draw: Callable[[Path, dict[str, Any]], object],
+) -> None:
+    """Into the study's folder: the numbers, the table and the picture, under one name."""
+    (root / f"{name}.json").write_text(json.dumps(result, indent=2) + "\n")
+    (root / f"{name}.md").write_text(markdown)
+    draw(root / f"{name}.png", result)
 
 
 class Study:

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.world_model.judge import Estimate
+from accerl_lerobot.world_model.judge import Estimate, ranks
 
 DRAWS = 1000
 
@@ -68,7 +68,7 @@ def pearson(x: np.ndarray, y: np.ndarray) -> float:
 
 def spearman(x: np.ndarray, y: np.ndarray) -> float:
     """Correlation of ranks; ties have their mean rank."""
-    return pearson(_ranks(x), _ranks(y))
+    return pearson(ranks(x), ranks(y))
 
 
 def mmrv(real: np.ndarray, dreamt: np.ndarray) -> float:
@@ -101,12 +101,6 @@ def _all(real: np.ndarray, dreamt: np.ndarray) -> dict[str, float]:
         "slope": joint / spread if spread > 1e-12 else float("nan"),
         "mcc": float(np.mean(known)) if known else float("nan"),
     }
-
-
-def _ranks(x: np.ndarray) -> np.ndarray:
-    _, places, counts = np.unique(x, return_inverse=True, return_counts=True)
-    ranks: np.ndarray = (np.cumsum(counts) - (counts - 1) / 2)[places]
-    return ranks
 
 
 def _estimate(value: float, draws: list[float]) -> Estimate:

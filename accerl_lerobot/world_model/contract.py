@@ -38,6 +38,11 @@ State = dict[str, Tensor]
 """Each (B, ...)."""
 
 
+def rows(state: State, chosen: Sequence[int] | np.ndarray) -> State:
+    """Some of the batch."""
+    return {key: tensor[chosen] for key, tensor in state.items()}
+
+
 @dataclass(frozen=True, kw_only=True)
 class WorldModelSpec:
     """What a world model shows, and of what world."""

@@ -69,26 +69,27 @@ def make_imagination(config: RunConfig, name: str, on_segment: Callable[[Segment
     )
 
 
-def load_dreamer(config: RunConfig, world: WorldSpec | None = None) -> Dreamer:
-    """What a run dreams with; its ``policy.path`` must be set. `world` is looked at anew if it is not given.
+def load_dreamer(config: RunConfig, world: WorldSpec) -> Dreamer:
+    """What a run dreams with; its ``policy.path`` must be set.
 
     Raises:
         InputError: see `make_imagination`.
     """
     policy = load_lerobot_config(config.policy)
     executed = getattr(policy, "n_action_steps", 1)
-    return _dreamer(config, world or _spec(config), executed, policy.n_obs_steps)
+    return _dreamer(config, world, executed, policy.n_obs_steps)
 
 
-def make_learner(config: RunConfig, dreamer: Dreamer) -> OnlineLearner:
-    """What a run's world model goes on learning with, from `dreamer` on.
+def make_learner(config: RunConfig, dreamer: Dreamer | None = None) -> OnlineLearner:
+    """What a run's world model goes on learning with, from `dreamer` on; None: from the saved one.
 
     Raises:
         InputError: the dataset it was pre-trained on cannot be read, or is of another world.
     """
     learn = config.imagination.learn
-    model, success = dreamer
-    longest = config.imagination.horizon or math.ceil(_spec(config).max_steps / model.spec.chunk)
+    world = _spec(config)
+    model, success = dreamer or load_dreamer(config, world)
+    longest = _longest(config, world, model.spec.chunk)
     if isinstance(model, ShuffledModel):
         model = model.model
     assert isinstance(model, PixelWorldModel) and success is not None  # as `check_imagination` has found
@@ -140,6 +141,11 @@ def _trial(config: ImaginationConfig, longest: int) -> TrialConfig:
     return replace(trial, whole=False, depth=config.horizon)
 
 
+def _longest(config: RunConfig, world: WorldSpec, chunk: int) -> int:
+    """Decisions of a dream at most."""
+    return config.imagination.horizon or math.ceil(world.max_steps / chunk)
+
+
 def _spec(config: RunConfig) -> WorldSpec:
     world = make_world(config.env)
     try:
@@ -161,7 +167,7 @@ def _dreamer(config: RunConfig, spec: WorldSpec, executed: int, history: int) ->
         remedy = "it has no success model to go on learning with; use imagination.learn.steps_per_episode=0"
         raise InputError("imagination.path", config.imagination.path, remedy)
     check_fit(dreamer.model.spec, spec, executed, history, dreamer.success is not None)
-    longest = config.imagination.horizon or math.ceil(spec.max_steps / executed)
+    longest = _longest(config, spec, executed)
     config.imagination.replay.check(
         batch_decisions=config.trainer.batch_decisions, segment_decisions=longest, field="imagination.replay"
     )

@@ -108,15 +108,20 @@ def sensitivity(true: np.ndarray, other: np.ndarray, groups: np.ndarray) -> Esti
     return bootstrap(groups, of)
 
 
+def ranks(x: np.ndarray) -> np.ndarray:
+    """From 1 to M; ties have their mean rank."""
+    _, places, counts = np.unique(x, return_inverse=True, return_counts=True)
+    found: np.ndarray = (np.cumsum(counts) - (counts - 1) / 2)[places]
+    return found
+
+
 def auroc(scores: np.ndarray, labels: np.ndarray) -> float:
     """Chance that a success scores above a failure, ties counting half; NaN without both."""
     scores, labels = np.asarray(scores, np.float64), np.asarray(labels, bool)
     good, bad = int(labels.sum()), int((~labels).sum())
     if not good or not bad:
         return float("nan")
-    _, places, counts = np.unique(scores, return_inverse=True, return_counts=True)
-    ranks = (np.cumsum(counts) - (counts - 1) / 2)[places]
-    return float((ranks[labels].sum() - good * (good + 1) / 2) / (good * bad))
+    return float((ranks(scores)[labels].sum() - good * (good + 1) / 2) / (good * bad))
 
 
 def separation(scores: np.ndarray, labels: np.ndarray, groups: np.ndarray) -> Estimate:

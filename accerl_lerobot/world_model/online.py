@@ -244,10 +244,7 @@ class OnlineLearner:
         calibrate(model, known, self.trial, self._seed)
         # A dozen held-out episodes set no threshold. Those that were learnt from do, though they flatter; the
         # trial is on the others; and what serves knows both.
-        learnt, others = (
-            [scores(model, success, part, self.trial, self._seed)] if part else []
-            for part in (list(self._learnt)[-self.trial.most :], list(self._held))
-        )
+        learnt = self._scored(model, success, list(self._learnt)[-self.trial.most :])
         self._set_threshold(success, learnt)
         found = self.found = try_out(model, held, self.trial, success, self._seed)
         if not found["passed"]:
@@ -256,8 +253,13 @@ class OnlineLearner:
                 self.owed += self.config.try_every * self.config.steps_per_episode
             return None
         self.promoted += 1
-        self._set_threshold(success, learnt + others)
+        self._set_threshold(success, learnt + self._scored(model, success, list(self._held)))
         return Promotion(model.cpu(), success.cpu(), self.version, found)
+
+    def _scored(
+        self, model: PixelWorldModel, success: SuccessPairsRewardModel, episodes: list[Episode]
+    ) -> list[Scores]:
+        return [scores(model, success, episodes, self.trial, self._seed)] if episodes else []
 
     def _set_threshold(self, success: SuccessPairsRewardModel, dreams: list[Scores]) -> None:
         """By dreams of the policy's own episodes; without a failure among them it stays."""

@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from accerl_lerobot.world_model.contract import Context, State, WorldModel
+from accerl_lerobot.world_model.contract import Context, WorldModel, rows
 from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, held
 
 BATCH = 64
@@ -99,14 +99,14 @@ def dream(
     lengths = np.full(len(windows), depth) if lengths is None else lengths
     parts = []
     for start in range(0, len(windows), BATCH):
-        rows = slice(start, start + BATCH)
-        state = model.begin(context_of(windows, rows), windows.task[rows])
-        part = _blank(model, len(windows.task[rows]), depth)
+        of = slice(start, start + BATCH)
+        state = model.begin(context_of(windows, of), windows.task[of])
+        part = _blank(model, len(windows.task[of]), depth)
         alive = np.arange(len(part.frames))
         for d in range(depth):
             going = lengths[start + alive] > d
             if not going.all():
-                state, alive = _rows(state, np.flatnonzero(going)), alive[going]
+                state, alive = rows(state, np.flatnonzero(going)), alive[going]
             if not len(alive):
                 break
             seeds = [int(start + i + 1_000_003 * d) for i in alive]
@@ -120,7 +120,7 @@ def dream(
                 differ = np.flatnonzero((made != other).any((1, 2)))
                 if len(differ):
                     chosen = [seeds[i] for i in differ]
-                    again = model.step(_rows(state, differ), torch.from_numpy(other[differ]), chosen)
+                    again = model.step(rows(state, differ), torch.from_numpy(other[differ]), chosen)
                     part.ends[alive[differ], d] = again.frames.cpu().numpy()
             state = dreamt.state
         parts.append(part)
@@ -135,10 +135,6 @@ def _blank(model: WorldModel, count: int, depth: int) -> Dreams:
         uncertainty=np.zeros((count, depth), np.float32),
         ends=np.zeros(shape, np.uint8),
     )
-
-
-def _rows(state: State, chosen: np.ndarray) -> State:
-    return {key: tensor[chosen] for key, tensor in state.items()}
 
 
 class Replayed(NamedTuple):

@@ -28,7 +28,7 @@ from accerl_lerobot.envs.base import World
 from accerl_lerobot.experience import Observation, Request
 from accerl_lerobot.policies.base import PolicyAdapter
 from accerl_lerobot.seeds import noise_seed
-from accerl_lerobot.world_model.contract import Context
+from accerl_lerobot.world_model.contract import Context, rows
 from accerl_lerobot.world_model.frames import observed, seen
 from accerl_lerobot.world_model.imagine import Dreamer
 from accerl_lerobot.world_model.success import probabilities
@@ -124,7 +124,7 @@ def _dreamt(policy: PolicyAdapter, dreamer: Dreamer, world: World, starts: Seque
         robots = dream.robot.cpu().numpy()
         for row in on:
             observations[alive[row]] = observed(after[row], robots[row], tasks[alive[row]], spec, world.spec)
-        state, frames = {k: x[on] for k, x in dream.state.items()}, after[on]
+        state, frames = rows(dream.state, on), after[on]
         alive = [alive[row] for row in on]
     return success
 

@@ -34,7 +34,7 @@ from typing import TYPE_CHECKING, Any
 import ray
 
 from accerl_lerobot.experience import Segment
-from accerl_lerobot.world_model.dreaming import load_dreamer, make_imagination, make_learner
+from accerl_lerobot.world_model.dreaming import make_imagination, make_learner
 from accerl_lerobot.world_model.online import Promotion
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ class WorldLearningWorker:
 
         torch.set_num_threads(config.trainer.num_threads)
         torch.manual_seed(config.seed)
-        self._learner = make_learner(config, load_dreamer(config))
+        self._learner = make_learner(config)
 
     def ready(self) -> int:
         """Answers once the world model and its dataset are loaded; returns this process's id."""
