@@ -20,7 +20,7 @@ A run that is going on or has died has no ``summary.json`` (or ``trial.json``), 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,14 +33,54 @@ from accerl_lerobot.errors import InputError
 Record = dict[str, Any]
 
 CONFIG, METRICS, SUMMARY, TRIAL = "config.yaml", "metrics.jsonl", "summary.json", "trial.json"
-RESULTS = {
-    SUMMARY: (
-        "success_before", "success_after", "ci95_before", "ci95_after", "n_after", "env_steps", "wall_s",
-        "seed",
-    ),
-    TRIAL: ("gates", "passed", "depths", "trials"),
-}  # fmt: skip
-"""What a page cannot do without."""
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _is_interval(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, list) and all(
+        isinstance(row, dict) and _is_number(row.get("depth")) for row in value
+    )
+
+
+def _is_gates(value: Any) -> bool:
+    return isinstance(value, dict) and all(
+        isinstance(gate, dict) and {"value", "wanted", "holds"} <= gate.keys() for gate in value.values()
+    )
+
+
+Needs = dict[str, Callable[[Any], bool]]
+"""What a page cannot do without, and what it has to be."""
+
+SUMMARY_NEEDS: Needs = {
+    "success_after": _is_number,
+    "ci95_after": _is_interval,
+    "n_after": _is_number,
+    "success_before": lambda value: value is None or _is_number(value),
+    "ci95_before": lambda value: value is None or _is_interval(value),
+    "env_steps": _is_number,
+    "wall_s": _is_number,
+    "seed": _is_number,
+}
+TRIAL_NEEDS: Needs = {
+    "passed": lambda value: isinstance(value, bool),
+    "trials": _is_number,
+    "gates": _is_gates,
+    "depths": _is_list,
+}
+EVALUATION_NEEDS: Needs = {
+    "success": _is_number,
+    "ci95": _is_interval,
+    "n": _is_number,
+    "env_steps": _is_number,
+    "steps_mean": _is_number,
+}
 GROWING = ("wall_s", "env_steps", "decisions", "episodes")
 """Counters of workers: a run that was taken up again may count them from 0."""
 
@@ -109,7 +149,9 @@ def read_run(path: Path) -> Run:
         config=config,
         config_text=text,
         records=records,
-        result=_result(path / (SUMMARY if verb == "train" else TRIAL)),
+        result=_result(path / SUMMARY, SUMMARY_NEEDS)
+        if verb == "train"
+        else _result(path / TRIAL, TRIAL_NEEDS),
         torn=torn,
         sessions=sessions,
         written=max(file.stat().st_mtime for file in path.iterdir() if file.suffix != ".html"),
@@ -151,7 +193,7 @@ def _text(path: Path) -> str:
     try:
         return path.read_text()
     except UnicodeDecodeError as error:
-        raise InputError(str(path), f"byte {error.start}", "not text; restore the file") from error
+        raise InputError("runs", str(path), f"not text, at byte {error.start}; restore the file") from error
 
 
 def _mapping(path: Path, text: str) -> Record:
@@ -159,21 +201,26 @@ def _mapping(path: Path, text: str) -> Record:
     try:
         tree = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        what = str(error).splitlines()[0]
-        raise InputError(str(path), what, "damaged; restore the file, or remove it") from error
+        remedy = f"damaged ({str(error).splitlines()[0]}); restore it, or remove it"
+        raise InputError("runs", str(path), remedy) from error
     if not isinstance(tree, dict):
-        raise InputError(str(path), type(tree).__name__, "not a mapping; restore the file, or remove it")
+        raise InputError("runs", str(path), "damaged: not a mapping; restore it, or remove it")
     return tree
 
 
-def _result(path: Path) -> Record | None:
+def _result(path: Path, needs: Needs) -> Record | None:
     if not path.is_file():
         return None
     result = _mapping(path, _text(path))
-    missing = [key for key in RESULTS[path.name] if key not in result]
-    if missing:
-        raise InputError(str(path), missing[0], "this is not in it: it is damaged, or of another version")
+    if lacking := _lacking(result, needs):
+        remedy = f"it has no good {lacking}: it is damaged, or of another version; restore or remove it"
+        raise InputError("runs", str(path), remedy)
     return result
+
+
+def _lacking(record: Record, needs: Needs) -> str:
+    """The first field that is missing or of the wrong kind; empty if all is well."""
+    return next((key for key, good in needs.items() if not good(record.get(key))), "")
 
 
 def _lines(path: Path) -> tuple[list[Record], bool]:
@@ -187,7 +234,9 @@ def _lines(path: Path) -> tuple[list[Record], bool]:
             found.append(record)
         elif number < len(lines):
             shown = line[:60].decode(errors="replace")
-            raise InputError(f"{path}:{number}", shown, "not a record; mend or remove this line")
+            raise InputError(
+                "runs", f"{path}:{number}", f"{shown!r} is not a whole record; mend or remove this line"
+            )
     return found, len(found) < len(lines)
 
 
@@ -196,7 +245,9 @@ def _record(line: bytes) -> Record | None:
         record = json.loads(line)
     except (ValueError, RecursionError):
         return None
-    return record if isinstance(record, dict) and isinstance(record.get("kind"), str) else None
+    if not isinstance(record, dict) or not isinstance(record.get("kind"), str):
+        return None
+    return None if record["kind"] == "evaluation" and _lacking(record, EVALUATION_NEEDS) else record
 
 
 def _continuous(lines: list[Record]) -> tuple[dict[str, list[Record]], int]:

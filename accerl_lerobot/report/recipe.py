@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import typing
 from collections.abc import Mapping
 from typing import Any
@@ -41,25 +42,20 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> Flat:
     return found
 
 
-def defaults(config_class: type[Any], tree: dict[str, Any]) -> Flat:
-    """What every field is when only the types of `tree` are chosen: GIPO's for a run of GIPO.
-
-    Raises:
-        InputError: the types do not go together, or this version does not know one.
-    """
-    return flat(encode(decode(config_class, _types(config_class, tree))))
-
-
 def differences(config_class: type[Any], tree: dict[str, Any]) -> list[tuple[str, Any, Any]]:
-    """Field, value and default, where the two differ; types that were chosen too.
+    """Field, value and default, where the two differ.
 
-    Raises:
-        InputError: as `defaults`.
+    Defaults are those of the types that were chosen: GIPO's for a run of GIPO. That it was chosen is a
+    difference too, and so is a room that is off unless it is given.
     """
-    usual, chosen = defaults(config_class, tree), flat(encode(decode(config_class, {})))
-    usual |= {key: chosen[key] for key in chosen if key.rpartition(".")[2] == TYPE}
     here = {key: value for key, value in flat(tree).items() if key not in PLACES}
-    return [(k, v, usual.get(k, ABSENT)) for k, v in here.items() if k not in usual or usual[k] != v]
+    usual, untouched = (flat(_usual(None, config_class, given)) for given in (tree, {}))
+    given = [k for k in untouched if k not in here and any(other.startswith(f"{k}.") for other in here)]
+    for key in untouched:
+        if key.rpartition(".")[2] == TYPE:
+            usual[key] = untouched[key]
+    changed = [(k, v, usual.get(k, ABSENT)) for k, v in here.items() if k not in usual or usual[k] != v]
+    return [(k, here.get(f"{k}.{TYPE}", "given"), untouched[k]) for k in given] + changed
 
 
 def apart(trees: list[dict[str, Any]]) -> list[tuple[str, list[Any]]]:
@@ -84,15 +80,34 @@ def unreadable(config_class: type[Any], tree: dict[str, Any]) -> str:
     return ""
 
 
-def _types(config_class: type[Any], tree: dict[str, Any]) -> dict[str, Any]:
-    """`tree` with nothing in it but which config of several was chosen, at any depth."""
-    kept: dict[str, Any] = {}
-    for name, hint in typing.get_type_hints(config_class).items():
-        room, value = room_of(hint), tree.get(name)
-        if room is None or not isinstance(value, dict):
+def _usual(instance: Any, config_class: type[Any], tree: dict[str, Any]) -> dict[str, Any]:
+    """What every field is by default where `tree` chooses types; unchecked, as some rooms have no default.
+
+    Args:
+        instance: whose fields are the defaults; None: those of the class.
+        config_class: of the room.
+        tree: what was chosen in it.
+    """
+    usual: dict[str, Any] = {}
+    hints = typing.get_type_hints(config_class)
+    for field in dataclasses.fields(config_class):
+        name, value = field.name, _default(field) if instance is None else getattr(instance, field.name)
+        room, given = room_of(hints[name]), tree.get(name)
+        if room is None or not isinstance(given, dict):
+            usual[name] = encode(value) | _type(value) if dataclasses.is_dataclass(value) else encode(value)
             continue
-        kind = choices_of(room).get(str(value.get(TYPE)))
-        below = _types(kind or room, value) | ({TYPE: value[TYPE]} if kind else {})
-        if below:
-            kept[name] = below
-    return kept
+        kind = choices_of(room).get(str(given.get(TYPE)), room)
+        same = value if type(value) is kind else None
+        usual[name] = _usual(same, kind, given) | ({TYPE: given[TYPE]} if TYPE in given else {})
+    return usual
+
+
+def _default(field: dataclasses.Field[Any]) -> Any:
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return ABSENT if field.default is dataclasses.MISSING else field.default
+
+
+def _type(room: Any) -> dict[str, Any]:
+    """The name under which a config of several was registered."""
+    return {TYPE: room.type} if hasattr(room, TYPE) else {}

@@ -16,12 +16,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import yaml
 
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.report.blocks import (
     Block,
     Cell,
@@ -45,7 +45,7 @@ from accerl_lerobot.report.dreams import dream_blocks
 from accerl_lerobot.report.learning import lag_chart, learning_charts
 from accerl_lerobot.report.notes import notes, status
 from accerl_lerobot.report.read import Record, Run, column, newest
-from accerl_lerobot.report.recipe import differences, lag_bound
+from accerl_lerobot.report.recipe import differences, lag_bound, unreadable
 from accerl_lerobot.report.speed import speed_charts, time_blocks
 from accerl_lerobot.report.words import count, duration, number, percent, rate
 
@@ -132,6 +132,9 @@ def exploring(run: Run) -> tuple[np.ndarray, np.ndarray]:
 def success_chart(run: Run) -> Chart:
     """Evaluations with intervals over env steps, and the exploring policy's success behind them."""
     steps, share = exploring(run)
+    behind = line("while exploring", steps, share, colour=7)
+    points = evaluated(run, "evaluation, 95 % Wilson", 0)
+    reach = (0.0, max([*behind.x[-1:], *points.x], default=1.0))
     return Chart(
         title="Success",
         x_label="env steps of online experience",
@@ -140,10 +143,7 @@ def success_chart(run: Run) -> Chart:
         wide=True,
         note="Evaluations use LeRobot's own sampler on seeds that no run trains on; exploring is the policy "
         "with its noise, over the newest 100 episodes.",
-        series=(
-            line("while exploring", steps, share, colour=7),
-            evaluated(run, "evaluation, 95 % Wilson", 0),
-        ),
+        series=(replace(behind, reach=reach), points),
     )
 
 
@@ -190,15 +190,11 @@ def films(run: Run) -> list[Section]:
 
 def recipe_blocks(run: Run, config_class: type[Any]) -> list[Block]:
     """What differs from the defaults, and all of it."""
-    found: list[Block]
-    try:
-        rows = [
-            (field, shown(value), shown(usual))
-            for field, value, usual in differences(config_class, run.config)
-        ]
-        found = [Changes(caption="What this run sets, and what the default would be", rows=rows)]
-    except InputError as error:
-        found = [Words(text=f"This version of accerl cannot tell what differs from the defaults: {error}.")]
+    rows = [(field, shown(v), shown(usual)) for field, v, usual in differences(config_class, run.config)]
+    found: list[Block] = [Changes(caption="What this run sets, and what the default would be", rows=rows)]
+    if why := unreadable(config_class, run.config):
+        text = f"Another version of accerl wrote this recipe, so what it implies is not known here: {why}."
+        found.append(Words(text=text))
     return [*found, Folded(title="The complete recipe, config.yaml", text=run.config_text)]
 
 

@@ -34,9 +34,9 @@ from typing import Any, Self
 
 import pytest
 
-NAMES = ("chromium", "chromium-headless-shell", "chromium-browser", "google-chrome")
+NAMES = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
 INSTALL = (
-    "no browser for the tests of the report: run make setup as root, which installs it, or "
+    "no browser to look at reports with: run make test as root, which installs one, or "
     "apt-get install -y --no-install-recommends chromium-headless-shell"
 )
 ANSWER_S = 120.0
