@@ -59,10 +59,12 @@ def comparison_page(runs: Sequence[Run], now: float) -> Page:
 def labels(runs: Sequence[Run]) -> list[str]:
     """Each run's folder name, with as many folders above it as it takes to tell them apart."""
     parts = [run.path.resolve().parts for run in runs]
-    depth = 1
-    while len({path[-depth:] for path in parts}) < len(runs) and depth < max(map(len, parts)):
-        depth += 1
-    return ["/".join(path[-depth:]) for path in parts]
+    named = []
+    for own in parts:
+        depths = range(1, len(own) + 1)
+        alone = next(d for d in depths if sum(other[-d:] == own[-d:] for other in parts) == 1)
+        named.append("/".join(own[-alone:]))
+    return named
 
 
 def _range(runs: Sequence[Run]) -> str:

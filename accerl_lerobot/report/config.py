@@ -42,7 +42,5 @@ class ReportConfig:
     def __post_init__(self) -> None:
         if not self.runs:
             raise InputError("runs", "", "name the folder of a run: accerl report RUN")
-        if len(set(self.runs)) < len(self.runs):
-            raise InputError("runs", ",".join(self.runs), "name each run once")
         if not self.video_mb >= 0:
             raise InputError("video_mb", self.video_mb, "use 0 (link every video) or more megabytes")

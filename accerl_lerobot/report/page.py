@@ -63,6 +63,8 @@ def write_report(config: ReportConfig, recipes: Mapping[str, type[Any]]) -> Path
         InputError: a run cannot be read, runs are of different kinds, or the page has no place.
     """
     runs = [read_run(Path(name).expanduser()) for name in config.runs]
+    if len({run.path.resolve() for run in runs}) < len(runs):
+        raise InputError("runs", ",".join(config.runs), "name each run once")
     verbs = dict.fromkeys(run.verb for run in runs)
     if len(verbs) > 1:
         remedy = f"a page compares runs of one kind; these are of accerl {' and '.join(verbs)}"

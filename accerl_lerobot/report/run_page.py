@@ -262,6 +262,8 @@ def _tiles(run: Run, bound: int | None) -> list[Tile]:
     ]
     lags = column(train, "lag_mean")
     largest = column(train, "lag_max")
+    known = [f"largest {number(float(np.nanmax(largest)))}"] if len(lags) else []
+    known += [f"bound {bound}"] if bound is not None else []
     of = run.room("trainer").get("updates")
     return [
         Tile(
@@ -278,8 +280,7 @@ def _tiles(run: Run, bound: int | None) -> list[Tile]:
         Tile(
             name="lag",
             value=number(float(np.nanmean(lags)), 2) if len(lags) else number(None),
-            note=f"largest {number(float(np.nanmax(largest)))}" * bool(len(lags))
-            + (f", bound {bound}" if bound is not None else ""),
+            note=", ".join(known),
         ),
         Tile(
             name="algorithm", value=algorithm(run), note=f"advantage {run.room('algorithm').get('advantage')}"

@@ -64,11 +64,11 @@ class Browser:
             # Whatever a page may ask for, no request leaves this machine.
             "--host-resolver-rules=MAP * ~NOTFOUND", f"--user-data-dir={profile}", "--remote-debugging-pipe",
         ]  # fmt: skip
-        # The browser reads from descriptor 3 and writes to 4.
+        # The browser reads from descriptor 3 and writes to 4. Not every sh knows descriptors of two digits.
         shell = f'exec "$@" 3<&{reads} 4>&{writes}'
         self._log = (profile.parent / f"{profile.name}.log").open("wb")
         self._process = subprocess.Popen(
-            ["sh", "-c", shell, "sh", found, *flags, "about:blank"],
+            ["bash", "-c", shell, "bash", found, *flags, "about:blank"],
             pass_fds=(reads, writes),
             stdout=self._log,
             stderr=self._log,
