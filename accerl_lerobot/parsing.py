@@ -90,9 +90,7 @@ def encode(config: Any) -> dict[str, Any]:
 def read_arguments(arguments: list[str], bare: str | None = None) -> tuple[Path | None, dict[str, Any]]:
     """Splits a command line into the recipe's path and a tree of overrides.
 
-    Args:
-        arguments: as they were typed.
-        bare: the list that bare arguments are entries of; None: the one there may be is the recipe.
+    Bare arguments are entries of the list that `bare` names; without it, the one there may be is the recipe.
 
     Raises:
         InputError: an argument is not of the form ``--room.field=value``, or there are two recipes.

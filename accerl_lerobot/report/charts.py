@@ -36,6 +36,8 @@ SPANS = 100
 """Points of a line at most."""
 COLOURS = 8
 """Colours in the style sheet, ``c0`` to ``c7``; a ninth line is dashed."""
+WHOLE = (-0.03, 1.04)
+"""Ends of a share from 0 to 100 %, such that a dot at either is whole."""
 ROOM = 0.06
 """Of the height, free above and below the data where the limits are not given."""
 
@@ -164,7 +166,7 @@ def draw(chart: Chart) -> Drawn:
     x0, x1 = _x_range(chart.series)
     y0, y1 = _y_range(chart)
     x_at, x_step = ticks(x0, x1, 5)
-    y_at, y_step = ticks(y0, y1, 5)
+    y_at, y_step = ticks(y0, y1, 6)
     shapes = [shape for series in chart.series for shape in _shapes(series, (x0, x1), (y0, y1))]
     lines = [f"M0 {_round(_down(v, y0, y1))}H{W}" for v in y_at]
     return Drawn(

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from accerl_lerobot.report.blocks import Block, Cell, Page, Table, Words, figures, rated, section
-from accerl_lerobot.report.charts import COLOURS, Chart, Series, line
+from accerl_lerobot.report.charts import COLOURS, WHOLE, Chart, Series, line
 from accerl_lerobot.report.notes import notes, status
 from accerl_lerobot.report.read import Record, Run, column, newest
 from accerl_lerobot.report.recipe import apart
@@ -42,7 +42,7 @@ def comparison_page(runs: Sequence[Run], now: float) -> Page:
         state=f"{done} of {len(runs)} finished",
         state_good=done == len(runs),
         headline=_range(runs) if trained else f"{len(runs)} world models",
-        lead=f"{', '.join(names)}.",
+        lead=f"{', '.join(names)}." if len(runs) <= COLOURS else "",
         outcomes=[],
         tiles=[],
         warnings=warnings,
@@ -105,7 +105,7 @@ def _trained(runs: Sequence[Run], names: Sequence[str], now: float) -> Table:
         rows.append(
             (
                 Cell(text=name, colour=i),
-                Cell(text=algorithm(run)),
+                Cell(text=algorithm(run), number=True),
                 Cell(text=str(run.config.get("seed")), number=True),
                 rated(result.get("success_before"), result.get("ci95_before")),
                 rated(success, interval),
@@ -168,7 +168,7 @@ def _curves(runs: Sequence[Run], names: Sequence[str]) -> list[Chart]:
             title="Success in evaluation",
             x_label=x,
             share=True,
-            limits=(0.0, 1.0),
+            limits=WHOLE,
             wide=True,
             series=_there(ended),
             note="LeRobot's own sampler on seeds that no run trains on"
@@ -178,7 +178,7 @@ def _curves(runs: Sequence[Run], names: Sequence[str]) -> list[Chart]:
             title="Success while exploring",
             x_label=x,
             share=True,
-            limits=(0.0, 1.0),
+            limits=WHOLE,
             wide=True,
             series=_there(explored),
             note="The policy with its noise, over the newest 100 episodes.",

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from accerl_lerobot.report.blocks import Block, Cell, Table, Words, figures
-from accerl_lerobot.report.charts import Chart, line
+from accerl_lerobot.report.charts import WHOLE, Chart, line
 from accerl_lerobot.report.read import Record, column, has, newest
 from accerl_lerobot.report.words import count, number, percent
 
@@ -105,7 +105,7 @@ def _charts(rollout: Sequence[Record]) -> list[Chart]:
             title="Success in dreams and in reality",
             x_label="updates",
             share=True,
-            limits=(0.0, 1.0),
+            limits=WHOLE,
             note="Dreams far above reality flatter the policy.",
             series=tuple(
                 line(label, update, column(rollout, f"imagination_{name}"), colour=colour)
@@ -117,7 +117,7 @@ def _charts(rollout: Sequence[Record]) -> list[Chart]:
             title="Imagined share",
             x_label="updates",
             share=True,
-            limits=(0.0, 1.0),
+            limits=WHOLE,
             note="Of the decisions of a batch, and of all learnt from so far.",
             series=(
                 line("of a batch", update, column(rollout, "replay_imagined_share"), colour=0),

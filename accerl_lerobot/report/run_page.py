@@ -39,7 +39,7 @@ from accerl_lerobot.report.blocks import (
     rated,
     section,
 )
-from accerl_lerobot.report.charts import Chart, Series, line
+from accerl_lerobot.report.charts import WHOLE, Chart, Series, line
 from accerl_lerobot.report.commands import commands
 from accerl_lerobot.report.dreams import dream_blocks
 from accerl_lerobot.report.learning import lag_chart, learning_charts
@@ -136,10 +136,10 @@ def success_chart(run: Run) -> Chart:
     points = evaluated(run, "evaluation, 95 % Wilson", 0)
     reach = (0.0, max([*behind.x[-1:], *points.x], default=1.0))
     return Chart(
-        title="Success",
+        title="Success rate",
         x_label="env steps of online experience",
         share=True,
-        limits=(0.0, 1.0),
+        limits=WHOLE,
         wide=True,
         note="Evaluations use LeRobot's own sampler on seeds that no run trains on; exploring is the policy "
         "with its noise, over the newest 100 episodes.",

@@ -19,6 +19,7 @@ import math
 from collections.abc import Sequence
 
 ABSENT = "–"
+UNBROKEN = "\N{NO-BREAK SPACE}"
 
 
 def number(value: float | None, digits: int = 4) -> str:
@@ -36,10 +37,10 @@ def number(value: float | None, digits: int = 4) -> str:
 
 
 def percent(share: float | None) -> str:
-    """A share as ``98 %``, with a decimal where it has one."""
+    """A share as ``98 %``, with a decimal where it has one; no line breaks before the sign."""
     if share is None or not math.isfinite(share):
         return ABSENT
-    return f"{100 * share:.3g} %"
+    return f"{100 * share:.3g}{UNBROKEN}%"
 
 
 def rate(success: float | None, interval: Sequence[float] | None) -> str:

@@ -120,7 +120,7 @@ def test_nothing_that_counts_from_zero_up_goes_below() -> None:
 
 def test_words_for_those_who_do_not_see_it() -> None:
     drawn = draw(chart(line("mean", np.arange(3.0), np.array([0.1, 0.9, 0.5])), share=True))
-    assert drawn.label == "Lag over updates. mean: from 10 % to 50 %, between 10 % and 90 %."
+    assert drawn.label == "Lag over updates. mean: from 10\xa0% to 50\xa0%, between 10\xa0% and 90\xa0%."
 
 
 def test_what_the_page_is_told_is_json_in_the_strict_sense() -> None:

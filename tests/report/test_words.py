@@ -31,9 +31,9 @@ def test_numbers(value: float | None, text: str) -> None:
 
 
 def test_rates_have_their_interval() -> None:
-    assert rate(0.46, [0.3656, 0.5574]) == "46 % [37, 56]"
-    assert rate(0.61333, (0.5, 0.7)) == "61.3 % [50, 70]"
-    assert rate(None, None) == "–" and percent(1.0) == "100 %"
+    assert rate(0.46, [0.3656, 0.5574]) == "46\xa0% [37, 56]"
+    assert rate(0.61333, (0.5, 0.7)) == "61.3\xa0% [50, 70]"
+    assert rate(None, None) == "–" and percent(1.0) == "100\xa0%"
 
 
 @pytest.mark.parametrize(
