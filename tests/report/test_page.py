@@ -18,6 +18,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import time
 from pathlib import Path
 from typing import Any
@@ -25,12 +26,14 @@ from typing import Any
 import pytest
 
 from accerl_lerobot import run
-from accerl_lerobot.config import LaunchConfig
+from accerl_lerobot.config import LaunchConfig, RunConfig, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
+from accerl_lerobot.report.commands import commands
 from accerl_lerobot.report.config import ReportConfig
 from accerl_lerobot.report.page import write_report
+from accerl_lerobot.report.read import read_run
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.verbs import CONFIGS
 from tests.report.folders import (
@@ -105,6 +108,14 @@ class TestARealRun:
         assert f"--config_path={real}/config.yaml --output_dir={real}-again" in seen.text
         assert f"--policy.path={real}/checkpoints/last/pretrained_model" in seen.text
         assert "lerobot-eval" not in seen.text  # LeRobot has no simulated world
+
+    def test_its_commands_would_be_understood(self, real: Path) -> None:
+        found = commands(read_run(real))
+        assert len(found) == 3
+        for _, line in found[:2]:
+            _, verb, *arguments = shlex.split(line)
+            config = parse(CONFIGS[verb], arguments, recipe_class=RunConfig)
+        assert config.policy.path == str(real / "checkpoints" / "last" / "pretrained_model")
 
     def test_it_can_be_made_again(self, real: Path, seen: Seen) -> None:
         assert page_of(real).text == seen.text
@@ -256,6 +267,15 @@ def test_a_world_model(tmp_path: Path) -> None:
     assert "The world model failed its trial: recall" in failed and "recall 0.1 above 0.3 fails" in failed
     begun = page_of(write_world_model(tmp_path / "begun", finished=False)).text
     assert "A world model after 400 steps, not tried yet" in begun and "there is no trial.json yet" in begun
+
+
+def test_a_world_model_that_was_tried_again(tmp_path: Path) -> None:
+    folder = write_world_model(tmp_path / "tried")
+    (folder / "metrics.jsonl").unlink()
+    (folder / "config.yaml").write_text("path: model/world_model\ntrial: {depth: 9}\n")
+    text = page_of(folder).text
+    assert "accerl world-model-eval · tried" in text and "trial.depth 9 6" in text
+    assert "There are no metrics" not in text  # it makes none
 
 
 def test_runs_beside_each_other(tmp_path: Path) -> None:
