@@ -292,6 +292,6 @@ def _tick(value: float, step: float, share: bool = False) -> str:
             return f"{value / size:.{1 if step < size else 0}f} {letter}"
     if value == 0:
         return "0"
-    if abs(value) < 1e-3 or abs(value) >= 1e6:
-        return f"{value:.3g}".replace("e-0", "e-")
+    if step < 1e-4 or step >= 1e6:
+        return f"{value:.1e}".replace(".0e", "e").replace("e-0", "e-").replace("e+0", "e")
     return f"{value:.{max(0, -math.floor(math.log10(step) + 1e-9))}f}"

@@ -65,7 +65,7 @@ def _state(run: Run, now: float) -> Iterator[str]:
                 f"The last thing it wrote is from {_at(run.written)}, {duration(ago)} before this page."
             )
     if not run.records and run.verb != "world-model-eval":
-        yield "There are no metrics: the run did not come to its first record."
+        yield "There are no metrics: the run has not come to its first record."
     if run.torn:
         yield "The last line of metrics.jsonl is incomplete and left out: the run was writing it, or died."
     if run.sessions > 1:

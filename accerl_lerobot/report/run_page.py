@@ -258,7 +258,7 @@ def _tiles(run: Run, bound: int | None) -> list[Tile]:
     parts = [
         f"{name} {duration(result[key])}"
         for key, name in (("warm_start_s", "warm start"), ("rl_s", "RL"))
-        if result.get(key)
+        if result.get(key, 0.0) >= 1
     ]
     lags = column(train, "lag_mean")
     largest = column(train, "lag_max")

@@ -24,6 +24,8 @@ from accerl_lerobot.report.charts import Chart, line, rates
 from accerl_lerobot.report.read import Record, column, has, newest
 from accerl_lerobot.report.words import duration, number, percent
 
+SOME, MOST = 0.1, 0.8
+"""Share of its time up to which the trainer hardly waits; and above which inference hardly does."""
 TIME = "minutes since the workers began to start"
 TRAINER = (
     ("update_s", "updating", 0),
@@ -59,7 +61,7 @@ def time_blocks(train: Sequence[Record], rollout: Sequence[Record], batch: int |
         busy = Part(name="deciding", share=inference, colour=0, note=percent(inference))
         bars.append(Bar(name="inference", parts=(busy, idle)))
     return [
-        Words(text=_verdict(spent, newest(rollout, "replay_insert_wait_s"))),
+        Words(text=_verdict(spent, newest(rollout, "replay_insert_wait_s"), inference)),
         Bars(bars=bars),
         *figures(_busy_chart(train, rollout), _batch_chart(rollout, batch), _request_chart(rollout)),
     ]
@@ -79,19 +81,21 @@ def _trainer_parts(spent: dict[str, float]) -> list[Part]:
     ]
 
 
-def _verdict(spent: dict[str, float], at_the_door: float | None) -> str:
-    """Who waited for whom, in words."""
+def _verdict(spent: dict[str, float], at_the_door: float | None, inference: float | None) -> str:
+    """Who waited for whom, in words; `inference` is its busy share."""
     waited = spent.get("wait_s", 0.0) / sum(spent.values())
     text = f"The trainer was busy for {percent(1 - waited)} of its time and waited for batches in the rest. "
     if at_the_door is not None:
         text += (
             f"Segments stood at the replay's door for {duration(at_the_door)}, added up over all of them. "
         )
-    if waited > 0.5:
-        return text + "Collecting was the slower side: more worlds or workers would be used."
-    if waited > 0.1:
-        return text + "Collecting and learning were about balanced."
-    return text + "Learning was the slower side: more worlds would wait at the door."
+    if waited <= SOME:
+        return text + "Learning was the slower side: more worlds would wait at the door."
+    if inference is not None and inference > MOST:
+        return text + f"Inference, busy for {percent(inference)} of the time, held collecting up."
+    return (
+        text + "Collecting was the slower side, and inference had time left: there is room for more worlds."
+    )
 
 
 def _inference_busy(rollout: Sequence[Record]) -> float | None:

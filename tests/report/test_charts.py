@@ -78,6 +78,20 @@ def test_ticks(low: float, high: float, expected: list[float]) -> None:
     assert found == pytest.approx(expected)
 
 
+@pytest.mark.parametrize(
+    ("top", "texts"),
+    [
+        (1e-4, ["0", "2e-5", "4e-5", "6e-5", "8e-5", "1e-4"]),
+        (0.004, ["0", "0.001", "0.002", "0.003", "0.004"]),
+        (250_000, ["0", "50 k", "100 k", "150 k", "200 k", "250 k"]),
+        (1200, ["0", "200", "400", "600", "800", "1.0 k", "1.2 k"]),
+    ],
+)
+def test_labels_of_an_axis(top: float, texts: list[str]) -> None:
+    drawn = draw(chart(line("a", np.arange(2.0), np.array([0.0, top])), limits=(0.0, top)))
+    assert [tick.text for tick in drawn.y_ticks] == texts
+
+
 def test_a_line_from_corner_to_corner() -> None:
     drawn = draw(chart(line("a", np.array([0.0, 10.0]), np.array([0.0, 1.0])), limits=(0.0, 1.0)))
     (shape,) = drawn.shapes

@@ -185,7 +185,23 @@ def test_numbers_of_a_known_run(tmp_path: Path) -> None:
     assert series["inference"]["y"] == pytest.approx([0.3] * len(series["inference"]["y"]), rel=1e-3)
     assert "The trainer was busy for 75 % of its time" in seen.text
     assert "updating 70 %, 28 s" in seen.text and "waiting for a batch 25 %, 10 s" in seen.text
+    assert "Collecting was the slower side, and inference had time left" in seen.text
     assert "Segments stood at the replay's door for 20 s" in seen.text
+
+
+@pytest.mark.parametrize(
+    ("waited", "busy", "said"),
+    [
+        (0.01, 0.5, "Learning was the slower side: more worlds would wait at the door."),
+        (2.0, 0.95, "Inference, busy for 95 % of the time, held collecting up."),
+        (2.0, 0.3, "Collecting was the slower side, and inference had time left"),
+    ],
+)
+def test_who_waited_for_whom(tmp_path: Path, waited: float, busy: float, said: str) -> None:
+    folder = write_run(tmp_path / "run", rollout={"inference_busy_share": busy})
+    text = (folder / "metrics.jsonl").read_text()
+    (folder / "metrics.jsonl").write_text(text.replace('"wait_s": 0.25', f'"wait_s": {waited}'))
+    assert said in page_of(folder).text
 
 
 def test_several_tasks_have_a_table(tmp_path: Path) -> None:
@@ -240,7 +256,7 @@ def test_a_run_that_died_before_its_first_record(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run", finished=False)
     (folder / "metrics.jsonl").unlink()
     seen = page_of(folder)
-    assert "the run did not come to its first record" in seen.text and seen.charts == []
+    assert "the run has not come to its first record" in seen.text and seen.charts == []
     assert "0 of 40 updates on match so far" in seen.text
 
 
