@@ -35,6 +35,7 @@ VERBS = {
     "eval": ("verbs:evaluate", "success of a checkpoint, with its confidence interval"),
     "world-model": ("verbs:world_model", "learn to dream a world from a LeRobotDataset, and be tried on it"),
     "world-model-eval": ("verbs:world_model_eval", "try a world model on another dataset"),
+    "report": ("verbs:report", "one HTML page of a run, or of several beside each other, to look at"),
     "doctor": ("doctor:main", "resolve a recipe and check this machine"),
     "bench": ("verbs:bench", "measure: accerl bench world, policy, lag, dream, ranking, …"),
 }

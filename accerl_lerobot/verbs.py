@@ -47,6 +47,7 @@ from accerl_lerobot.evaluation.config import EvaluationConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.parsing import read_arguments
 from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.report.config import ReportConfig
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.world_model.config import TrialConfig, WorldModelConfig
 
@@ -309,6 +310,15 @@ def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Cons
     return 0 if found["passed"] else 1
 
 
+def report(arguments: list[str]) -> int:
+    """``accerl report``."""
+    config: ReportConfig = parse(ReportConfig, arguments)
+    from accerl_lerobot.report.page import write_report
+
+    sys.stdout.write(f"{write_report(config, CONFIGS)}\n")
+    return 0
+
+
 def bench(arguments: list[str]) -> int:
     """``accerl bench world``, ``policy``, ``lag``, ``dream``, ``efficiency`` and ``ranking``."""
     name = arguments[0] if arguments else ""
@@ -331,6 +341,7 @@ CONFIGS: dict[str, type[Any]] = {
     "eval": EvalRun,
     "world-model": WorldModelRun,
     "world-model-eval": WorldModelEvalRun,
+    "report": ReportConfig,
     "doctor": RunConfig,
     "bench world": BenchWorldConfig,
     "bench policy": BenchPolicyConfig,
