@@ -50,14 +50,20 @@ class LaunchConfig:
     stall_s: float = 300.0
     """How long, in seconds, a worker may owe an answer or a world a step, and a run stand still; > 0.
 
-    A rollout worker is started again then; any other, and a run in which nothing moves, ends with an error.
+    A rollout worker is started again then; with any other, and where nothing moves, all are.
     """
+    max_recoveries: int = 3
+    """How often in a row, no later checkpoint having been reached in between, all workers are started again
+    from the last checkpoint because one of them was lost that is not a rollout worker; once more ends the run
+    with its error."""
 
     def __post_init__(self) -> None:
         if self.engine not in ("ray", "local"):
             raise InputError("launch.engine", self.engine, "use ray or local")
         if not self.stall_s > 0:
             raise InputError("launch.stall_s", self.stall_s, "use a positive number of seconds")
+        if self.max_recoveries < 0:
+            raise InputError("launch.max_recoveries", self.max_recoveries, "use 0 or more")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -44,6 +44,10 @@ class Progress:
     """Empty where nothing is imagined."""
 
 
+class WorkerError(RuntimeError):
+    """A worker is lost for good, and the engine with it; another one may go on from what was saved."""
+
+
 class Saved(NamedTuple):
     """What was written."""
 
@@ -80,7 +84,7 @@ class Engine(ABC):
         """Does or awaits a little work and reports it.
 
         Raises:
-            RuntimeError: a worker failed for good; carries its own traceback.
+            WorkerError: a worker failed for good; carries its own traceback.
         """
 
     @abstractmethod

@@ -25,8 +25,9 @@
 
 The trainer is the clock: when it has made its updates the run is over. Another worker that ends is an event:
 a rollout worker is started again, a few times (with it go its unfinished segments and groups, nothing else);
-any other ends the run with its own traceback. The same goes for one that hangs: nothing here waits for an
-answer without a limit. Workers get handles and never hold the conductor.
+any other ends this engine with its own traceback, and `run` makes another one that goes on from the last
+checkpoint. The same goes for one that hangs: nothing here waits for an answer without a limit. Workers get
+handles and never hold the conductor.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ from ray.exceptions import RayError, RayTaskError
 
 from accerl_lerobot.checkpoint import TRAINING_STATE, saved_version
 from accerl_lerobot.config import RunConfig
-from accerl_lerobot.engine import Engine, Progress, Saved
+from accerl_lerobot.engine import Engine, Progress, Saved, WorkerError
 from accerl_lerobot.inference.worker import ServiceStoppedError
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seats import START_S, Seats
@@ -78,7 +79,7 @@ class RayEngine(Engine):
 
     Raises:
         InputError: the state is of a run in one process.
-        RuntimeError: a worker did not start; carries its own traceback.
+        WorkerError: a worker did not start; carries its own traceback.
     """
 
     def __init__(
@@ -249,11 +250,11 @@ class RayEngine(Engine):
                 self._blame()
             if self._seats.restart_worker(worker, error):
                 return
-            raise RuntimeError(f"{worker.name} worker failed for good:\n{error}") from error
+            raise WorkerError(f"{worker.name} worker failed for good:\n{error}") from error
         if worker is self._trainer:
             self._finish(int(result))
         elif not (self._done and worker in (self._replay, self._dreamer, self._learner)):
-            raise RuntimeError(f"{worker.name} worker ended without being asked to")
+            raise WorkerError(f"{worker.name} worker ended without being asked to")
 
     def _blame(self) -> None:
         """A worker failed because of another one: ends the run with that one's failure, if it is found."""
@@ -289,24 +290,24 @@ class RayEngine(Engine):
         try:
             return worker.answer(timeout)
         except RayError as error:
-            raise RuntimeError(f"{worker.name} worker failed for good:\n{error}") from error
+            raise WorkerError(f"{worker.name} worker failed for good:\n{error}") from error
 
     def _check_hung(self) -> None:
         """Starts a rollout worker again that does not answer or whose world does not return.
 
         Raises:
-            RuntimeError: another worker does not answer.
+            WorkerError: another worker does not answer.
         """
         for worker in self._services:
             if worker.silent_s() > self._limit:
-                raise RuntimeError(f"{worker.name} worker has not answered for {worker.silent_s():.0f} s")
+                raise WorkerError(f"{worker.name} worker has not answered for {worker.silent_s():.0f} s")
         self._seats.check_hung()
 
     def _check_moving(self, progress: Progress) -> None:
         """Ends a run in which everybody answers and nothing moves.
 
         Raises:
-            RuntimeError: neither decisions nor updates for `LaunchConfig.stall_s`.
+            WorkerError: neither decisions nor updates for `LaunchConfig.stall_s`.
         """
         imagined = tuple(progress.imagination.get(k) for k in ("decisions", "learn_steps", "trial_s"))
         state = (progress.version, progress.rollout.get("decisions"), progress.rollout["restarts"], imagined)
@@ -318,7 +319,7 @@ class RayEngine(Engine):
         if state != self._last_state or not waiting:
             self._last_state, self._last_change = state, now
         elif now - self._last_change > self._limit and not suspect:
-            raise RuntimeError(
+            raise WorkerError(
                 f"nothing moved for {self._limit:.0f} s: {progress.rollout}, {progress.replay}, "
                 f"{progress.inference}; raise launch.stall_s if a single step takes that long"
             )

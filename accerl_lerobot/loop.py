@@ -96,13 +96,13 @@ class Times:
     """Warm start."""
     rl_s: float = 0.0
     """Training, in processes before this one."""
-    before_s: float = 0.0
-    """All, in processes before this one."""
+    before_s: float | None = 0.0
+    """All, in processes before this one; None: the checkpoint will tell."""
 
     @property
     def wall_s(self) -> float:
         """All of them."""
-        return self.before_s + time.monotonic() - self.started
+        return (self.before_s or 0.0) + time.monotonic() - self.started
 
 
 class Loop:
@@ -191,15 +191,17 @@ class Loop:
 
     def _state(self) -> dict[str, Any]:
         """All that `_restore` needs; see `snapshot`."""
-        spent = {"rl_s": self._rl_s, "before_s": self.times.wall_s, "warm_s": self.times.warm_s}
+        spent = {"rl_s": self._rl_s, "wall_s": self.times.wall_s, "warm_s": self.times.warm_s}
         return {name: getattr(self, name) for name in _STATE} | {"log": self.log.state(), "times": spent}
 
     def _restore(self, state: dict[str, Any], version: int) -> None:
         for name in _STATE:
             setattr(self, name, state[name])
         self.log.restore(state["log"], version)
-        for name, seconds in state["times"].items():
-            setattr(self.times, name, seconds)
+        times = state["times"]
+        self.times.rl_s, self.times.warm_s = times["rl_s"], times["warm_s"]
+        if self.times.before_s is None:
+            self.times.before_s = times["wall_s"]
 
     def _summary(
         self,

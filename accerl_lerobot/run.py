@@ -41,7 +41,7 @@ from accerl_lerobot import ray_environment
 from accerl_lerobot.checkpoint import CONFIG, PRETRAINED, TRAINING_STATE, newest_whole, write_atomically
 from accerl_lerobot.config import RunConfig, encode
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine import Engine
+from accerl_lerobot.engine import Engine, WorkerError
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.loop import CHECKPOINTS, Loop, Times
@@ -50,6 +50,8 @@ from accerl_lerobot.stopping import Stopping
 
 logger = logging.getLogger(__name__)
 
+FIRST_PAUSE_S = 1.0
+"""Before all workers are started again the first time; twice as long each time."""
 WARM_START = "warm_start.json"
 """File that says which policy a run's own demonstrations and SFT have led to."""
 
@@ -165,15 +167,69 @@ def train(config: RunConfig, directory: Path, console: Console, wanted: str | No
     else:
         config = _going_on(config, directory, checkpoint)
         console.say(f"going on from {checkpoint}")
-    times = Times(started=started, warm_s=time.monotonic() - started)
-    history = check_policy(config)
-    state = None if checkpoint is None else checkpoint / TRAINING_STATE
-    with contextlib.ExitStack() as stack:  # ends the workers and flushes the log, whatever fails
+    before_s = 0.0 if checkpoint is None else None
+    times = Times(started=started, warm_s=time.monotonic() - started, before_s=before_s)
+    with contextlib.ExitStack() as stack:  # flushes the log, whatever fails
         stop = stack.enter_context(Stopping())
         log = stack.enter_context(contextlib.closing(MetricsLog(directory, config.wandb, encode(config))))
-        with console.stage("starting workers"):
-            engine = stack.enter_context(contextlib.closing(make_engine(config, tasks, history, state)))
+        recovery = Recovery(config.launch.max_recoveries)
+        while True:
+            try:
+                return _attempt(config, directory, checkpoint, console, log, tasks, times, stop)
+            except WorkerError as error:
+                checkpoint = recovery.next(directory / CHECKPOINTS, console, error)
+                config = _going_on(config, directory, checkpoint)
+
+
+def _attempt(
+    config: RunConfig,
+    directory: Path,
+    checkpoint: Path | None,
+    console: Console,
+    log: MetricsLog,
+    tasks: tuple[str, ...],
+    times: Times,
+    stop: Stopping,
+) -> dict[str, Any]:
+    """The run, or what is left of it, by one set of workers, which have ended when this returns or raises."""
+    history = check_policy(config)
+    state = None if checkpoint is None else checkpoint / TRAINING_STATE
+    with console.stage("starting workers"):
+        engine = make_engine(config, tasks, history, state)
+    with contextlib.closing(engine):
         return Loop(config, directory, console, engine, log, tasks, times, stop).run(state)
+
+
+class Recovery:
+    """Goes on after the loss of a worker, from the last checkpoint, unless it happens again and again.
+
+    Args:
+        most: times in a row.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most, self._times, self._reached = most, 0, ""
+
+    def next(self, checkpoints: Path, console: Console, error: WorkerError) -> Path:
+        """The checkpoint to go on from; waits a little, longer each time.
+
+        Raises:
+            WorkerError: the one given: there is no checkpoint, or it has been tried often enough.
+        """
+        try:
+            path, passed = newest_whole(checkpoints)
+        except InputError:
+            raise error from None
+        self._times = self._times + 1 if path.name == self._reached else 1
+        self._reached = path.name
+        if self._times > self._most:
+            raise error
+        for why in passed:
+            console.say(f"passed over checkpoint {why}")
+        pause = FIRST_PAUSE_S * 2 ** (self._times - 1)
+        console.say(f"{error}\ngoing on from {path} in {pause:.0f} s ({self._times} of {self._most} times)")
+        time.sleep(pause)
+        return path
 
 
 def _checkpoint(directory: Path, wanted: str, console: Console) -> Path | None:
@@ -192,7 +248,7 @@ def _warm_started(config: RunConfig, directory: Path, console: Console) -> RunCo
     if config.policy.path is not None:
         return config
     if not note.is_file():
-        for name in ("demos", "sft"):
+        for name in ("demos", "demos.partial", "sft"):
             shutil.rmtree(directory / name, ignore_errors=True)
         warm = warm_start(config, directory, console)
         path = Path(str(warm.policy.path)).absolute().relative_to(directory.absolute())

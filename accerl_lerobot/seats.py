@@ -31,7 +31,7 @@ from ray.exceptions import RayActorError, RayError
 
 from accerl_lerobot import snapshot
 from accerl_lerobot.config import RunConfig
-from accerl_lerobot.engine import check_new, episode_key
+from accerl_lerobot.engine import WorkerError, check_new, episode_key
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.rollout.plans import budgets, whole_groups
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
@@ -128,7 +128,7 @@ class Seats:
             except RayActorError:
                 continue  # its `run` has ended as well, and the engine deals with that
             except RayError as error:
-                raise RuntimeError(f"{seat.worker.name} worker failed to report:\n{error}") from error
+                raise WorkerError(f"{seat.worker.name} worker failed to report:\n{error}") from error
             if report is None:
                 continue
             seat.counters, seat.in_world_s, seat.spent = report.counters, report.in_world_s, report.spent
@@ -167,7 +167,7 @@ class Seats:
         """Starts a worker again that has failed; False if it is none of these.
 
         Raises:
-            RuntimeError: it has been done `RolloutConfig.max_restarts` times; carries the worker's traceback.
+            WorkerError: it has been done `RolloutConfig.max_restarts` times; carries the worker's traceback.
         """
         for seat in self._seats:
             if seat.worker is worker:
@@ -179,7 +179,7 @@ class Seats:
         """Starts those again that do not answer or whose world does not return.
 
         Raises:
-            RuntimeError: see `restart_worker`.
+            WorkerError: see `restart_worker`.
         """
         limit = self._config.launch.stall_s
         for seat in self._seats:
@@ -232,7 +232,7 @@ class Seats:
         name = seat.worker.name
         if seat.restarts >= self._config.rollout.max_restarts:
             times = f" after {seat.restarts} restarts" if seat.restarts else ""
-            raise RuntimeError(f"{name} worker failed for good{times}:\n{error}") from error
+            raise WorkerError(f"{name} worker failed for good{times}:\n{error}") from error
         reason = str(error).strip().splitlines()[-1][:200]
         logger.warning("%s worker is started again: %s", name, reason)
         ray.kill(seat.worker.actor)

@@ -21,6 +21,8 @@ from typing import Any
 import ray
 from ray.exceptions import GetTimeoutError, RayError
 
+from accerl_lerobot.engine import WorkerError
+
 
 class Watched:
     """One long call that must not end unasked, and one question at a time.
@@ -76,7 +78,7 @@ class Watched:
         """Waits for one answer.
 
         Raises:
-            RuntimeError: it failed, with its traceback, or did not come in time.
+            WorkerError: it failed, with its traceback, or did not come in time.
         """
         return self.result(getattr(self.actor, method).remote(*arguments), method, timeout)
 
@@ -85,8 +87,6 @@ class Watched:
         try:
             return ray.get(reference, timeout=timeout)
         except GetTimeoutError as error:
-            raise RuntimeError(
-                f"{self.name} worker did not answer {method} within {timeout:.0f} s"
-            ) from error
+            raise WorkerError(f"{self.name} worker did not answer {method} within {timeout:.0f} s") from error
         except RayError as error:
-            raise RuntimeError(f"{self.name} worker failed in {method}:\n{error}") from error
+            raise WorkerError(f"{self.name} worker failed in {method}:\n{error}") from error

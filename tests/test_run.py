@@ -24,9 +24,10 @@ import pytest
 import yaml
 
 from accerl_lerobot import run
+from accerl_lerobot.checkpoint import saved_version
 from accerl_lerobot.config import LaunchConfig, RunConfig, parse
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine import Engine, Progress, Saved
+from accerl_lerobot.engine import Engine, Progress, Saved, WorkerError
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
@@ -250,6 +251,66 @@ def test_an_evaluation_that_ends_after_training_is_not_lost(
     # What is stepped to evaluate after training is no experience that was learned from.
     assert summary["env_steps"] == found[-1]["env_steps"] == found[-2]["env_steps"] == 12 * 10
     assert engine.closed and (tmp_path / "checkpoints" / "last").is_symlink()
+
+
+def losing(monkeypatch: pytest.MonkeyPatch, config: RunConfig, lost_at: list[int]) -> list[Scripted]:
+    """Engines that lose a worker after so many updates, one after the other."""
+    made: list[Scripted] = []
+
+    def make(config: RunConfig, tasks: Any, history: int, state: Path | None) -> Scripted:
+        engine = Scripted(config)
+        engine.version = 0 if state is None else saved_version(state)
+        engine.training = False
+        at, poll = lost_at[len(made)] if len(made) < len(lost_at) else -1, engine.poll
+
+        def watched() -> Progress:
+            if engine.version == at:
+                raise WorkerError("replay worker failed for good:\nKilled")
+            return poll()
+
+        monkeypatch.setattr(engine, "poll", watched)
+        made.append(engine)
+        return engine
+
+    monkeypatch.setattr(run, "make_engine", make)
+    monkeypatch.setattr(run, "check_policy", lambda config: 1)
+    monkeypatch.setattr(run, "FIRST_PAUSE_S", 0.01)
+    return made
+
+
+def test_after_the_loss_of_a_worker_the_run_goes_on_from_its_last_checkpoint(
+    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    config = local_run(tiny_checkpoint, tmp_path)
+    made = losing(monkeypatch, config, [7, 11, 11])
+    summary = run.train(config, tmp_path, Console())
+    assert len(made) == 4 and all(engine.closed for engine in made) and summary["updates"] == 12
+    assert [r["update"] for r in records(tmp_path, "train")] == list(range(1, 13)), "none twice"
+    said = capsys.readouterr().err
+    assert said.count("replay worker failed for good:\nKilled\ngoing on from") == 3
+    # The checkpoints after updates 5 and 10; that of 10 is gone on with twice.
+    assert said.count("(1 of 3 times)") == 2 and said.count("(2 of 3 times)") == 1
+    assert 0 < summary["wall_s"] < 60
+
+
+def test_a_worker_that_is_lost_again_and_again_ends_the_run(
+    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    config = local_run(tiny_checkpoint, tmp_path, launch=LaunchConfig(engine="local", max_recoveries=2))
+    made = losing(monkeypatch, config, [7, 7, 7, 7])
+    with pytest.raises(WorkerError, match="Killed"):
+        run.train(config, tmp_path, Console())
+    assert len(made) == 3 and all(engine.closed for engine in made)
+
+
+def test_without_a_checkpoint_there_is_nothing_to_go_on_from(
+    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    config = local_run(tiny_checkpoint, tmp_path, save_every_updates=0, save_every_s=0.0)
+    made = losing(monkeypatch, config, [7])
+    with pytest.raises(WorkerError, match="Killed"):
+        run.train(config, tmp_path, Console())
+    assert len(made) == 1 and made[0].closed
 
 
 def test_groups_with_nothing_to_compare_are_said_aloud(

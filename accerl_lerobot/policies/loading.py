@@ -343,14 +343,9 @@ def _load_ours(adapter: LeRobotAdapter, folder: Path) -> None:
 
 def _copied(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Copies on the CPU; what shared its memory shares it again, so that it is written once."""
-    copies: dict[tuple[Any, ...], Tensor] = {}
-    made = {}
-    for name, tensor in tensors.items():
-        place = (tensor.data_ptr(), tensor.shape, tensor.stride(), tensor.device)
-        if place not in copies:
-            copies[place] = tensor.detach().to("cpu", copy=True).contiguous()
-        made[name] = copies[place]
-    return made
+    places = {name: (t.data_ptr(), t.shape, t.stride()) for name, t in tensors.items()}
+    copies = {places[n]: t.detach().to("cpu", copy=True).contiguous() for n, t in tensors.items()}
+    return {name: copies[place] for name, place in places.items()}
 
 
 def _load_module(module: nn.Module, path: Path, what: str, otherwise: str) -> None:
