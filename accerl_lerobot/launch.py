@@ -45,6 +45,7 @@ from ray.exceptions import RayActorError, RayError, RayTaskError
 from accerl_lerobot.config import RunConfig
 from accerl_lerobot.engine import Engine, Progress, check_new, episode_key
 from accerl_lerobot.inference.worker import ServiceStoppedError
+from accerl_lerobot.ray_environment import TOKENLESS
 from accerl_lerobot.rollout.plans import budgets, whole_groups
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.watched import Watched
@@ -240,7 +241,7 @@ class RayEngine(Engine):
 
         c = self._config
         film = (c.evaluation.video_size, c.evaluation.video_every)
-        actor = ray.remote(RolloutWorker).options(num_cpus=0, num_gpus=0, max_concurrency=4)
+        actor = ray.remote(RolloutWorker).options(num_cpus=0, num_gpus=0, max_concurrency=4, **TOKENLESS)
         return Watched(
             f"rollout {index}",
             actor.remote(

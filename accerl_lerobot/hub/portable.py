@@ -110,7 +110,8 @@ def own_names(config: dict[str, Any], processor: dict[str, Any], has: set[str]) 
 
 def _walk(value: Any, folder: Path) -> Any:
     if isinstance(value, dict):
-        return {k: _walk(v, folder) for k, v in value.items()}
+        # Where results went is nobody's business, and null is a folder of its own for whoever repeats it.
+        return {k: None if k == "output_dir" and _is_local(v) else _walk(v, folder) for k, v in value.items()}
     if isinstance(value, list):
         return [_walk(v, folder) for v in value]
     return _relative(value, folder) if isinstance(value, str) else value
@@ -118,11 +119,17 @@ def _walk(value: Any, folder: Path) -> Any:
 
 def _relative(text: str, folder: Path) -> str:
     """Text in which paths of a machine are replaced; a text that is a path as a whole may hold blanks."""
-    if text.startswith(("/", "~/")) and "\n" not in text and _of_a_machine(text):
+    if _is_local(text):
         return _portable(text, folder)
     for root in {str(folder.absolute()), str(folder.resolve())}:
         text = text.replace(f"{root}/", "")
     return PATH.sub(lambda m: _portable(m[0], folder) if _of_a_machine(m[0]) else m[0], text)
+
+
+def _is_local(value: Any) -> bool:
+    """Whether it is a path of a machine as a whole."""
+    whole = isinstance(value, str) and value.startswith(("/", "~/")) and "\n" not in value
+    return whole and _of_a_machine(value)
 
 
 def _of_a_machine(path: str) -> bool:

@@ -15,7 +15,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -38,7 +37,6 @@ from accerl_lerobot.errors import InputError
 CONNECT_S, SILENT_S = 30.0, 300.0
 """Seconds until a Hub that does not answer, or stops answering, counts as unreachable. The client has no
 limit of its own; committing thousands of files takes a minute or two."""
-TOKEN = re.compile(r"\bhf_\w{6,}")
 LOGIN = "log in with 'hf auth login', or set HF_TOKEN to a token"
 AGAIN = "run the same command again, it goes on where it was"
 
@@ -98,12 +96,6 @@ def explain(error: BaseException, repo_id: str, revision: str | None, writing: b
     return None
 
 
-def scrubbed(text: str) -> str:
-    """Text without any token."""
-    token = get_token()
-    return TOKEN.sub("<token>", text.replace(token, "<token>") if token else text)
-
-
 def _answered(error: HfHubHTTPError, writing: bool) -> str:
     """What the Hub's answer means, and what to do."""
     code = error.response.status_code
@@ -129,8 +121,9 @@ def _answered(error: HfHubHTTPError, writing: bool) -> str:
 
 def _brief(error: BaseException) -> str:
     """The last line of an error's words, which is what the server said."""
-    lines = [line.strip() for line in scrubbed(str(error)).splitlines() if line.strip()]
-    return (lines[-1] if lines else type(error).__name__)[:160]
+    token, text = get_token(), str(error)
+    lines = [line.strip() for line in (text.replace(token, "<token>") if token else text).splitlines()]
+    return ([line for line in lines if line] or [type(error).__name__])[-1][:160]
 
 
 def _patient_client() -> httpx.Client:
