@@ -35,7 +35,7 @@ from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, unquote, urlsplit
+from urllib.parse import unquote, urlsplit
 
 LARGE = (".safetensors", ".parquet", ".mp4", ".png", ".bin")
 """Suffixes of files that are stored as LFS objects, as the Hub's .gitattributes has it."""
@@ -52,11 +52,13 @@ class Fault:
     match: str
     """Part of the path."""
     status: int = 0
-    """Answered instead of an answer."""
+    """Answered instead of an answer,"""
+    says: str = "as it was told to"
+    """with these words."""
     cut_after: int = -1
     """Bytes of the request's body after which the connection is cut."""
     hang_s: float = 0.0
-    """How long nothing is answered."""
+    """How long nothing happens before the connection is cut."""
     spoil: bool = False
     """One byte of the answer is another."""
     times: int = 1
@@ -94,7 +96,7 @@ class Repo:
         return oid
 
 
-class Refused(Exception):
+class RefusedError(Exception):
     """An answer that is an error."""
 
     def __init__(self, status: int, code: str = "", message: str = "no") -> None:
@@ -166,24 +168,27 @@ class Handler(BaseHTTPRequestHandler):
 
     server: HubServer
     protocol_version = "HTTP/1.1"
+    wbufsize = -1  # head and body at once: two packets cost a delayed acknowledgement, 40 ms
 
     def log_message(self, format: str, *arguments: Any) -> None:
         pass
 
-    def do_GET(self) -> None:  # noqa: N802 - the name is the library's
-        self._answer()
-
-    do_HEAD = do_POST = do_PUT = do_DELETE = do_GET
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("do_"):  # GET, HEAD, POST, PUT and DELETE differ in the answer only
+            return self._answer
+        raise AttributeError(name)
 
     def _answer(self) -> None:
         path = unquote(urlsplit(self.path).path)
-        self.server.seen += [self.path, *(f"{k}: {v}" for k, v in self.headers.items() if k != "authorization")]
+        self.server.seen += [
+            self.path,
+            *(f"{k}: {v}" for k, v in self.headers.items() if k != "authorization"),
+        ]
         self.fault = self.server.fault(self.command, path)
         fault = self.fault
-        if fault is not None and fault.hang_s:
+        if fault is not None and (fault.hang_s or fault.cut_after >= 0):
             time.sleep(fault.hang_s)
-        if fault is not None and fault.cut_after >= 0:
-            self.rfile.read(fault.cut_after)
+            self.rfile.read(max(0, fault.cut_after))
             self._note(path, 0)
             self.close_connection = True
             self.connection.shutdown(2)
@@ -191,12 +196,14 @@ class Handler(BaseHTTPRequestHandler):
         body = self._body()
         try:
             if fault is not None and fault.status:
-                raise Refused(fault.status, message="as it was told to")
+                raise RefusedError(fault.status, message=fault.says)
             self._route(path, body)
-        except Refused as refused:
+        except RefusedError as refused:
             data = json.dumps({"error": refused.message}).encode()
             headers = {"X-Error-Message": refused.message, "Content-Type": "application/json"}
-            self._send(refused.status, data, headers | ({"X-Error-Code": refused.code} if refused.code else {}))
+            self._send(
+                refused.status, data, headers | ({"X-Error-Code": refused.code} if refused.code else {})
+            )
 
     def _body(self) -> bytes:
         if self.headers.get("Transfer-Encoding") == "chunked":
@@ -244,7 +251,7 @@ class Handler(BaseHTTPRequestHandler):
             return self._resolve(repo, found[3], found[4])
         found = re.fullmatch(r"/api/(model|dataset)s/([^/]+/[^/]+)(?:/([a-z-]+)(?:/(.+))?)?", path)
         if found is None:
-            raise Refused(404, message=f"no route {path}")
+            raise RefusedError(404, message=f"no route {path}")
         kind, repo_id, verb, rest = found.groups()
         writing = verb in ("commit", "preupload", "tag", "branch")
         return self._api(self._open(kind, repo_id, who, writing=writing), repo_id, verb, rest, body)
@@ -252,27 +259,31 @@ class Handler(BaseHTTPRequestHandler):
     def _account(self) -> tuple[str, str] | None:
         given = self.headers.get("authorization", "").removeprefix("Bearer ")
         if given and given not in ACCOUNTS:
-            raise Refused(401, message="Invalid credentials in Authorization header")
+            raise RefusedError(401, message="Invalid credentials in Authorization header")
         return ACCOUNTS.get(given)
 
     def _open(self, kind: str, repo_id: str, who: tuple[str, str] | None, *, writing: bool = False) -> Repo:
         repo = self.server.repos.get((kind, repo_id))
         owner = who is not None and repo_id.split("/")[0] == who[0]
         if repo is None or repo.private and not owner:
-            raise Refused(404 if who else 401, "RepoNotFound", "Repository not found")
+            raise RefusedError(404 if who else 401, "RepoNotFound", "Repository not found")
         if writing and not (owner and who is not None and who[1] == "write"):
-            raise Refused(403, message="you do not have the right to write here") if who else Refused(401)
+            raise (
+                RefusedError(403, message="you do not have the right to write here")
+                if who
+                else RefusedError(401)
+            )
         return repo
 
     def _create(self, given: dict[str, Any], who: tuple[str, str] | None) -> None:
         if who is None:
-            raise Refused(401, message="Invalid username or password.")
+            raise RefusedError(401, message="Invalid username or password.")
         owner = given.get("organization") or who[0]
         if owner != who[0] or who[1] != "write":
-            raise Refused(403, message=f"you may not create repositories under {owner}")
+            raise RefusedError(403, message=f"you may not create repositories under {owner}")
         key = given.get("type", "model"), f"{owner}/{given['name']}"
         if key in self.server.repos:
-            raise Refused(409, message="You already created this repo")
+            raise RefusedError(409, message="You already created this repo")
         repo = self.server.repos[key] = Repo(private=given.get("visibility") == "private")
         attributes = b"*.safetensors filter=lfs diff=lfs merge=lfs -text\n"
         file = File(git_oid(attributes), len(attributes), self.server.keep(attributes), lfs=False)
@@ -293,11 +304,13 @@ class Handler(BaseHTTPRequestHandler):
             return self._json({})
         commit = repo.resolve(rest or "main")
         if commit is None:
-            raise Refused(404, "RevisionNotFound", "Invalid rev id")
+            raise RefusedError(404, "RevisionNotFound", "Invalid rev id")
         files = repo.commits[commit]
         if verb in (None, "revision"):
             siblings = [{"rfilename": name} for name in files]
-            return self._json({"id": repo_id, "sha": commit, "private": repo.private, "siblings": siblings, "tags": []})
+            return self._json(
+                {"id": repo_id, "sha": commit, "private": repo.private, "siblings": siblings, "tags": []}
+            )
         if verb == "tree":
             return self._json([_listed(name, file) for name, file in files.items()])
         if verb == "paths-info":
@@ -310,7 +323,7 @@ class Handler(BaseHTTPRequestHandler):
             return self._json({"files": [_mode(f["path"], files) for f in json.loads(body)["files"]]})
         if verb == "commit":
             return self._commit(repo, repo_id, str(rest), body)
-        raise Refused(404, message=f"no verb {verb}")
+        raise RefusedError(404, message=f"no verb {verb}")
 
     def _commit(self, repo: Repo, repo_id: str, branch: str, body: bytes) -> None:
         lines = [json.loads(line) for line in body.decode().splitlines()]
@@ -318,7 +331,7 @@ class Handler(BaseHTTPRequestHandler):
             files = dict(repo.commits[repo.branches[branch]])
             header = lines[0]["value"]
             if header.get("parentCommit") not in (None, repo.branches[branch]):
-                raise Refused(412, message="A commit has happened since. Please refresh and try again.")
+                raise RefusedError(412, message="A commit has happened since. Please refresh and try again.")
             for line in lines[1:]:
                 value = line["value"]
                 if line["key"] == "file":
@@ -326,12 +339,12 @@ class Handler(BaseHTTPRequestHandler):
                     files[value["path"]] = File(git_oid(data), len(data), self.server.keep(data), lfs=False)
                 elif line["key"] == "lfsFile":
                     if not (self.server.blobs / value["oid"]).is_file():
-                        raise Refused(400, message=f"{value['path']} names an object that is not here")
+                        raise RefusedError(400, message=f"{value['path']} names an object that is not here")
                     files[value["path"]] = File(value["oid"][:40], value["size"], value["oid"], lfs=True)
                 elif line["key"] == "deletedFile":
                     del files[value["path"]]
                 else:
-                    raise Refused(400, message=f"no operation {line['key']}")
+                    raise RefusedError(400, message=f"no operation {line['key']}")
             oid = repo.commit(branch, files, header["summary"])
         self._json({"commitUrl": f"{self.server.url}/{repo_id}/commit/{oid}", "commitOid": oid})
 
@@ -346,7 +359,7 @@ class Handler(BaseHTTPRequestHandler):
 
     def _receive(self, oid: str, body: bytes) -> None:
         if hashlib.sha256(body).hexdigest() != oid:
-            raise Refused(400, message="the content is not what its hash says")
+            raise RefusedError(400, message="the content is not what its hash says")
         self.server.keep(body)
         self.server.uploaded.append(oid)
         self._json({})
@@ -354,10 +367,10 @@ class Handler(BaseHTTPRequestHandler):
     def _resolve(self, repo: Repo, revision: str, name: str) -> None:
         commit = repo.resolve(revision)
         if commit is None:
-            raise Refused(404, "RevisionNotFound", "Invalid rev id")
+            raise RefusedError(404, "RevisionNotFound", "Invalid rev id")
         file = repo.commits[commit].get(name)
         if file is None:
-            raise Refused(404, "EntryNotFound", "Entry not found")
+            raise RefusedError(404, "EntryNotFound", "Entry not found")
         data, status = (self.server.blobs / file.sha256).read_bytes(), 200
         etag = file.sha256 if file.lfs else file.oid
         headers = {"X-Repo-Commit": commit, "ETag": f'"{etag}"', "Content-Type": "application/octet-stream"}
@@ -404,7 +417,7 @@ def serving(folder: Path) -> Iterator[HubServer]:
 
 
 def environment(server: HubServer, home: Path, token: str | None = WRITER) -> dict[str, str]:
-    """What a process needs in its environment to take the server for the Hub, with an empty cache in `home`."""
+    """What a process has in its environment to take the server for the Hub, with an empty cache in `home`."""
     found = {
         "HF_ENDPOINT": server.url,
         "HF_HOME": str(home),

@@ -87,9 +87,9 @@ def _of_a_run(run: Path, include: Sequence[str]) -> Files:
         if path.is_file() and path.suffix in OF_A_RUN and path.name not in NOT_CONTENTS
     }
     last = _last(run)
-    parts = [(f"checkpoints/{last.name}", last), *((name.strip("/"), run / name) for name in include)]
-    for name, folder in parts:
-        if not folder.is_dir() or not folder.resolve().is_relative_to(run.resolve()):
+    parts = {f"checkpoints/{last.name}": last} | {name.strip("/"): run / name for name in include}
+    for name, folder in parts.items():
+        if not folder.is_dir() or folder is not last and (folder.name != name or name.startswith(".")):
             raise InputError("include", name, f"no such folder in {run}")
         files |= {f"{name}/{below}": path for below, path in walk(folder)}
     return files

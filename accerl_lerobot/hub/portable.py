@@ -134,7 +134,7 @@ def _is_local(value: Any) -> bool:
 
 def _of_a_machine(path: str) -> bool:
     top = path.split("/")[1]
-    return path.startswith("~") or top in HOMES or Path("/", top).is_dir() and path.count("/") > 1
+    return path.startswith("~") or path.count("/") > 1 and (top in HOMES or Path("/", top).is_dir())
 
 
 def _portable(path: str, folder: Path) -> str:

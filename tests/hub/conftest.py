@@ -15,8 +15,10 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -25,8 +27,8 @@ from tests.hub_server import WRITER, HubServer, serving
 
 @pytest.fixture
 def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[HubServer]:
-    """Nothing else than the server's address, an empty cache and the right to write is set in this process."""
-    from huggingface_hub import constants
+    """This process knows the server's address, has an empty cache, may write, and does not wait to retry."""
+    from huggingface_hub import constants, file_download
     from huggingface_hub.utils import _http
 
     with serving(tmp_path / "hub") as server:
@@ -37,6 +39,7 @@ def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[HubServer]:
         monkeypatch.setattr(constants, "HF_TOKEN_PATH", str(tmp_path / "no-token"))
         monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
         monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", True)
-        monkeypatch.setattr(_http.time, "sleep", lambda seconds: None)  # between two attempts
+        for module in (_http, file_download):  # which wait between two attempts
+            monkeypatch.setattr(module, "time", SimpleNamespace(**vars(time) | {"sleep": lambda s: None}))
         monkeypatch.setenv("HF_TOKEN", WRITER)
         yield server

@@ -55,6 +55,7 @@ def checkpoint(tiny_checkpoint: Path, tmp_path: Path) -> Path:
     config = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
     adapter = load_adapter(config)
     perturb(adapter, 0.1)
+
     def write(directory: Path) -> int:
         save_pretrained(adapter, directory, config)
         return 12
