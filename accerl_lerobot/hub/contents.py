@@ -22,7 +22,7 @@ from pathlib import Path
 
 from accerl_lerobot.checkpoint import BACKBONE, CONFIG_FOLDERS, PREPROCESSOR, PRETRAINED
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.hub.kinds import CONFIG, POLICY, RUN, read_json
+from accerl_lerobot.hub.kinds import CONFIG, DATASET, POLICY, RUN, read_json
 from accerl_lerobot.hub.manifest import CARD, MANIFEST
 from accerl_lerobot.hub.portable import cleaned, is_record, own_names
 
@@ -55,6 +55,8 @@ def contents(folder: Path, kind: str, include: Sequence[str] = ()) -> Files:
         policies = [f"checkpoints/{_last(folder).name}/{PRETRAINED}"]
     else:
         files = {name: path for name, path in walk(folder) if name not in NOT_CONTENTS}
+        if kind == DATASET:  # what LeRobot leaves behind of pictures that are in the tables or films now
+            files = {name: path for name, path in files.items() if not name.startswith("images/")}
         policies = [""] if kind == POLICY else []
     for policy in policies:
         _bring_backbone(files, folder, policy)

@@ -27,6 +27,7 @@ from pathlib import Path
 
 from accerl_lerobot import __version__
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.hub.kinds import NEEDED
 
 MANIFEST = "accerl_manifest.json"
 CARD = "README.md"
@@ -79,7 +80,9 @@ def read_manifest(data: bytes, repo_id: str) -> Manifest:
             raise ValueError(f"format {content['format']}")
         entries = content["files"].items()
         files = {str(name): Entry(int(e["size"]), str(e["sha256"])) for name, e in entries}
-        return Manifest(str(content["kind"]), files)
+        if content["kind"] not in NEEDED:
+            raise ValueError("no such kind")
+        return Manifest(content["kind"], files)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         remedy = f"its {MANIFEST} is broken ({type(error).__name__}: {error}); push it anew"
         raise InputError("repo_id", repo_id, remedy) from error

@@ -34,7 +34,7 @@ from accerl_lerobot.checkpoint import PREPROCESSOR, PRETRAINED, relocate
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.config import REPO_TYPES, PullConfig
 from accerl_lerobot.hub.contents import RECORD
-from accerl_lerobot.hub.kinds import CONFIG, POLICY, RUN, recognise
+from accerl_lerobot.hub.kinds import CONFIG, POLICY, recognise
 from accerl_lerobot.hub.manifest import CARD, MANIFEST, Entry, read_manifest, verify
 from accerl_lerobot.hub.trouble import told
 
@@ -134,29 +134,41 @@ def _receive(folder: Path, home: Path, expected: dict[str, Entry], repo_id: str)
     links = [path for path in folder.rglob("*") if path.is_symlink()]
     if links:
         raise InputError("repo_id", repo_id, f"{links[0].name} came as a link; pull again")
-    verify(folder, expected, repo_id)
-    kind, checked = None, 0
+    manifest = None
     if (folder / MANIFEST).is_file():
         manifest = read_manifest((folder / MANIFEST).read_bytes(), repo_id)
         check_names(list(manifest.files), repo_id)
-        verify(folder, manifest.files, repo_id)
-        kind, checked = manifest.kind, len(manifest.files)
+    files = manifest.files if manifest is not None else {}
+    verify(folder, {**expected, **files}, repo_id)
+    if manifest is not None:
         (folder / MANIFEST).unlink()  # paths are set below, and then it does not hold any more
     (folder / ".gitattributes").unlink(missing_ok=True)
-    if kind == RUN:
-        _link_last(folder)
-    if kind is None:
-        kind = recognise(folder, "repo_id")
-    policies = {POLICY: [folder], RUN: sorted((folder / "checkpoints").glob(f"*/{PRETRAINED}"))}.get(kind, [])
-    for policy in policies:
-        if (policy / CONFIG).is_file() and (policy / PREPROCESSOR).is_file():
-            relocate(policy, home / policy.relative_to(folder))
-    unlisted = sorted(expected.keys() - {CARD, ".gitattributes", MANIFEST}) if not checked else []
-    return {"kind": kind, "files": len(expected), "checked": checked, "unchecked": len(unlisted)}
+    _link_last(folder)
+    kind = recognise(folder, "repo_id")
+    if manifest is not None and kind != manifest.kind:
+        raise InputError("repo_id", repo_id, f"its {MANIFEST} says {manifest.kind}, but this is a {kind}")
+    for policy in [folder] if kind == POLICY else sorted(folder.glob(f"checkpoints/*/{PRETRAINED}")):
+        if policy.parent.name != "last":
+            _move_in(policy, home / policy.relative_to(folder), repo_id)
+    unchecked = expected.keys() - files.keys() - {CARD, MANIFEST, ".gitattributes"}
+    return {"kind": kind, "files": len(expected), "checked": len(files), "unchecked": len(unchecked)}
+
+
+def _move_in(policy: Path, home: Path, repo_id: str) -> None:
+    """Has a policy's files name the folders beside them, where they will be.
+
+    Raises:
+        InputError: they are not LeRobot's.
+    """
+    try:
+        relocate(policy, home)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        remedy = f"its {CONFIG} or {PREPROCESSOR} is not one of LeRobot's ({type(error).__name__}: {error})"
+        raise InputError("repo_id", repo_id, remedy) from error
 
 
 def _link_last(run: Path) -> None:
     """A repository has no links; the checkpoint that came is the last one."""
-    numbers = sorted(p.name for p in (run / "checkpoints").iterdir() if p.is_dir())
-    if numbers and not (run / "checkpoints" / "last").exists():
+    numbers = sorted(p.name for p in run.glob("checkpoints/*") if p.is_dir())
+    if numbers and "last" not in numbers:
         (run / "checkpoints" / "last").symlink_to(numbers[-1])

@@ -84,11 +84,11 @@ def explain(error: BaseException, repo_id: str, revision: str | None, writing: b
             return InputError(field, value, f"name a repository as user/name ({_brief(link)})")
         if isinstance(link, HfHubHTTPError):
             return InputError(field, value, _answered(link, writing))
-        if isinstance(link, httpx.TransportError):
+        if isinstance(link, httpx.TransportError | ConnectionError | TimeoutError):
             reached = f"{constants.ENDPOINT} cannot be reached ({type(link).__name__})"
             return InputError(field, value, f"{reached}; see to the network and {AGAIN}")
-        if isinstance(link, XetDownloadError | EntryNotFoundError) or "xet" in type(link).__module__:
-            return InputError(field, value, f"the transfer broke off ({_brief(link)}); {AGAIN}")
+    if isinstance(error, XetDownloadError | EntryNotFoundError) or "xet" in type(error).__module__:
+        return InputError(field, value, f"the transfer broke off ({_brief(error)}); {AGAIN}")
     if isinstance(error, ValueError) and ("LFS" in str(error) or "README.md" in str(error)):
         return InputError(field, value, f"the Hub refused it: {_brief(error)}")
     if isinstance(error, OSError) and "Consistency check failed" in str(error):

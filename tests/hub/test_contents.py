@@ -59,6 +59,13 @@ def test_hidden_files_and_what_a_pull_left_stay_here(tmp_path: Path):
     }
 
 
+def test_what_lerobot_leaves_behind_of_a_recording_stays_here(tmp_path: Path):
+    for name in ("images/front/frame.png", "data/chunk-000/file-000.parquet"):
+        (tmp_path / name).parent.mkdir(parents=True)
+        (tmp_path / name).write_bytes(b"x")
+    assert set(contents(tmp_path, "dataset")) == {"data/chunk-000/file-000.parquet"}
+
+
 def test_a_backbone_elsewhere_is_brought(tmp_path: Path):
     backbone = tmp_path / "backbone"
     write_json(backbone / "config.json", {"model_type": "smolvlm"})

@@ -138,7 +138,13 @@ def test_a_manifest_that_leads_elsewhere(
     for files in ({"../policy/config.json": entry}, {"/etc/passwd": entry}):
         hub.plant(NAME, {MANIFEST: json.dumps({"format": 1, "kind": "policy", "files": files}).encode()})
         assert "not safe" in refused()
-    for broken in (b"[]", b"{", b'{"format": 2}', b'{"format": 1, "kind": "policy", "files": {"a": 1}}'):
+    for broken in (
+        b"[]",
+        b"{",
+        b'{"format": 2}',
+        b'{"format": 1, "kind": "policy", "files": {"a": 1}}',
+        b'{"format": 1, "kind": "pickle", "files": {}}',
+    ):
         hub.plant(NAME, {MANIFEST: broken})
         assert f"its {MANIFEST} is broken" in refused()
     assert list(tmp_path.glob(".pulling-*")) == []
@@ -158,6 +164,23 @@ def test_files_changed_since_the_push(
     hub.plant(NAME, planted)
     assert words in refused()
     assert list(tmp_path.glob(".pulling-*")) == [], "going on would not make it better"
+
+
+@pytest.mark.parametrize(
+    ("planted", "words"),
+    [
+        ({"policy_preprocessor.json": b"[1]"}, "is not one of LeRobot's"),
+        ({"config.json": b'{"spec": {}, "model": {}}'}, "says policy, but this is a world model"),
+        ({"config.json": b"[]"}, "nothing that can be pushed"),
+    ],
+)
+def test_files_that_are_no_policy(
+    hub: HubServer, policy: Path, refused: Callable[..., str], tmp_path: Path, planted: Files, words: str
+):
+    manifest = json.dumps({"format": 1, "kind": "policy", "files": {}}).encode()
+    hub.plant(NAME, {MANIFEST: manifest, "backbone/config.json": b"{}"} | planted)
+    assert words in refused()
+    assert list(tmp_path.glob(".pulling-*")) == []
 
 
 def test_files_gone_since_the_push(hub: HubServer, policy: Path, refused: Callable[..., str]):

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What is pushed comes back as it was, through the real client and a Hub on this machine."""
+"""What is pushed comes back as it was and loads, through the real client and a Hub on this machine."""
 
 from __future__ import annotations
 
@@ -22,22 +22,58 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 
 from accerl_lerobot import cli
 from accerl_lerobot.checkpoint import save_checkpoint
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.loading import load_adapter, save_pretrained
+from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, save_pretrained
+from tests.hub.folders import SUMMARY, write_json
 from tests.hub_server import HubServer, environment
+from tests.policies.checkpoints import write_gaussian_actor
 from tests.policies.tiny import perturb
+from tests.world_model.test_pixels import model
 
 ROOT = Path(__file__).parents[2]
 TINY = ROOT / "datasets" / "metaworld_tiny"
-NAME = "alice/door"
+LAST = "checkpoints/last/pretrained_model"
+
+LOAD = """
+import hashlib, json, sys
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.loading import load_adapter
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+def digest(state):
+    parts = (k.encode() + v.numpy().tobytes() for k, v in sorted(state.items()))
+    return hashlib.sha256(b"".join(parts)).hexdigest()
+found = {}
+for path, revision in json.loads(sys.argv[1]):
+    adapter = load_adapter(PolicyConfig(path=path, revision=revision, device="cpu"))
+    found[path] = [digest(adapter.policy.state_dict()), digest(adapter.value_head.state_dict())]
+stock = get_policy_class("smolvla").from_pretrained(sys.argv[2])
+make_pre_post_processors(stock.config, pretrained_path=sys.argv[2])
+found["stock"] = digest(stock.state_dict())
+print(json.dumps(found))
+"""
+
+FRAMES = """
+import hashlib, json, sys
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+def digest(dataset):
+    frames = [dataset[i] for i in range(0, len(dataset), 30)]
+    values = (f[k].numpy().tobytes() for f in frames for k in sorted(f) if hasattr(f[k], "numpy"))
+    content = hashlib.sha256(b"".join(values)).hexdigest()
+    return [len(dataset), dataset.num_episodes, frames[0]["task"], content]
+here = digest(LeRobotDataset("any/name", root=sys.argv[2]))
+print(json.dumps([here, digest(LeRobotDataset(sys.argv[1]))]))
+"""
 
 
-def accerl(*arguments: str) -> int:
-    return cli.main(list(arguments))
+def accerl(*arguments: str) -> None:
+    assert cli.main(list(arguments)) == 0
 
 
 def fresh(server: HubServer, home: Path, code: str, *arguments: str) -> Any:
@@ -50,8 +86,8 @@ def fresh(server: HubServer, home: Path, code: str, *arguments: str) -> Any:
 
 
 @pytest.fixture
-def checkpoint(tiny_checkpoint: Path, tmp_path: Path) -> Path:
-    """The last checkpoint of a run, with a critic and a backbone of its own."""
+def run(tiny_checkpoint: Path, tmp_path: Path) -> Path:
+    """A run, whose last checkpoint has a critic and a backbone of its own."""
     config = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
     adapter = load_adapter(config)
     perturb(adapter, 0.1)
@@ -61,53 +97,90 @@ def checkpoint(tiny_checkpoint: Path, tmp_path: Path) -> Path:
         return 12
 
     save_checkpoint(tmp_path / "run" / "checkpoints", write, {"algorithm": "gipo"})
-    return tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
+    (tmp_path / "run" / "config.yaml").write_text(f"output_dir: {tmp_path}/run\njob_name: tiny\n")
+    write_json(tmp_path / "run" / "summary.json", SUMMARY)
+    return tmp_path / "run"
 
 
-LOAD = """
-import json, sys, hashlib
-from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.loading import load_adapter
-from accerl_lerobot.policies.plugins import register_policies
-path, revision = sys.argv[1], sys.argv[2] or None
-def digest(state):
-    return hashlib.sha256(b"".join(k.encode() + v.numpy().tobytes() for k, v in sorted(state.items()))).hexdigest()
-adapter = load_adapter(PolicyConfig(path=path, revision=revision, device="cpu"))
-found = {"policy": digest(adapter.policy.state_dict()), "critic": digest(adapter.value_head.state_dict())}
-if len(sys.argv) > 3:
+def test_policies_and_runs_load_wherever_they_are(hub: HubServer, run: Path, tmp_path: Path):
+    for name, path in (("alice/policy", run / LAST), ("alice/run", run)):
+        accerl("push", f"--path={path}", f"--repo_id={name}")
+    commit = hub.repo("alice/policy").branches["main"]
+    original = run.rename(tmp_path / "moved") / LAST  # whatever still names the old place is found out
+    accerl("pull", "--repo_id=alice/policy", f"--output_dir={tmp_path / 'policy'}")
+    accerl("pull", "--repo_id=alice/run", f"--output_dir={tmp_path / 'again'}")
+    hub.plant("alice/policy", {"model.safetensors": b"what came later"})
+    pulled, again = str(tmp_path / "policy"), str(tmp_path / "again" / LAST)
+    places = [(str(original), None), (pulled, None), (again, None), ("alice/policy", commit)]
+    found = fresh(hub, tmp_path / "home", LOAD, json.dumps(places), pulled)
+    assert {path: found[path] for path, _ in places} == dict.fromkeys(found.keys() - {"stock"}, found[pulled])
+    assert found["stock"] == found[pulled][0]
+    assert os.readlink(tmp_path / "again" / "checkpoints" / "last") == "000012"
+    assert json.loads((tmp_path / "again" / "summary.json").read_text()) == SUMMARY
+    assert (tmp_path / "again" / "config.yaml").read_text() == "output_dir: null\njob_name: tiny\n"
+    before = hub.files("alice/run")
+    accerl("push", f"--path={tmp_path / 'again'}", "--repo_id=alice/run")
+    assert hub.files("alice/run") == before, "there and back changes nothing"
+
+
+def test_a_policy_from_the_hub_can_be_improved_and_pushed_again(hub: HubServer, run: Path, tmp_path: Path):
+    accerl("push", f"--path={run / LAST}", "--repo_id=alice/policy")
+    config = PolicyConfig(path="alice/policy", device="cpu")
+    save_pretrained(load_adapter(config), tmp_path / "better", config)
+    stored = json.loads((tmp_path / "better" / "config.json").read_text())
+    assert stored["vlm_model_name"] == str(tmp_path / "better" / "backbone"), "as LeRobot wants it"
+    accerl("push", f"--path={tmp_path / 'better'}", "--repo_id=alice/better")
+    names = ("model.safetensors", "value_head.safetensors", "config.json", "policy_preprocessor.json")
+    first, second = hub.files("alice/policy"), hub.files("alice/better")
+    assert {n: first[n] for n in names} == {n: second[n] for n in names}
+
+
+def test_a_policy_that_is_not_there_is_an_error_of_one_line(hub: HubServer):
+    with pytest.raises(
+        InputError, match="policy.path='alice/nothing': not a directory here and not loadable"
+    ):
+        load_lerobot_config(PolicyConfig(path="alice/nothing", device="cpu"))
+
+
+def test_stock_lerobot_loads_a_policy_from_the_hub(hub: HubServer, tmp_path: Path):
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-    register_policies()
-    stock = get_policy_class(PreTrainedConfig.from_pretrained(path).type).from_pretrained(path)
-    make_pre_post_processors(stock.config, pretrained_path=path)
-    found["stock"] = digest(stock.state_dict())
-print(json.dumps(found))
-"""
+
+    folder = write_gaussian_actor(tmp_path / "actor")
+    accerl("push", f"--path={folder}", "--repo_id=alice/actor")
+    config = PreTrainedConfig.from_pretrained("alice/actor")
+    there = get_policy_class(config.type).from_pretrained("alice/actor")
+    make_pre_post_processors(config, pretrained_path="alice/actor")
+    here = get_policy_class(config.type).from_pretrained(folder).state_dict()
+    assert here.keys() == there.state_dict().keys()
+    assert all(torch.equal(value, here[key]) for key, value in there.state_dict().items())
 
 
-def test_a_policy(hub: HubServer, checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert accerl("push", f"--path={checkpoint}", f"--repo_id={NAME}") == 0
-    pushed = json.loads(capsys.readouterr().out)
-    commit = hub.repo(NAME).branches["main"]
-    assert pushed["commit"] == commit and pushed["kind"] == "policy" and hub.repo(NAME).private
-    moved = tmp_path / "elsewhere"
-    checkpoint.parents[2].rename(moved)  # whatever still names the old place is found out
-    assert accerl("pull", f"--repo_id={NAME}", f"--output_dir={tmp_path / 'pulled'}") == 0
-    pulled = json.loads(capsys.readouterr().out)
-    assert pulled["commit"] == commit and pulled["unchecked"] == 0 and pulled["checked"] > 8
-    record = json.loads((tmp_path / "pulled" / "accerl_pulled.json").read_text())
-    assert record["commit"] == commit and record["repo_id"] == NAME
-    home = str(tmp_path / "home")
-    before = fresh(hub, tmp_path / "home", LOAD, str(moved / "checkpoints/000012/pretrained_model"), "")
-    after = fresh(hub, tmp_path / "home", LOAD, str(tmp_path / "pulled"), "", "stock")
-    assert after["stock"] == after.pop("stock") == after["policy"]
-    assert before == after
-    assert not list(tmp_path.glob(".pulling-*")) and not Path(home, "hub", "models--alice--door").exists()
+def test_a_dataset_is_one_that_lerobot_finds(hub: HubServer, tmp_path: Path):
+    accerl("push", f"--path={TINY}", "--repo_id=alice/tiny")
+    accerl("pull", "--repo_id=alice/tiny", f"--output_dir={tmp_path / 'tiny'}")
+    here, there = fresh(hub, tmp_path / "home", FRAMES, "alice/tiny", str(tmp_path / "tiny"))
+    assert here == there and here[:3] == [365, 4, "Open a drawer"]
+    pulled = {p.relative_to(tmp_path / "tiny"): p.read_bytes() for p in (tmp_path / "tiny").rglob("*.*")}
+    assert {p.relative_to(TINY): p.read_bytes() for p in TINY.rglob("*.*")}.items() <= pulled.items()
 
 
-def test_a_policy_straight_from_the_hub_at_a_commit(hub: HubServer, checkpoint: Path, tmp_path: Path):
-    assert accerl("push", f"--path={checkpoint}", f"--repo_id={NAME}") == 0
-    commit = hub.repo(NAME).branches["main"]
-    hub.plant(NAME, {"model.safetensors": b"something else"})
-    home = tmp_path / "home"
-    assert fresh(hub, home, LOAD, NAME, commit) == fresh(hub, home, LOAD, str(checkpoint), "")
+def test_world_models_and_success_models(hub: HubServer, tmp_path: Path):
+    from accerl_lerobot.world_model.store import Source, load_source, load_world_model, save_world_model
+    from accerl_lerobot.world_model.success import new_success_model
+    from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+
+    source = Source(repo_id="a/b", fingerprint="f", learnt=(0, 2), held_out=(1,))
+    world, success = model(), new_success_model(5)
+    save_world_model(tmp_path / "world_model", world, success, source)
+    accerl("push", f"--path={tmp_path / 'world_model'}", "--repo_id=alice/world")
+    accerl("push", f"--path={tmp_path / 'world_model' / 'success_model'}", "--repo_id=alice/success")
+    accerl("pull", "--repo_id=alice/world", f"--output_dir={tmp_path / 'pulled'}")
+    came, judge = load_world_model(tmp_path / "pulled")
+    assert load_source(tmp_path / "pulled") == source and came.spec == world.spec and judge is not None
+    for first, second in ((world, came), (success, judge)):
+        assert all(torch.equal(value, second.state_dict()[key]) for key, value in first.state_dict().items())
+    alone = SuccessPairsRewardModel.from_pretrained("alice/success", strict=True)
+    frames = torch.from_numpy(np.random.default_rng(0).random((2, 1, 3, 16, 16), dtype=np.float32))
+    with torch.no_grad():
+        assert torch.equal(alone.logits(frames, frames)[0], judge.logits(frames, frames)[0])
