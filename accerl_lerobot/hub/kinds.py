@@ -101,4 +101,4 @@ def _hint(folder: Path) -> str:
     if (folder / "world_model").is_dir():
         return "name the folder world_model in it"
     shapes = [f"a {kind} has {', '.join(NEEDED[kind])}" for kind in (POLICY, WORLD_MODEL, DATASET, RUN)]
-    return f"nothing that can be pushed: {'; '.join(shapes)}; a success model has what a world model has"
+    return f"nothing that we know: {'; '.join(shapes)}; a success model has what a world model has"

@@ -171,7 +171,7 @@ def test_files_changed_since_the_push(
     [
         ({"policy_preprocessor.json": b"[1]"}, "is not one of LeRobot's"),
         ({"config.json": b'{"spec": {}, "model": {}}'}, "says policy, but this is a world model"),
-        ({"config.json": b"[]"}, "nothing that can be pushed"),
+        ({"config.json": b"[]"}, "nothing that we know"),
     ],
 )
 def test_files_that_are_no_policy(
