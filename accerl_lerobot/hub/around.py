@@ -69,27 +69,32 @@ def look_around(folder: Path, kind: str, evaluation: str | None) -> Around:
     """
     if evaluation is not None and kind not in (POLICY, RUN):
         raise InputError("evaluation", evaluation, f"only a policy is evaluated, this is a {kind}")
-    carried = folder / FOLDER
-    home = folder if kind == RUN else carried if carried.is_dir() else _run_of(folder.resolve(), kind)
-    known: dict[str, Any] = {}
-    files: dict[str, Path] = {}
-    if home is not None:
-        mine = kind == RUN or home == carried or _is_last(folder.resolve(), home)
-        known = {"recipe": _recipe(home / RECIPE), "trial": read_json(home / TRIAL)}
-        if kind in (POLICY, RUN) and mine:
-            known |= {"summary": read_json(home / SUMMARY), "evaluation": read_json(home / EVALUATION)}
-        if kind != RUN:
-            names = [n for n in KEPT[kind] if mine or kind != POLICY or n == RECIPE]
-            if home != carried:
-                names = [n for n in names if n != EVALUATION]
-                known.pop("evaluation", None)
-            files = {f"{FOLDER}/{n}": home / n for n in names if (home / n).is_file()}
+    known, files = _known(folder, kind)
     if evaluation is not None:
         path = Path(evaluation).expanduser()
         path = path / EVALUATION if path.is_dir() else path
         known["evaluation"] = _evaluation(path, folder, kind)
         files[EVALUATION if kind == RUN else f"{FOLDER}/{EVALUATION}"] = path
     return Around(**known, files=files)
+
+
+def _known(folder: Path, kind: str) -> tuple[dict[str, Any], dict[str, Path]]:
+    """Fields of an `Around`, and files of the run that go with the folder."""
+    carried = folder / FOLDER
+    if kind == RUN or carried.is_dir():  # an evaluation is there only if one was given to an earlier push
+        home = folder if kind == RUN else carried
+        records = {"summary": read_json(home / SUMMARY), "evaluation": read_json(home / EVALUATION)}
+        names = KEPT.get(kind, ())
+    elif (run := _run_of(folder.resolve(), kind)) is not None:
+        home = run
+        last = kind == POLICY and _is_last(folder.resolve(), run)
+        records = {"summary": read_json(run / SUMMARY) if last else {}}
+        names = KEPT[kind] if last or kind != POLICY else (RECIPE,)
+        names = tuple(name for name in names if name != EVALUATION)
+    else:
+        return {}, {}
+    known = records | {"recipe": _recipe(home / RECIPE), "trial": read_json(home / TRIAL)}
+    return known, {f"{FOLDER}/{name}": home / name for name in names if (home / name).is_file()}
 
 
 def _run_of(folder: Path, kind: str) -> Path | None:

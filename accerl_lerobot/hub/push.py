@@ -92,7 +92,7 @@ class _Push:
 
     def run(self) -> dict[str, Any]:
         parent = self._prepare()
-        before = self._before(parent) if parent is not None else None
+        before = self._before(parent)
         self._keep_their_card(parent)
         entries = {name: entry_of(content) for name, content in self.files.items() if name != CARD}
         uploads = dict(self.files) | {MANIFEST: write_manifest(Manifest(self.kind, entries))}
@@ -130,7 +130,7 @@ class _Push:
             "url": f"{self.api.endpoint}/{prefix}{self.repo_id}",
         }
 
-    def _prepare(self) -> str | None:
+    def _prepare(self) -> str:
         """Makes the repository if need be; returns the commit to go on top of.
 
         Raises:
@@ -151,7 +151,7 @@ class _Push:
             make = f"hf repos branch create {self.repo_id} {self.revision}"
             remedy = f"{self.repo_id} has no such branch, but {there}; make it with '{make}'"
             raise InputError("revision", self.revision, remedy)
-        return branches[self.revision]
+        return str(branches[self.revision])
 
     def _create(self) -> None:
         (other,) = set(REPO_TYPES) - {self.type}
@@ -172,15 +172,19 @@ class _Push:
         data = self._read(MANIFEST, commit)
         if data is None:
             return None
-        before = read_manifest(data, self.repo_id)
+        try:
+            before = read_manifest(data, self.repo_id)
+        except InputError as error:
+            logger.warning("%s", error)  # which this push does
+            return None
         if before.kind != self.kind:
             remedy = f"it holds a {before.kind}, and this is a {self.kind}; choose another name or branch"
             raise InputError("repo_id", self.repo_id, remedy)
         return before
 
-    def _keep_their_card(self, commit: str | None) -> None:
+    def _keep_their_card(self, commit: str) -> None:
         """Somebody may have written a card on the Hub; it gives way only to one of the user's own."""
-        if commit is None or self.own_card:
+        if self.own_card:
             return
         there = self._read(CARD, commit)
         if there is not None and MARK.encode() not in there and there.strip():
@@ -196,7 +200,7 @@ class _Push:
             return None
         return Path(path).read_bytes()
 
-    def _names(self, commit: str | None) -> set[str]:
+    def _names(self, commit: str) -> set[str]:
         return set(self.api.list_repo_files(self.repo_id, revision=commit, repo_type=self.type))
 
     def _tag(self, commit: str) -> None:

@@ -218,6 +218,16 @@ def test_a_push_replaces_what_the_last_one_left_and_nothing_else(
     assert "notes.json" not in hub.files(NAME) and hub.files(NAME)["added on the Hub.txt"] == b"by hand"
 
 
+def test_a_broken_list_of_files_is_replaced(
+    hub: HubServer, policy: Path, pushed: Callable[..., dict[str, Any]], caplog: pytest.LogCaptureFixture
+):
+    pushed(policy)
+    hub.plant(NAME, {"accerl_manifest.json": b"{"})
+    pushed(policy)
+    assert "accerl_manifest.json is broken" in caplog.text
+    assert json.loads(hub.files(NAME)["accerl_manifest.json"])["kind"] == "policy"
+
+
 def test_a_card_written_on_the_hub_stays(hub: HubServer, policy: Path, pushed: Callable[..., dict[str, Any]]):
     pushed(policy)
     assert MARK.encode() in hub.files(NAME)["README.md"]
