@@ -28,6 +28,7 @@ import torch
 
 from accerl_lerobot import cli
 from accerl_lerobot.checkpoint import save_checkpoint
+from accerl_lerobot.demos.sft import SFTConfig, sft_command
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, save_pretrained
@@ -133,6 +134,18 @@ def test_a_policy_from_the_hub_can_be_improved_and_pushed_again(hub: HubServer, 
     names = ("model.safetensors", "value_head.safetensors", "config.json", "policy_preprocessor.json")
     first, second = hub.files("alice/policy"), hub.files("alice/better")
     assert {n: first[n] for n in names} == {n: second[n] for n in names}
+
+
+def test_fine_tuning_one_with_its_own_backbone_wants_a_folder(hub: HubServer, run: Path, tmp_path: Path):
+    accerl("push", f"--path={run / LAST}", "--repo_id=alice/policy")
+    accerl("pull", "--repo_id=alice/policy", f"--output_dir={tmp_path / 'pulled'}")
+
+    def command(path: str) -> list[str]:
+        return sft_command(SFTConfig(steps=1, init_path=path), "a/b", None, tmp_path / "sft", 0, "cpu")
+
+    with pytest.raises(InputError, match="accerl pull it, and name that"):
+        command("alice/policy")
+    assert f"--policy.path={tmp_path / 'pulled'}" in command(str(tmp_path / "pulled"))
 
 
 def test_a_policy_that_is_not_there_is_an_error_of_one_line(hub: HubServer):
