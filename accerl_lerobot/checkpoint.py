@@ -13,12 +13,21 @@
 # limitations under the License.
 """Checkpoints in LeRobot's layout, visible only when whole.
 
-``checkpoints/NNNNNN/pretrained_model`` holds what stock LeRobot loads; ``checkpoints/last`` points at the
-newest. A checkpoint is written under a temporary name and renamed, so that a reader never finds half of one.
+    checkpoints/NNNNNN/
+      pretrained_model/     what stock LeRobot loads
+      training_state/       what a run needs to go on, see `snapshot`; `training_step.json` is LeRobot's
+      world_model/          what dreams, where it has learnt on
+      config.yaml           the run's
+      manifest.json         size and SHA-256 of all of these
+    checkpoints/last        the newest
+
+A checkpoint is written under another name, its manifest last, and renamed, so that a reader never finds half
+of one. Whoever goes on from one looks at every byte first.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -26,7 +35,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-PRETRAINED = "pretrained_model"
+from accerl_lerobot.errors import InputError
+
+PRETRAINED, TRAINING_STATE, WORLD_MODEL = "pretrained_model", "training_state", "world_model"
+CONFIG, MANIFEST, LAST, WRITING = "config.yaml", "manifest.json", "last", ".writing-"
+RUN_STATE, WEIGHTS = "run", "weights"
+"""Names of states in `TRAINING_STATE`: how far the run has come; what is trained, exactly as it is."""
+STEP = "training_step.json"
+"""LeRobot's file of how far it has come."""
+FORMAT = 1
+"""Of the manifest and the training state; another one is refused."""
 BACKBONE = "backbone"
 """Folder beside the weights with the vision-language backbone's config and tokenisers."""
 FAST = f"{BACKBONE}/fast"
@@ -42,40 +60,166 @@ PREPROCESSOR = "policy_preprocessor.json"
 """LeRobot's file of the processor steps before the policy."""
 
 
-def save_checkpoint(checkpoints: Path, write: Callable[[Path], int], state: dict[str, Any]) -> Path:
-    """Writes one checkpoint and points ``last`` at it.
+def save_checkpoint(checkpoints: Path, write: Callable[[Path], int]) -> Path:
+    """Writes one checkpoint and points ``last`` at it; both survive a loss of power once this returns.
 
     Args:
         checkpoints: the run's ``checkpoints`` folder.
-        write: creates and fills the ``pretrained_model`` folder it is given and returns the version of what
-            it wrote, the number of updates behind it.
-        state: plain JSON, stored as ``training_state/training_step.json``; ``step`` is added.
+        write: creates and fills ``pretrained_model``, and what else there is to be, in the folder it is
+            given, and returns the version of what it wrote, the number of updates behind it.
 
     Returns:
-        ``checkpoints/NNNNNN``, left as it is if that version has been saved before.
+        ``checkpoints/NNNNNN``, left as it is if that version has been saved before, whole.
 
     Raises:
         Exception: whatever `write` raises; older checkpoints and ``last`` are as before.
     """
     checkpoints.mkdir(parents=True, exist_ok=True)
-    temporary = checkpoints / f".writing-{os.getpid()}"
-    shutil.rmtree(temporary, ignore_errors=True)
+    for left in checkpoints.glob(f"{WRITING}*"):  # by a process that was killed
+        shutil.rmtree(left)
+    temporary = checkpoints / f"{WRITING}{os.getpid()}"
     try:
-        version = write(temporary / PRETRAINED)
+        temporary.mkdir()
+        version = write(temporary)
         final = checkpoints / f"{version:06d}"
-        if not final.exists():  # the same version is the same weights
+        if defect(final) is not None:  # else: the same version is the same weights
             relocate(temporary / PRETRAINED, final / PRETRAINED)
-            (temporary / "training_state").mkdir()
-            step = json.dumps({"step": version, **state}, indent=2)
-            (temporary / "training_state" / "training_step.json").write_text(step + "\n")
+            (temporary / TRAINING_STATE).mkdir(exist_ok=True)
+            step = json.dumps({"step": version}, indent=2)
+            (temporary / TRAINING_STATE / STEP).write_text(step + "\n")
+            write_manifest(temporary)
+            _make_durable(temporary)
+            shutil.rmtree(final, ignore_errors=True)
             temporary.rename(final)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     link = checkpoints / ".last-new"
     link.unlink(missing_ok=True)
     link.symlink_to(final.name)
-    link.replace(checkpoints / "last")
+    link.replace(checkpoints / LAST)
+    _sync(checkpoints)
     return final
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Replaces a file in one stroke: readers find the old one or the new one, even after a loss of power."""
+    new = path.with_name(f".{path.name}.new")
+    new.write_text(text)
+    _sync(new)
+    new.replace(path)
+    _sync(path.parent)
+
+
+def write_manifest(directory: Path, without: str = MANIFEST) -> None:
+    """Writes the size and SHA-256 of every file in a checkpoint, in one stroke; but of those in `without`."""
+    files = {
+        str(path.relative_to(directory)): {"size": path.stat().st_size, "sha256": _digest(path)}
+        for path in sorted(directory.rglob("*"))
+        if path.is_file() and path.relative_to(directory).parts[0] not in (MANIFEST, without)
+    }
+    write_atomically(directory / MANIFEST, json.dumps({"format": FORMAT, "files": files}, indent=2) + "\n")
+
+
+def defect(directory: Path) -> str | None:
+    """Why a checkpoint is not what was written; None if it is, byte by byte."""
+    try:
+        manifest = _manifest(directory)
+        if manifest["format"] != FORMAT:
+            return f"its format is {manifest['format']}, and this accerl reads {FORMAT}"
+        files = {str(name): (int(v["size"]), str(v["sha256"])) for name, v in manifest["files"].items()}
+    except FileNotFoundError:
+        return f"it has no {MANIFEST}"
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        return f"its {MANIFEST} is broken ({' '.join(str(error).split())[:80]})"
+    for name, (size, digest) in files.items():
+        path = directory / name
+        if Path(name).is_absolute() or ".." in Path(name).parts:
+            return f"its {MANIFEST} names {name!r}, outside of it"
+        if not path.is_file():
+            return f"{name} is missing"
+        if path.stat().st_size != size:
+            return f"{name} has {path.stat().st_size} bytes, not {size}"
+        if _digest(path) != digest:
+            return f"{name} is not what was written"
+    return None
+
+
+def newest_whole(checkpoints: Path, wanted: str = LAST) -> tuple[Path, list[str]]:
+    """The checkpoint to go on from.
+
+    Args:
+        checkpoints: the run's folder of them.
+        wanted: which one; where it is broken, or its training state was let go, the newest before it.
+
+    Returns:
+        Its folder, and why each that was passed over was.
+
+    Raises:
+        InputError: none is left.
+    """
+    numbers = _numbered(checkpoints)
+    if wanted != LAST:
+        if checkpoints / wanted not in numbers:
+            names = ", ".join(p.name for p in numbers) or "none"
+            raise InputError(
+                "config_path", str(checkpoints / wanted), f"no such checkpoint; there are {names}"
+            )
+        numbers = numbers[: numbers.index(checkpoints / wanted) + 1]
+    passed: list[str] = []
+    for path in reversed(numbers):
+        why = defect(path)
+        if why is None and f"{TRAINING_STATE}/{RUN_STATE}.json" not in _manifest(path)["files"]:
+            why = "its training state was not kept, see save_keep"
+        if why is None:
+            return path, passed
+        passed.append(f"{path.name}: {why}")
+    said = "; ".join(passed) or "there is none"
+    remedy = (
+        f"no checkpoint here can be gone on from ({said}); begin a new run from a policy, with --policy.path"
+    )
+    raise InputError("config_path", str(checkpoints), remedy)
+
+
+def saved_version(state: Path) -> int:
+    """Updates behind what a ``training_state`` holds."""
+    return int(json.loads((state / STEP).read_text())["step"])
+
+
+def let_go(checkpoints: Path, keep: int) -> None:
+    """Removes the training state of all but the newest `keep` checkpoints; their policies stay."""
+    having = [path for path in _numbered(checkpoints) if (path / TRAINING_STATE).is_dir()]
+    for path in having[: max(0, len(having) - keep)]:
+        write_manifest(path, without=TRAINING_STATE)  # first, or one half removed would count as broken
+        shutil.rmtree(path / TRAINING_STATE)
+
+
+def _numbered(checkpoints: Path) -> list[Path]:
+    """The oldest first."""
+    return sorted((p for p in checkpoints.glob("*") if p.name.isdigit()), key=lambda p: int(p.name))
+
+
+def _manifest(directory: Path) -> Any:
+    return json.loads((directory / MANIFEST).read_text())
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _make_durable(directory: Path) -> None:
+    """Has the disk hold all files in a folder, and their names."""
+    for path in sorted(directory.rglob("*"), reverse=True):
+        _sync(path)
+    _sync(directory)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def relocate(directory: Path, home: Path) -> None:

@@ -89,13 +89,34 @@ class RunConfig:
     launch: LaunchConfig = field(default_factory=LaunchConfig)
     wandb: WandBConfig = field(default_factory=WandBConfig)
     save_every_updates: int = 0
-    """Checkpoint every so many updates; 0: only at the end."""
+    """Checkpoint every so many updates; 0: none by their number."""
+    save_every_s: float = 600.0
+    """Checkpoint at least every so many seconds of training; 0: none by time. There is one at the end in any
+    case, and when the run is asked to stop; before the training there is one if there are any by number or
+    time."""
+    save_keep: int = 2
+    """Checkpoints that keep what it takes to go on from them, the newest ones, at least 1; the others keep
+    their policies."""
+    resume: bool = False
+    """Go on with the run whose config is ``--config_path``: ``RUN/config.yaml``, or that of one of its
+    checkpoints, ``RUN/checkpoints/last/config.yaml``."""
+
+    @property
+    def saves(self) -> bool:
+        """Whether there are checkpoints on the way."""
+        return bool(self.save_every_updates or self.save_every_s)
 
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 100:
             raise InputError("seed", self.seed, "use 0 to 99")
         if self.save_every_updates < 0:
-            raise InputError("save_every_updates", self.save_every_updates, "use 0 (only at the end) or more")
+            raise InputError("save_every_updates", self.save_every_updates, "use 0 (none by number) or more")
+        if not self.save_every_s >= 0:
+            raise InputError("save_every_s", self.save_every_s, "use 0 (none by time) or more seconds")
+        if self.save_keep < 1:
+            raise InputError(
+                "save_keep", self.save_keep, "use at least 1, or the run could not be gone on with"
+            )
         if self.demos.seed:
             raise InputError(
                 "demos.seed", self.demos.seed, "a run's demonstrations take its own seed; use --seed"

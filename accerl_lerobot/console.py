@@ -64,7 +64,9 @@ class Console:
 
     def say(self, text: str) -> None:
         """One line, with the seconds since the start."""
-        self.rich.print(f"[{time.monotonic() - self._started:6.1f} s] {text}", highlight=False, markup=False)
+        line = f"[{time.monotonic() - self._started:6.1f} s] {text}"
+        # Not wrapped: commands and paths in it are there to be copied.
+        self.rich.print(line, highlight=False, markup=False, soft_wrap=True)
 
     @contextmanager
     def stage(self, name: str, total: int | None = None) -> Iterator[Stage]:

@@ -19,6 +19,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 
@@ -43,8 +44,17 @@ class Progress:
     """Empty where nothing is imagined."""
 
 
+class Saved(NamedTuple):
+    """What was written."""
+
+    version: int
+    """Of the policy: updates behind it."""
+    updates: list[dict[str, float]]
+    """Metrics of those updates among them that `Engine.poll` has not reported, and will not any more."""
+
+
 class Engine(ABC):
-    """Worlds, policy and trainer, ready to go.
+    """Worlds, policy and trainer, ready to go; or to go on, from what `save` has written.
 
     Example:
         >>> engine.plan(evaluation_plans(tasks, 100, "before"))   # runs at once, nothing else does
@@ -74,8 +84,12 @@ class Engine(ABC):
         """
 
     @abstractmethod
-    def save(self, directory: Path) -> int:
-        """Writes the current policy as LeRobot files; returns its version."""
+    def save(self, directory: Path) -> Saved:
+        """Writes a checkpoint's ``pretrained_model`` and ``training_state``, see `checkpoint`.
+
+        All of it is as it was after one and the same update: no segment that was learnt from later counts as
+        learnt from, and no planned episode is reported twice.
+        """
 
     @abstractmethod
     def close(self) -> None:

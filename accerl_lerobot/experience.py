@@ -24,6 +24,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from accerl_lerobot.snapshot import kind
+
 Observation = dict[str, np.ndarray | str]
 """One observation under LeRobot's feature names.
 
@@ -51,6 +53,7 @@ class Request:
     """False asks for LeRobot's stock sampler, the one evaluation uses."""
 
 
+@kind
 @dataclass(frozen=True, kw_only=True)
 class Decision:
     """One policy call, as the inference service answers it.
@@ -73,6 +76,7 @@ class Decision:
     """Number of optimiser steps behind the weights that decided."""
 
 
+@kind
 class Origin(NamedTuple):
     """Where in which episode something begins."""
 
@@ -84,6 +88,7 @@ class Origin(NamedTuple):
     """Decisions made before."""
 
 
+@kind
 @dataclass(kw_only=True)
 class Segment:
     """T consecutive decisions of one episode, plus the observation after the last one.

@@ -35,26 +35,23 @@ import logging
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import ray
-from ray.exceptions import RayActorError, RayError, RayTaskError
+from ray.exceptions import RayError, RayTaskError
 
+from accerl_lerobot.checkpoint import TRAINING_STATE, saved_version
 from accerl_lerobot.config import RunConfig
-from accerl_lerobot.engine import Engine, Progress, check_new, episode_key
+from accerl_lerobot.engine import Engine, Progress, Saved
 from accerl_lerobot.inference.worker import ServiceStoppedError
-from accerl_lerobot.ray_environment import TOKENLESS
-from accerl_lerobot.rollout.plans import budgets, whole_groups
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
+from accerl_lerobot.seats import START_S, Seats
 from accerl_lerobot.watched import Watched
 
 logger = logging.getLogger(__name__)
 
 POLL_S = 0.5
-START_S = 600.0
-"""How long a worker may take to start; `LaunchConfig.stall_s` counts from its first answer."""
 BLAME_S = 10.0
 """How long to wait for the failure that another failure is the consequence of."""
 
@@ -70,24 +67,6 @@ def start_ray() -> None:
     )
 
 
-@dataclass(kw_only=True)
-class _Seat:
-    """A rollout worker's place, which outlives the processes that take it in turn."""
-
-    index: int
-    worker: Watched
-    incarnation: int = 0
-    outstanding: dict[tuple[str, int], EpisodePlan] = field(default_factory=dict)
-    """Planned episodes without a result; whoever sits here next runs them."""
-    unsent: list[EpisodePlan] = field(default_factory=list)
-    counters: dict[str, float] = field(default_factory=dict)
-    in_world_s: float = 0.0
-    budget: int | None = None
-    """Exploring episodes that are still to be played; None: no end."""
-    spent: bool = False
-    """Whether all of them are in replay."""
-
-
 class RayEngine(Engine):
     """The asynchronous engine.
 
@@ -95,16 +74,19 @@ class RayEngine(Engine):
         config: the run; its ``policy.path`` must be set.
         tasks: the training tasks.
         history: env steps that an observation holds, the policy's ``n_obs_steps``.
+        state: the ``training_state`` to go on from, but for episodes under way, which are lost; None: begin.
 
     Raises:
+        InputError: the state is of a run in one process.
         RuntimeError: a worker did not start; carries its own traceback.
     """
 
-    def __init__(self, config: RunConfig, tasks: tuple[str, ...], history: int = 1) -> None:
-        self._config, self._tasks, self._history = config, tasks, history
+    def __init__(
+        self, config: RunConfig, tasks: tuple[str, ...], history: int = 1, state: Path | None = None
+    ) -> None:
+        self._config, self._state = config, state
         self._services: list[Watched] = []
-        self._seats: list[_Seat] = []
-        self._past: dict[str, float] = {"restarts": 0.0}
+        self._seats = Seats(config, tasks, history, state)
         self._updates: list[dict[str, float]] = []
         self._replay_metrics: dict[str, float] = {}
         self._inference_metrics: dict[str, float] = {}
@@ -113,7 +95,7 @@ class RayEngine(Engine):
         self._learner: Watched | None = None
         self._real_ended = False
         self._training = self._done = self._closed = False
-        self._version = 0
+        self._version = 0 if state is None else saved_version(state)
         self._last_change = time.monotonic()
         self._last_state: tuple[object, ...] = ()
         self._started_ray = not ray.is_initialized()
@@ -126,11 +108,7 @@ class RayEngine(Engine):
             raise
 
     def plan(self, plans: list[EpisodePlan]) -> None:
-        check_new(plans, {key for seat in self._seats for key in seat.outstanding})
-        for seat in self._seats:
-            mine = plans[seat.index :: len(self._seats)]
-            seat.outstanding |= {episode_key(p): p for p in mine}
-            seat.unsent += mine
+        self._seats.plan(plans)
         self._last_change = time.monotonic()  # whatever the caller did before took its time
 
     def train(self) -> None:
@@ -146,10 +124,6 @@ class RayEngine(Engine):
         self._await_end()
         episodes = self._listen()
         self._check_hung()
-        totals = dict(self._past)
-        for seat in self._seats:
-            for key, value in seat.counters.items():
-                totals[key] = totals.get(key, 0.0) + value
         updates, self._updates = self._updates, []
         if updates:
             self._version = int(updates[-1]["update"])
@@ -158,7 +132,7 @@ class RayEngine(Engine):
             done=self._done,
             updates=updates,
             episodes=episodes,
-            rollout=totals,
+            rollout=self._seats.counters(),
             replay=self._replay_metrics,
             inference=self._inference_metrics,
             imagination=self._imagination_metrics,
@@ -166,10 +140,17 @@ class RayEngine(Engine):
         self._check_moving(progress)
         return progress
 
-    def save(self, directory: Path) -> int:
-        version = int(self._trainer.call("save", str(directory.absolute()), timeout=self._limit))
-        self._last_change = time.monotonic()  # the trainer could not move meanwhile
-        return version
+    def save(self, directory: Path) -> Saved:
+        directory = directory.absolute()
+        state = directory / TRAINING_STATE
+        # What the trainer has told already is heard first: all other records up to its version come with it.
+        told = self._updates + (self._hear(self._trainer, self._limit) or [])
+        self._updates = []
+        version, records = self._trainer.call("save", directory, timeout=self._limit)
+        self._replay.call("save", state, version, timeout=self._limit)
+        self._seats.save(state)
+        self._last_change = time.monotonic()
+        return Saved(version, told + records)
 
     def close(self) -> None:
         if self._closed:
@@ -194,7 +175,7 @@ class RayEngine(Engine):
     def _everyone(self) -> Iterator[Watched]:
         """Those that others depend on first."""
         yield from self._services
-        yield from (seat.worker for seat in self._seats)
+        yield from self._seats.workers()
 
     def _start(self) -> None:
         from accerl_lerobot.inference.worker import InferenceWorker
@@ -207,13 +188,18 @@ class RayEngine(Engine):
         users = 2 + (imagination.share > 0) + imagination.learns
         share = 0.0 if c.policy.device == "cpu" or not gpus else 1 / math.ceil(users / gpus)
         inference = ray.remote(InferenceWorker).options(num_cpus=0, num_gpus=share, max_concurrency=1000)
-        self._inference = self._service("inference", inference.remote(c.policy, c.inference))
+        self._inference = self._service(
+            "inference", inference.remote(c.policy, c.inference, self._version, self._state)
+        )
         replay = ray.remote(ReplayWorker).options(num_cpus=0, num_gpus=0, max_concurrency=1000)
         imagined, counted = imagination.replay if imagination.share else None, c.rollout.episodes > 0
-        self._replay = self._service("replay", replay.remote(c.replay, c.seed, imagined, counted))
+        self._replay = self._service(
+            "replay", replay.remote(c.replay, c.seed, imagined, counted, self._state)
+        )
         threads = {"num_cpus": 0, "num_gpus": share, "max_concurrency": 4}
         trainer = ray.remote(TrainerWorker).options(**threads)
-        self._trainer = self._service("trainer", trainer.remote(c.policy, c.algorithm, c.trainer, c.seed))
+        learns = trainer.remote(c.policy, c.algorithm, c.trainer, c.seed, self._state)
+        self._trainer = self._service("trainer", learns)
         if imagination.share:
             from accerl_lerobot.world_model.worker import DreamWorker, WorldLearningWorker
 
@@ -221,43 +207,22 @@ class RayEngine(Engine):
             if imagination.learns:
                 learner = ray.remote(WorldLearningWorker).options(**threads)
                 self._learner = self._service("world learning", learner.remote(c))
-        for index, budget in enumerate(budgets(c.rollout)):
-            worker = self._new_rollout(index, 0, budget)
-            self._seats.append(_Seat(index=index, worker=worker, budget=budget, spent=budget == 0))
+        self._seats.start()
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
         for worker, reference in ready:
             worker.result(reference, "ready", max(START_S, self._limit))
         self._inference.work = self._inference.actor.serve.remote()
         self._replay.work = self._replay.actor.run.remote()
-        for seat in self._seats:
-            self._set_to_work(seat)
+        self._seats.set_to_work(self._inference.actor, self._replay.actor)
 
     def _service(self, name: str, actor: Any) -> Watched:
         self._services.append(Watched(name, actor))
         return self._services[-1]
 
-    def _new_rollout(self, index: int, incarnation: int, budget: int | None) -> Watched:
-        from accerl_lerobot.rollout.worker import RolloutWorker
-
-        c = self._config
-        film = (c.evaluation.video_size, c.evaluation.video_every)
-        actor = ray.remote(RolloutWorker).options(num_cpus=0, num_gpus=0, max_concurrency=4, **TOKENLESS)
-        return Watched(
-            f"rollout {index}",
-            actor.remote(
-                c.env, c.rollout, self._tasks, c.seed, index, incarnation, film, self._history, budget
-            ),
-        )
-
-    def _set_to_work(self, seat: _Seat) -> None:
-        seat.worker.work = seat.worker.actor.run.remote(self._inference.actor, self._replay.actor)
-
     def _ask(self) -> None:
         for worker in self._services:
             worker.ask("metrics")
-        for seat in self._seats:
-            if seat.worker.ask("report", self._training and not self._done, seat.unsent):
-                seat.unsent = []
+        self._seats.ask(self._training and not self._done)
 
     def _await_end(self) -> None:
         """Waits a little, and deals with every worker whose long call has ended."""
@@ -277,9 +242,8 @@ class RayEngine(Engine):
         except RayError as error:
             if isinstance(error, RayTaskError) and isinstance(error.cause, RayError | ServiceStoppedError):
                 self._blame()
-            for seat in self._seats:
-                if seat.worker is worker:
-                    return self._restart(seat, error)
+            if self._seats.restart_worker(worker, error):
+                return
             raise RuntimeError(f"{worker.name} worker failed for good:\n{error}") from error
         if worker is self._trainer:
             self._finish(int(result))
@@ -310,24 +274,8 @@ class RayEngine(Engine):
         for imaginer in (self._dreamer, self._learner):
             if imaginer is not None:
                 self._imagination_metrics |= self._hear(imaginer) or {}
-        episodes: list[EpisodeResult] = []
-        for seat in self._seats:
-            try:
-                report = seat.worker.answer()
-            except RayActorError:
-                continue  # its `run` has ended as well, and the next poll deals with that
-            except RayError as error:
-                raise RuntimeError(f"{seat.worker.name} worker failed to report:\n{error}") from error
-            if report is not None:
-                seat.counters, seat.in_world_s = report.counters, report.in_world_s
-                seat.spent = report.spent
-                if seat.budget is not None:
-                    seat.budget -= sum(e.plan.explore for e in report.episodes)
-                for episode in report.episodes:
-                    planned = seat.outstanding.pop(episode_key(episode.plan), None)
-                    if episode.plan.explore or planned is not None:
-                        episodes.append(episode)
-        if not self._real_ended and all(seat.spent for seat in self._seats):
+        episodes = self._seats.listen()
+        if not self._real_ended and self._seats.spent:
             self._real_ended = True
             self._replay.call("end_real", timeout=self._limit)
         return episodes
@@ -338,30 +286,6 @@ class RayEngine(Engine):
         except RayError as error:
             raise RuntimeError(f"{worker.name} worker failed for good:\n{error}") from error
 
-    def _restart(self, seat: _Seat, error: Exception) -> None:
-        """Puts a new process into a rollout worker's seat.
-
-        Raises:
-            RuntimeError: it has been done `RolloutConfig.max_restarts` times; carries the worker's traceback.
-        """
-        name = seat.worker.name
-        if seat.incarnation >= self._config.rollout.max_restarts:
-            times = f" after {seat.incarnation} restarts" if seat.incarnation else ""
-            raise RuntimeError(f"{name} worker failed for good{times}:\n{error}") from error
-        reason = str(error).strip().splitlines()[-1][:200]
-        logger.warning("%s worker is started again: %s", name, reason)
-        ray.kill(seat.worker.actor)
-        self._past["restarts"] += 1
-        for key, value in seat.counters.items():
-            self._past[key] = self._past.get(key, 0.0) + value
-        seat.counters, seat.in_world_s = {}, 0.0
-        seat.incarnation += 1
-        if seat.budget is not None:
-            seat.budget = whole_groups(seat.budget, self._config.rollout)
-        seat.worker = self._new_rollout(seat.index, seat.incarnation, seat.budget)
-        seat.unsent = list(seat.outstanding.values())
-        self._set_to_work(seat)
-
     def _check_hung(self) -> None:
         """Starts a rollout worker again that does not answer or whose world does not return.
 
@@ -371,12 +295,7 @@ class RayEngine(Engine):
         for worker in self._services:
             if worker.silent_s() > self._limit:
                 raise RuntimeError(f"{worker.name} worker has not answered for {worker.silent_s():.0f} s")
-        for seat in self._seats:
-            silent = seat.worker.silent_s()
-            if silent > (self._limit if seat.worker.answered else max(START_S, self._limit)):
-                self._restart(seat, RuntimeError(f"no answer for {silent:.0f} s"))
-            elif seat.in_world_s > self._limit:
-                self._restart(seat, RuntimeError(f"its world has not returned for {seat.in_world_s:.0f} s"))
+        self._seats.check_hung()
 
     def _check_moving(self, progress: Progress) -> None:
         """Ends a run in which everybody answers and nothing moves.
@@ -387,10 +306,10 @@ class RayEngine(Engine):
         imagined = tuple(progress.imagination.get(k) for k in ("decisions", "learn_steps", "trial_s"))
         state = (progress.version, progress.rollout.get("decisions"), progress.rollout["restarts"], imagined)
         now = time.monotonic()
-        waiting = any(seat.outstanding for seat in self._seats) or (self._training and not self._done)
+        waiting = self._seats.outstanding or (self._training and not self._done)
         # Where one worker is to blame, `_check_hung` comes to it a moment later.
         silent = max(worker.silent_s() for worker in self._everyone())
-        suspect = max(silent, *(seat.in_world_s for seat in self._seats)) > self._limit / 2
+        suspect = max(silent, self._seats.in_world_s) > self._limit / 2
         if state != self._last_state or not waiting:
             self._last_state, self._last_change = state, now
         elif now - self._last_change > self._limit and not suspect:

@@ -30,16 +30,23 @@ from pathlib import Path
 
 import numpy as np
 
+from accerl_lerobot import snapshot
+from accerl_lerobot.checkpoint import PRETRAINED, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.config import RunConfig
-from accerl_lerobot.engine import Engine, Progress, check_new, episode_key
+from accerl_lerobot.engine import Engine, Progress, Saved, check_new, episode_key
 from accerl_lerobot.envs import make_world
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Request, Segment
 from accerl_lerobot.replay import MixedReplay
 from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutRunner
+from accerl_lerobot.seeds import global_generators, restore_global_generators
 from accerl_lerobot.weights.held_back import HeldBack
 
 logger = logging.getLogger(__name__)
+
+LOCAL = "local"
+"""Name of this engine's own state."""
 
 
 class LocalEngine(Engine):
@@ -49,9 +56,15 @@ class LocalEngine(Engine):
         config: the run; its ``policy.path`` must be set.
         tasks: the training tasks.
         history: env steps that an observation holds, the policy's ``n_obs_steps``.
+        state: the ``training_state`` to go on from, as if it had never been left; None: begin.
+
+    Raises:
+        InputError: the state is of an asynchronous run.
     """
 
-    def __init__(self, config: RunConfig, tasks: tuple[str, ...], history: int = 1) -> None:
+    def __init__(
+        self, config: RunConfig, tasks: tuple[str, ...], history: int = 1, state: Path | None = None
+    ) -> None:
         import torch
 
         from accerl_lerobot.policies.loading import load_adapter
@@ -102,6 +115,8 @@ class LocalEngine(Engine):
             self._plans.groups,
         )
         self._due: dict[int, Request] = {}
+        if state is not None:
+            self._restore(state)
 
     def plan(self, plans: list[EpisodePlan]) -> None:
         check_new(plans, self._outstanding)
@@ -138,11 +153,49 @@ class LocalEngine(Engine):
             inference={"version": float(self._acting_version)},
         )
 
-    def save(self, directory: Path) -> int:
+    def save(self, directory: Path) -> Saved:
         from accerl_lerobot.policies.loading import save_pretrained
 
-        save_pretrained(self._adapter, directory, self._config.policy)
-        return self._update.version
+        save_pretrained(self._adapter, directory / PRETRAINED, self._config.policy)
+        state = directory / TRAINING_STATE
+        snapshot.save(state / WEIGHTS, self._adapter.export_trainable())
+        snapshot.save(state / "trainer", self._update.state())
+        snapshot.save(state / "replay", self._replay.state())
+        acting = None if self._acting is self._adapter else self._acting.export_trainable()
+        engine = {
+            "generators": global_generators(),
+            "rng": self._rng,
+            "acting": (self._acting_version, acting),
+            "held_back": self._held.state(),
+            "outstanding": sorted(self._outstanding),
+            "outbox": list(self._outbox),
+            "plans": self._plans.state(),
+            "runner": self._runner.state(),
+        }
+        snapshot.save(state / LOCAL, engine)
+        return Saved(self._update.version, [])
+
+    def _restore(self, directory: Path) -> None:
+        if not (directory / f"{LOCAL}.json").is_file():
+            raise InputError(
+                "launch.engine", "local", "this run was asynchronous; go on with launch.engine=ray"
+            )
+        self._adapter.load_trainable(snapshot.load(directory / WEIGHTS))
+        self._update.restore(snapshot.load(directory / "trainer"))
+        self._replay.restore(snapshot.load(directory / "replay"))
+        engine = snapshot.load(directory / LOCAL)
+        self._rng = engine["rng"]
+        self._acting_version, acting = engine["acting"]
+        if acting is not None:
+            self._acting.load_trainable(acting)
+        self._held.restore(engine["held_back"])
+        self._outstanding = set(engine["outstanding"])
+        self._outbox.extend(engine["outbox"])
+        self._plans.restore(engine["plans"])
+        self._runner.restore(engine["runner"])
+        requests = ((slot, self._runner.request(slot)) for slot in range(len(self._runner)))
+        self._due = {slot: request for slot, request in requests if request is not None}
+        restore_global_generators(engine["generators"])
 
     def close(self) -> None:
         try:

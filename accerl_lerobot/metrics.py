@@ -21,6 +21,8 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import secrets
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,23 +53,30 @@ class MetricsLog:
     """
 
     def __init__(self, directory: Path, wandb: WandBConfig, config: dict[str, Any]) -> None:
-        from tensorboard.compat.proto.event_pb2 import Event
+        from tensorboard.compat.proto.event_pb2 import Event, SessionLog
         from tensorboard.compat.proto.summary_pb2 import Summary
         from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
-        self._event, self._summary = Event, Summary
-        self._file = (directory / "metrics.jsonl").open("a", buffering=1)
+        self._event, self._session, self._summary = Event, SessionLog, Summary
+        self._path = directory / "metrics.jsonl"
+        self._file = self._path.open("a", buffering=1)
         self._board = EventFileWriter(str(directory / "tensorboard"))
         self._started = time.monotonic()
         self._wandb = None
         if wandb.enable:
             import wandb as client
 
+            # A run that is gone on with is the same one there.
+            note = directory / ".wandb-id"
+            if not note.is_file():
+                note.write_text(secrets.token_hex(8))
             self._wandb = client.init(
                 project=wandb.project,
                 entity=wandb.entity,
                 dir=str(directory),
                 name=directory.name,
+                id=note.read_text(),
+                resume="allow",
                 config=config,
             )
 
@@ -95,6 +104,20 @@ class MetricsLog:
         self._board.add_event(self._event(wall_time=time.time(), step=update, summary=summary))
         if self._wandb is not None:
             self._wandb.log({f"{kind}/{k}": v for k, v in scalars.items()} | {"update": update})
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs: how far the file goes, and the seconds."""
+        self._file.flush()
+        return {"bytes": self._path.stat().st_size, "wall_s": self.wall_s}
+
+    def restore(self, state: dict[str, Any], update: int) -> None:
+        """Goes on from what `state` gave, after `update` updates: what was written since is about others."""
+        if self._path.stat().st_size > state["bytes"]:
+            os.truncate(self._path, state["bytes"])
+        # TensorBoard forgets what older files have of this step and later ones.
+        begun = self._session(status=self._session.START)
+        self._board.add_event(self._event(wall_time=time.time(), step=update + 1, session_log=begun))
+        self._started = time.monotonic() - state["wall_s"]
 
     def close(self) -> None:
         """Flushes and closes everything."""

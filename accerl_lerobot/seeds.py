@@ -18,6 +18,12 @@ MetaWorld and Gymnasium take seeds below 2**32; each use owns one range of them.
 
 from __future__ import annotations
 
+import random
+import sys
+from typing import Any
+
+import numpy as np
+
 from accerl_lerobot.errors import InputError
 
 DEMO_SEEDS = range(0, 1_000_000_000)
@@ -75,3 +81,26 @@ def eval_seed(index: int) -> int:
     if not 0 <= index < len(EVAL_SEEDS):
         raise ValueError(f"evaluation episode {index}: use 0 to {len(EVAL_SEEDS) - 1}")
     return EVAL_SEEDS.start + index
+
+
+def global_generators() -> dict[str, Any]:
+    """The states of the generators that libraries share: Python's, NumPy's, and torch's if it is in use."""
+    states: dict[str, Any] = {"python": random.getstate(), "numpy": np.random.get_state()}
+    if "torch" in sys.modules:
+        import torch
+
+        states["torch"] = torch.get_rng_state()
+        states["cuda"] = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
+    return states
+
+
+def restore_global_generators(states: dict[str, Any]) -> None:
+    """Sets them to what `global_generators` gave."""
+    random.setstate(states["python"])
+    np.random.set_state(states["numpy"])
+    if "torch" in states:
+        import torch
+
+        torch.set_rng_state(states["torch"])
+        if torch.cuda.is_available() and len(states["cuda"]) == torch.cuda.device_count():
+            torch.cuda.set_rng_state_all(states["cuda"])

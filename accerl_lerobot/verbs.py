@@ -46,6 +46,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
 from accerl_lerobot.hub.config import PullConfig, PushConfig
 from accerl_lerobot.inference.worker import InferenceConfig
+from accerl_lerobot.parsing import read_arguments
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.world_model.config import TrialConfig, WorldModelConfig
@@ -144,17 +145,29 @@ def train(arguments: list[str]) -> int:
     """``accerl train``."""
     config: RunConfig = parse(RunConfig, arguments)
     from accerl_lerobot import run
+    from accerl_lerobot.loop import how_to_go_on
     from accerl_lerobot.preflight import check_start
+    from accerl_lerobot.resume import begun_run, locked
+    from accerl_lerobot.stopping import StoppedError
 
+    begun = begun_run(read_arguments(arguments)[0], config) if config.resume else None
     check_start(config)
     console = Console()
-    directory = run.make_output_dir(config)
+    directory = run.make_output_dir(config) if begun is None else begun.directory
     console.say(f"run {directory}")
     try:
-        with redirect_stdout(sys.stderr):
-            summary = run.train(config, directory, console)
+        with redirect_stdout(sys.stderr), locked(directory, "config_path", "another process goes on with it"):
+            wanted = None if begun is None else begun.checkpoint
+            summary = run.train(config, directory, console, wanted)
     except InputError:
-        _discard_unused(directory)
+        if begun is None:
+            _discard_unused(directory)
+        raise
+    except StoppedError as stopped:
+        console.say(str(stopped))
+        return 128 + stopped.number
+    except BaseException:
+        console.say(f"failed; what there is may be gone on with: {how_to_go_on(directory)}")
         raise
     before = summary["success_before"]
     console.say(
@@ -223,6 +236,7 @@ def evaluate(arguments: list[str]) -> int:
     from accerl_lerobot import run
     from accerl_lerobot.evaluation.config import evaluation_plans
     from accerl_lerobot.evaluation.summary import summarise, table
+    from accerl_lerobot.loop import run_plans
 
     rooms = ("seed", "env", "policy", "rollout", "inference", "evaluation", "launch")
     whole = RunConfig(**{name: getattr(config, name) for name in rooms})
@@ -234,7 +248,7 @@ def evaluate(arguments: list[str]) -> int:
         engine = run.make_engine(whole, tasks, history)
         try:
             engine.plan(evaluation_plans(tasks, config.evaluation.episodes, "eval", film))
-            results = run.run_plans(engine, config.evaluation.episodes, "eval", console)
+            results = run_plans(engine, config.evaluation.episodes, "eval", console)
         finally:
             engine.close()
     summary: dict[str, Any] = summarise(results) | {"policy": config.policy.path}
@@ -372,5 +386,5 @@ def _write_evaluation(out: Path, summary: dict[str, Any], results: list[EpisodeR
 
 def _discard_unused(directory: Path) -> None:
     """Removes the folder of a run that was refused before it did anything, so that its name is free again."""
-    if {path.name for path in directory.iterdir()} <= {"config.yaml"}:
+    if {path.name for path in directory.iterdir()} <= {"config.yaml", ".lock"}:
         shutil.rmtree(directory)

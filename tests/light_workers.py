@@ -16,15 +16,19 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from accerl_lerobot import snapshot
+from accerl_lerobot.checkpoint import TRAINING_STATE
 from accerl_lerobot.experience import Decision, Request
 
 
@@ -42,6 +46,8 @@ def light_ray() -> Iterator[None]:
 
 
 NO_WEIGHTS = "a path without weights"
+FULL = "full"
+"""A folder that nothing can be written into."""
 
 
 class LightInference:
@@ -83,9 +89,11 @@ def _decision(request: Request, version: int) -> Decision:
 
 
 class LightTrainer:
-    """Takes batches and learns nothing from them; breaks or idles on request."""
+    """Takes batches and learns nothing from them but what they were; breaks or idles on request."""
 
-    def __init__(self, policy: Any, algorithm: Any, config: Any, seed: int) -> None:
+    def __init__(
+        self, policy: Any, algorithm: Any, config: Any, seed: int, state: Path | None = None
+    ) -> None:
         if policy.path == NO_WEIGHTS:
             raise FileNotFoundError("no weights there")
         self._config = config
@@ -93,6 +101,10 @@ class LightTrainer:
         self._lock = threading.Lock()
         self._failure: str | None = None
         self._idle = False
+        self._ledger: list[dict[str, int]] = []
+        """Of each update, the keys of its segments, and their decisions."""
+        if state is not None:
+            self._ledger = snapshot.load(state / "trainer")["ledger"]
 
     def ready(self) -> int:
         return os.getpid()
@@ -106,16 +118,21 @@ class LightTrainer:
     def run(self, replay: Any, readers: list[Any]) -> int:
         import ray
 
-        for version in range(self._config.updates):
+        n = self._config.batch_decisions
+        upcoming = replay.sample.remote(n, len(self._ledger))
+        while len(self._ledger) < self._config.updates:
             while self._idle:
                 time.sleep(0.05)
-            ray.get(replay.sample.remote(self._config.batch_decisions, version))
+            segments = ray.get(upcoming)
+            upcoming = replay.sample.remote(n, len(self._ledger) + 1)
             time.sleep(0.02)
             if self._failure is not None:
                 raise ArithmeticError(self._failure)
-            ray.get([reader.receive_weights.remote(version + 1, {}) for reader in readers])
             with self._lock:
-                self._records.append({"update": version + 1.0})
+                self._ledger.append({segment.key: len(segment) for segment in segments})
+                version = len(self._ledger)
+                self._records.append({"update": float(version)})
+            ray.get([reader.receive_weights.remote(version, {}) for reader in readers])
         return self._config.updates
 
     def metrics(self) -> list[dict[str, float]]:
@@ -123,5 +140,12 @@ class LightTrainer:
             records, self._records = self._records, []
         return records
 
-    def save(self, directory: str) -> int:
-        raise OSError("no space left on the device")
+    def save(self, directory: Path) -> tuple[int, list[dict[str, float]]]:
+        if directory.name == FULL:
+            raise OSError("no space left on the device")
+        with self._lock:
+            records, self._records = self._records, []
+            ledger = list(self._ledger)
+        snapshot.save(directory / TRAINING_STATE / "trainer", {"ledger": ledger})
+        (directory / TRAINING_STATE / "training_step.json").write_text(json.dumps({"step": len(ledger)}))
+        return len(ledger), records

@@ -21,15 +21,29 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from accerl_lerobot.checkpoint import BACKBONE, PRETRAINED, displaced, relocate, save_checkpoint
+from accerl_lerobot import snapshot
+from accerl_lerobot.checkpoint import (
+    BACKBONE,
+    PRETRAINED,
+    RUN_STATE,
+    TRAINING_STATE,
+    defect,
+    displaced,
+    let_go,
+    newest_whole,
+    relocate,
+    save_checkpoint,
+)
+from accerl_lerobot.errors import InputError
 
 
 def writer(version: int, content: str = "weights") -> Callable[[Path], int]:
     def write(directory: Path) -> int:
-        directory.mkdir(parents=True)
-        (directory / "model.safetensors").write_text(content)
+        (directory / PRETRAINED).mkdir()
+        (directory / PRETRAINED / "model.safetensors").write_text(content)
         return version
 
     return write
@@ -40,19 +54,19 @@ def listing(folder: Path) -> list[str]:
 
 
 def test_layout(tmp_path: Path):
-    path = save_checkpoint(tmp_path / "checkpoints", writer(7), {"algorithm": "gipo"})
+    path = save_checkpoint(tmp_path / "checkpoints", writer(7))
     assert path == tmp_path / "checkpoints" / "000007"
-    assert listing(path) == [PRETRAINED, "training_state"] and listing(path / PRETRAINED) == [
-        "model.safetensors"
-    ]
+    assert listing(path) == ["manifest.json", PRETRAINED, "training_state"] and listing(
+        path / PRETRAINED
+    ) == ["model.safetensors"]
     step = json.loads((path / "training_state" / "training_step.json").read_text())
-    assert step == {"step": 7, "algorithm": "gipo"}
+    assert step == {"step": 7}
     assert listing(path.parent) == ["000007", "last"]
 
 
 def test_last_is_the_newest_and_survives_a_move(tmp_path: Path):
     for version in (1, 20):
-        save_checkpoint(tmp_path / "run" / "checkpoints", writer(version), {})
+        save_checkpoint(tmp_path / "run" / "checkpoints", writer(version))
     last = tmp_path / "run" / "checkpoints" / "last"
     assert os.readlink(last) == "000020", "relative"
     shutil.move(tmp_path / "run", tmp_path / "moved")
@@ -68,24 +82,21 @@ def test_nothing_is_visible_while_it_is_written(tmp_path: Path):
         seen.append([name for name in listing(tmp_path) if not name.startswith(".")])
         return writer(3)(directory)
 
-    save_checkpoint(tmp_path, write, {})
+    save_checkpoint(tmp_path, write)
     assert seen == [[]]
 
 
-@pytest.mark.parametrize("state", [{}, {"unwritable": object()}], ids=["write fails", "state is not JSON"])
-def test_a_failure_leaves_everything_as_it_was(tmp_path: Path, state: dict):
-    save_checkpoint(tmp_path, writer(1), {})
+def test_a_failure_leaves_everything_as_it_was(tmp_path: Path):
+    save_checkpoint(tmp_path, writer(1))
 
     def write(directory: Path) -> int:
         writer(2)(directory)
-        if state:
-            return 2
         raise OSError("no space left on device")
 
-    with pytest.raises((OSError, TypeError)):
-        save_checkpoint(tmp_path, write, state)
+    with pytest.raises(OSError, match="no space"):
+        save_checkpoint(tmp_path, write)
     assert listing(tmp_path) == ["000001", "last"] and os.readlink(tmp_path / "last") == "000001"
-    save_checkpoint(tmp_path, writer(2), {})
+    save_checkpoint(tmp_path, writer(2))
     assert os.readlink(tmp_path / "last") == "000002", "and the next attempt succeeds"
 
 
@@ -93,21 +104,111 @@ def test_what_a_killed_process_left_behind_is_no_obstacle(tmp_path: Path):
     (tmp_path / f".writing-{os.getpid()}" / PRETRAINED).mkdir(parents=True)
     (tmp_path / f".writing-{os.getpid()}" / PRETRAINED / "half").touch()
     (tmp_path / ".last-new").symlink_to("000000")
-    path = save_checkpoint(tmp_path, writer(1), {})
+    path = save_checkpoint(tmp_path, writer(1))
     assert listing(path / PRETRAINED) == ["model.safetensors"]
     assert listing(tmp_path) == ["000001", "last"]
 
 
 def test_the_same_version_again_keeps_the_first(tmp_path: Path):
-    first = save_checkpoint(tmp_path, writer(5, "first"), {"saved": 1})
-    again = save_checkpoint(tmp_path, writer(5, "again"), {"saved": 2})
+    first = save_checkpoint(tmp_path, writer(5, "first"))
+    again = save_checkpoint(tmp_path, writer(5, "again"))
     assert first == again and (first / PRETRAINED / "model.safetensors").read_text() == "first"
-    assert json.loads((first / "training_state" / "training_step.json").read_text())["saved"] == 1
     assert listing(tmp_path) == ["000005", "last"]
+
+
+def test_a_broken_one_is_replaced(tmp_path: Path):
+    first = save_checkpoint(tmp_path, writer(5, "first"))
+    (first / PRETRAINED / "model.safetensors").write_text("fir")
+    save_checkpoint(tmp_path, writer(5, "again"))
+    assert (first / PRETRAINED / "model.safetensors").read_text() == "again" and defect(first) is None
+
+
+def state_writer(version: int) -> Callable[[Path], int]:
+    def write(directory: Path) -> int:
+        snapshot.save(directory / TRAINING_STATE / RUN_STATE, {"version": version, "array": np.arange(50)})
+        return writer(version)(directory)
+
+    return write
+
+
+def test_every_torn_or_changed_file_is_noticed_and_the_one_before_is_taken(tmp_path: Path):
+    for version in (1, 2):
+        save_checkpoint(tmp_path, state_writer(version))
+    newest = tmp_path / "000002"
+    assert newest_whole(tmp_path) == (newest, [])
+    files = [path for path in newest.rglob("*") if path.is_file()]
+    assert len(files) == 5
+    for path in files:
+        whole = path.read_bytes()
+        changed = bytes([whole[0] ^ 1]) + whole[1:]
+        for broken in (whole[:-2], changed, b"", None):
+            path.unlink()
+            if broken is not None:
+                path.write_bytes(broken)
+            assert defect(newest) is not None, path
+            found, passed = newest_whole(tmp_path)
+            assert found == tmp_path / "000001" and len(passed) == 1 and passed[0].startswith("000002: ")
+        path.write_bytes(whole)
+        assert defect(newest) is None
+
+
+def test_where_nothing_is_whole_nothing_is_begun_from_scratch(tmp_path: Path):
+    with pytest.raises(InputError, match="there is none"):
+        newest_whole(tmp_path)
+    path = save_checkpoint(tmp_path, state_writer(3))
+    (path / PRETRAINED / "model.safetensors").write_text("WEIGHTS")
+    with pytest.raises(
+        InputError, match=r"000003: pretrained_model/model.safetensors is not what was written"
+    ):
+        newest_whole(tmp_path)
+    manifest = json.loads((path / "manifest.json").read_text())
+    (path / "manifest.json").write_text(json.dumps(manifest | {"format": 9}))
+    with pytest.raises(InputError, match="its format is 9, and this accerl reads 1"):
+        newest_whole(tmp_path)
+    manifest["files"]["../../outside"] = {"size": 1, "sha256": "0"}
+    (path / "manifest.json").write_text(json.dumps(manifest))
+    (path / PRETRAINED / "model.safetensors").write_text("weights")
+    with pytest.raises(InputError, match=r"names '../../outside', outside of it"):
+        newest_whole(tmp_path)
+
+
+def test_an_older_one_may_be_named(tmp_path: Path):
+    for version in (1, 2, 30):
+        save_checkpoint(tmp_path, state_writer(version))
+    assert newest_whole(tmp_path, "000002")[0].name == "000002"
+    with pytest.raises(InputError, match="no such checkpoint; there are 000001, 000002, 000030"):
+        newest_whole(tmp_path, "000003")
+
+
+def test_only_the_newest_keep_what_it_takes_to_go_on(tmp_path: Path):
+    for version in range(1, 6):
+        save_checkpoint(tmp_path, state_writer(version))
+        let_go(tmp_path, keep=2)
+    kept = [path.name for path in sorted(tmp_path.glob("0*")) if (path / TRAINING_STATE).exists()]
+    assert kept == ["000004", "000005"]
+    assert all((tmp_path / f"00000{v}" / PRETRAINED / "model.safetensors").is_file() for v in range(1, 6))
+    assert all(defect(tmp_path / f"00000{v}") is None for v in range(1, 6))
+    with pytest.raises(InputError, match="000003: its training state was not kept, see save_keep"):
+        newest_whole(tmp_path, "000003")
+
+
+def test_one_that_was_being_let_go_when_the_process_died_is_no_obstacle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    for version in (1, 2):
+        save_checkpoint(tmp_path, state_writer(version))
+    with monkeypatch.context() as context:
+        context.setattr(shutil, "rmtree", lambda path: (path / "training_step.json").unlink() or 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            let_go(tmp_path, keep=1)
+    assert newest_whole(tmp_path)[0].name == "000002" and defect(tmp_path / "000001") is None
+    let_go(tmp_path, keep=1)
+    assert not (tmp_path / "000001" / TRAINING_STATE).exists()
 
 
 def test_paths_in_the_files_are_those_of_the_final_place(tmp_path: Path):
     def write(directory: Path) -> int:
+        directory = directory / PRETRAINED
         (directory / BACKBONE).mkdir(parents=True)
         (directory / "config.json").write_text(json.dumps({"vlm_model_name": "/elsewhere", "chunk_size": 4}))
         steps = [
@@ -120,7 +221,7 @@ def test_paths_in_the_files_are_those_of_the_final_place(tmp_path: Path):
         (directory / "policy_preprocessor.json").write_text(json.dumps({"name": "pre", "steps": steps}))
         return 4
 
-    pretrained = save_checkpoint(tmp_path, write, {}) / PRETRAINED
+    pretrained = save_checkpoint(tmp_path, write) / PRETRAINED
     home = str(pretrained / BACKBONE)
     assert json.loads((pretrained / "config.json").read_text()) == {"vlm_model_name": home, "chunk_size": 4}
     first, second = json.loads((pretrained / "policy_preprocessor.json").read_text())["steps"]

@@ -27,6 +27,7 @@ from pathlib import Path
 
 import pytest
 
+from accerl_lerobot.checkpoint import PRETRAINED
 from accerl_lerobot.config import RunConfig
 from accerl_lerobot.engine import Progress
 from accerl_lerobot.envs import SimulatedConfig
@@ -101,7 +102,9 @@ def story(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> It
             elif planned and not killed:
                 killed = True
                 os.kill(pids["rollout 1"], signal.SIGKILL)
-                told.saved = engine.save(told.directory / "middle")
+                saved = engine.save(told.directory / "middle")
+                told.saved = saved.version
+                told.history.append(Progress(version=progress.version, updates=saved.updates))
         engine.plan(evaluation_plans(("match",), 6, "after"))
         told.after = collect(engine, "after", 6)
         engine.save(told.directory / "end")
@@ -199,7 +202,7 @@ def test_what_is_saved_during_training_loads_again(story: Story, tiny_checkpoint
     assert 4 <= story.saved <= UPDATES
     weights = load_file(tiny_checkpoint / "model.safetensors")
     for name in ("middle", "end"):
-        saved = load_file(story.directory / name / "model.safetensors")
+        saved = load_file(story.directory / name / PRETRAINED / "model.safetensors")
         assert saved.keys() == weights.keys()
         assert all(torch.equal(saved[k], weights[k]) for k in weights), "learning rate 0 moved the policy"
     load_adapter(PolicyConfig(path=str(story.directory / "middle"), device="cpu"))

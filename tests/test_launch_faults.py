@@ -39,7 +39,7 @@ from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.trainer import worker as trainer_worker
 from accerl_lerobot.trainer.config import TrainerConfig
-from tests.light_workers import NO_WEIGHTS, LightInference, LightTrainer, light_ray
+from tests.light_workers import FULL, NO_WEIGHTS, LightInference, LightTrainer, light_ray
 from tests.runs import collect, drive, polls, tiny_run
 
 __all__ = ["light_ray"]
@@ -121,7 +121,7 @@ def test_what_cannot_be_done_is_refused_and_an_exception_in_the_trainer_ends_the
     with pytest.raises(ValueError, match="episode 0 of 'a' is planned twice"):
         one.plan(evaluation_plans(("match",), 1, "a"))
     with pytest.raises(RuntimeError, match=r"trainer worker failed in save(.|\n)*no space left"):
-        one.save(tmp_path)
+        one.save(tmp_path / FULL)
     assert len(collect(one, "a", 2)) == 2
     one._last_change -= 1e6  # as if nobody had polled for days: no reason to say that nothing moves
     one.plan(evaluation_plans(("match",), 1, "a"))

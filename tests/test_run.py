@@ -26,7 +26,7 @@ import yaml
 from accerl_lerobot import run
 from accerl_lerobot.config import LaunchConfig, RunConfig, parse
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine import Engine, Progress
+from accerl_lerobot.engine import Engine, Progress, Saved
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
@@ -126,7 +126,7 @@ def test_checkpoints_load_again(finished: Finished):
 
     checkpoints = finished.directory / "checkpoints"
     names = sorted(path.name for path in checkpoints.iterdir() if not path.is_symlink())
-    assert names == ["000005", "000010", "000012"]
+    assert names == ["000000", "000005", "000010", "000012"]
     assert (checkpoints / "last").resolve().name == "000012"
     step = json.loads((checkpoints / "000010" / "training_state" / "training_step.json").read_text())
     assert step["step"] == 10
@@ -220,9 +220,8 @@ class Scripted(Engine):
             rollout={"env_steps": self.steps, "decisions": 1.0},
         )
 
-    def save(self, directory: Path) -> int:
-        directory.mkdir(parents=True)
-        return self.version
+    def save(self, directory: Path) -> Saved:
+        return Saved(self.version, [])
 
     def close(self) -> None:
         self.closed = True

@@ -19,15 +19,13 @@ else the machine is doing. What is finished is kept: the same command goes on wh
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,8 +38,10 @@ from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.stats import Rate
+from accerl_lerobot.resume import locked
 
-CONFIG, SUMMARY, LOCK = "config.yaml", "summary.json", ".lock"
+CONFIG, SUMMARY = "config.yaml", "summary.json"
+IN_USE = "a study, or a run of one that was killed, still writes there; wait for it or end it"
 LOG_LINES = 12
 """Of a run that failed, shown in the error."""
 
@@ -246,7 +246,7 @@ class Study:
 
         for start in self.starts.values():
             check_start(start)
-        with _locked(self.root) as lock:
+        with locked(self.root, "output_dir", IN_USE) as lock:
             runner = _Runner(self.config.jobs, lock, console)
             runner.run("warm starts", {self.start(seed): start for seed, start in self.starts.items()})
             for cell in self.cells:
@@ -285,19 +285,6 @@ class Study:
             ],
         )
         return config
-
-
-@contextmanager
-def _locked(root: Path) -> Iterator[int]:
-    """Creates the study's folder and keeps others out, for as long as one of its runs is alive."""
-    root.mkdir(parents=True, exist_ok=True)
-    with (root / LOCK).open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            remedy = "a study, or a run of one that was killed, still writes there; wait for it or end it"
-            raise InputError("output_dir", str(root), remedy) from error
-        yield file.fileno()
 
 
 class _Runner:

@@ -18,12 +18,14 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
-from accerl_lerobot.checkpoint import BACKBONE, CONFIG_FOLDERS, PREPROCESSOR, PRETRAINED
+from accerl_lerobot import checkpoint as checkpoints
+from accerl_lerobot.checkpoint import BACKBONE, CONFIG_FOLDERS, PREPROCESSOR, PRETRAINED, defect
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.kinds import CONFIG, DATASET, POLICY, RUN, read_json
-from accerl_lerobot.hub.manifest import CARD, MANIFEST
+from accerl_lerobot.hub.manifest import CARD, MANIFEST, entry_of
 from accerl_lerobot.hub.portable import cleaned, is_record, own_names
 
 RECORD = "accerl_pulled.json"
@@ -46,7 +48,8 @@ def contents(folder: Path, kind: str, include: Sequence[str] = ()) -> Files:
         include: folders of a run that are left at home otherwise.
 
     Raises:
-        InputError: `include` names no folder of the run; or a policy's backbone is gone.
+        InputError: `include` names no folder of the run; its checkpoint is broken; or a policy's backbone is
+            gone.
     """
     if include and kind != RUN:
         raise InputError("include", list(include), f"for a run; a {kind} is pushed whole")
@@ -60,12 +63,13 @@ def contents(folder: Path, kind: str, include: Sequence[str] = ()) -> Files:
         policies = [""] if kind == POLICY else []
     for policy in policies:
         _bring_backbone(files, folder, policy)
-    return {
-        name: cleaned(name, content if isinstance(content, bytes) else content.read_bytes(), folder)
-        if is_record(name)
-        else content
-        for name, content in files.items()
-    }
+    for name, content in files.items():
+        if is_record(name):
+            data = content if isinstance(content, bytes) else content.read_bytes()
+            files[name] = cleaned(name, data, folder)
+    if kind == RUN:
+        _renew_manifest(files, f"checkpoints/{_last(folder).name}/")
+    return files
 
 
 def walk(folder: Path) -> Iterator[tuple[str, Path]]:
@@ -89,12 +93,25 @@ def _of_a_run(run: Path, include: Sequence[str]) -> Files:
         if path.is_file() and path.suffix in OF_A_RUN and path.name not in NOT_CONTENTS
     }
     last = _last(run)
+    if (last / checkpoints.MANIFEST).is_file() and (why := defect(last)) is not None:
+        raise InputError("path", str(last), f"the checkpoint is broken: {why}")
     parts = {f"checkpoints/{last.name}": last} | {name.strip("/"): run / name for name in include}
     for name, folder in parts.items():
         if not folder.is_dir() or folder is not last and (folder.name != name or name.startswith(".")):
             raise InputError("include", name, f"no such folder in {run}")
         files |= {f"{name}/{below}": path for below, path in walk(folder)}
     return files
+
+
+def _renew_manifest(files: Files, checkpoint: str) -> None:
+    """Has a checkpoint's own manifest say what its files are now."""
+    if (name := f"{checkpoint}{checkpoints.MANIFEST}") in files:
+        listed = {
+            n.removeprefix(checkpoint): c for n, c in files.items() if n.startswith(checkpoint) and n != name
+        }
+        entries = {n: asdict(entry_of(content)) for n, content in sorted(listed.items())}
+        content = {"format": checkpoints.FORMAT, "files": entries}
+        files[name] = (json.dumps(content, indent=2) + "\n").encode()
 
 
 def _bring_backbone(files: Files, folder: Path, policy: str) -> None:

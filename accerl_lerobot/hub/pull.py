@@ -30,13 +30,15 @@ from huggingface_hub import HfApi
 from huggingface_hub.errors import RepositoryNotFoundError
 from huggingface_hub.hf_api import RepoFile
 
-from accerl_lerobot.checkpoint import PREPROCESSOR, PRETRAINED, relocate
+from accerl_lerobot.checkpoint import MANIFEST as OF_CHECKPOINT
+from accerl_lerobot.checkpoint import PREPROCESSOR, PRETRAINED, defect, relocate, write_manifest
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.config import REPO_TYPES, PullConfig
 from accerl_lerobot.hub.contents import RECORD
-from accerl_lerobot.hub.kinds import CONFIG, POLICY, recognise
+from accerl_lerobot.hub.kinds import CONFIG, POLICY, RUN, recognise
 from accerl_lerobot.hub.manifest import CARD, MANIFEST, Entry, read_manifest, verify
 from accerl_lerobot.hub.trouble import told
+from accerl_lerobot.resume import LOCK
 
 CACHE = ".cache"
 """Where the client keeps its books while it fetches into a folder."""
@@ -147,11 +149,29 @@ def _receive(folder: Path, home: Path, expected: dict[str, Entry], repo_id: str)
     kind = recognise(folder, "repo_id")
     if manifest is not None and kind != manifest.kind:
         raise InputError("repo_id", repo_id, f"its {MANIFEST} says {manifest.kind}, but this is a {kind}")
-    for policy in [folder] if kind == POLICY else sorted(folder.glob(f"checkpoints/*/{PRETRAINED}")):
-        if policy.parent.name != "last":
-            _move_in(policy, home / policy.relative_to(folder), repo_id)
+    if kind == POLICY:
+        _move_in(folder, home, repo_id)
+    elif kind == RUN:
+        (folder / LOCK).touch()  # so a run is known that can be gone on with
+        for checkpoint in (p for p in folder.glob("checkpoints/*") if not p.is_symlink()):
+            _arrive(checkpoint, home / "checkpoints" / checkpoint.name, repo_id)
     unchecked = expected.keys() - files.keys() - {CARD, MANIFEST, ".gitattributes"}
     return {"kind": kind, "files": len(expected), "checked": len(files), "unchecked": len(unchecked)}
+
+
+def _arrive(checkpoint: Path, home: Path, repo_id: str) -> None:
+    """Makes a checkpoint one of the place it will be in, its own manifest included, where it has one.
+
+    Raises:
+        InputError: it is broken.
+    """
+    own = (checkpoint / OF_CHECKPOINT).is_file()
+    if own and (why := defect(checkpoint)) is not None:
+        raise InputError("repo_id", repo_id, f"its checkpoint {checkpoint.name} is broken: {why}")
+    if (checkpoint / PRETRAINED).is_dir():
+        _move_in(checkpoint / PRETRAINED, home / PRETRAINED, repo_id)
+    if own:
+        write_manifest(checkpoint)
 
 
 def _move_in(policy: Path, home: Path, repo_id: str) -> None:

@@ -33,9 +33,12 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from accerl_lerobot import snapshot
+from accerl_lerobot.checkpoint import WEIGHTS
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import Batcher
@@ -81,9 +84,13 @@ class InferenceWorker:
     Args:
         policy: which checkpoint to load; every inference worker and the trainer load the same one.
         config: batching.
+        version: of the weights it begins with.
+        state: the ``training_state`` that holds these; None: they are the checkpoint's.
     """
 
-    def __init__(self, policy: PolicyConfig, config: InferenceConfig) -> None:
+    def __init__(
+        self, policy: PolicyConfig, config: InferenceConfig, version: int = 0, state: Path | None = None
+    ) -> None:
         import torch
 
         from accerl_lerobot.policies.loading import load_adapter
@@ -93,7 +100,9 @@ class InferenceWorker:
         self._batcher: Batcher[_Waiting] = Batcher(config.max_batch, config.max_wait_s)
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="forward")
         self._wake = asyncio.Event()
-        self._version = 0
+        self._version = version
+        if state is not None:
+            self._adapter.load_trainable(snapshot.load(state / WEIGHTS))
         self._received = -1
         self._published: tuple[int, dict[str, np.ndarray]] | None = None
         self._failure: BaseException | None = None

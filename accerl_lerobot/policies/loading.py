@@ -26,13 +26,13 @@ import logging
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import draccus
 import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
-from torch import nn
+from torch import Tensor, nn
 
 from accerl_lerobot.checkpoint import BACKBONE, relocate
 from accerl_lerobot.errors import InputError
@@ -228,16 +228,42 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
     return adapter
 
 
-def save_pretrained(adapter: LeRobotAdapter, directory: Path, config: PolicyConfig) -> None:
-    """Writes LeRobot's ``pretrained_model`` layout, and what is ours beside it, into `directory`."""
+class Weights(NamedTuple):
+    """All of an adapter's, on the CPU, under the names that LeRobot gives them."""
+
+    policy: dict[str, Tensor]
+    value_head: dict[str, Tensor]
+    family: dict[str, Tensor]
+
+
+def copy_weights(adapter: LeRobotAdapter) -> Weights:
+    """A copy to be saved while the adapter goes on learning."""
+    modules = (adapter.value_head, adapter.family)
+    policy = merged_state_dict(adapter.policy) or adapter.policy.state_dict()
+    return Weights(_copied(policy), *(_copied(module.state_dict()) for module in modules))
+
+
+def save_pretrained(
+    adapter: LeRobotAdapter, directory: Path, config: PolicyConfig, weights: Weights | None = None
+) -> None:
+    """Writes LeRobot's ``pretrained_model`` layout, and what is ours beside it, into `directory`.
+
+    Args:
+        adapter: what is saved.
+        directory: created if it is missing.
+        config: what the adapter was loaded by.
+        weights: those to be written; None: the adapter's of now.
+    """
+    weights = weights or copy_weights(adapter)
     directory.mkdir(parents=True, exist_ok=True)
     save_backbone(adapter.policy.config, adapter.processing.preprocessor, directory)
-    adapter.policy.save_pretrained(directory, state_dict=merged_state_dict(adapter.policy))
+    adapter.policy.save_pretrained(directory, state_dict=weights.policy)
     adapter.processing.preprocessor.save_pretrained(directory)
     adapter.processing.postprocessor.save_pretrained(directory)
     relocate(directory, directory)
-    _save_module(adapter.value_head, directory / VALUE_HEAD)
-    _save_module(adapter.family, directory / FAMILY)
+    for name, tensors in ((VALUE_HEAD, weights.value_head), (FAMILY, weights.family)):
+        if tensors:
+            save_file(tensors, directory / name)
     ours = {
         "sampler": draccus.encode(adapter.family.sampler, SamplerConfig),
         "value_head": asdict(config.value_head),
@@ -315,11 +341,16 @@ def _load_ours(adapter: LeRobotAdapter, folder: Path) -> None:
         adapter.value_head.load_state_dict(load_file(folder / VALUE_HEAD))
 
 
-def _save_module(module: nn.Module, path: Path) -> None:
-    """Its weights as safetensors; no file where it has none."""
-    state = {k: v.detach().cpu().contiguous() for k, v in module.state_dict().items()}
-    if state:
-        save_file(state, path)
+def _copied(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Copies on the CPU; what shared its memory shares it again, so that it is written once."""
+    copies: dict[tuple[Any, ...], Tensor] = {}
+    made = {}
+    for name, tensor in tensors.items():
+        place = (tensor.data_ptr(), tensor.shape, tensor.stride(), tensor.device)
+        if place not in copies:
+            copies[place] = tensor.detach().to("cpu", copy=True).contiguous()
+        made[name] = copies[place]
+    return made
 
 
 def _load_module(module: nn.Module, path: Path, what: str, otherwise: str) -> None:

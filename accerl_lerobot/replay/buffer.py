@@ -15,17 +15,19 @@
 
 What must hold, in segments and in decisions:
 
-    inserted = stored + evicted + retired + lost
+    inserted = stored + evicted + retired
 
-*evicted* made room for newer ones, *retired* were older than `max_lag` allows, *lost* were held when a
-checkpoint was written (counters are saved, segments are not). A duplicate or a non-finite segment is
-counted but never inserted.
+*evicted* made room for newer ones, *retired* were older than `max_lag` allows. A duplicate or a non-finite
+segment is counted but never inserted.
+
+The store survives its process: `state` is all of it, as it was before the batches that a trainer has drawn
+and not learnt from.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from dataclasses import asdict, dataclass, field
+from collections import Counter, OrderedDict, deque
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +36,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.replay import pacing
 from accerl_lerobot.replay.pacing import Pace, ReplayConfig
+from accerl_lerobot.snapshot import kind
 
 KEY_MEMORY = 65_536
 """How many keys are remembered to recognise a segment that is sent twice, even after it has left the store.
@@ -43,6 +46,14 @@ without end.
 """
 
 
+DRAWS = 1024
+"""How many of the last draws are remembered, to be taken back in `Replay.state`.
+
+A trainer draws one batch ahead, and goes on for some moments while it is saved.
+"""
+
+
+@kind
 @dataclass(kw_only=True)
 class ReplayCounters:
     """What happened since the run began, resumptions included; in decisions where the name says so."""
@@ -57,10 +68,6 @@ class ReplayCounters:
     retired_decisions: int = 0
     retired_unused: int = 0
     """Segments retired before they were ever trained on."""
-    lost_segments: int = 0
-    lost_decisions: int = 0
-    lost_unused: int = 0
-    """Segments lost in a resumption before they were ever trained on."""
     duplicates: int = 0
     """Segments ignored because their key had been seen."""
     dropped_nonfinite: int = 0
@@ -77,17 +84,22 @@ class ReplayCounters:
 
 @dataclass(kw_only=True)
 class _Entry:
-    segment: Segment
+    segment: Segment | None
+    """None once it has left."""
+    size: int
+    """Decisions."""
     oldest: int
     """The smallest version."""
     draws: int
     """How often it may be drawn in all."""
     uses: int = 0
+    left: str = ""
+    """How it has left."""
 
     @property
     def unspent(self) -> int:
         """Draws left, in decisions."""
-        return (self.draws - self.uses) * len(self.segment)
+        return (self.draws - self.uses) * self.size
 
 
 class Replay:
@@ -109,6 +121,8 @@ class Replay:
         self._stored = 0
         self._available = 0
         self._carry = 0.0
+        self._drawn: deque[tuple[int, list[_Entry]]] = deque(maxlen=DRAWS)
+        """The trainer's version and what it was given, of each of the last draws."""
 
     @property
     def stored_decisions(self) -> int:
@@ -159,7 +173,8 @@ class Replay:
         while self._stored + n > self.config.capacity:
             self._depart(next(iter(self._entries)), "evicted")
         draws, self._carry = pacing.entitle(self.config.samples_per_insert, n, self._carry)
-        self._entries[segment.key] = _Entry(segment=segment, oldest=int(segment.version.min()), draws=draws)
+        oldest = int(segment.version.min())
+        self._entries[segment.key] = _Entry(segment=segment, size=n, oldest=oldest, draws=draws)
         self._stored += n
         self._available += n
         self.counters.inserted_segments += 1
@@ -193,15 +208,16 @@ class Replay:
             return []
         available = [e for e in self._entries.values() if e.unspent]
         shuffled = [available[i] for i in rng.permutation(len(available))]
-        drawn: list[Segment] = []
+        drawn: list[_Entry] = []
         collected = 0
         for entry in sorted(shuffled, key=lambda e: e.uses):
             self._use(entry)
-            drawn.append(entry.segment)
-            collected += len(entry.segment)
+            drawn.append(entry)
+            collected += entry.size
             if collected >= num_decisions:
                 break
-        return drawn
+        self._drawn.append((trainer_version, drawn))
+        return [entry.segment for entry in drawn if entry.segment is not None]
 
     def uses_histogram(self) -> dict[int, int]:
         """Times trained on → segments, over all ever inserted, ascending."""
@@ -217,29 +233,67 @@ class Replay:
         flat["available_decisions"] = float(self._available)
         return flat
 
-    def state(self) -> dict[str, Any]:
-        """The counters as a resumption will find them: what is held now counts as lost. Plain JSON types."""
-        shadow = Replay(self.config)
-        shadow.counters = ReplayCounters(**asdict(self.counters))
-        shadow._entries = self._entries.copy()
-        for key in self._entries:
-            shadow._depart(key, "lost")
-        uses = {str(k): v for k, v in shadow.uses_histogram().items()}
-        return {**asdict(shadow.counters), "departed_uses": uses}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Continues the counters of an earlier run.
+    def state(self, version: int | None = None) -> dict[str, Any]:
+        """All that `restore` needs; see `snapshot`. Shares the segments, which nobody changes.
 
         Args:
-            state: from `state`, possibly by way of a JSON file.
+            version: updates made by the trainer that this is to go with; what it has drawn for later ones
+                counts as not drawn. None: it has learnt from all it drew.
+
+        Raises:
+            RuntimeError: that is too many draws ago.
+        """
+        late = [] if version is None else [entries for made, entries in self._drawn if made >= version]
+        if late and len(late) == self._drawn.maxlen:
+            raise RuntimeError(f"replay has given more than {DRAWS} batches since update {version}")
+        back: Counter[int] = Counter(id(entry) for entries in late for entry in entries)
+        counters = replace(self.counters, departed_uses=dict(self.counters.departed_uses))
+        for entry in {id(e): e for entries in late for e in entries}.values():
+            count = back[id(entry)]
+            counters.trained_decisions -= count * entry.size
+            if count == entry.uses:
+                counters.unique_decisions -= entry.size
+            if not entry.left:
+                continue
+            uses, unused = entry.uses - count, f"{entry.left}_unused"
+            counters.unspent_draws += count * entry.size
+            counters.departed_uses[entry.uses] -= 1
+            counters.departed_uses[uses] = counters.departed_uses.get(uses, 0) + 1
+            setattr(counters, unused, getattr(counters, unused) + (uses == 0))
+        entries = [
+            {"segment": e.segment, "draws": e.draws, "uses": e.uses - back[id(e)]}
+            for e in self._entries.values()
+        ]
+        counters.departed_uses = {k: v for k, v in counters.departed_uses.items() if v}
+        return {"counters": counters, "keys": list(self._keys), "entries": entries, "carry": self._carry}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave.
 
         Raises:
             RuntimeError: something has been inserted already.
         """
         if self.counters != ReplayCounters():
             raise RuntimeError("restore before the first insert")
-        uses = {int(k): int(v) for k, v in state["departed_uses"].items()}
-        self.counters = ReplayCounters(**{**state, "departed_uses": uses})
+        self.counters, self._carry = state["counters"], state["carry"]
+        self._keys = OrderedDict.fromkeys(state["keys"])
+        for held in state["entries"]:
+            segment: Segment = held["segment"]
+            entry = _Entry(
+                segment=segment,
+                size=len(segment),
+                oldest=int(segment.version.min()),
+                draws=held["draws"],
+                uses=held["uses"],
+            )
+            self._entries[segment.key] = entry
+            self._stored += entry.size
+            self._available += entry.size if entry.unspent else 0
+
+    @property
+    def segments(self) -> list[Segment]:
+        """All that is stored, the oldest first."""
+        return [e.segment for e in self._entries.values() if e.segment is not None]
 
     def retire(self, trainer_version: int) -> None:
         """Takes out what is too old for a trainer that has made so many updates."""
@@ -248,7 +302,7 @@ class Replay:
             self._depart(key, "retired")
 
     def _use(self, entry: _Entry) -> None:
-        n = len(entry.segment)
+        n = entry.size
         self.counters.trained_decisions += n
         self.counters.unique_decisions += n if entry.uses == 0 else 0
         entry.uses += 1
@@ -258,7 +312,8 @@ class Replay:
     def _depart(self, key: str, how: str) -> None:
         """Takes a segment out and books it under ``<how>_*``."""
         entry = self._entries.pop(key)
-        n, counters = len(entry.segment), self.counters
+        entry.segment, entry.left = None, how
+        n, counters = entry.size, self.counters
         self._stored -= n
         self._available -= n if entry.unspent else 0
         for name, amount in (("segments", 1), ("decisions", n), ("unused", int(entry.uses == 0))):

@@ -27,6 +27,8 @@ When neither can give, and neither ever will, the replay is *exhausted*.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from accerl_lerobot.experience import REAL, Segment
@@ -102,6 +104,24 @@ class MixedReplay:
         for replay, count in zip((self.real, self.imagined), parts, strict=True):
             drawn += replay.sample(count, trainer_version, rng) if count else []
         return drawn
+
+    def state(self, version: int | None = None) -> dict[str, Any]:
+        """See `Replay.state`."""
+        return {
+            "real": self.real.state(version),
+            "imagined": self.imagined.state(version),
+            "share": self.share,
+            "real_ended": self.real_ended,
+            "awaited": self.awaited,
+            "held": self.held,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """See `Replay.restore`."""
+        self.real.restore(state["real"])
+        self.imagined.restore(state["imagined"])
+        for name in ("share", "real_ended", "awaited", "held"):
+            setattr(self, name, state[name])
 
     def metrics(self) -> dict[str, float]:
         """Of the real store by their names; where anything is imagined, of the other one with ``imagined_``

@@ -22,13 +22,16 @@ unblocked   by the other side, or by `close`
 from __future__ import annotations
 
 import asyncio
+import copy
 import os
 import time
 from collections import deque
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from accerl_lerobot import snapshot
 from accerl_lerobot.experience import REAL, Segment
 from accerl_lerobot.replay.mixed import MixedReplay
 from accerl_lerobot.replay.pacing import ReplayConfig
@@ -58,10 +61,16 @@ class ReplayWorker:
         seed: of the draw among segments used equally often.
         imagined: size and pace of imagined experience; None: there is none.
         patient: see `MixedReplay`.
+        state: the ``training_state`` to go on from; None: begin.
     """
 
     def __init__(
-        self, config: ReplayConfig, seed: int, imagined: ReplayConfig | None = None, patient: bool = False
+        self,
+        config: ReplayConfig,
+        seed: int,
+        imagined: ReplayConfig | None = None,
+        patient: bool = False,
+        state: Path | None = None,
     ) -> None:
         self._replay = MixedReplay(config, imagined or ReplayConfig(), share=0.0, patient=patient)
         # Nothing is imagined until the dreamer says so.
@@ -73,6 +82,13 @@ class ReplayWorker:
         self._closed = False
         self._insert_wait_s = self._sample_wait_s = 0.0
         self._episodes: list[dict[str, float]] = []
+        if state is not None:
+            saved = snapshot.load(state / "replay")
+            self._replay.restore(saved["replay"])
+            self._rng = saved["rng"]
+            # Those who dream begin with what they would have been told last.
+            self._real.extend(self._replay.real.segments)
+            self._real_count = len(self._replay.real.segments)
 
     async def ready(self) -> int:
         """Answers once this process is up; returns its id."""
@@ -149,6 +165,11 @@ class ReplayWorker:
         async with self._changed:
             self._replay.end_real()
             self._changed.notify_all()
+
+    async def save(self, directory: Path, version: int) -> None:
+        """Writes its part of ``training_state``, as it was when the trainer had made `version` updates."""
+        state = {"replay": self._replay.state(version), "rng": copy.deepcopy(self._rng)}
+        await asyncio.to_thread(snapshot.save, directory / "replay", state)
 
     async def close(self) -> None:
         """Ends all waiting; nothing is stored or drawn any more."""

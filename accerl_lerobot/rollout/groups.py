@@ -34,11 +34,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from accerl_lerobot.experience import Segment
+from accerl_lerobot.snapshot import kind
 
 GroupAdvantage = Literal["grpo", "rloo", "grpo_no_std"]
 GroupFilter = Literal["outcome", "return", "none"]
@@ -81,6 +82,7 @@ def group_advantages(returns: np.ndarray, form: GroupAdvantage) -> np.ndarray:
     return _FORMS[form](np.asarray(returns, np.float64))
 
 
+@kind
 class Outcome(NamedTuple):
     """How an episode ended."""
 
@@ -88,6 +90,7 @@ class Outcome(NamedTuple):
     success: bool
 
 
+@kind
 class Place(NamedTuple):
     """Where an episode belongs."""
 
@@ -107,6 +110,7 @@ def comparable(outcomes: list[Outcome], rule: GroupFilter) -> bool:
     return rule == "return" or len({o.success for o in outcomes}) == 2
 
 
+@kind
 @dataclass(kw_only=True)
 class GroupCounters:
     """What became of the groups of a worker, and of the decisions in them."""
@@ -118,8 +122,11 @@ class GroupCounters:
     dropped_decisions: int = 0
 
 
+@kind
 @dataclass
-class _Member:
+class Member:
+    """An episode of a group, and its segments so far."""
+
     segments: list[Segment] = field(default_factory=list)
     outcome: Outcome | None = None
     ended: bool = False
@@ -162,7 +169,7 @@ class Groups:
         self.counters = GroupCounters()
         self._form: GroupAdvantage = form
         self._rule: GroupFilter = rule
-        self._open: dict[int, list[_Member]] = {}
+        self._open: dict[int, list[Member]] = {}
         self._newest, self._claimed = -1, size
 
     @property
@@ -182,7 +189,7 @@ class Groups:
             if self.open >= self.limit:
                 return None
             self._newest, self._claimed = self._newest + 1, 0
-            self._open[self._newest] = [_Member() for _ in range(self.size)]
+            self._open[self._newest] = [Member() for _ in range(self.size)]
         self._claimed += 1
         return Place(self._newest, self._claimed - 1)
 
@@ -222,7 +229,17 @@ class Groups:
         self._open.clear()
         self._claimed = self.size
 
-    def _judge(self, group: list[_Member]) -> list[Segment]:
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs; see `snapshot`."""
+        counters, claim = replace(self.counters), (self._newest, self._claimed)
+        return {"counters": counters, "open": dict(self._open), "claim": claim}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave."""
+        self.counters, self._open = state["counters"], state["open"]
+        self._newest, self._claimed = state["claim"]
+
+    def _judge(self, group: list[Member]) -> list[Segment]:
         left = [(m, m.outcome) for m in group if m.outcome is not None]
         outcomes = [outcome for _, outcome in left]
         if len(left) < 2 or not comparable(outcomes, self._rule):
@@ -239,7 +256,7 @@ class Groups:
         self.counters.released_decisions += sum(len(s) for s in released)
         return released
 
-    def _drop(self, members: list[_Member]) -> None:
+    def _drop(self, members: list[Member]) -> None:
         for member in members:
             self.counters.dropped_decisions += sum(len(s) for s in member.segments)
             member.segments = []

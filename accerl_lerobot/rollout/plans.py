@@ -23,6 +23,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable
+from typing import Any
 
 from accerl_lerobot.rollout.groups import Groups
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
@@ -116,6 +117,25 @@ class EpisodePlans:
     def spent(self) -> bool:
         """Whether every exploring episode has been handed out."""
         return self._budget is not None and self._budget <= 0
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs; see `snapshot`."""
+        return {
+            "budget": self._budget,
+            "starts": self._starts,
+            "start": self._start,
+            "queued": list(self._queued),
+            "tasks": self._tasks.state(),
+            "groups": None if self.groups is None else self.groups.state(),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave."""
+        self._budget, self._starts, self._start = state["budget"], state["starts"], state["start"]
+        self._queued.extend(state["queued"])
+        self._tasks.restore(state["tasks"])
+        if self.groups is not None:
+            self.groups.restore(state["groups"])
 
     def _explore(self) -> EpisodePlan | None:
         if self.groups is None:

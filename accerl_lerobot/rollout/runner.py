@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -32,8 +32,10 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Observation, Origin, Request, Segment
 from accerl_lerobot.rollout.groups import GroupAdvantage, GroupFilter, Groups, Outcome, Place
 from accerl_lerobot.rollout.segments import SegmentBuilder
+from accerl_lerobot.rollout.slot import Slot
 from accerl_lerobot.rollout.tasks import TaskSampling
 from accerl_lerobot.seeds import noise_seed
+from accerl_lerobot.snapshot import kind
 
 LARGEST_GROUP = 256
 """Episodes; a worker holds all of a group's segments until its last episode has ended."""
@@ -109,9 +111,9 @@ class RolloutConfig:
             "group_filter": GroupFilter,
             "task_sampling": TaskSampling,
         }
-        for name, kind in choices.items():
-            if getattr(self, name) not in get_args(kind):
-                raise InputError(f"rollout.{name}", getattr(self, name), f"use {' or '.join(get_args(kind))}")
+        for name, of in choices.items():
+            if getattr(self, name) not in get_args(of):
+                raise InputError(f"rollout.{name}", getattr(self, name), f"use {' or '.join(get_args(of))}")
         if self.group_size and self.episodes % self.group_size:
             remedy = f"use a multiple of rollout.group_size, {self.group_size}"
             raise InputError("rollout.episodes", self.episodes, remedy)
@@ -120,6 +122,7 @@ class RolloutConfig:
                 raise InputError(f"rollout.{name}", getattr(self, name), "use 0 or more")
 
 
+@kind
 @dataclass(frozen=True, kw_only=True)
 class EpisodePlan:
     """One episode to run."""
@@ -138,6 +141,7 @@ class EpisodePlan:
     """Record frames for people. Steps the world one action at a time, which changes nothing else."""
 
 
+@kind
 @dataclass(frozen=True, kw_only=True)
 class EpisodeResult:
     """How an episode went."""
@@ -153,6 +157,7 @@ class EpisodeResult:
     """uint8 (H, W, 3) each, when the plan asked for a film."""
 
 
+@kind
 @dataclass
 class Counters:
     """What a runner has done so far."""
@@ -168,18 +173,6 @@ class Counters:
     """Groups thrown away: nothing to compare, too few left, or unfinished when exploring ended."""
     groups_dropped_decisions: int = 0
     """Decisions that were held back and thrown away, with their group or with their own episode."""
-
-
-@dataclass
-class _Slot:
-    world: World
-    plan: EpisodePlan | None = None
-    builder: SegmentBuilder | None = None
-    episode_return: float = 0.0
-    steps: int = 0
-    decisions: int = 0
-    versions: list[int] = field(default_factory=list)
-    frames: list[np.ndarray] = field(default_factory=list)
 
 
 class RolloutRunner:
@@ -210,7 +203,7 @@ class RolloutRunner:
         self.config, self.name = config, name
         self.counters = Counters()
         self._groups = groups
-        self._slots = [_Slot(world) for world in worlds]
+        self._slots = [Slot(world) for world in worlds]
         self._next_plan, self._on_segment, self._on_episode = next_plan, on_segment, on_episode
         self._sequence = 0
         self._film = film
@@ -234,7 +227,7 @@ class RolloutRunner:
             raise RuntimeError(f"{plan.task} with seed {plan.seed}: the first observation is not finite")
         origin = Origin(plan.task, plan.seed, decision=0)
         builder = SegmentBuilder(observation, self.config.segment_length, origin)
-        self._slots[slot] = _Slot(state.world, plan, builder)
+        self._slots[slot] = Slot(state.world, plan, builder)
         return self._request(self._slots[slot])
 
     def advance(self, slot: int, decision: Decision) -> Request | None:
@@ -243,6 +236,7 @@ class RolloutRunner:
         plan, builder = state.plan, state.builder
         assert plan is not None and builder is not None
         result = self._filmed(state, decision.chunk) if plan.film else state.world.step_chunk(decision.chunk)
+        state.chunks.append(decision.chunk)
         self.counters.env_steps += result.steps
         self.counters.decisions += 1
         sound = np.isfinite(result.rewards).all() and _finite(result.observation)
@@ -269,6 +263,26 @@ class RolloutRunner:
             return self.start(slot)
         return self._request(state)
 
+    def request(self, slot: int) -> Request | None:
+        """What the episode in `slot` waits for; None if there is none."""
+        state = self._slots[slot]
+        return None if state.plan is None else self._request(state)
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs; see `snapshot`."""
+        slots = [slot.state() for slot in self._slots]
+        return {"counters": replace(self.counters), "sequence": self._sequence, "slots": slots}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave: worlds are brought back by doing again what was done in them.
+
+        Raises:
+            RuntimeError: a world does not show then what it had shown.
+        """
+        self.counters, self._sequence = state["counters"], state["sequence"]
+        for slot, saved in zip(self._slots, state["slots"], strict=True):
+            slot.restore(saved, self.config.segment_length)
+
     def abandon_groups(self) -> None:
         """Throws unfinished groups away, because exploring has ended."""
         if self._groups is not None:
@@ -280,7 +294,7 @@ class RolloutRunner:
         for state in self._slots:
             state.world.close()
 
-    def _filmed(self, state: _Slot, actions: np.ndarray) -> ChunkResult:
+    def _filmed(self, state: Slot, actions: np.ndarray) -> ChunkResult:
         """Executes a chunk one action at a time and keeps frames."""
         side, every = self._film
         rewards = []
@@ -293,7 +307,7 @@ class RolloutRunner:
                 break
         return replace(result, rewards=np.concatenate(rewards))
 
-    def _request(self, state: _Slot) -> Request:
+    def _request(self, state: Slot) -> Request:
         plan, builder = state.plan, state.builder
         assert plan is not None and builder is not None
         seed = noise_seed(plan.seed, plan.place.member if plan.place else 0, state.decisions)
@@ -301,7 +315,7 @@ class RolloutRunner:
 
     def _emit(
         self,
-        state: _Slot,
+        state: Slot,
         plan: EpisodePlan,
         builder: SegmentBuilder,
         terminated: bool,
@@ -325,7 +339,7 @@ class RolloutRunner:
         elif plan.explore:
             self._on_segment(segment)
 
-    def _finish(self, state: _Slot, plan: EpisodePlan, success: bool) -> None:
+    def _finish(self, state: Slot, plan: EpisodePlan, success: bool) -> None:
         self.counters.episodes += 1
         versions = state.versions or [0]
         self._on_episode(

@@ -15,6 +15,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from accerl_lerobot.experience import REAL, TASK, Decision, Observation, Origin, Segment
@@ -51,6 +53,14 @@ class SegmentBuilder:
     @property
     def full(self) -> bool:
         return len(self.decisions) >= self.length
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs; see `snapshot`."""
+        return dict(vars(self))
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave."""
+        vars(self).update(state)
 
     def add(
         self, decision: Decision, actions: np.ndarray, reward: float, steps: int, following: Observation

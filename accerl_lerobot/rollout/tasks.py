@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -66,6 +66,17 @@ class TaskSampler:
             self._turn += 1
             return self._tasks[(self._turn - 1) % len(self._tasks)]
         return self._tasks[int(self._rng.choice(len(self._tasks), p=self.probabilities()))]
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs; see `snapshot`."""
+        failed = {task: list(recent) for task, recent in self._failed.items()}
+        return {"turn": self._turn, "rng": self._rng, "failed": failed}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave."""
+        self._turn, self._rng = state["turn"], state["rng"]
+        for task, recent in state["failed"].items():
+            self._failed[task].extend(recent)
 
     def report(self, task: str, success: bool) -> None:
         """Counts one finished exploring episode."""

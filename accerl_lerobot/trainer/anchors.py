@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import torch
@@ -70,6 +71,22 @@ class Anchors:
     def drop(self, name: str) -> None:
         """Frees a copy."""
         del self._copies[name]
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs; see `snapshot`."""
+        return {"named": {name: version for name, (version, _) in self._copies.items()}} | {
+            "weights": {
+                version: [t.detach().clone() for t in kept] for version, kept in self._copies.values()
+            }
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave."""
+        weights = {
+            version: [t.to(live.device) for t, live in zip(kept, self._live, strict=True)]
+            for version, kept in state["weights"].items()
+        }
+        self._copies = {name: (version, weights[version]) for name, version in state["named"].items()}
 
     @torch.no_grad()
     def log_prob(

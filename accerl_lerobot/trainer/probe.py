@@ -28,6 +28,8 @@ another one is taken. That is after `replay.max_lag` updates at the latest.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -54,6 +56,14 @@ class Probe:
         self._version: int | None = None
         self._next = 0
         self.renew(0)
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs; the copy itself is with the anchors."""
+        return {"version": self._version, "next": self._next}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave."""
+        self._version, self._next = state["version"], state["next"]
 
     def renew(self, version: int) -> None:
         """Takes a copy if it is time for one.

@@ -28,6 +28,7 @@ Shapes: S segments, T decisions of the longest one, N decisions in all.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -119,6 +120,31 @@ class Update:
             "value_lr": float(critic_group["lr"]),
             "skipped": float(self.skipped),
         }
+
+    def state(self) -> dict[str, Any]:
+        """A copy of all that `restore` needs, the policy's weights apart; see `snapshot`."""
+        moments = self.optimizer.state_dict()["state"]
+        return {
+            "version": self.version,
+            "skipped": (self.skipped, self._skipped_in_a_row),
+            "moments": self._moments.clone(),
+            "optimizer": {
+                i: {name: torch.as_tensor(value).detach().clone() for name, value in of.items()}
+                for i, of in moments.items()
+            },
+            "anchors": self.anchors.state(),
+            "probe": self._probe.state(),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave; the adapter has its weights already."""
+        self.version = state["version"]
+        self.skipped, self._skipped_in_a_row = state["skipped"]
+        self._moments = state["moments"]
+        groups = self.optimizer.state_dict()["param_groups"]
+        self.optimizer.load_state_dict({"state": state["optimizer"], "param_groups": groups})
+        self.anchors.restore(state["anchors"])
+        self._probe.restore(state["probe"])
 
     @property
     def _is_proximal(self) -> bool:

@@ -30,7 +30,9 @@ from typing import Any
 
 import ray
 
+from accerl_lerobot import snapshot
 from accerl_lerobot.algorithms import AlgorithmConfig
+from accerl_lerobot.checkpoint import PRETRAINED, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.weights.held_back import HeldBack
@@ -45,10 +47,16 @@ class TrainerWorker:
         algorithm: the objective.
         config: the optimiser.
         seed: of torch's global generator.
+        state: the ``training_state`` to go on from; None: begin.
     """
 
     def __init__(
-        self, policy: PolicyConfig, algorithm: AlgorithmConfig, config: TrainerConfig, seed: int
+        self,
+        policy: PolicyConfig,
+        algorithm: AlgorithmConfig,
+        config: TrainerConfig,
+        seed: int,
+        state: Path | None = None,
     ) -> None:
         import torch
 
@@ -58,7 +66,11 @@ class TrainerWorker:
         torch.set_num_threads(config.num_threads)
         torch.manual_seed(seed)
         self._policy, self._config = policy, config
-        self._update = Update(load_adapter(policy), algorithm, config)
+        adapter = load_adapter(policy)
+        self._update = Update(adapter, algorithm, config)
+        if state is not None:
+            adapter.load_trainable(snapshot.load(state / WEIGHTS))
+            self._update.restore(snapshot.load(state / "trainer"))
         self._lock = threading.Lock()
         self._history: deque[dict[str, float]] = deque()  # filled on one thread, emptied on another
 
@@ -70,7 +82,8 @@ class TrainerWorker:
         """Trains; returns the number of updates made."""
         publisher, held = RayPublisher(readers), HeldBack(self._config.hold_back)
         n, config = self._config.batch_decisions, self._config
-        publisher.publish(0, self._export())  # a checkpoint need not hold a critic: all start from this one
+        # A checkpoint need not hold a critic: all start from this one.
+        publisher.publish(self._update.version, self._export())
         upcoming = replay.sample.remote(n, self._update.version)
         while self._update.version < config.updates:
             asked = time.monotonic()
@@ -80,21 +93,21 @@ class TrainerWorker:
             waited = time.monotonic() - asked
             if self._update.version + 1 < config.updates:
                 upcoming = replay.sample.remote(n, self._update.version + 1)
-            started = time.monotonic()
             with self._lock:
+                started = time.monotonic()
                 metrics = self._update.step(segments)
-            updated = time.monotonic()
-            version = self._update.version
-            if config.publishes(version):
-                for due in held.push(version, self._export(), last=version == config.updates):
-                    publisher.publish(*due)
-            metrics |= {
-                "update": float(self._update.version),
-                "wait_s": waited,
-                "update_s": updated - started,
-                "publish_s": time.monotonic() - updated,
-            }
-            self._history.append(metrics)
+                updated = time.monotonic()
+                version = self._update.version
+                if config.publishes(version):
+                    for due in held.push(version, self._export(), last=version == config.updates):
+                        publisher.publish(*due)
+                metrics |= {
+                    "update": float(self._update.version),
+                    "wait_s": waited,
+                    "update_s": updated - started,
+                    "publish_s": time.monotonic() - updated,
+                }
+                self._history.append(metrics)
         version = self._update.version
         if version < config.updates and (config.hold_back or not config.publishes(version)):
             # It has ended early, and what is evaluated is to be what is saved.
@@ -107,13 +120,24 @@ class TrainerWorker:
         """One record per update since the last call."""
         return [self._history.popleft() for _ in range(len(self._history))]
 
-    def save(self, directory: str) -> int:
-        """Writes LeRobot's ``pretrained_model`` files between two updates; returns their version."""
-        from accerl_lerobot.policies.loading import save_pretrained
+    def save(self, directory: Path) -> tuple[int, list[dict[str, float]]]:
+        """Writes ``pretrained_model`` and its part of ``training_state``, as they are between two updates.
 
+        The next update waits for them to be copied, and not for the files.
+
+        Returns:
+            Their version, and the records up to it that `metrics` has not given.
+        """
+        from accerl_lerobot.policies.loading import copy_weights, save_pretrained
+
+        adapter = self._update.adapter
         with self._lock:
-            save_pretrained(self._update.adapter, Path(directory), self._policy)
-            return self._update.version
+            weights, trained, state = copy_weights(adapter), self._export(), self._update.state()
+            version, records = self._update.version, self.metrics()
+        save_pretrained(adapter, directory / PRETRAINED, self._policy, weights)
+        snapshot.save(directory / TRAINING_STATE / WEIGHTS, trained)
+        snapshot.save(directory / TRAINING_STATE / "trainer", state)
+        return version, records
 
     def _export(self) -> dict[str, Any]:
         return self._update.adapter.export_trainable()

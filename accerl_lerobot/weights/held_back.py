@@ -48,3 +48,11 @@ class HeldBack:
         while self._waiting and (last or self._waiting[0][0] <= max(0, version - self.updates)):
             due.append(self._waiting.popleft())
         return due[-1:] if last else due
+
+    def state(self) -> list[tuple[int, Tensors]]:
+        """All that `restore` needs; see `snapshot`."""
+        return list(self._waiting)
+
+    def restore(self, state: list[tuple[int, Tensors]]) -> None:
+        """Goes on from what `state` gave."""
+        self._waiting.extend(state)

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -25,17 +26,22 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from accerl_lerobot import cli
-from accerl_lerobot.checkpoint import save_checkpoint
+from accerl_lerobot.checkpoint import defect, save_checkpoint
+from accerl_lerobot.config import LaunchConfig, encode
 from accerl_lerobot.demos.sft import SFTConfig, sft_command
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.config import EvaluationConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, save_pretrained
+from accerl_lerobot.trainer.config import TrainerConfig
 from tests.hub.folders import SUMMARY, write_json
 from tests.hub_server import HubServer, environment
 from tests.policies.checkpoints import write_gaussian_actor
 from tests.policies.tiny import perturb
+from tests.runs import tiny_run
 from tests.world_model.test_pixels import model
 
 ROOT = Path(__file__).parents[2]
@@ -94,10 +100,10 @@ def run(tiny_checkpoint: Path, tmp_path: Path) -> Path:
     perturb(adapter, 0.1)
 
     def write(directory: Path) -> int:
-        save_pretrained(adapter, directory, config)
+        save_pretrained(adapter, directory / "pretrained_model", config)
         return 12
 
-    save_checkpoint(tmp_path / "run" / "checkpoints", write, {"algorithm": "gipo"})
+    save_checkpoint(tmp_path / "run" / "checkpoints", write)
     (tmp_path / "run" / "config.yaml").write_text(f"output_dir: {tmp_path}/run\njob_name: tiny\n")
     write_json(tmp_path / "run" / "summary.json", SUMMARY)
     return tmp_path / "run"
@@ -134,6 +140,34 @@ def test_a_policy_from_the_hub_can_be_improved_and_pushed_again(hub: HubServer, 
     names = ("model.safetensors", "value_head.safetensors", "config.json", "policy_preprocessor.json")
     first, second = hub.files("alice/policy"), hub.files("alice/better")
     assert {n: first[n] for n in names} == {n: second[n] for n in names}
+
+
+def test_a_run_that_was_pulled_can_be_gone_on_with(hub: HubServer, tiny_checkpoint: Path, tmp_path: Path):
+    trainer = TrainerConfig(updates=3, batch_decisions=16)
+    launch, evaluation = LaunchConfig(engine="local"), EvaluationConfig(episodes=2, videos=0)
+    accerl("push", f"--path={tiny_checkpoint}", "--repo_id=alice/start")
+    policy = PolicyConfig(path="alice/start", device="cpu")
+    config = tiny_run(tiny_checkpoint, policy=policy, trainer=trainer, launch=launch, evaluation=evaluation)
+    (tmp_path / "recipe.yaml").write_text(yaml.safe_dump(encode(config)))
+    accerl("train", f"--config_path={tmp_path / 'recipe.yaml'}", f"--output_dir={tmp_path / 'run'}")
+    accerl("push", f"--path={tmp_path / 'run'}", "--repo_id=alice/run")
+    uploaded = hub.files("alice/run")
+    assert [n for n, data in uploaded.items() if str(tmp_path).encode() in data] == []
+    shutil.rmtree(tmp_path / "run")
+    accerl("pull", "--repo_id=alice/run", f"--output_dir={tmp_path / 'pulled'}")
+    assert defect(tmp_path / "pulled" / "checkpoints" / "000003") is None
+    accerl(
+        "train",
+        "--resume=true",
+        f"--config_path={tmp_path / 'pulled' / 'config.yaml'}",
+        "--trainer.updates=5",
+    )
+    assert os.readlink(tmp_path / "pulled" / "checkpoints" / "last") == "000005"
+    assert json.loads((tmp_path / "pulled" / "summary.json").read_text())["updates"] == 5
+    weights = tmp_path / "pulled" / LAST / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-1] + b"x")
+    assert cli.main(["push", f"--path={tmp_path / 'pulled'}", "--repo_id=alice/run"]) == 2
+    assert hub.files("alice/run") == uploaded, "what is broken is not pushed"
 
 
 def test_fine_tuning_one_with_its_own_backbone_wants_a_folder(hub: HubServer, run: Path, tmp_path: Path):

@@ -295,10 +295,10 @@ def test_a_moved_checkpoint_needs_nothing_from_where_it_was_made(tmp_path: Path)
     perturb(adapter, 0.1)
 
     def write(directory: Path) -> int:
-        save_pretrained(adapter, directory, config)
+        save_pretrained(adapter, directory / PRETRAINED, config)
         return 12
 
-    final = save_checkpoint(tmp_path / "run" / "checkpoints", write, {})
+    final = save_checkpoint(tmp_path / "run" / "checkpoints", write)
     shutil.rmtree(tmp_path / "origin")
     asked = requests(3)
     decisions = adapter.decide(asked, 0)

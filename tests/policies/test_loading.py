@@ -231,10 +231,10 @@ def test_a_moved_checkpoint_needs_nothing_from_where_it_was_made(tmp_path: Path)
     perturb(adapter, 0.1)
 
     def write(directory: Path) -> int:
-        save_pretrained(adapter, directory, config)
+        save_pretrained(adapter, directory / PRETRAINED, config)
         return 12
 
-    path = save_checkpoint(tmp_path / "run" / "checkpoints", write, {}) / PRETRAINED
+    path = save_checkpoint(tmp_path / "run" / "checkpoints", write) / PRETRAINED
     shutil.rmtree(tmp_path / "origin")
 
     stock = SmolVLAPolicy.from_pretrained(path)

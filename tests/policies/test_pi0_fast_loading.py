@@ -198,10 +198,10 @@ def test_lerobot_s_checkpoint_needs_the_hub_and_ours_does_not(
     config = PolicyConfig(path=str(original), device="cpu")
 
     def write(directory: Path) -> int:
-        save_pretrained(adapter, directory, config)
+        save_pretrained(adapter, directory / PRETRAINED, config)
         return 3
 
-    ours = save_checkpoint(tmp_path / "checkpoints", write, {}) / PRETRAINED
+    ours = save_checkpoint(tmp_path / "checkpoints", write) / PRETRAINED
     for folder in (original, tmp_path / "original-hub"):
         shutil.rmtree(folder)
     moved = Path(shutil.move(ours, tmp_path / "moved"))

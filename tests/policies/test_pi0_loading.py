@@ -201,10 +201,10 @@ def test_lerobot_s_checkpoint_needs_the_hub_and_ours_does_not(path: Path, tmp_pa
     config = PolicyConfig(path=str(original), device="cpu")
 
     def write(directory: Path) -> int:
-        save_pretrained(adapter, directory, config)
+        save_pretrained(adapter, directory / PRETRAINED, config)
         return 3
 
-    ours = save_checkpoint(tmp_path / "checkpoints", write, {}) / PRETRAINED
+    ours = save_checkpoint(tmp_path / "checkpoints", write) / PRETRAINED
     shutil.rmtree(original)
     moved = Path(shutil.move(ours, tmp_path / "moved"))
     again = adapter_at(moved)

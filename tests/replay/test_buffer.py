@@ -13,16 +13,18 @@
 # limitations under the License.
 """The store: order, bounds, idempotence, age, and books that balance."""
 
-import json
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from accerl_lerobot import snapshot
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay import Replay, ReplayConfig
 from accerl_lerobot.replay import buffer as buffer_module
+from accerl_lerobot.replay.buffer import DRAWS
 from tests.replay.segments import make_segment
 
 
@@ -37,7 +39,7 @@ def keys(segments: list[Any]) -> list[str]:
 def assert_books_balance(replay: Replay) -> None:
     c = replay.counters
     for unit in ("segments", "decisions"):
-        gone = sum(getattr(c, f"{how}_{unit}") for how in ("evicted", "retired", "lost"))
+        gone = sum(getattr(c, f"{how}_{unit}") for how in ("evicted", "retired"))
         assert getattr(c, f"inserted_{unit}") == getattr(replay, f"stored_{unit}") + gone
     uses = replay.uses_histogram()
     assert sum(uses.values()) == c.inserted_segments
@@ -198,27 +200,63 @@ def test_books_balance_under_random_use() -> None:
     assert c.duplicates > 20 and c.retired_segments > 20 and c.evicted_segments > 20 and version > 200
 
 
-def test_counters_survive_a_resumption_and_what_was_held_is_lost() -> None:
+def carried(replay: Replay, version: int | None, folder: Path) -> Replay:
+    """A new store that goes on from what this one saves."""
+    snapshot.save(folder / "replay", replay.state(version))
+    resumed = Replay(replay.config)
+    resumed.restore(snapshot.load(folder / "replay"))
+    return resumed
+
+
+def test_what_is_saved_goes_on_as_if_it_had_never_been(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    replay = make_replay(capacity=16, ahead=16)
+    replay = make_replay(capacity=16, ahead=16, samples_per_insert=1.5)
     for i in range(6):
         replay.insert(make_segment(f"k{i}"))
-    replay.sample(4, 0, rng)
+    replay.sample(8, 0, rng)
     before = replay.metrics()
-    state = json.loads(json.dumps(replay.state()))
-    assert replay.metrics() == before  # asking changes nothing
-
-    resumed = make_replay(capacity=16, ahead=16)
-    resumed.restore(state)
-    c = resumed.counters
-    assert (c.inserted_segments, c.evicted_segments, c.lost_segments, c.lost_unused) == (6, 2, 4, 3)
-    assert c.trained_decisions == 4 and resumed.uses_histogram() == replay.uses_histogram()
-    assert resumed.may_insert() and not resumed.may_sample(4)  # warm start again
-    resumed.insert(make_segment("k9"))
-    assert resumed.may_sample(4)
+    resumed = carried(replay, None, tmp_path)
+    assert replay.metrics() == before == resumed.metrics(), "asking changes nothing"
+    assert not resumed.insert(make_segment("k0")), "left long ago, and still known"
+    replay.insert(make_segment("k0"))
+    for store in (replay, resumed):
+        store.insert(make_segment("k9"))
+    drawn = [keys(store.sample(12, 1, np.random.default_rng(1))) for store in (replay, resumed)]
+    assert drawn[0] == drawn[1] and replay.metrics() == resumed.metrics()
     assert_books_balance(resumed)
-    with pytest.raises(RuntimeError):
-        resumed.restore(state)
+    with pytest.raises(RuntimeError, match="before the first insert"):
+        resumed.restore(replay.state())
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_batches_that_were_drawn_and_not_learnt_from_do_not_count(seed: int, tmp_path: Path) -> None:
+    """Beside a store that was never asked for them."""
+    rng = np.random.default_rng(seed)
+    replay, other = (make_replay(capacity=24, samples_per_insert=1.7) for _ in range(2))
+    left_at = int(rng.integers(2, 12))
+    for version in range(left_at + 4):
+        for number in range(rng.integers(1, 4)):
+            for store in (replay, other):
+                store.insert(make_segment(f"{version}.{number}", n=4, version=version))
+        replay.sample(8, version, np.random.default_rng(version))
+        if version < left_at:
+            other.sample(8, version, np.random.default_rng(version))
+        other.retire(version)
+    resumed = carried(replay, left_at, tmp_path)
+    assert resumed.metrics() == other.metrics() and resumed.uses_histogram() == other.uses_histogram()
+    assert [e.uses for e in resumed._entries.values()] == [e.uses for e in other._entries.values()]
+    assert keys(resumed.segments) == keys(other.segments)
+    assert_books_balance(resumed)
+
+
+def test_what_is_too_long_ago_cannot_be_taken_back() -> None:
+    replay = make_replay(samples_per_insert=10_000.0)
+    replay.insert(make_segment("a"))
+    for version in range(DRAWS + 5):
+        replay.sample(4, 3 if version else 0, np.random.default_rng(0))
+    assert replay.state(4)["entries"][0]["uses"] == DRAWS + 5
+    with pytest.raises(RuntimeError, match=f"more than {DRAWS} batches since update 3"):
+        replay.state(3)
 
 
 def test_every_counter_is_logged() -> None:

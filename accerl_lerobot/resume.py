@@ -1,0 +1,107 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Which run is gone on with, and whether it may be."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from accerl_lerobot.checkpoint import CONFIG, LAST
+from accerl_lerobot.config import RunConfig, encode, parse
+from accerl_lerobot.errors import InputError
+
+LOCK = ".lock"
+CHANGEABLE = (
+    "resume", "output_dir", "evaluation", "launch", "wandb", "save_every_updates", "save_every_s",
+    "save_keep", "trainer.updates", "trainer.num_threads", "rollout.max_restarts", "inference",
+)  # fmt: skip
+"""Fields, and rooms, that may be other than before: what is learnt, and from what, is the same."""
+
+
+class Begun(NamedTuple):
+    """A run that was begun before."""
+
+    directory: Path
+    checkpoint: str
+    """Which one to go on from: ``last``, or a number."""
+
+
+def begun_run(path: Path | None, config: RunConfig) -> Begun:
+    """The run that a config file belongs to.
+
+    Args:
+        path: ``--config_path``: ``RUN/config.yaml`` or ``RUN/checkpoints/NNNNNN/config.yaml``.
+        config: the run as it is to go on.
+
+    Raises:
+        InputError: the file is of no run, a setting differs that must not, or there is nothing left to do.
+    """
+    how = "name RUN/config.yaml or RUN/checkpoints/last/config.yaml"
+    if path is None:
+        raise InputError("resume", True, f"add --config_path: {how}")
+    folders = path.absolute().parents
+    directory, checkpoint = folders[0], LAST
+    if len(folders) > 2 and folders[1].name == "checkpoints":
+        directory, checkpoint = folders[2], folders[0].name
+    if not (directory / CONFIG).is_file() or not (directory / LOCK).is_file():
+        raise InputError("config_path", str(path), f"no run has been begun there; {how}")
+    before: RunConfig = parse(RunConfig, [f"--config_path={directory / CONFIG}"])
+    for name, (was, now) in _differences(encode(before), encode(config), "").items():
+        if not any(name == free or name.startswith(f"{free}.") for free in CHANGEABLE):
+            remedy = f"the run was begun with {was!r}; leave it so, or begin a new run with --policy.path"
+            raise InputError(name, now, remedy)
+    summary = directory / "summary.json"
+    if summary.is_file() and json.loads(summary.read_text())["updates"] >= config.trainer.updates:
+        remedy = f"the run {directory} has made them, and has ended; ask for more"
+        raise InputError("trainer.updates", config.trainer.updates, remedy)
+    return Begun(directory, checkpoint)
+
+
+def _differences(before: Any, now: Any, name: str) -> dict[str, tuple[Any, Any]]:
+    """Dotted field → what it was and is, where they differ."""
+    if not (isinstance(before, dict) and isinstance(now, dict)):
+        return {} if before == now else {name: (before, now)}
+    found: dict[str, tuple[Any, Any]] = {}
+    for key in before.keys() | now.keys():
+        found |= _differences(before.get(key), now.get(key), f"{name}.{key}" if name else str(key))
+    return found
+
+
+@contextmanager
+def locked(directory: Path, field: str, in_use: str) -> Iterator[int]:
+    """Keeps other processes out of a folder, which is made if need be, while one that was told so is alive.
+
+    Args:
+        directory: the folder.
+        field: that it was given by,
+        in_use: and what to say if it is in use.
+
+    Returns:
+        A file descriptor to hand to child processes that are to keep it locked.
+
+    Raises:
+        InputError: it is in use.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    with (directory / LOCK).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InputError(field, str(directory), in_use) from error
+        yield file.fileno()

@@ -1,0 +1,251 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The rollout workers of an asynchronous run: seats that outlive the processes that take them in turn.
+
+A worker that died or hangs is started again, with a new incarnation number in its seeds and in the keys of
+its segments. With it go its unfinished segments and groups, nothing else: planned episodes without a result
+are run by whoever sits there next. So it is when a run is gone on with.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import ray
+from ray.exceptions import RayActorError, RayError
+
+from accerl_lerobot import snapshot
+from accerl_lerobot.config import RunConfig
+from accerl_lerobot.engine import check_new, episode_key
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.ray_environment import TOKENLESS
+from accerl_lerobot.rollout.plans import budgets, whole_groups
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
+from accerl_lerobot.watched import Watched
+
+logger = logging.getLogger(__name__)
+
+START_S = 600.0
+"""How long a worker may take to start; `LaunchConfig.stall_s` counts from its first answer."""
+ROLLOUT = "rollout"
+"""Name of their state."""
+
+
+@dataclass(kw_only=True)
+class Seat:
+    """A rollout worker's place."""
+
+    index: int
+    incarnation: int = 0
+    """Processes that have sat here before."""
+    restarts: int = 0
+    """Of them, since the run was begun or gone on with."""
+    outstanding: dict[tuple[str, int], EpisodePlan] = field(default_factory=dict)
+    """Planned episodes without a result."""
+    unsent: list[EpisodePlan] = field(default_factory=list)
+    counters: dict[str, float] = field(default_factory=dict)
+    in_world_s: float = 0.0
+    budget: int | None = None
+    """Exploring episodes that are still to be played; None: no end."""
+    spent: bool = False
+    """Whether all of them are in replay."""
+    worker: Watched = field(init=False)
+
+
+class Seats:
+    """All of them.
+
+    Args:
+        config: the run.
+        tasks: the training tasks.
+        history: env steps that an observation holds.
+        state: the ``training_state`` to go on from; None: begin.
+
+    Raises:
+        InputError: the state is not of an asynchronous run with as many workers.
+    """
+
+    def __init__(
+        self, config: RunConfig, tasks: tuple[str, ...], history: int, state: Path | None = None
+    ) -> None:
+        self._config, self._tasks, self._history = config, tasks, history
+        self._past: dict[str, float] = {"restarts": 0.0}
+        self._peers: tuple[Any, Any] | None = None
+        self._seats = [
+            Seat(index=index, budget=budget, spent=budget == 0)
+            for index, budget in enumerate(budgets(config.rollout))
+        ]
+        if state is not None:
+            self._restore(state)
+
+    def start(self) -> None:
+        """Starts a process for each."""
+        for seat in self._seats:
+            seat.worker = self._new(seat)
+
+    def set_to_work(self, inference: Any, replay: Any) -> None:
+        """Has them step worlds, with these actors."""
+        self._peers = inference, replay
+        for seat in self._seats:
+            seat.worker.work = seat.worker.actor.run.remote(inference, replay)
+
+    def workers(self) -> Iterator[Watched]:
+        """Those that have been started."""
+        return (seat.worker for seat in self._seats if hasattr(seat, "worker"))
+
+    def plan(self, plans: list[EpisodePlan]) -> None:
+        """See `Engine.plan`."""
+        check_new(plans, {key for seat in self._seats for key in seat.outstanding})
+        for seat in self._seats:
+            self._hand(seat, plans[seat.index :: len(self._seats)])
+
+    def ask(self, training: bool) -> None:
+        """Has each report, unless it owes a report already."""
+        for seat in self._seats:
+            if seat.worker.ask("report", training, seat.unsent):
+                seat.unsent = []
+
+    def listen(self) -> list[EpisodeResult]:
+        """Picks up the reports that have come; returns the episodes in them."""
+        episodes: list[EpisodeResult] = []
+        for seat in self._seats:
+            try:
+                report = seat.worker.answer()
+            except RayActorError:
+                continue  # its `run` has ended as well, and the engine deals with that
+            except RayError as error:
+                raise RuntimeError(f"{seat.worker.name} worker failed to report:\n{error}") from error
+            if report is None:
+                continue
+            seat.counters, seat.in_world_s, seat.spent = report.counters, report.in_world_s, report.spent
+            if seat.budget is not None:
+                seat.budget -= sum(e.plan.explore for e in report.episodes)
+            for episode in report.episodes:
+                planned = seat.outstanding.pop(episode_key(episode.plan), None)
+                if episode.plan.explore or planned is not None:
+                    episodes.append(episode)
+        return episodes
+
+    def counters(self) -> dict[str, float]:
+        """Over all of them, and those before them, since the run began."""
+        totals = dict(self._past)
+        for seat in self._seats:
+            for key, value in seat.counters.items():
+                totals[key] = totals.get(key, 0.0) + value
+        return totals
+
+    @property
+    def outstanding(self) -> bool:
+        """Whether a planned episode has no result yet."""
+        return any(seat.outstanding for seat in self._seats)
+
+    @property
+    def spent(self) -> bool:
+        """Whether all exploring episodes that were paid for are in replay."""
+        return all(seat.spent for seat in self._seats)
+
+    @property
+    def in_world_s(self) -> float:
+        """How long the slowest world has been at what it does now."""
+        return max(seat.in_world_s for seat in self._seats)
+
+    def restart_worker(self, worker: Watched, error: Exception) -> bool:
+        """Starts a worker again that has failed; False if it is none of these.
+
+        Raises:
+            RuntimeError: it has been done `RolloutConfig.max_restarts` times; carries the worker's traceback.
+        """
+        for seat in self._seats:
+            if seat.worker is worker:
+                self._restart(seat, error)
+                return True
+        return False
+
+    def check_hung(self) -> None:
+        """Starts those again that do not answer or whose world does not return.
+
+        Raises:
+            RuntimeError: see `restart_worker`.
+        """
+        limit = self._config.launch.stall_s
+        for seat in self._seats:
+            silent = seat.worker.silent_s()
+            if silent > (limit if seat.worker.answered else max(START_S, limit)):
+                self._restart(seat, RuntimeError(f"no answer for {silent:.0f} s"))
+            elif seat.in_world_s > limit:
+                self._restart(seat, RuntimeError(f"its world has not returned for {seat.in_world_s:.0f} s"))
+
+    def save(self, directory: Path) -> None:
+        """Writes their part of ``training_state``."""
+        seats = [
+            {"incarnation": s.incarnation, "budget": s.budget, "outstanding": list(s.outstanding.values())}
+            for s in self._seats
+        ]
+        snapshot.save(directory / ROLLOUT, {"past": self.counters(), "seats": seats})
+
+    def _restore(self, directory: Path) -> None:
+        if not (directory / f"{ROLLOUT}.json").is_file():
+            remedy = "this run was in one process; go on with launch.engine=local"
+            raise InputError("launch.engine", self._config.launch.engine, remedy)
+        saved = snapshot.load(directory / ROLLOUT)
+        if len(saved["seats"]) != len(self._seats):
+            remedy = f"this run has {len(saved['seats'])}; leave the field out"
+            raise InputError("rollout.workers", len(self._seats), remedy)
+        self._past = saved["past"]
+        for seat, was in zip(self._seats, saved["seats"], strict=True):
+            seat.incarnation, seat.budget = was["incarnation"] + 1, was["budget"]
+            if seat.budget is not None:
+                seat.budget = whole_groups(seat.budget, self._config.rollout)
+                seat.spent = seat.budget == 0
+            self._hand(seat, was["outstanding"])
+
+    def _hand(self, seat: Seat, plans: list[EpisodePlan]) -> None:
+        seat.outstanding |= {episode_key(plan): plan for plan in plans}
+        seat.unsent += plans
+
+    def _new(self, seat: Seat) -> Watched:
+        from accerl_lerobot.rollout.worker import RolloutWorker
+
+        c = self._config
+        film = (c.evaluation.video_size, c.evaluation.video_every)
+        actor = ray.remote(RolloutWorker).options(num_cpus=0, num_gpus=0, max_concurrency=4, **TOKENLESS)
+        place = (c.seed, seat.index, seat.incarnation)
+        made = actor.remote(c.env, c.rollout, self._tasks, *place, film, self._history, seat.budget)
+        return Watched(f"rollout {seat.index}", made)
+
+    def _restart(self, seat: Seat, error: Exception) -> None:
+        """Puts a new process into a seat."""
+        name = seat.worker.name
+        if seat.restarts >= self._config.rollout.max_restarts:
+            times = f" after {seat.restarts} restarts" if seat.restarts else ""
+            raise RuntimeError(f"{name} worker failed for good{times}:\n{error}") from error
+        reason = str(error).strip().splitlines()[-1][:200]
+        logger.warning("%s worker is started again: %s", name, reason)
+        ray.kill(seat.worker.actor)
+        self._past["restarts"] += 1
+        for key, value in seat.counters.items():
+            self._past[key] = self._past.get(key, 0.0) + value
+        seat.counters, seat.in_world_s = {}, 0.0
+        seat.incarnation += 1
+        seat.restarts += 1
+        if seat.budget is not None:
+            seat.budget = whole_groups(seat.budget, self._config.rollout)
+        seat.worker = self._new(seat)
+        seat.unsent = list(seat.outstanding.values())
+        assert self._peers is not None
+        seat.worker.work = seat.worker.actor.run.remote(*self._peers)

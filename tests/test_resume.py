@@ -1,0 +1,218 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A run that was stopped, or killed, and gone on with by its command line."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from accerl_lerobot.cli import main
+from accerl_lerobot.config import LaunchConfig, encode
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.evaluation.config import EvaluationConfig
+from accerl_lerobot.local import LocalEngine
+from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.trainer.config import TrainerConfig
+from tests.runs import tiny_run
+
+UPDATES = 14
+TIMES = ("wall_s", "wait_s", "update_s", "publish_s", "rl_s", "warm_start_s")
+
+
+def recipe(folder: Path, checkpoint: Path, **rooms: Any) -> Path:
+    defaults: dict[str, Any] = {
+        "env": SimulatedConfig(max_steps=12, tolerance=0.4),
+        "evaluation": EvaluationConfig(
+            episodes=6, every_updates=4, episodes_during=5, videos=1, video_size=32, video_every=1
+        ),
+        "trainer": TrainerConfig(
+            updates=UPDATES, batch_decisions=16, lr=1e-3, warmup_updates=2, value_warmup_updates=2
+        ),
+        "launch": LaunchConfig(engine="local"),
+        "save_every_updates": 5,
+    }
+    config = tiny_run(checkpoint, **{**defaults, **rooms})
+    folder.mkdir(exist_ok=True)
+    (folder / "recipe.yaml").write_text(yaml.safe_dump(encode(config)))
+    return folder / "recipe.yaml"
+
+
+def records(run: Path) -> list[dict[str, Any]]:
+    """All that was logged, but how long it took."""
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in line.items() if k not in TIMES} for line in lines]
+
+
+def summary(run: Path) -> dict[str, Any]:
+    found = json.loads((run / "summary.json").read_text())
+    return {k: v for k, v in found.items() if k not in TIMES}
+
+
+def weights(run: Path) -> list[bytes]:
+    last = run / "checkpoints" / "last" / "pretrained_model"
+    return [(last / name).read_bytes() for name in ("model.safetensors", "value_head.safetensors")]
+
+
+@pytest.fixture(scope="module")
+def whole(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that was never stopped."""
+    folder = tmp_path_factory.mktemp("whole")
+    assert main(["train", str(recipe(folder, tiny_checkpoint)), f"--output_dir={folder / 'run'}"]) == 0
+    return folder / "run"
+
+
+def stop_at(monkeypatch: pytest.MonkeyPatch, version: int, number: int = signal.SIGTERM) -> None:
+    """This process gets a signal once so many updates have been made."""
+    poll = LocalEngine.poll
+
+    def watched(self: LocalEngine) -> Any:
+        progress = poll(self)
+        if progress.version == version and progress.updates:
+            os.kill(os.getpid(), number)
+        return progress
+
+    monkeypatch.setattr(LocalEngine, "poll", watched)
+
+
+def go_on(run: Path, *arguments: str, config: str = "config.yaml") -> int:
+    return main(["train", "--resume=true", f"--config_path={run / config}", *arguments])
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_run_that_was_asked_to_stop_goes_on_as_if_it_had_not(
+    number: int,
+    code: int,
+    whole: Path,
+    tiny_checkpoint: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    run = tmp_path / "run"
+    with monkeypatch.context() as context:
+        stop_at(context, 7, number)
+        assert main(["train", str(recipe(tmp_path, tiny_checkpoint)), f"--output_dir={run}"]) == code
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"stopped by {signal.Signals(number).name}; to go on: accerl train --resume=true" in said
+    assert not (run / "summary.json").exists()
+    assert sorted(p.name for p in (run / "checkpoints").iterdir()) == ["000000", "000005", "000007", "last"]
+    assert go_on(run, config="checkpoints/last/config.yaml") == 0
+    assert records(run) == records(whole)
+    assert summary(run) == summary(whole)
+    assert weights(run) == weights(whole)
+    assert (run / "before_after.mp4").is_file() and not list(run.glob(".before*"))
+
+
+def test_a_run_that_fell_over_goes_on_from_its_last_whole_checkpoint(
+    whole: Path,
+    tiny_checkpoint: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    run = tmp_path / "run"
+    poll = LocalEngine.poll
+
+    def falls(self: LocalEngine) -> Any:
+        progress = poll(self)
+        if progress.version == 12:
+            raise ArithmeticError("it fell over")
+        return progress
+
+    with monkeypatch.context() as context:
+        context.setattr(LocalEngine, "poll", falls)
+        with pytest.raises(ArithmeticError):
+            main(["train", str(recipe(tmp_path, tiny_checkpoint)), f"--output_dir={run}"])
+    assert "may be gone on with: accerl train --resume=true" in " ".join(capsys.readouterr().err.split())
+    newest = run / "checkpoints" / "000010" / "training_state" / "replay.safetensors"
+    newest.write_bytes(newest.read_bytes()[:-10])  # torn, as by a full disk
+    with (run / "metrics.jsonl").open("a") as file:
+        file.write('{"kind": "train", "upd')  # the last line, too
+    assert go_on(run) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "passed over checkpoint 000010: training_state/replay.safetensors has" in said
+    assert "going on from" in said and "000005" in said
+    assert (
+        records(run) == records(whole) and summary(run) == summary(whole) and weights(run) == weights(whole)
+    )
+
+
+def test_more_updates_may_be_asked_for_and_nothing_else(whole: Path, capsys: pytest.CaptureFixture[str]):
+    assert go_on(whole) == 2
+    assert "trainer.updates=14: the run" in capsys.readouterr().err
+    assert go_on(whole, "--trainer.lr=0.1", "--trainer.updates=20") == 2
+    assert "trainer.lr=0.1: the run was begun with 0.001; leave it so" in capsys.readouterr().err
+    before = {path: path.read_bytes() for path in whole.rglob("*") if path.is_file()}
+    assert go_on(whole, "--env.type=metaworld") == 2
+    assert {path: path.read_bytes() for path in whole.rglob("*") if path.is_file()} == before
+    capsys.readouterr()
+
+
+def test_what_is_no_run_is_refused(
+    tiny_checkpoint: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert main(["train", "--resume=true"]) == 2
+    assert "resume=True: add --config_path: name RUN/config.yaml" in capsys.readouterr().err
+    path = recipe(tmp_path, tiny_checkpoint)
+    assert main(["train", "--resume=true", f"--config_path={path}"]) == 2
+    assert "no run has been begun there" in capsys.readouterr().err
+    assert go_on(whole, config="checkpoints/000003/config.yaml") == 2
+    assert "no such file" in capsys.readouterr().err
+
+
+def test_a_run_killed_without_warning_goes_on(tiny_checkpoint: Path, tmp_path: Path):
+    """Asynchronous, all of it real, in a process of its own that gets SIGKILL."""
+    run = tmp_path / "run"
+    path = recipe(
+        tmp_path,
+        tiny_checkpoint,
+        launch=LaunchConfig(stall_s=120),
+        env=SimulatedConfig(max_steps=12, tolerance=0.4, step_ms=2.0),
+        rollout=RolloutConfig(workers=2, worlds=2, segment_length=3),
+        trainer=TrainerConfig(updates=150, batch_decisions=16, lr=1e-3),
+        save_every_updates=4,
+    )
+    command = [sys.executable, "-m", "accerl_lerobot.cli", "train"]
+    log = tmp_path / "log"
+    with log.open("wb") as out:
+        first = subprocess.Popen([*command, str(path), f"--output_dir={run}"], stdout=out, stderr=out)
+        deadline = time.monotonic() + 240
+        while not any(int(p.name) >= 12 for p in (run / "checkpoints").glob("0*")):
+            assert first.poll() is None and time.monotonic() < deadline, log.read_text()
+            time.sleep(0.02)
+        first.kill()
+        first.wait()
+    assert not (run / "summary.json").exists()
+    again = [*command, "--resume=true", f"--config_path={run / 'config.yaml'}"]
+    ended = subprocess.run(again, capture_output=True, text=True, timeout=300)
+    assert ended.returncode == 0, ended.stderr
+    train = [r for r in records(run) if r["kind"] == "train"]
+    assert [r["update"] for r in train] == list(range(1, 151)), "none lost, none twice"
+    found = summary(run)
+    assert found["updates"] == 150 and found["n_before"] == found["n_after"] == 6
+    evaluations = [r["group"] for r in records(run) if r["kind"] == "evaluation"]
+    assert len(set(evaluations)) == len(evaluations) and {"before", "after"} <= set(evaluations)
+    assert max(r["lag_max"] for r in train) == found["lag_max"] < 40
+    steps = [r["env_steps"] for r in records(run) if r["kind"] == "rollout"]
+    assert steps == sorted(steps)

@@ -1,0 +1,159 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""An asynchronous run that is gone on with: nothing that was committed is lost, doubled or learnt from twice.
+
+Inference and trainer are stand-ins that start at once, and the trainer writes down what it was given; rollout
+and replay are real. The run with everything real is in ``test_resume.py``.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from accerl_lerobot import launch, snapshot
+from accerl_lerobot.checkpoint import TRAINING_STATE
+from accerl_lerobot.config import RunConfig
+from accerl_lerobot.engine import Progress
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.config import evaluation_plans
+from accerl_lerobot.inference import worker as inference_worker
+from accerl_lerobot.launch import RayEngine
+from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.trainer import worker as trainer_worker
+from accerl_lerobot.trainer.config import TrainerConfig
+from tests.light_workers import LightInference, LightTrainer, light_ray
+from tests.runs import drive, polls, tiny_run
+
+__all__ = ["light_ray"]
+
+UPDATES, DURING = 60, 12
+TWO = RolloutConfig(workers=2, worlds=2, segment_length=3)
+
+
+@pytest.fixture
+def engine(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., RayEngine]]:
+    monkeypatch.setattr(launch, "POLL_S", 0.05)
+    monkeypatch.setattr(inference_worker, "InferenceWorker", LightInference)
+    monkeypatch.setattr(trainer_worker, "TrainerWorker", LightTrainer)
+    made: list[RayEngine] = []
+
+    def make(state: Path | None = None, **rooms: Any) -> RayEngine:
+        made.append(RayEngine(run_of(**rooms), ("match",), state=state))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.close()
+
+
+def run_of(**rooms: Any) -> RunConfig:
+    defaults: dict[str, Any] = {
+        "env": SimulatedConfig(max_steps=16, step_ms=1.0),
+        "rollout": TWO,
+        "replay": ReplayConfig(capacity=160, min_decisions=16, ahead=48, samples_per_insert=2.0, max_lag=40),
+        "trainer": TrainerConfig(updates=UPDATES, batch_decisions=16),
+    }
+    return tiny_run(Path("nowhere"), **{**defaults, **rooms})
+
+
+def until(one: RayEngine, version: int) -> list[Progress]:
+    history = []
+    for progress in polls(one):
+        history.append(progress)
+        if progress.version >= version:
+            break
+    return history
+
+
+def updates(history: list[Progress]) -> list[float]:
+    return [u["update"] for p in history for u in p.updates]
+
+
+def test_nothing_committed_is_lost_or_doubled_and_no_update_made_twice(engine, tmp_path: Path):
+    first = engine()
+    first.plan(evaluation_plans(("match",), DURING, "during"))
+    first.train()
+    history = until(first, 20)
+    saved = first.save(tmp_path)
+    assert updates(history) + [u["update"] for u in saved.updates] == [i + 1.0 for i in range(saved.version)]
+    counters = first._seats.counters()
+    until(first, saved.version + 10)  # what comes after the checkpoint is to be forgotten
+    first.close()
+
+    state = tmp_path / TRAINING_STATE
+    cut = snapshot.load(state / "replay")["replay"]["real"]
+    ledger = snapshot.load(state / "trainer")["ledger"]
+    assert len(ledger) == saved.version
+    uses = Counter(key for keys in ledger for key in keys)
+    held = {entry["segment"].key: entry for entry in cut["entries"]}
+    assert len(held) == len(cut["entries"]) > 0 and len(set(cut["keys"])) == len(cut["keys"])
+    assert all(entry["uses"] == uses[key] for key, entry in held.items()), "as many as it had learnt from"
+
+    second = engine(state)
+    second.train()
+    after = drive(second)
+    assert updates(after) == [i + 1.0 for i in range(saved.version, UPDATES)]
+    whole = second._trainer.call("save", tmp_path / "end", timeout=60)[0]
+    ledger = snapshot.load(tmp_path / "end" / TRAINING_STATE / "trainer")["ledger"]
+    assert whole == len(ledger) == UPDATES
+    uses = Counter(key for keys in ledger for key in keys)
+    assert all(uses[key] <= entry["draws"] for key, entry in held.items())
+    incarnations = {key.rsplit(".", 1)[0] for keys in ledger[saved.version :] for key in keys}
+    assert {"rollout0.1", "rollout1.1"} <= incarnations, "keys are new, and so are the seeds"
+    replay = after[-1].replay
+    gone = replay["evicted_segments"] + replay["retired_segments"]
+    assert replay["inserted_segments"] == replay["stored_segments"] + gone
+    assert replay["inserted_decisions"] > cut["counters"].inserted_decisions
+    # The batch drawn ahead for the update after the last one is never learnt from.
+    assert 0 <= replay["trained_decisions"] - sum(n for keys in ledger for n in keys.values()) < 16 + 3
+    assert after[-1].rollout["env_steps"] > counters["env_steps"], "counted on, not anew"
+    during = [e.plan.index for p in history + after for e in p.episodes if e.plan.group == "during"]
+    assert sorted(during) == list(range(DURING)), "planned episodes have one result each"
+
+
+def test_episodes_that_were_paid_for_are_played_once(engine, tmp_path: Path):
+    rollout = RolloutConfig(workers=2, worlds=2, segment_length=3, episodes=40)
+    endless = TrainerConfig(updates=10_000, batch_decisions=16)
+    first = engine(rollout=rollout, trainer=endless)
+    first.train()
+    played = [e for p in until(first, 4) for e in p.episodes]
+    first.save(tmp_path)
+    first.close()
+    second = engine(tmp_path / TRAINING_STATE, rollout=rollout, trainer=endless)
+    second.train()
+    episodes = []
+    for progress in polls(second):
+        episodes += progress.episodes
+        if second._real_ended:
+            break
+    # Episodes that were under way are begun anew; one that had ended but not been told of counts as such.
+    assert len(played) + len(episodes) == 40
+
+
+def test_a_run_of_another_engine_or_size_is_refused(engine, tmp_path: Path):
+    (tmp_path / "training_step.json").write_text('{"step": 3}')
+    with pytest.raises(InputError, match=r"launch\.engine='ray': this run was in one process"):
+        engine(tmp_path)
+    first = engine()
+    first.save(tmp_path)
+    three = RolloutConfig(workers=3, worlds=2, segment_length=3)
+    with pytest.raises(InputError, match=r"rollout\.workers=3: this run has 2"):
+        engine(tmp_path / TRAINING_STATE, rollout=three)

@@ -1,0 +1,129 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""In one process, a run that was left and gone on with is the run that was never left, to the last bit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.algorithms.decoupled import DecoupledConfig
+from accerl_lerobot.checkpoint import TRAINING_STATE
+from accerl_lerobot.config import RunConfig
+from accerl_lerobot.engine import Progress
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.config import evaluation_plans
+from accerl_lerobot.local import LocalEngine
+from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.trainer.config import TrainerConfig
+from tests.runs import drive, polls, tiny_run
+
+GROUPS: dict[str, Any] = {
+    "rollout": RolloutConfig(worlds=5, segment_length=2, group_size=3, group_filter="none"),
+    "algorithm": GIPOConfig(advantage="group", level="chunk"),
+    # A whole group enters at once.
+    "replay": ReplayConfig(capacity=96, min_decisions=16, ahead=48, samples_per_insert=1.5, max_lag=50),
+}
+CASES: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "weights held back": {"trainer": {"hold_back": 3, "probe_every": 4}},
+    "copies of weights": {"algorithm": DecoupledConfig(reference_coef=0.1, proximal_every=4, level="chunk")},
+    "groups": GROUPS,
+    "counted episodes": {"rollout": RolloutConfig(worlds=4, segment_length=3, episodes=20)},
+    "tasks that fail more often": {
+        "rollout": RolloutConfig(worlds=4, segment_length=3, task_sampling="failures"),
+        "env": SimulatedConfig(max_steps=16, task="match,mirror"),
+    },
+}
+
+
+def config_of(checkpoint: Path, case: str) -> RunConfig:
+    rooms = dict(CASES[case])
+    trainer: dict[str, Any] = {"updates": 14, "batch_decisions": 16, "lr": 1e-3, "advantage_memory": 0.5}
+    rooms["trainer"] = TrainerConfig(**trainer | {"warmup_updates": 2} | rooms.pop("trainer", {}))
+    return tiny_run(checkpoint, seed=3, **rooms)
+
+
+def weights(engine: LocalEngine) -> dict[str, np.ndarray]:
+    return engine._adapter.export_trainable()
+
+
+def told(history: list[Progress]) -> list[Any]:
+    """All that a run says, and nothing of when it was asked."""
+    episodes = [(e.plan, e.success, e.episode_return, e.versions) for p in history for e in p.episodes]
+    return [[u for p in history for u in p.updates], episodes, history[-1].rollout, history[-1].replay]
+
+
+def until(engine: LocalEngine, version: int) -> list[Progress]:
+    history = []
+    for progress in polls(engine):
+        history.append(progress)
+        if progress.version >= version:
+            break
+    return history
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("left_at", [1, 7])
+def test_a_run_that_was_left_goes_on_as_if_it_had_not(
+    case: str, left_at: int, tiny_checkpoint: Path, tmp_path: Path
+):
+    config = config_of(tiny_checkpoint, case)
+    tasks = ("match", "mirror") if case.startswith("tasks") else ("match",)
+
+    def begin() -> LocalEngine:
+        engine = LocalEngine(config, tasks)
+        engine.plan(evaluation_plans(tasks, 9, "during"))  # some of them are under way when it is left
+        engine.train()
+        return engine
+
+    whole = begin()
+    expected = drive(whole)
+    first = begin()
+    before = until(first, left_at)
+    saved = first.save(tmp_path)
+    assert saved == (before[-1].version, [])
+    between = drive(first)
+    first.close()
+    again = LocalEngine(config, tasks, state=tmp_path / TRAINING_STATE)
+    again.train()
+    after = drive(again)
+    assert told(before + between) == told(expected), "saving changes nothing"
+    assert told(before + after) == told(expected)
+    assert len(after) == len(between) > 1
+    for name, tensor in weights(whole).items():
+        np.testing.assert_array_equal(tensor, weights(again)[name])
+    whole.close()
+    again.close()
+
+
+def test_a_run_left_before_it_began_learning(tiny_checkpoint: Path, tmp_path: Path):
+    config = tiny_run(tiny_checkpoint, seed=3)
+    first = LocalEngine(config, ("match",))
+    first.save(tmp_path)
+    first.train()
+    again = LocalEngine(config, ("match",), state=tmp_path / TRAINING_STATE)
+    again.train()
+    assert told(drive(first)) == told(drive(again))
+
+
+def test_the_state_of_an_asynchronous_run_is_refused(tiny_checkpoint: Path, tmp_path: Path):
+    with pytest.raises(InputError, match=r"launch\.engine='local': this run was asynchronous"):
+        LocalEngine(tiny_run(tiny_checkpoint), ("match",), state=tmp_path)
