@@ -31,6 +31,7 @@ quickstart: setup
 	@echo "TensorBoard: .venv/bin/tensorboard --logdir $(RUN)/tensorboard"
 
 test: setup
+	@.ci/browser
 	.venv/bin/python -m pytest $(ARGS)
 
 check: lint format-check types

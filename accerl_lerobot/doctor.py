@@ -20,7 +20,6 @@ process down; packages are compared with the pins this version was tested with.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import importlib.metadata
 import importlib.util
 import math
@@ -289,10 +288,12 @@ def dreams(config: RunConfig) -> Iterator[Check]:
 
 def memory_estimate_gib(config: RunConfig, history: int = 1) -> float:
     """Rough: processes with their libraries, simulators, and replay."""
+    from accerl_lerobot.staleness import under_way
+
     tasks = len(getattr(config.env, "tasks", ("one",)))
     worlds = config.rollout.workers * config.rollout.worlds
     simulators = worlds * tasks * SIMULATOR_GIB if config.env.type == "metaworld" else 0.0
-    decisions = config.replay.capacity + _under_way(config)
+    decisions = config.replay.capacity + under_way(config)
     pictures = decisions * history * observation_bytes(config) / GIB
     if config.launch.engine == "local":
         return POLICY_PROCESS_GIB + simulators + pictures
@@ -312,16 +313,11 @@ def observation_bytes(config: RunConfig) -> int:
 
 def pace(config: RunConfig) -> Iterator[Check]:
     """How far apart collecting and learning may run under this recipe, and how much it collects."""
-    from accerl_lerobot.replay import lag_bound
+    from accerl_lerobot.staleness import executed, lag_limits, under_way
 
     replay, trainer = config.replay, config.trainer
-    in_flight = _under_way(config)
-    ahead = 1 if config.launch.engine == "ray" else 0  # of publications under way, and of batches drawn early
-    arguments = {"batch_decisions": trainer.batch_decisions, "in_flight": in_flight}
-    pickup = ahead + trainer.hold_back
-    arguments |= {"publish_every": trainer.publish_every, "pickup": pickup, "prefetch": ahead}
-    bound = lag_bound(replay, **arguments)
-    of_pace = lag_bound(dataclasses.replace(replay, max_lag=sys.maxsize), **arguments)
+    in_flight = under_way(config)
+    bound, of_pace = lag_limits(config)
     text = f"at most {bound} updates with {in_flight} decisions under way"
     if of_pace > bound:
         text += (
@@ -331,30 +327,9 @@ def pace(config: RunConfig) -> Iterator[Check]:
     yield Check(name="lag", status=WARN if of_pace > bound else OK, text=text)
     collected = math.ceil(trainer.updates * trainer.batch_decisions / replay.samples_per_insert)
     text = f"{trainer.updates:,} updates of {trainer.batch_decisions} on about {collected:,} decisions"
-    executed = _executed(config)
-    if executed:
-        text += f", at most {collected * executed:,} env steps"
+    if actions := executed(config):
+        text += f", at most {collected * actions:,} env steps"
     yield Check(name="work", status=OK, text=text)
-
-
-def _executed(config: RunConfig) -> int:
-    """Actions of a chunk that are executed; 0 where only the checkpoint knows."""
-    of_sft = config.sft.steps and config.sft.policy.get("n_action_steps")
-    return int(config.policy.n_action_steps or of_sft or 0)
-
-
-def _under_way(config: RunConfig) -> int:
-    """Decisions on their way to replay; an unknown chunk counts as one action, the worst case."""
-    from accerl_lerobot.replay import decisions_under_way
-
-    rollout = config.rollout
-    return decisions_under_way(
-        workers=rollout.workers,
-        worlds=rollout.worlds,
-        segment_length=rollout.segment_length,
-        group_size=rollout.group_size,
-        episode_decisions=math.ceil(config.env.max_steps / (_executed(config) or 1)),
-    )
 
 
 def _resolve(arguments: list[str]) -> tuple[RunConfig | None, int, list[Check]]:

@@ -40,13 +40,22 @@ def help_text(verb: str, config_class: type[Any], what: str) -> str:
         what: what it does, one line.
     """
     lines = [
-        f"usage: accerl {verb} [recipe.yaml | --config_path=recipe.yaml] [--room.field=value …]",
+        f"usage: accerl {verb} {_bare(config_class)} [--room.field=value …]",
         "",
         textwrap.fill(f"{what[0].upper()}{what[1:]}. Fields not given keep the value shown.", WIDTH),
         "",
         *_fields(config_class, ""),
     ]
     return "\n".join(lines)
+
+
+def _bare(config_class: type[Any]) -> str:
+    """What stands on the command line without a name."""
+    name: str | None = getattr(config_class, "BARE", None)
+    if name is None:
+        return "[recipe.yaml | --config_path=recipe.yaml]"
+    one = name.removesuffix("s").upper()
+    return f"{one} [{one} …]"
 
 
 def docstrings(cls: type[Any]) -> dict[str, str]:

@@ -147,6 +147,9 @@ class RayEngine(Engine):
         told = self._updates + (self._hear(self._trainer, self._limit) or [])
         self._updates = []
         version, records = self._trainer.call("save", directory, timeout=self._limit)
+        for imaginer in (self._dreamer, self._learner):
+            if imaginer is not None:
+                imaginer.call("save", directory, timeout=self._limit)
         self._replay.call("save", state, version, timeout=self._limit)
         self._seats.save(state)
         self._last_change = time.monotonic()
@@ -203,10 +206,12 @@ class RayEngine(Engine):
         if imagination.share:
             from accerl_lerobot.world_model.worker import DreamWorker, WorldLearningWorker
 
-            self._dreamer = self._service("dream", ray.remote(DreamWorker).options(**threads).remote(c))
+            self._dreamer = self._service(
+                "dream", ray.remote(DreamWorker).options(**threads).remote(c, self._state)
+            )
             if imagination.learns:
                 learner = ray.remote(WorldLearningWorker).options(**threads)
-                self._learner = self._service("world learning", learner.remote(c))
+                self._learner = self._service("world learning", learner.remote(c, self._state))
         self._seats.start()
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
         for worker, reference in ready:

@@ -31,7 +31,7 @@ from pathlib import Path
 import numpy as np
 
 from accerl_lerobot import snapshot
-from accerl_lerobot.checkpoint import PRETRAINED, TRAINING_STATE, WEIGHTS
+from accerl_lerobot.checkpoint import PRETRAINED, TRAINING_STATE, WEIGHTS, WORLD_MODEL
 from accerl_lerobot.config import RunConfig
 from accerl_lerobot.engine import Engine, Progress, Saved, check_new, episode_key
 from accerl_lerobot.envs import make_world
@@ -45,8 +45,8 @@ from accerl_lerobot.weights.held_back import HeldBack
 
 logger = logging.getLogger(__name__)
 
-LOCAL = "local"
-"""Name of this engine's own state."""
+LOCAL, DREAMS = "local", "dreams"
+"""Names of this engine's own state, and of all that imagines."""
 
 
 class LocalEngine(Engine):
@@ -173,6 +173,10 @@ class LocalEngine(Engine):
             "runner": self._runner.state(),
         }
         snapshot.save(state / LOCAL, engine)
+        if self._dreams is not None:
+            learner = None if self._world_learner is None else self._world_learner.state()
+            snapshot.save(state / DREAMS, {"dreams": self._dreams.state(), "learner": learner})
+            self._dreams.save_promoted(directory / WORLD_MODEL)
         return Saved(self._update.version, [])
 
     def _restore(self, directory: Path) -> None:
@@ -195,6 +199,11 @@ class LocalEngine(Engine):
         self._runner.restore(engine["runner"])
         requests = ((slot, self._runner.request(slot)) for slot in range(len(self._runner)))
         self._due = {slot: request for slot, request in requests if request is not None}
+        if self._dreams is not None:
+            imagined = snapshot.load(directory / DREAMS)
+            self._dreams.restore(imagined["dreams"])
+            if self._world_learner is not None:
+                self._world_learner.restore(imagined["learner"])
         restore_global_generators(engine["generators"])
 
     def close(self) -> None:

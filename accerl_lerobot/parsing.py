@@ -48,14 +48,15 @@ def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[A
 
     Args:
         config_class: what to build.
-        arguments: ``--room.field=value`` or ``--room.field value``; a bare first argument is the recipe.
+        arguments: ``--room.field=value`` or ``--room.field value``; a bare first argument is the recipe, or
+            bare ones are the entries of the field that `config_class` names in ``BARE``.
         recipe_class: top-level keys of a *file* that this class has and `config_class` has not are ignored,
             so that one recipe serves several verbs.
 
     Raises:
         InputError: a file, key, type or value is wrong; names the field.
     """
-    path, given = read_arguments(arguments)
+    path, given = read_arguments(arguments, getattr(config_class, "BARE", None))
     tree = {} if path is None else read_recipe(path)
     if recipe_class is not None:
         other = _names(recipe_class) - _names(config_class)
@@ -86,14 +87,17 @@ def encode(config: Any) -> dict[str, Any]:
     return encoded
 
 
-def read_arguments(arguments: list[str]) -> tuple[Path | None, dict[str, Any]]:
+def read_arguments(arguments: list[str], bare: str | None = None) -> tuple[Path | None, dict[str, Any]]:
     """Splits a command line into the recipe's path and a tree of overrides.
+
+    Bare arguments are entries of the list that `bare` names; without it, the one there may be is the recipe.
 
     Raises:
         InputError: an argument is not of the form ``--room.field=value``, or there are two recipes.
     """
     path: str | None = None
     given: dict[str, Any] = {}
+    entries: list[str] = []
     rest = list(arguments)
     while rest:
         argument = rest.pop(0)
@@ -103,6 +107,9 @@ def read_arguments(arguments: list[str]) -> tuple[Path | None, dict[str, Any]]:
                 if not rest or rest[0].startswith("--"):
                     raise InputError(key or "--", "", f"give it a value: --{key}=…")
                 value = rest.pop(0)
+        elif bare is not None:
+            entries.append(argument)
+            continue
         elif path is None and not given:
             key, value = "config_path", argument
         else:
@@ -113,6 +120,10 @@ def read_arguments(arguments: list[str]) -> tuple[Path | None, dict[str, Any]]:
             path = value
         else:
             _set(given, key.split("."), _value(value), key)
+    if bare is not None and entries:
+        if bare in given:
+            raise InputError(bare, given[bare], f"leave out --{bare} or {entries[0]}: name them in one way")
+        given[bare] = entries
     return (None if path is None else Path(path).expanduser()), given
 
 

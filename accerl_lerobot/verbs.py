@@ -48,6 +48,7 @@ from accerl_lerobot.hub.config import PullConfig, PushConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.parsing import read_arguments
 from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.report.config import ReportConfig
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.world_model.config import TrialConfig, WorldModelConfig
 
@@ -337,6 +338,15 @@ def pull(arguments: list[str]) -> int:
     return 0
 
 
+def report(arguments: list[str]) -> int:
+    """``accerl report``."""
+    config: ReportConfig = parse(ReportConfig, arguments)
+    from accerl_lerobot.report.page import write_report
+
+    sys.stdout.write(f"{write_report(config, CONFIGS)}\n")
+    return 0
+
+
 def bench(arguments: list[str]) -> int:
     """``accerl bench world``, ``policy``, ``lag``, ``dream``, ``efficiency`` and ``ranking``."""
     name = arguments[0] if arguments else ""
@@ -361,6 +371,7 @@ CONFIGS: dict[str, type[Any]] = {
     "world-model-eval": WorldModelEvalRun,
     "push": PushConfig,
     "pull": PullConfig,
+    "report": ReportConfig,
     "doctor": RunConfig,
     "bench world": BenchWorldConfig,
     "bench policy": BenchPolicyConfig,

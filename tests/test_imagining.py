@@ -144,6 +144,43 @@ def test_two_runs_are_equal_to_the_last_bit(tiny_checkpoint: Path, world_model: 
         np.testing.assert_array_equal(tensor, runs[1][2]._adapter.export_trainable()[key])
 
 
+@pytest.mark.parametrize(
+    ("model", "left_at"), [("learned", 0.1), ("learned", 0.6), ("shuffled", 0.8), ("oracle", 0.6)]
+)
+def test_a_run_that_was_left_goes_on_as_if_it_had_not(
+    model: str, left_at: float, tiny_checkpoint: Path, world_model: Path, tmp_path: Path
+):
+    """Dreams, world model and success model included."""
+    learn = OnlineLearnConfig(steps_per_episode=1.0, try_every=8, held_out=0.5, trial=LOOSE, batch=4)
+    chosen: dict[str, Any] = {"model": model, "horizon": None, "beginnings": 0.5, "window": 4, "gap": 2.0}
+    chosen["witnesses"] = 2
+    if model != "oracle":
+        chosen |= {"path": str(world_model), "learn": learn}
+    config = dreaming(tiny_checkpoint, episodes=24, **chosen)
+
+    def told(history: list[Progress]) -> list[Any]:
+        return [[u for p in history for u in p.updates], history[-1].rollout, history[-1].replay]
+
+    whole, _, expected = lived(config)
+    first = LocalEngine(config, ("match",))
+    first.train()
+    before = [first.poll() for _ in range(round(left_at * len(whole)))]
+    first.save(tmp_path)
+    first.close()
+    again = LocalEngine(config, ("match",), state=tmp_path / "training_state")
+    again.train()
+    after = drive(again)
+    again.close()
+    assert len(whole) == len(before) + len(after) and len(after) > 1 and whole[-1].imagination["dreams"] > 8
+    assert told(before + after) == told(whole)
+    ends = [history[-1].imagination for history in (whole, after)]
+    assert ends[0] == pytest.approx(ends[1], rel=0, abs=0, nan_ok=True)
+    for key, tensor in expected._adapter.export_trainable().items():
+        np.testing.assert_array_equal(tensor, again._adapter.export_trainable()[key])
+    promoted = before[-1].imagination.get("promoted", 0) > 0
+    assert (tmp_path / "world_model" / "model.safetensors").is_file() is promoted
+
+
 def test_whole_dreams_of_a_model_that_learns_are_watched(tiny_checkpoint: Path, world_model: Path):
     learn = OnlineLearnConfig(steps_per_episode=1.0, try_every=8, held_out=0.5, trial=LOOSE, batch=4)
     config = dreaming(

@@ -88,7 +88,8 @@ def bench_ranking(config: BenchRankingConfig) -> dict[str, Any]:
     from accerl_lerobot.policies.config import PolicyConfig
     from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, resolve_device
     from accerl_lerobot.world_model.agreement import agreement
-    from accerl_lerobot.world_model.imagine import Dreamer, check_fit
+    from accerl_lerobot.world_model.fit import check_fit
+    from accerl_lerobot.world_model.imagine import Dreamer
     from accerl_lerobot.world_model.side_by_side import dreamt, lived
     from accerl_lerobot.world_model.store import load_world_model
 

@@ -86,9 +86,9 @@ class ReplayWorker:
             saved = snapshot.load(state / "replay")
             self._replay.restore(saved["replay"])
             self._rng = saved["rng"]
-            # Those who dream begin with what they would have been told last.
+            # Those who dream were saved before, and may not have been told of the last ones.
             self._real.extend(self._replay.real.segments)
-            self._real_count = len(self._replay.real.segments)
+            self._real_count = saved["real_count"]
 
     async def ready(self) -> int:
         """Answers once this process is up; returns its id."""
@@ -168,7 +168,11 @@ class ReplayWorker:
 
     async def save(self, directory: Path, version: int) -> None:
         """Writes its part of ``training_state``, as it was when the trainer had made `version` updates."""
-        state = {"replay": self._replay.state(version), "rng": copy.deepcopy(self._rng)}
+        state = {
+            "replay": self._replay.state(version),
+            "rng": copy.deepcopy(self._rng),
+            "real_count": self._real_count,
+        }
         await asyncio.to_thread(snapshot.save, directory / "replay", state)
 
     async def close(self) -> None:

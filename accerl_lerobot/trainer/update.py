@@ -40,6 +40,7 @@ from accerl_lerobot.algorithms.gae import decision_mask, gae
 from accerl_lerobot.algorithms.normalise import moments, normalise
 from accerl_lerobot.algorithms.ratio import present
 from accerl_lerobot.experience import Segment
+from accerl_lerobot.optimizers import optimizer_state, restore_optimizer
 from accerl_lerobot.policies.base import PolicyAdapter
 from accerl_lerobot.trainer.anchors import CRITIC, Anchors
 from accerl_lerobot.trainer.batch import Batch, Part, collate, pick, split
@@ -123,15 +124,11 @@ class Update:
 
     def state(self) -> dict[str, Any]:
         """A copy of all that `restore` needs, the policy's weights apart; see `snapshot`."""
-        moments = self.optimizer.state_dict()["state"]
         return {
             "version": self.version,
             "skipped": (self.skipped, self._skipped_in_a_row),
             "moments": self._moments.clone(),
-            "optimizer": {
-                i: {name: torch.as_tensor(value).detach().clone() for name, value in of.items()}
-                for i, of in moments.items()
-            },
+            "optimizer": optimizer_state(self.optimizer),
             "anchors": self.anchors.state(),
             "probe": self._probe.state(),
         }
@@ -141,8 +138,7 @@ class Update:
         self.version = state["version"]
         self.skipped, self._skipped_in_a_row = state["skipped"]
         self._moments = state["moments"]
-        groups = self.optimizer.state_dict()["param_groups"]
-        self.optimizer.load_state_dict({"state": state["optimizer"], "param_groups": groups})
+        restore_optimizer(self.optimizer, state["optimizer"])
         self.anchors.restore(state["anchors"])
         self._probe.restore(state["probe"])
 

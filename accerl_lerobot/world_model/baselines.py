@@ -94,7 +94,7 @@ class OracleModel(WorldModel):
         self._at: OrderedDict[bytes, World] = OrderedDict()  # the longest unused first
         self._free: list[World] = []
         self._made = 0
-        self._tasks: list[str] = []
+        self.tasks: list[str] = []
 
     def begin(
         self, context: Context, tasks: Sequence[str], histories: Sequence[History | None] | None = None
@@ -107,13 +107,13 @@ class OracleModel(WorldModel):
         if histories is None or any(h is None for h in histories):
             raise ValueError("an oracle needs the history of every start")
         known = [h for h in histories if h is not None]
-        self._tasks += sorted({h.task for h in known} - set(self._tasks))
+        self.tasks += sorted({h.task for h in known} - set(self.tasks))
         longest = max(len(h.actions) for h in known)
         played = np.zeros((len(known), longest, self.spec.action_dim), np.float32)
         for row, h in zip(played, known, strict=True):
             row[: len(h.actions)] = h.actions
         return {
-            "task": torch.tensor([self._tasks.index(h.task) for h in known]),
+            "task": torch.tensor([self.tasks.index(h.task) for h in known]),
             "seed": torch.tensor([h.seed for h in known]),
             "count": torch.tensor([len(h.actions) for h in known]),
             "played": torch.from_numpy(played),
@@ -147,7 +147,7 @@ class OracleModel(WorldModel):
         self._free.clear()
 
     def _play(self, state: State, row: int, actions: np.ndarray) -> ChunkResult:
-        task, seed = self._tasks[int(state["task"][row])], int(state["seed"][row])
+        task, seed = self.tasks[int(state["task"][row])], int(state["seed"][row])
         played = state["played"][row, : int(state["count"][row])].numpy()
         world = self._at.pop(_name(task, seed, played), None)
         if world is None:

@@ -34,6 +34,8 @@ from typing import NamedTuple
 import numpy as np
 from torch import Tensor
 
+from accerl_lerobot.snapshot import kind
+
 State = dict[str, Tensor]
 """Each (B, ...)."""
 
@@ -98,6 +100,7 @@ class Context(NamedTuple):
     """float32 (B, S), where it was then."""
 
 
+@kind
 class History(NamedTuple):
     """How to get to where a dream begins, for those that can go there."""
 

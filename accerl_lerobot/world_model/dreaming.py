@@ -32,8 +32,9 @@ from accerl_lerobot.world_model.baselines import ShuffledModel
 from accerl_lerobot.world_model.config import TrialConfig
 from accerl_lerobot.world_model.dataset import check_metadata, fingerprint, load_episodes
 from accerl_lerobot.world_model.episodes import Episode
+from accerl_lerobot.world_model.fit import check_fit
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
-from accerl_lerobot.world_model.imagine import Dreamer, Imagination, check_fit
+from accerl_lerobot.world_model.imagine import Dreamer, Imagination
 from accerl_lerobot.world_model.online import OnlineLearner
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.store import load_source

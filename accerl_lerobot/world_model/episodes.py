@@ -30,7 +30,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from accerl_lerobot.snapshot import kind
 
+
+@kind
 @dataclass(frozen=True, kw_only=True)
 class Episode:
     """One episode.

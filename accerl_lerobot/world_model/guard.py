@@ -21,6 +21,7 @@ flatters; the outcome of the episode that a dream began in may be older.
 from __future__ import annotations
 
 from collections import deque
+from typing import Any
 
 
 class KillSwitch:
@@ -63,6 +64,17 @@ class KillSwitch:
             self._pairs.clear()
             self._imagined = self._real = float("nan")
         self.tripped = False
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs; see `snapshot`."""
+        shown = (self._share, self._imagined, self._real, self.tripped)
+        return {"dreams": list(self._dreams), "pairs": list(self._pairs), "shown": shown}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave."""
+        self._dreams.extend(state["dreams"])
+        self._pairs.extend(state["pairs"])
+        self._share, self._imagined, self._real, self.tripped = state["shown"]
 
     @property
     def share(self) -> float:

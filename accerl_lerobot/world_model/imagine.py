@@ -25,22 +25,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 
 from accerl_lerobot.envs.base import WorldSpec
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, Decision, Observation, Request, Segment
+from accerl_lerobot.optimizers import copied
 from accerl_lerobot.rollout.segments import SegmentBuilder
+from accerl_lerobot.snapshot import kind
 from accerl_lerobot.world_model.baselines import OracleModel, ShuffledModel
-from accerl_lerobot.world_model.contract import Context, Dream, State, WorldModel, WorldModelSpec
+from accerl_lerobot.world_model.contract import Context, Dream, State, WorldModel
 from accerl_lerobot.world_model.frames import observed
 from accerl_lerobot.world_model.guard import KillSwitch
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
+from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.starts import Start, StartPool
+from accerl_lerobot.world_model.store import save_world_model
 from accerl_lerobot.world_model.success import probabilities
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
@@ -48,51 +52,9 @@ if TYPE_CHECKING:
     from accerl_lerobot.world_model.online import Promotion
 
 
-def check_fit(spec: WorldModelSpec, world: WorldSpec, executed: int, history: int, judged: bool) -> None:
-    """Refuses a world model that cannot stand for a world, before a run begins.
-
-    Args:
-        spec: what it shows.
-        world: what the policy acts in.
-        executed: actions that the policy executes per decision.
-        history: env steps that the policy's observations hold.
-        judged: whether there is a success model beside it.
-
-    Raises:
-        InputError: it shows other cameras or another robot, goes another number of steps at a time, cannot
-            tell a success, or the policy looks back at what is not imagined.
-    """
-
-    def refuse(value: object, why: str) -> InputError:
-        return InputError("imagination.path", value, why)
-
-    if missing := [camera for camera in world.images if camera not in spec.cameras]:
-        theirs = ", ".join(spec.cameras)
-        raise refuse(
-            missing[0], f"the world shows this camera, the world model {theirs}; learn one of this world"
-        )
-    needed = {"pixels"} | ({"state"} if world.state_dim else set())
-    if lacking := needed - spec.provides:
-        why = "the policy reads it, and the world model does not provide it"
-        raise refuse(sorted(lacking)[0], f"{why}; learn one with accerl world-model")
-    for name in ("state_dim", "action_dim", "fps"):
-        theirs, ours = getattr(spec, name), getattr(world, name)
-        if theirs != ours:
-            remedy = f"is the world model's {name}, and the world's is {ours}; learn one of this world"
-            raise refuse(theirs, remedy)
-    if spec.chunk != executed:
-        why = f"env steps to a dream's chunk, and the policy executes {executed} actions per decision"
-        raise refuse(spec.chunk, f"{why}; learn one with world_model.chunk={executed}")
-    if history > 1:
-        why = "the policy looks back so many env steps, and dreams show one frame per decision"
-        raise InputError("policy.n_obs_steps", history, f"{why}; use a policy with 1, or imagination.share=0")
-    if not judged and "success" not in spec.provides:
-        why = "there is no success model beside the world model, and it cannot tell a success"
-        raise refuse(None, f"{why}; learn both with accerl world-model")
-
-
+@kind
 @dataclass
-class Counters:
+class DreamCounters:
     """What was imagined so far."""
 
     dreams: int = 0
@@ -103,7 +65,7 @@ class Counters:
     """Dreams that ended before something too uncertain."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _Row:
     builder: SegmentBuilder
     start: Start
@@ -156,7 +118,7 @@ class Imagination:
         name: str,
         on_segment: Callable[[Segment], object],
     ) -> None:
-        self.config, self.counters = config, Counters()
+        self.config, self.counters = config, DreamCounters()
         # Whether there are dreams of whole episodes, which real ones can be held against.
         self._beside = config.horizon is None and config.beginnings > 0
         outcomes = config.witnesses if self._beside else config.window
@@ -208,6 +170,59 @@ class Imagination:
         self._success = promotion.success.to(device)
         self.version, self.waits = promotion.version, False
         self.switch.reset()
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs; see `snapshot`."""
+        rows = [None if row is None else vars(row) | {"builder": row.builder.state()} for row in self._rows]
+        promoted = None
+        if self.version and self._success is not None:
+            models = (copied(self._learned), copied(self._success))
+            promoted = (*models, self._success.config.threshold)
+        return {
+            "counters": replace(self.counters),
+            "switch": self.switch.state(),
+            "version": (self.version, self.waits),
+            "starts": self._starts.state(),
+            "rng": self._rng,
+            "rows": rows,
+            "dreams": self._state,
+            "sequence": (self._sequence, self._doubted_in_a_row),
+            "promoted": promoted,
+            "tasks": self._model.tasks if isinstance(self._model, OracleModel) else [],
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave, with the model that dreamt then."""
+        self.counters, self._rng = state["counters"], state["rng"]
+        self.switch.restore(state["switch"])
+        self.version, self.waits = state["version"]
+        self._starts.restore(state["starts"])
+        self._sequence, self._doubted_in_a_row = state["sequence"]
+        if state["promoted"] is not None and self._success is not None:
+            model, success, self._success.config.threshold = state["promoted"]
+            self._learned.load_state_dict(model)
+            self._success.load_state_dict(success)
+        if isinstance(self._model, OracleModel):
+            self._model.tasks = state["tasks"]
+        self._state = state["dreams"]
+        for i, row in enumerate(state["rows"]):
+            if row is not None:
+                start: Start = row["start"]
+                builder = SegmentBuilder({}, self._longest, start.origin, IMAGINED)
+                builder.restore(row["builder"])
+                self._rows[i] = _Row(**row | {"builder": builder})
+
+    def save_promoted(self, directory: Path) -> None:
+        """Writes the world model that has passed last, and its success model; nothing if none has."""
+        if self.version and self._success is not None:
+            save_world_model(directory, self._learned, self._success)
+
+    @property
+    def _learned(self) -> PixelWorldModel:
+        """What has been promoted."""
+        model = self._model.model if isinstance(self._model, ShuffledModel) else self._model
+        assert isinstance(model, PixelWorldModel)
+        return model
 
     @property
     def on(self) -> bool:

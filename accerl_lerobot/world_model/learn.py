@@ -22,10 +22,12 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 
+from accerl_lerobot.optimizers import copied, optimizer_state, restore_optimizer
 from accerl_lerobot.world_model.config import LearnConfig
 from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, places
 from accerl_lerobot.world_model.judge import shuffled
@@ -100,6 +102,24 @@ class Learner:
         self._average()
         self.count += 1
         return metrics | {"loss": loss.item(), "grad_norm": norm.item()}
+
+    def state(self) -> dict[str, Any]:
+        """A copy of all that `restore` needs; see `snapshot`."""
+        weights = {name: copied(model) for name, model in (("model", self.model), ("serving", self.serving))}
+        return weights | {
+            "count": self.count,
+            "rng": copy.deepcopy(self.rng),
+            "generator": self._generator.get_state(),
+            "optimizer": optimizer_state(self._optimizer),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave."""
+        self.model.load_state_dict(state["model"])
+        self.serving.load_state_dict(state["serving"])
+        self.count, self.rng = state["count"], state["rng"]
+        self._generator.set_state(state["generator"])
+        restore_optimizer(self._optimizer, state["optimizer"])
 
     def _average(self) -> None:
         # Early on, when few steps are behind it, the average is short.

@@ -45,6 +45,7 @@ from accerl_lerobot.world_model.trial import calibrate, try_out
 
 LONGEST_TRIAL_S = 3600.0
 """Until then a trial that is going on counts as something that moves, see `launch`."""
+_STATE = ("owed", "promoted", "refused", "found", "_ended", "_since", "_last_tries")
 ENDLESS = 10**9
 """Steps of a learning rate that never falls."""
 
@@ -76,15 +77,15 @@ class Unfinished:
 
     def __init__(self, most: int = 1024) -> None:
         self._most = most
-        self._parts: OrderedDict[tuple[str, int], dict[int, Segment]] = OrderedDict()
+        self.parts: OrderedDict[tuple[str, int], dict[int, Segment]] = OrderedDict()
 
     def add(self, segment: Segment) -> list[Segment] | None:
         """The whole episode, in order, if it is complete with this one."""
         name = segment.origin[:2]
-        parts = self._parts.setdefault(name, {})
+        parts = self.parts.setdefault(name, {})
         parts[segment.origin.decision] = segment
-        if len(self._parts) > self._most:
-            self._parts.popitem(last=False)
+        if len(self.parts) > self._most:
+            self.parts.popitem(last=False)
         ordered = [parts[at] for at in sorted(parts)]
         expected = 0
         for part in ordered:
@@ -93,7 +94,7 @@ class Unfinished:
             expected += len(part)
         if not (ordered[-1].terminated or ordered[-1].truncated):
             return None
-        self._parts.pop(name, None)
+        self.parts.pop(name, None)
         return ordered
 
 
@@ -267,6 +268,29 @@ class OnlineLearner:
             found = together(*dreams)
             least = threshold(found, np.ones(len(found.achieved), bool), self.trial)
             success.config.threshold = least or success.config.threshold
+
+    def state(self) -> dict[str, Any]:
+        """A copy of all that `restore` needs; see `snapshot`. A trial that is going on is begun anew."""
+        unfinished = {name: dict(parts) for name, parts in self._unfinished.parts.items()}
+        return {name: getattr(self, name) for name in _STATE} | {
+            "learner": self._learner.state(),
+            "success": self._success.state(),
+            "learnt": list(self._learnt),
+            "held": list(self._held),
+            "rng": copy.deepcopy(self._rng),
+            "unfinished": unfinished,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave."""
+        for name in _STATE:
+            setattr(self, name, state[name])
+        self._learner.restore(state["learner"])
+        self._success.restore(state["success"])
+        self._learnt.extend(state["learnt"])
+        self._held.extend(state["held"])
+        self._rng = state["rng"]
+        self._unfinished.parts.update(state["unfinished"])
 
     def metrics(self) -> dict[str, float]:
         """What it has learnt from, and how its trials ended."""

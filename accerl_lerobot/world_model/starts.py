@@ -20,10 +20,12 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from accerl_lerobot.experience import Origin, Segment
+from accerl_lerobot.snapshot import kind
 from accerl_lerobot.world_model.contract import History, WorldModelSpec
 from accerl_lerobot.world_model.frames import executed, seen
 
@@ -31,6 +33,7 @@ Name = tuple[str, int]
 """Of an episode: its task and its seed."""
 
 
+@kind
 @dataclass(frozen=True, kw_only=True)
 class Start:
     """A real observation, and what led there."""
@@ -103,6 +106,16 @@ class StartPool:
             names.pop(0)
             if gone.name not in names:
                 self._outcomes.pop(gone.name, None)
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs; see `snapshot`."""
+        return {"segments": [held.segment for held in self._held], "outcomes": dict(self._outcomes)}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave."""
+        self._held.extend(_Held(segment, self.spec) for segment in state["segments"])
+        self._count = sum(len(held.segment) for held in self._held)
+        self._outcomes = state["outcomes"]
 
     def draw(self, count: int, rng: np.random.Generator) -> list[Start]:
         """So many starts, with repetition.

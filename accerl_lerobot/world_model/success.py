@@ -21,11 +21,16 @@ short by that; its last action is held then, and in dreams of failures just so.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 
+from accerl_lerobot.optimizers import copied, optimizer_state, restore_optimizer
+from accerl_lerobot.snapshot import kind
 from accerl_lerobot.world_model.config import SuccessLearnConfig
 from accerl_lerobot.world_model.contract import WorldModel
 from accerl_lerobot.world_model.episodes import Episode, Place
@@ -105,47 +110,65 @@ class Examples:
         return [of[k][i] for k, n in sizes.items() for i in rng.integers(len(of[k]), size=n)]
 
 
+@kind
+@dataclass(frozen=True, kw_only=True)
 class Dreamt:
-    """Dreams of episodes to their ends, and what had come of them: so looks what a success model will judge.
-
-    Args:
-        examples: whose episodes are dreamt.
-        world: dreams them.
-        judge: of failures, those are drawn most that it takes for successes.
-        count: how many, half of them successes where there are enough.
-        depth: chunks of a dream at most.
-        rng: of which, and of where they begin: half of them where the episode did.
+    """Frames of dreams of episodes to their ends, and what had come of them: so looks what a success model
+    will judge.
     """
 
-    def __init__(
-        self,
+    before: np.ndarray
+    """uint8 (M, V, H, W, 3),"""
+    after: np.ndarray
+    """and a chunk later."""
+    success: np.ndarray
+    """bool (M,), whether it had been achieved by then in truth."""
+    progress: np.ndarray
+    """float (M,), see `Examples.progress`."""
+    chances: np.ndarray
+    """float (M,), how much each is drawn."""
+
+    @classmethod
+    def of(
+        cls,
         examples: Examples,
         world: WorldModel,
         judge: SuccessPairsRewardModel,
         count: int,
         depth: int,
         rng: np.random.Generator,
-    ) -> None:
+    ) -> Dreamt:
+        """Dreams them.
+
+        Args:
+            examples: whose episodes are dreamt.
+            world: dreams them.
+            judge: of failures, those are drawn most that it takes for successes.
+            count: how many, half of them successes where there are enough.
+            depth: chunks of a dream at most.
+            rng: of which, and of where they begin: half of them where the episode did.
+        """
         at = [Place(e, 0 if rng.random() < 0.5 else f) for e, f in examples.chunks(count, rng)]
         replayed = replay(world, examples.episodes, at, depth, rng)
         windows = replayed.windows
         rows, depths = np.nonzero(replayed.made)
-        self._success = windows.success[rows, depths]
-        self._before = np.stack([replayed.before(d)[m] for m, d in zip(rows, depths, strict=True)])
-        self._after = replayed.dreams.ends[rows, depths]
-        self._progress = np.array(
+        success = windows.success[rows, depths]
+        before = np.stack([replayed.before(d)[m] for m, d in zip(rows, depths, strict=True)])
+        after = replayed.dreams.ends[rows, depths]
+        progress = np.array(
             [examples.progress(at[m], (d + 1) * world.spec.chunk) for m, d in zip(rows, depths, strict=True)]
         )
-        self._chances = np.where(self._success, 1.0, EASY + probabilities(judge, self._before, self._after))
+        chances = np.where(success, 1.0, EASY + probabilities(judge, before, after))
+        return cls(before=before, after=after, success=success, progress=progress, chances=chances)
 
     def seen(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
         """As `Examples.seen`, but dreamt."""
         chosen = []
-        for kind, size in ((self._success, count // 2), (~self._success, count - count // 2)):
-            if kind.any():
-                chances = self._chances * kind
-                chosen += rng.choice(len(kind), size=size, p=chances / chances.sum()).tolist()
-        return self._before[chosen], self._after[chosen], self._success[chosen], self._progress[chosen]
+        for which, size in ((self.success, count // 2), (~self.success, count - count // 2)):
+            if which.any():
+                chances = self.chances * which
+                chosen += rng.choice(len(which), size=size, p=chances / chances.sum()).tolist()
+        return self.before[chosen], self.after[chosen], self.success[chosen], self.progress[chosen]
 
 
 class SuccessLearner:
@@ -176,7 +199,7 @@ class SuccessLearner:
         if dreamt:
             if self._dreamt is None or self._count % self.config.every == 0:
                 config = self.config
-                self._dreamt = Dreamt(examples, world, self.model, config.episodes, config.depth, self.rng)
+                self._dreamt = Dreamt.of(examples, world, self.model, config.episodes, config.depth, self.rng)
             parts.append(self._dreamt.seen(dreamt, self.rng))
         self._count += 1
         before, after, success, progress = (np.concatenate(x) for x in zip(*parts, strict=True))
@@ -193,6 +216,24 @@ class SuccessLearner:
         torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
         self._optimizer.step()
         return metrics
+
+    def state(self) -> dict[str, Any]:
+        """A copy of all that `restore` needs; see `snapshot`."""
+        return {
+            "model": copied(self.model),
+            "count": self._count,
+            "rng": copy.deepcopy(self.rng),
+            "generator": self._generator.get_state(),
+            "optimizer": optimizer_state(self._optimizer),
+            "dreamt": self._dreamt,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave."""
+        self.model.load_state_dict(state["model"])
+        self._count, self.rng, self._dreamt = state["count"], state["rng"], state["dreamt"]
+        self._generator.set_state(state["generator"])
+        restore_optimizer(self._optimizer, state["optimizer"])
 
 
 def new_success_model(chunk: int) -> SuccessPairsRewardModel:

@@ -29,10 +29,13 @@ from __future__ import annotations
 import os
 import threading
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import ray
 
+from accerl_lerobot import snapshot
+from accerl_lerobot.checkpoint import TRAINING_STATE, WORLD_MODEL
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.world_model.dreaming import make_imagination, make_learner
 from accerl_lerobot.world_model.online import Promotion
@@ -42,6 +45,8 @@ if TYPE_CHECKING:
 
 AT_THE_DOOR = 2
 """Insert calls that may be waiting before dreams pause."""
+DREAMS, LEARNER = "dreams", "world_learner"
+"""Names of their states."""
 PAUSE_S = 0.02
 """How long a worker with nothing to do sleeps."""
 LOOK_S = 0.2
@@ -53,9 +58,10 @@ class DreamWorker:
 
     Args:
         config: the run; its ``policy.path`` must be set.
+        state: the ``training_state`` to go on from; None: begin.
     """
 
-    def __init__(self, config: RunConfig) -> None:
+    def __init__(self, config: RunConfig, state: Path | None = None) -> None:
         import torch
 
         torch.set_num_threads(config.trainer.num_threads)
@@ -63,8 +69,15 @@ class DreamWorker:
         self._outbox: list[Segment] = []
         self._dreams = make_imagination(config, "dream", self._outbox.append)
         self._lock = threading.Lock()
+        self._dreaming = threading.Lock()
+        """Held while dreams change; outside, nothing stands in the outbox."""
         self._promoted: Promotion | None = None
         self._promising = config.imagination.learns
+        self._cursor = 0
+        if state is not None:
+            saved = snapshot.load(state / DREAMS)
+            self._dreams.restore(saved["dreams"])
+            self._cursor = saved["cursor"]
 
     def ready(self) -> int:
         """Answers once the world model is loaded; returns this process's id."""
@@ -84,14 +97,23 @@ class DreamWorker:
         """See `Imagination.metrics`."""
         return self._dreams.metrics()
 
+    def save(self, directory: Path) -> None:
+        """Writes its part of a checkpoint."""
+        with self._dreaming:
+            saved = {"dreams": self._dreams.state(), "cursor": self._cursor}
+            snapshot.save(directory / TRAINING_STATE / DREAMS, saved)
+            self._dreams.save_promoted(directory / WORLD_MODEL)
+
     def run(self, inference: Any, replay: Any) -> None:
         """Dreams until replay is closed."""
-        news, told = _News(replay), None
+        news, told = _News(replay, self._cursor), None
         door: list[Any] = []
         while not news.closed:
-            promising = self._swap()
-            for segment in news.fresh():
-                self._dreams.remember(segment)
+            with self._dreaming:
+                promising = self._swap()
+                for segment in news.fresh():
+                    self._dreams.remember(segment)
+                self._cursor = news.cursor
             # Both at once: a run in which nothing is imagined and nothing expected has nothing to wait for.
             if told != (self._dreams.on, promising):
                 told = (self._dreams.on, promising)
@@ -99,16 +121,18 @@ class DreamWorker:
             done, door = ray.wait(door, num_returns=len(door), timeout=0) if door else ([], [])
             if not all(ray.get(list(done))):
                 return
-            requests = [] if len(door) >= AT_THE_DOOR else self._dreams.requests()
+            with self._dreaming:
+                requests = [] if len(door) >= AT_THE_DOOR else self._dreams.requests()
             if not requests:
                 time.sleep(PAUSE_S)
                 continue
             parts = [requests[i : i + self._batch] for i in range(0, len(requests), self._batch)]
             answers = ray.get([inference.decide.remote(part) for part in parts])
-            self._dreams.advance([decision for answer in answers for decision in answer])
-            if self._outbox:
-                door.append(replay.insert.remote(list(self._outbox)))
-                self._outbox.clear()
+            with self._dreaming:
+                self._dreams.advance([decision for answer in answers for decision in answer])
+                if self._outbox:
+                    door.append(replay.insert.remote(list(self._outbox)))
+                    self._outbox.clear()
 
     def _swap(self) -> bool:
         """Takes over what was promoted; whether more may come."""
@@ -125,14 +149,22 @@ class WorldLearningWorker:
 
     Args:
         config: the run; its ``policy.path`` must be set.
+        state: the ``training_state`` to go on from; None: begin.
     """
 
-    def __init__(self, config: RunConfig) -> None:
+    def __init__(self, config: RunConfig, state: Path | None = None) -> None:
         import torch
 
         torch.set_num_threads(config.trainer.num_threads)
         torch.manual_seed(config.seed)
         self._learner = make_learner(config)
+        self._learning = threading.Lock()
+        """Held while it changes, but not during a trial, which is of a copy."""
+        self._cursor = 0
+        if state is not None:
+            saved = snapshot.load(state / LEARNER)
+            self._learner.restore(saved["learner"])
+            self._cursor = saved["cursor"]
 
     def ready(self) -> int:
         """Answers once the world model and its dataset are loaded; returns this process's id."""
@@ -142,13 +174,21 @@ class WorldLearningWorker:
         """See `OnlineLearner.metrics`."""
         return self._learner.metrics()
 
+    def save(self, directory: Path) -> None:
+        """Writes its part of ``training_state``."""
+        with self._learning:
+            saved = {"learner": self._learner.state(), "cursor": self._cursor}
+        snapshot.save(directory / TRAINING_STATE / LEARNER, saved)
+
     def run(self, dreamer: Any, replay: Any) -> None:
         """Learns until replay is closed."""
-        news, learner = _News(replay), self._learner
+        news, learner = _News(replay, self._cursor), self._learner
         promising, held = None, False
         while not news.closed:
-            for segment in news.fresh():
-                learner.add(segment)
+            with self._learning:
+                for segment in news.fresh():
+                    learner.add(segment)
+                self._cursor = news.cursor
             last = news.ended
             if held is not (learner.due(last=False) and not last):
                 held = not held
@@ -157,7 +197,8 @@ class WorldLearningWorker:
                 promising = learner.promising(last)
                 ray.get(dreamer.expect.remote(promising))
             if learner.owed >= 1:
-                learner.step()
+                with self._learning:
+                    learner.step()
             elif learner.due(last):
                 if promotion := learner.promote(last):
                     ray.get(dreamer.promote.remote(promotion))
@@ -168,9 +209,9 @@ class WorldLearningWorker:
 class _News:
     """What is new in replay, asked for every now and then and never waited for."""
 
-    def __init__(self, replay: Any) -> None:
+    def __init__(self, replay: Any, cursor: int) -> None:
         self._replay, self._asked, self._next = replay, None, 0.0
-        self._cursor = 0
+        self.cursor = cursor
         self.ended = self.closed = False
 
     def fresh(self) -> list[Segment]:
@@ -178,11 +219,11 @@ class _News:
         if self._asked is None:
             if time.monotonic() < self._next:
                 return []
-            self._asked = self._replay.news.remote(self._cursor)
+            self._asked = self._replay.news.remote(self.cursor)
         done, _ = ray.wait([self._asked], timeout=0)
         if not done:
             return []
         news = ray.get(self._asked)
         self._asked, self._next = None, time.monotonic() + LOOK_S
-        self._cursor, self.ended, self.closed = news.cursor, news.ended, news.closed
+        self.cursor, self.ended, self.closed = news.cursor, news.ended, news.closed
         return list(news.segments)

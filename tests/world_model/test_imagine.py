@@ -30,8 +30,9 @@ from accerl_lerobot.experience import IMAGINED, REAL, Decision, Request, Segment
 from accerl_lerobot.world_model import imagine
 from accerl_lerobot.world_model.baselines import OracleModel, ShuffledModel
 from accerl_lerobot.world_model.contract import Context, Dream, History, State, WorldModel
+from accerl_lerobot.world_model.fit import check_fit
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig, OnlineLearnConfig
-from accerl_lerobot.world_model.imagine import Imagination, check_fit
+from accerl_lerobot.world_model.imagine import Imagination
 from accerl_lerobot.world_model.online import Promotion
 from tests.world_model.lived import SPEC, WORLD, K, decided, lived
 

@@ -184,13 +184,13 @@ def test_a_success_model_learns_how_dreams_end():
     """Pairs are of dreams, the label is what really came of it, and near misses are drawn most."""
     episodes = ending_on_the_right(60)
     examples, rng = Examples(episodes, K), np.random.default_rng(0)
-    dreamt = Dreamt(examples, Deterministic("copy"), SimpleNamespace(), 20, 9, rng)  # type: ignore[arg-type]
+    dreamt = Dreamt.of(examples, Deterministic("copy"), SimpleNamespace(), 20, 9, rng)  # type: ignore[arg-type]
     before, after, achieved, progress = dreamt.seen(8, rng)
     assert np.array_equal(before, after), "nothing moves in its dreams"
     assert achieved.tolist() == [True] * 4 + [False] * 4 and before.shape == (8, 1, SIZE, SIZE, 3)
     assert (progress[:4] == 1).all()
-    exact = Dreamt(examples, Deterministic("exact"), SimpleNamespace(), 40, 9, rng)  # type: ignore[arg-type]
+    exact = Dreamt.of(examples, Deterministic("exact"), SimpleNamespace(), 40, 9, rng)  # type: ignore[arg-type]
     pairs = exact.seen(400, rng)
     assert on_the_right(None, pairs[0], pairs[1])[pairs[2]].mean() > 0.7
-    hard = exact._chances[~exact._success]
+    hard = exact.chances[~exact.success]
     assert set(np.round(np.unique(hard), 6)) <= {0.2, 1.0}

@@ -1,0 +1,39 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The state of torch's modules and optimisers, as trees of tensors, see `snapshot`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+
+def optimizer_state(optimizer: torch.optim.Optimizer) -> dict[int, dict[str, torch.Tensor]]:
+    """A copy of what it knows of each parameter, in order; rates are not its own."""
+    known: dict[int, dict[str, Any]] = optimizer.state_dict()["state"]
+    return {
+        place: {name: torch.as_tensor(value).detach().clone() for name, value in of.items()}
+        for place, of in known.items()
+    }
+
+
+def restore_optimizer(optimizer: torch.optim.Optimizer, state: dict[int, dict[str, torch.Tensor]]) -> None:
+    """Sets it to what `optimizer_state` gave of one for the same parameters."""
+    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+
+
+def copied(module: torch.nn.Module) -> dict[str, torch.Tensor]:
+    """A copy of its weights and buffers."""
+    return {name: tensor.detach().clone() for name, tensor in module.state_dict().items()}

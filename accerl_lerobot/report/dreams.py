@@ -1,0 +1,161 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What was imagined: how much, how true, and what the world model had to pass."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from accerl_lerobot.report.blocks import Block, Cell, Table, Words, figures
+from accerl_lerobot.report.charts import WHOLE, Chart, line
+from accerl_lerobot.report.read import Record, column, has, newest
+from accerl_lerobot.report.words import count, number, percent
+
+GATE = "imagination_gate_"
+MEANING = {
+    "skill_changed_first": "better than a copy of the last frame, where pixels changed, after one chunk",
+    "skill_changed_last": "the same at the end of the horizon",
+    "skill_last": "the same on all pixels",
+    "sensitivity_low": "how much worse it gets with another episode's actions",
+    "auroc": "tells episodes that succeed from those that fail, lower end of the interval",
+    "false_success": "failed episodes that are dreamt as successes",
+    "false_success_still": "dreams without actions that are taken for successes",
+    "recall": "successes that are dreamt as such",
+}
+FIELDS = {
+    "skill_changed_first": "skill_first",
+    "skill_changed_last": "skill_last",
+    "skill_last": "skill_last",
+    "sensitivity_low": "sensitivity",
+    "auroc": "auroc",
+    "false_success": "false_success",
+    "false_success_still": "false_success",
+    "recall": "recall",
+}
+"""Gate → the field of the trial's config that holds what is wanted."""
+AT_MOST = ("false_success", "false_success_still")
+
+
+def dream_blocks(rollout: Sequence[Record], imagination: Mapping[str, Any]) -> list[Block]:
+    """Of a run that imagines; nothing for one that does not."""
+    if not imagination.get("share") or not has(rollout, "imagination_dreams"):
+        return []
+    return [Words(text=_amount(rollout)), *figures(*_charts(rollout)), *_trial(rollout, imagination)]
+
+
+def gate_table(caption: str, rows: Sequence[tuple[str, float | None, str, bool]]) -> Table:
+    """Gates of a trial: name, value, what is wanted, and whether it holds."""
+    return Table(
+        caption=caption,
+        columns=("gate", "found", "wanted", "", "meaning"),
+        rows=[
+            (
+                Cell(text=name),
+                Cell(text=number(value, 3), number=True),
+                Cell(text=wanted, number=True),
+                Cell(text="holds" if holds else "fails", good=holds),
+                Cell(text=MEANING.get(name, "")),
+            )
+            for name, value, wanted, holds in rows
+        ],
+    )
+
+
+def _amount(rollout: Sequence[Record]) -> str:
+    def last(name: str) -> int:
+        return int(newest(rollout, f"imagination_{name}") or 0)
+
+    dreams, decisions = last("dreams"), last("decisions")
+    text = f"{count(dreams, 'dream')} of {count(decisions, 'decision')}; "
+    text += f"{percent(last('successes') / dreams if dreams else None)} of them succeeded"
+    if last("doubted"):
+        text += f", and {last('doubted'):,} ended early because the model was too uncertain"
+    tried = last("promoted") + last("refused")
+    if tried:
+        text += f". The world model passed {last('promoted')} of {count(tried, 'trial')} in this run"
+    return f"{text}."
+
+
+def _charts(rollout: Sequence[Record]) -> list[Chart]:
+    update = column(rollout, "update")
+    real, imagined = (column(rollout, f"replay_{kind}trained_decisions") for kind in ("", "imagined_"))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        learnt = imagined / (real + imagined)
+    of_dreams = [
+        ("dreams", "success", 0),
+        ("dreams, at each real outcome", "success_beside", 2),
+        ("reality", "success_real", 1),
+    ]
+    return [
+        Chart(
+            title="Success in dreams and in reality",
+            x_label="updates",
+            share=True,
+            limits=WHOLE,
+            note="Dreams far above reality flatter the policy.",
+            series=tuple(
+                line(label, update, column(rollout, f"imagination_{name}"), colour=colour)
+                for label, name, colour in of_dreams
+                if has(rollout, f"imagination_{name}")
+            ),
+        ),
+        Chart(
+            title="Imagined share",
+            x_label="updates",
+            share=True,
+            limits=WHOLE,
+            note="Of the decisions of a batch, and of all learnt from so far.",
+            series=(
+                line("of a batch", update, column(rollout, "replay_imagined_share"), colour=0),
+                line("so far", update, learnt, colour=2),
+            ),
+        ),
+        Chart(
+            title="What it learns from",
+            unit="real episodes",
+            x_label="updates",
+            limits=(0.0, None),
+            note="Episodes of the policy that the world model has learnt from.",
+            series=(line("episodes", update, column(rollout, "imagination_learn_episodes"), colour=4),),
+        ),
+        Chart(
+            title="Skill of the world model",
+            x_label="updates",
+            note="At each trial: 1 is perfect, 0 a copy of the last frame.",
+            limits=(None, 1.0),
+            series=tuple(
+                line(label, update, column(rollout, f"{GATE}{name}"), colour=i)
+                for i, (label, name) in enumerate(
+                    [("after one chunk", "skill_changed_first"), ("at the horizon", "skill_changed_last")]
+                )
+                if has(rollout, f"{GATE}{name}")
+            ),
+        ),
+    ]
+
+
+def _trial(rollout: Sequence[Record], imagination: Mapping[str, Any]) -> list[Block]:
+    """The gates of the last trial, where the recipe says what was wanted."""
+    wanted = imagination.get("learn", {}).get("trial", {})
+    rows = []
+    for name, field in FIELDS.items():
+        value, bound = newest(rollout, f"{GATE}{name}"), wanted.get(field)
+        if value is None or bound is None:
+            continue
+        holds = value <= bound if name in AT_MOST else value > bound
+        rows.append((name, value, f"{'at most' if name in AT_MOST else 'above'} {bound}", holds))
+    return [gate_table("The last trial of the world model", rows)] if rows else []

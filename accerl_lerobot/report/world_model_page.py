@@ -1,0 +1,195 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The page of one world model: what it learnt, and how it did on episodes it had not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from accerl_lerobot.report.blocks import Block, Commands, Page, Tile, figures, section
+from accerl_lerobot.report.charts import Chart, Series, line
+from accerl_lerobot.report.commands import commands
+from accerl_lerobot.report.dreams import gate_table
+from accerl_lerobot.report.notes import notes, status
+from accerl_lerobot.report.read import Record, Run, column, has
+from accerl_lerobot.report.run_page import films, recipe_blocks
+from accerl_lerobot.report.words import count, duration, number
+
+DEPTH = "depth of the dream in chunks"
+ARMS = {
+    "true": "its own actions",
+    "shuffled": "another episode's",
+    "zero": "none",
+    "opposite": "the opposite",
+    "failed": "a failed episode's",
+}
+"""Which actions were dreamt with."""
+
+
+def world_model_page(run: Run, config_class: type[Any], now: float) -> Page:
+    """Says what became of a world model.
+
+    Args:
+        run: of ``accerl world-model`` or ``world-model-eval``.
+        config_class: of its recipe.
+        now: in seconds since 1970.
+    """
+    state, good = status(run, now)
+    found = run.result or {}
+    return Page(
+        title=run.name,
+        kicker=f"accerl {run.verb} · {run.name}",
+        state=state,
+        state_good=good,
+        headline=_headline(run),
+        lead=_lead(found),
+        outcomes=[],
+        tiles=_tiles(found),
+        warnings=notes(run, None, now),
+        sections=[
+            *section("trial", "Trial", _gates(found)),
+            *films(run),
+            *section("depth", "The deeper the dream", figures(*depth_charts(found.get("depths", [])))),
+            *section("learning", "Learning", figures(*_learning(run))),
+            *section("recipe", "Recipe", recipe_blocks(run, config_class)),
+            *section("next", "What to do next", [Commands(commands=commands(run))]),
+        ],
+    )
+
+
+def estimates(depths: Sequence[Record], name: str, called: str, colour: int) -> Series:
+    """An estimate at each depth with its interval; numbers without one are a plain line."""
+    x = column(depths, "depth")
+    if has(depths, name):
+        return line(called, x, column(depths, name), colour=colour)
+    parts = [d.get(name) or {} for d in depths]
+    y, low, high = (column(parts, key) for key in ("value", "low", "high"))
+    there = np.isfinite(y)
+    ends = (np.where(np.isfinite(end), end, y)[there] for end in (low, high))
+    low, high = ends
+    return Series(name=called, x=x[there], y=y[there], low=low, high=high, kind="points", colour=colour)
+
+
+def depth_charts(depths: Sequence[Record]) -> list[Chart]:
+    """Skill, sensitivity and outcomes by depth."""
+    arms = [arm for arm in ARMS if has(depths, f"false_success_{arm}")]
+    return [
+        Chart(
+            title="Skill",
+            x_label=DEPTH,
+            limits=(None, 1.0),
+            note="1 is perfect, 0 is a copy of the last frame.",
+            series=(
+                estimates(depths, "skill_changed", "where pixels changed", 0),
+                estimates(depths, "skill", "all pixels", 1),
+            ),
+        ),
+        Chart(
+            title="Sensitivity to actions",
+            unit="times the error",
+            x_label=DEPTH,
+            limits=(0.0, None),
+            note="How much the error grows with wrong actions; 1 would be a model that ignores them.",
+            series=tuple(
+                estimates(depths, f"sensitivity_{arm}", ARMS[arm], i)
+                for i, arm in enumerate(("shuffled", "zero", "opposite"))
+            ),
+        ),
+        Chart(
+            title="Error of the state",
+            x_label=DEPTH,
+            limits=(0.0, None),
+            series=(
+                estimates(depths, "state_error", "dreamt", 0),
+                estimates(depths, "state_error_copy", "copy of the last state", 7),
+            ),
+        ),
+        Chart(
+            title="Taken for a success",
+            x_label=DEPTH,
+            share=True,
+            limits=(0.0, None),
+            note="Share of dreams told as successes, by the actions they were dreamt with; with its own "
+            "actions, of failures.",
+            series=tuple(
+                estimates(depths, f"false_success_{arm}", ARMS[arm], i) for i, arm in enumerate(arms)
+            ),
+        ),
+    ]
+
+
+def _headline(run: Run) -> str:
+    if run.result is None:
+        steps = max((int(r.get("step", 0)) for r in run.records.get("world_model", [])), default=0)
+        return f"A world model after {count(steps, 'step')}, not tried yet"
+    gates = run.result["gates"]
+    failed = [name for name, gate in gates.items() if not gate["holds"]]
+    if not failed:
+        return f"The world model passed its trial: all {len(gates)} gates hold"
+    return f"The world model failed its trial: {', '.join(failed)}"
+
+
+def _lead(found: Record) -> str:
+    if not found:
+        return ""
+    text = f"{count(found['trials'], 'trial')}"
+    if "episodes" in found:
+        text += f" on {count(found['episodes'], 'episode')} it had not learnt from"
+    return (
+        f"{text}; each dreams on from a real frame with the actions that were really made, and with others."
+    )
+
+
+def _tiles(found: Record) -> list[Tile]:
+    tiles = []
+    for key, name in (("learnt", "learnt from"), ("held_out", "held out")):
+        amount = found.get(key)
+        if isinstance(amount, dict):
+            note = f"{number(amount.get('env_steps'))} env steps"
+            tiles.append(Tile(name=name, value=count(amount.get("episodes", 0), "episode"), note=note))
+    for row in found.get("depths", [])[-1:]:
+        skill = (row.get("skill_changed") or {}).get("value")
+        tiles.append(Tile(name="skill", value=number(skill, 2), note=f"after {count(row['depth'], 'chunk')}"))
+    auroc = (found.get("outcomes") or {}).get("auroc") or {}
+    if auroc:
+        ends = f"[{number(auroc.get('low'), 3)}, {number(auroc.get('high'), 3)}]"
+        tiles.append(Tile(name="AUROC of outcomes", value=number(auroc.get("value"), 3), note=ends))
+    if "seconds" in found:
+        tiles.append(Tile(name="learning", value=duration(found["seconds"])))
+    return tiles
+
+
+def _gates(found: Record) -> list[Block]:
+    gates = found.get("gates", {})
+    rows = [(name, gate["value"], gate["wanted"], gate["holds"]) for name, gate in gates.items()]
+    return [gate_table("What it had to pass", rows)] if rows else []
+
+
+def _learning(run: Run) -> list[Chart]:
+    charts = []
+    for kind, title, names in (
+        ("world_model", "Loss of the world model", ("image", "image_dreamt", "state")),
+        ("success_model", "Success model", ("loss", "accuracy")),
+    ):
+        records = run.records.get(kind, [])
+        series = tuple(
+            line(name.replace("_", " "), column(records, "step"), column(records, name), colour=i)
+            for i, name in enumerate(names)
+            if has(records, name)
+        )
+        charts.append(Chart(title=title, x_label="gradient steps", limits=(0.0, None), series=series))
+    return charts

@@ -1,0 +1,194 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Folders of runs, written as runs write them, with numbers that tests choose."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from accerl_lerobot.algorithms import PPOConfig
+from accerl_lerobot.config import RunConfig, encode
+from accerl_lerobot.dataset_config import DatasetConfig
+from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig
+from accerl_lerobot.evaluation.stats import wilson_interval
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.verbs import WorldModelRun
+from accerl_lerobot.world_model.imagination_config import ImaginationConfig
+
+HOSTILE = "<script>document.title = 'owned'</script>\"'><img src=x onerror=\"document.title = 'owned'\">"
+"""What a task, or any other text of a run, might be called."""
+
+
+def run_config(**fields: Any) -> RunConfig:
+    """A recipe on the simulated world."""
+    defaults: dict[str, Any] = {"env": SimulatedConfig(), "trainer": TrainerConfig(updates=40)}
+    return RunConfig(**{**defaults, **fields})
+
+
+def ppo(**fields: Any) -> RunConfig:
+    """The same with another algorithm."""
+    return run_config(algorithm=PPOConfig(), **fields)
+
+
+def metaworld(**fields: Any) -> RunConfig:
+    """The same on a world that LeRobot can evaluate on, too."""
+    return run_config(env=MetaWorldConfig(task="door-open-v3", max_steps=150), **fields)
+
+
+def dreaming() -> RunConfig:
+    """The same with dreams."""
+    return run_config(imagination=ImaginationConfig(share=0.5, model="oracle"))
+
+
+def write_run(
+    folder: Path,
+    *,
+    config: RunConfig | None = None,
+    tasks: Sequence[str] = ("door-open-v3",),
+    successes: tuple[int, int] = (40, 90),
+    n: int = 100,
+    finished: bool = True,
+    rollout: dict[str, Any] | None = None,
+) -> Path:
+    """A run of ``accerl train`` with an evaluation before, one after, and `n` episodes in each.
+
+    Args:
+        folder: to make.
+        config: its recipe; None: `run_config`.
+        tasks: evaluated on.
+        successes: before and after.
+        n: episodes of each evaluation.
+        finished: whether there is a summary and an evaluation after.
+        rollout: further numbers of each record of the workers.
+    """
+    folder.mkdir(parents=True)
+    config = config or run_config()
+    (folder / "config.yaml").write_text(yaml.safe_dump(encode(config), sort_keys=False))
+    updates = config.trainer.updates
+    evaluations = [evaluation("before", 0.0, successes[0], n, tasks)]
+    lines = [{"kind": "evaluation", "wall_s": 5.0, "update": 0, **evaluations[0]}]
+    for update in range(1, updates + 1):
+        lines += [train_record(update), rollout_record(update, n, rollout or {})]
+    if finished:
+        evaluations.append(evaluation("after", 100.0 * updates, successes[1], n, tasks))
+        lines.append({"kind": "evaluation", "wall_s": 12.0 + updates, "update": updates, **evaluations[1]})
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    if finished:
+        (folder / "summary.json").write_text(json.dumps(summary(config, evaluations, tasks)) + "\n")
+        (folder / "checkpoints" / "last" / "pretrained_model").mkdir(parents=True)
+    return folder
+
+
+def evaluation(group: str, steps: float, successes: int, n: int, tasks: Sequence[str]) -> dict[str, Any]:
+    ends = wilson_interval(successes, n)
+    rate = {"success": successes / n, "n": n, "ci95": [ends.low, ends.high]}
+    return {
+        **rate,
+        "steps_mean": 10.0,
+        "env_steps": steps,
+        "group": group,
+        "tasks": {task: {**rate, "n": n // len(tasks)} for task in tasks},
+    }
+
+
+def train_record(update: int) -> dict[str, Any]:
+    """One update a second, of which a quarter is spent waiting."""
+    return {
+        "kind": "train", "wall_s": 10.0 + update, "update": float(update),
+        "policy_loss": math.sin(update / 7),
+        "value_loss": 1 / update, "kl": 0.01, "approx_kl": 0.02, "clip_fraction": 0.1, "low_weight": 0.0,
+        "ess": 0.9, "explained_variance": 0.5, "grad_norm": 2.0, "lr": 1e-4, "return_mean": 0.3,
+        "lag_mean": 3.0 + update % 2, "lag_max": 7.0 + update % 3, "ratio_max_dev": 0.1, "skipped": 0.0,
+        "wait_s": 0.25, "update_s": 0.7, "publish_s": 0.05,
+    }  # fmt: skip
+
+
+def rollout_record(update: int, evaluated: int, more: dict[str, Any]) -> dict[str, Any]:
+    """100 env steps and one episode a second, after `evaluated` episodes of 10 steps each."""
+    return {
+        "kind": "rollout", "wall_s": 10.0 + update, "update": update, "restarts": 0.0,
+        "env_steps": 10.0 * evaluated + 100.0 * update, "decisions": evaluated + 10.0 * update,
+        "episodes": evaluated + float(update), "success_exploring": min(1.0, 0.2 + update / 100),
+        "replay_insert_wait_s": 0.5 * update, "inference_batches": 5.0 * update,
+        "inference_batch_size_mean": 3.0, "inference_wait_mean_s": 0.002, "inference_busy_share": 0.3, **more,
+    }  # fmt: skip
+
+
+def summary(config: RunConfig, evaluations: Sequence[dict[str, Any]], tasks: Sequence[str]) -> dict[str, Any]:
+    updates = config.trainer.updates
+    found = {
+        f"{name}_{when}": one[key]
+        for when, one in zip(("before", "after"), evaluations, strict=True)
+        for name, key in (("success", "success"), ("n", "n"), ("ci95", "ci95"), ("tasks", "tasks"))
+    }
+    return {
+        **found, "env_steps": 100 * updates, "episodes": updates, "updates": updates, "wall_s": 75.0,
+        "warm_start_s": 5.0, "rl_s": 60.0, "algorithm": config.algorithm.type, "seed": config.seed,
+        "tasks": list(tasks),
+    }  # fmt: skip
+
+
+def dreams(share: float = 0.5, on: float = 1.0) -> dict[str, Any]:
+    """Numbers of the workers where something is imagined."""
+    return {
+        "imagination_dreams": 100.0, "imagination_decisions": 700.0, "imagination_successes": 60.0,
+        "imagination_doubted": 3.0, "imagination_success": 0.6, "imagination_success_beside": 0.7,
+        "imagination_success_real": 0.4, "imagination_on": on, "imagination_promoted": 1.0,
+        "imagination_refused": 2.0, "imagination_learn_episodes": 30.0, "replay_imagined_share": share,
+        "replay_trained_decisions": 100.0, "replay_imagined_trained_decisions": 300.0,
+        "imagination_gate_skill_changed_first": 0.7, "imagination_gate_false_success": 0.8,
+    }  # fmt: skip
+
+
+def write_world_model(folder: Path, *, passed: bool = True, finished: bool = True) -> Path:
+    """A run of ``accerl world-model``."""
+    folder.mkdir(parents=True)
+    recipe = replace(WorldModelRun(), dataset=DatasetConfig(repo_id="accerl/demos"))
+    (folder / "config.yaml").write_text(yaml.safe_dump(encode(recipe), sort_keys=False))
+    losses = [
+        {"kind": "world_model", "step": step, "image": 1 / step, "state": 0.1, "image_dreamt": 1.1 / step}
+        for step in range(20, 420, 20)
+    ]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in losses))
+    if finished:
+        depths = [
+            {
+                "depth": depth, "trials": 50, "skill": {"value": 0.7, "low": 0.6, "high": 0.8},
+                "skill_changed": {"value": 0.8, "low": 0.7, "high": 0.9},
+                "state_error": 0.1, "state_error_copy": 0.2, "false_success_true": 0.1,
+                "sensitivity_shuffled": {"value": 2.0, "low": 1.5, "high": math.nan},
+            }
+            for depth in (1, 2, 3)
+        ]  # fmt: skip
+        gates = {
+            "skill_last": {"value": 0.7, "wanted": "above 0.0", "holds": True},
+            "recall": {"value": 0.1, "wanted": "above 0.3", "holds": passed},
+        }
+        trial = {
+            "gates": gates,
+            "passed": passed,
+            "depths": depths,
+            "trials": 50,
+            "episodes": 8,
+            "seconds": 61.0,
+        }
+        (folder / "trial.json").write_text(json.dumps(trial) + "\n")
+    return folder

@@ -1,0 +1,398 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What a page says of a run, that it says nothing else, and that it harms nobody."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from accerl_lerobot import run
+from accerl_lerobot.config import LaunchConfig, RunConfig, parse
+from accerl_lerobot.console import Console
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.config import EvaluationConfig
+from accerl_lerobot.report.commands import commands
+from accerl_lerobot.report.config import ReportConfig
+from accerl_lerobot.report.page import write_report
+from accerl_lerobot.report.read import read_run
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.verbs import CONFIGS
+from tests.report.folders import (
+    HOSTILE,
+    dreaming,
+    dreams,
+    metaworld,
+    ppo,
+    run_config,
+    write_run,
+    write_world_model,
+)
+from tests.report.html import Seen
+from tests.runs import tiny_run
+
+
+def page_of(*runs: Path, **fields: Any) -> Seen:
+    """Writes the report of runs, and reads it."""
+    path = write_report(ReportConfig(runs=tuple(map(str, runs)), **fields), CONFIGS)
+    return Seen(path.read_text())
+
+
+@pytest.fixture(scope="module")
+def real(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that was really made, in one process."""
+    evaluation = EvaluationConfig(
+        episodes=8, every_updates=6, episodes_during=4, videos=1, video_size=32, video_every=1
+    )
+    config = tiny_run(
+        tiny_checkpoint,
+        evaluation=evaluation,
+        launch=LaunchConfig(engine="local"),
+        output_dir=str(tmp_path_factory.mktemp("report") / "real"),
+    )
+    directory = run.make_output_dir(config)
+    run.train(config, directory, Console())
+    return directory
+
+
+class TestARealRun:
+    """From its folder to its page."""
+
+    @pytest.fixture(scope="class")
+    def seen(self, real: Path) -> Seen:
+        return page_of(real)
+
+    def test_the_page_stands_in_its_folder(self, real: Path, seen: Seen) -> None:
+        assert (real / "report.html").is_file()
+        assert [path.name for path in real.iterdir() if "part" in path.name] == []
+
+    def test_it_says_what_became_of_the_run(self, real: Path, seen: Seen) -> None:
+        summary = json.loads((real / "summary.json").read_text())
+        low, high = (f"{100 * end:.0f}" for end in summary["ci95_after"])
+        assert f"{100 * summary['success_after']:.3g} % [{low}, {high}]" in seen.text
+        assert "95 % Wilson intervals, on 8 episodes" in seen.text
+        for part in (f"{summary['env_steps']:,}", "GIPO", "seed 0", "finished", "12"):
+            assert part in seen.text
+
+    def test_evaluations_and_lag_are_those_of_the_run(self, real: Path, seen: Seen) -> None:
+        series = {s["name"]: s for chart in seen.charts for s in chart["series"]}
+        assert len(series["evaluation, 95 % Wilson"]["x"]) == 3
+        lag = series["largest of a batch"]
+        assert lag["x"] == list(range(1, 13)) and max(lag["y"]) <= series_limit(series)
+        assert {"env steps", "decisions", "updates", "policy loss", "value loss"} <= set(series)
+
+    def test_the_video_is_inside(self, seen: Seen) -> None:
+        (video,) = seen.named("video")
+        assert video["src"].startswith("data:video/mp4;base64,") and "autoplay" in video
+
+    def test_the_recipe_and_the_commands(self, real: Path, seen: Seen) -> None:
+        assert "trainer.updates 12 1000" in seen.text and "env.type simulated metaworld" in seen.text
+        assert f"--config_path={real}/config.yaml --output_dir={real}-again" in seen.text
+        assert f"--policy.path={real}/checkpoints/last/pretrained_model" in seen.text
+        assert "lerobot-eval" not in seen.text  # LeRobot has no simulated world
+
+    def test_its_commands_would_be_understood(self, real: Path) -> None:
+        found = commands(read_run(real))
+        assert len(found) == 3
+        for _, line in found[:2]:
+            _, verb, *arguments = shlex.split(line)
+            config = parse(CONFIGS[verb], arguments, recipe_class=RunConfig)
+        assert config.policy.path == str(real / "checkpoints" / "last" / "pretrained_model")
+
+    def test_it_can_be_made_again(self, real: Path, seen: Seen) -> None:
+        assert page_of(real).text == seen.text
+
+
+def series_limit(series: dict[str, Any]) -> float:
+    """What the line across the lag's chart stands at."""
+    (bound,) = [s for name, s in series.items() if name.startswith("bound of the recipe")]
+    return float(bound["y"][0])
+
+
+def test_everything_needed_is_inside(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run")
+    (folder / "before_after.mp4").write_bytes(b"not really a video")
+    html = write_report(ReportConfig(runs=(str(folder),)), CONFIGS).read_text()
+    seen = Seen(html)
+    for tag, attributes in seen.elements:
+        for name in ("src", "href", "srcset", "poster", "data", "action"):
+            value = attributes.get(name, "")
+            assert value == "" or value.startswith(("data:", "#")), (tag, value)
+    assert not re.search(r"@import|url\(", html)
+    (policy,) = [m["content"] for m in seen.named("meta") if m.get("http-equiv") == "Content-Security-Policy"]
+    assert "default-src 'none'" in policy and "script-src 'sha256-" in policy
+    assert seen.named("html")[0]["lang"] == "en"
+    assert any(m.get("name") == "viewport" for m in seen.named("meta"))
+
+
+def test_charts_and_tables_speak_to_those_who_do_not_see_them(tmp_path: Path) -> None:
+    seen = page_of(write_run(tmp_path / "run", tasks=("a", "b")))
+    plots = [a for _, a in seen.elements if a.get("class") == "plot"]
+    assert len(plots) == len(seen.charts) >= 12
+    assert all(a["role"] == "img" and " over " in a["aria-label"] for a in plots)
+    assert all("scope" in a for a in seen.named("th")) and len(seen.named("caption")) == len(
+        seen.named("table")
+    )
+    ids = [a["id"] for _, a in seen.elements if "id" in a]
+    assert len(ids) == len(set(ids))
+
+
+@pytest.mark.parametrize(
+    ("successes", "said"),
+    [
+        ((40, 90), "Success on door-open-v3 rose from 40 % to 90 %"),
+        ((90, 40), "Success on door-open-v3 fell from 90 % to 40 %"),
+        ((50, 55), "Success on door-open-v3 went from 50 % to 55 %, and the intervals overlap"),
+        ((50, 50), "Success on door-open-v3 stayed at 50 %"),
+    ],
+)
+def test_the_headline_does_not_promise_more_than_was_measured(
+    tmp_path: Path, successes: tuple[int, int], said: str
+) -> None:
+    assert said in page_of(write_run(tmp_path / "run", successes=successes)).text
+
+
+def test_numbers_of_a_known_run(tmp_path: Path) -> None:
+    seen = page_of(write_run(tmp_path / "run"))
+    series = {s["name"]: s for chart in seen.charts for s in chart["series"]}
+    assert series["evaluation, 95 % Wilson"]["x"] == [0, 4000] and series["evaluation, 95 % Wilson"]["y"] == [
+        0.4,
+        0.9,
+    ]
+    # The 1000 env steps of the evaluation before are not experience; the first 24 episodes say nothing.
+    assert series["while exploring"]["x"] == [100.0 * i for i in range(25, 41)]
+    assert series["env steps"]["y"] == pytest.approx([100.0] * len(series["env steps"]["y"]), rel=1e-3)
+    # 0.75 s of work and 0.25 s of waiting in each second; forward passes in 30 % of it.
+    assert series["trainer"]["y"] == pytest.approx([0.75] * len(series["trainer"]["y"]), rel=1e-3)
+    assert series["inference"]["y"] == pytest.approx([0.3] * len(series["inference"]["y"]), rel=1e-3)
+    assert "The trainer was busy for 75 % of its time" in seen.text
+    assert "updating 70 %, 28 s" in seen.text and "waiting for a batch 25 %, 10 s" in seen.text
+    assert "Collecting was the slower side, and inference had time left" in seen.text
+    assert "Segments stood at the replay's door for 20 s" in seen.text
+
+
+@pytest.mark.parametrize(
+    ("waited", "busy", "said"),
+    [
+        (0.01, 0.5, "Learning was the slower side: more worlds would wait at the door."),
+        (2.0, 0.95, "Inference, busy for 95 % of the time, held collecting up."),
+        (2.0, 0.3, "Collecting was the slower side, and inference had time left"),
+    ],
+)
+def test_who_waited_for_whom(tmp_path: Path, waited: float, busy: float, said: str) -> None:
+    folder = write_run(tmp_path / "run", rollout={"inference_busy_share": busy})
+    text = (folder / "metrics.jsonl").read_text()
+    (folder / "metrics.jsonl").write_text(text.replace('"wait_s": 0.25', f'"wait_s": {waited}'))
+    assert said in page_of(folder).text
+
+
+def test_several_tasks_have_a_table(tmp_path: Path) -> None:
+    several = page_of(write_run(tmp_path / "a", tasks=("door-open-v3", "drawer-open-v3")))
+    assert "Success of each task" in several.text and "Success on 2 tasks rose" in several.text
+    assert "Success of each task" not in page_of(write_run(tmp_path / "b")).text
+
+
+def test_stock_lerobot_is_told_the_world(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", config=metaworld())
+    text = page_of(folder).text
+    assert (
+        f"lerobot-eval --policy.path={folder}/checkpoints/last/pretrained_model "
+        "--env.discover_packages_path=accerl_lerobot.envs.lerobot_plugin --env.type=accerl_metaworld "
+        "--env.task=door-open-v3 --env.camera=corner2 --env.image_size=64 --env.max_steps=150" in text
+    )
+
+
+def test_nothing_goes_wrong_so_nothing_is_warned_of(tmp_path: Path) -> None:
+    assert [a for _, a in page_of(write_run(tmp_path / "run")).elements if a.get("class") == "warnings"] == []
+
+
+@pytest.mark.parametrize(
+    ("numbers", "said"),
+    [
+        ({"restarts": 2.0}, "2 restarts of a rollout worker"),
+        ({"dropped_nonfinite": 1.0}, "1 decision thrown away, because the world returned NaN"),
+        ({"replay_retired_unused": 7.0}, "7 segments left the replay unused because they were older"),
+        ({"groups_dropped": 9.0, "groups_kept": 1.0}, "9 groups of equal starts thrown away and 1 kept"),
+    ],
+)
+def test_what_went_wrong_is_said(tmp_path: Path, numbers: dict[str, float], said: str) -> None:
+    assert said in page_of(write_run(tmp_path / "run", rollout=numbers)).text
+
+
+def test_a_run_that_is_going_on_and_one_that_has_died(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", finished=False)
+    with (folder / "metrics.jsonl").open("a") as file:
+        file.write('{"kind": "tr')
+    going = page_of(folder)
+    assert "still going" in going.text and "there is no summary.json yet" in going.text
+    assert "40 of 40 updates on door-open-v3 so far, with 60 % success while exploring" in going.text
+    assert "The last line of metrics.jsonl is incomplete" in going.text and len(going.charts) >= 12
+    for path in folder.iterdir():
+        os.utime(path, (time.time() - 7200, time.time() - 7200))
+    died = page_of(folder).text
+    assert "not finished" in died and "it ended early, or waits for something" in died
+    assert "2 h 00 min before this page" in died and "accerl eval" not in died
+
+
+def test_a_run_that_died_before_its_first_record(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", finished=False)
+    (folder / "metrics.jsonl").unlink()
+    seen = page_of(folder)
+    assert "the run has not come to its first record" in seen.text and seen.charts == []
+    assert "0 of 40 updates on match so far" in seen.text
+
+
+def test_dreams(tmp_path: Path) -> None:
+    seen = page_of(write_run(tmp_path / "on", config=dreaming(), rollout=dreams()))
+    assert "100 dreams of 700 decisions; 60 % of them succeeded, and 3 ended early" in seen.text
+    assert "The world model passed 1 of 3 trials in this run." in seen.text
+    assert "skill_changed_first 0.7 above 0.3 holds" in seen.text
+    assert "false_success 0.8 at most 0.5 fails" in seen.text
+    series = {s["name"]: s for chart in seen.charts for s in chart["series"]}
+    assert set(series["so far"]["y"]) == {0.75} and set(series["reality"]["y"]) == {0.4}
+    off = page_of(write_run(tmp_path / "off", config=dreaming(), rollout=dreams(on=0.0))).text
+    assert "Dreams were switched off in the end: 70 % of them succeeded, and 40 % of real episodes." in off
+    assert "dreams of" not in page_of(write_run(tmp_path / "none")).text
+
+
+def test_a_world_model(tmp_path: Path) -> None:
+    seen = page_of(write_world_model(tmp_path / "good"))
+    assert "The world model passed its trial: all 2 gates hold" in seen.text
+    assert "50 trials on 8 episodes it had not learnt from" in seen.text
+    series = {s["name"]: s for chart in seen.charts for s in chart["series"]}
+    assert series["where pixels changed"]["y"] == [0.8] * 3 and series["image"]["x"][:2] == [20, 40]
+    failed = page_of(write_world_model(tmp_path / "bad", passed=False)).text
+    assert "The world model failed its trial: recall" in failed and "recall 0.1 above 0.3 fails" in failed
+    begun = page_of(write_world_model(tmp_path / "begun", finished=False)).text
+    assert "A world model after 400 steps, not tried yet" in begun and "there is no trial.json yet" in begun
+
+
+def test_a_world_model_that_was_tried_again(tmp_path: Path) -> None:
+    folder = write_world_model(tmp_path / "tried")
+    (folder / "metrics.jsonl").unlink()
+    (folder / "config.yaml").write_text("path: model/world_model\ntrial: {depth: 9}\n")
+    text = page_of(folder).text
+    assert "accerl world-model-eval · tried" in text and "trial.depth 9 6" in text
+    assert "There are no metrics" not in text  # it makes none
+
+
+def test_runs_beside_each_other(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a" / "seed0", successes=(40, 90))
+    b = write_run(tmp_path / "b" / "seed0", config=ppo(seed=1), successes=(30, 60))
+    c = write_run(tmp_path / "c", finished=False)
+    seen = page_of(a, b, c, output=str(tmp_path / "all.html"))
+    assert "2 of 3 finished" in seen.text
+    assert "Success from 40 % (c) to 90 % (a/seed0)" in seen.text
+    assert "a/seed0 GIPO 0 40 % [31, 50] 90 % [83, 94] 4,000" in seen.text
+    assert "b/seed0 PPO 1 30 % [22, 40] 60 % [50, 69] 4,000" in seen.text
+    assert "algorithm.type gipo ppo gipo" in seen.text and "replay.capacity" not in seen.text
+    evaluated = seen.charts[0]["series"]
+    assert [len(s["x"]) for s in evaluated] == [2, 2, 1]
+
+
+def test_more_runs_than_colours(tmp_path: Path) -> None:
+    runs = [write_run(tmp_path / f"run{i}", config=run_config(seed=i)) for i in range(12)]
+    seen = page_of(*runs, output=str(tmp_path / "all.html"))
+    styles = [s["style"] for s in seen.charts[0]["series"]]
+    assert len(set(styles)) == 12 and "c3 dashed points" in styles
+
+
+def test_world_models_beside_each_other(tmp_path: Path) -> None:
+    models = [write_world_model(tmp_path / "a"), write_world_model(tmp_path / "b", passed=False)]
+    seen = page_of(*models, output=str(tmp_path / "all.html"))
+    assert "a passed 0.7 0.1" in seen.text and "b failed 0.7 0.1" in seen.text
+    assert "Nothing: their recipes are the same." in seen.text
+
+
+def test_text_of_a_run_is_text(tmp_path: Path) -> None:
+    """In tasks, recipes, file names and on the axes of every chart; no element of it comes to be."""
+    config = metaworld(job_name=HOSTILE, output_dir=HOSTILE)
+    folder = write_run(tmp_path / "<b>&run", config=config, tasks=(HOSTILE, "door-open-v3"))
+    (folder / "<i onclick='x'>.mp4").write_bytes(b"")
+    other = write_run(tmp_path / "<script>2", config=config, tasks=(HOSTILE,))
+    for seen in (page_of(folder), page_of(folder, other, output=str(tmp_path / "both.html"))):
+        assert len(seen.named("script")) == len(seen.charts) + 1
+        assert seen.named("img") == seen.named("i onclick") == []
+        assert not any(name.startswith("on") for _, attributes in seen.elements for name in attributes)
+        assert "<b>&run" in seen.text
+    assert HOSTILE in page_of(folder).text
+
+
+def test_a_large_video_is_linked(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "a run")
+    (folder / "before_after.mp4").write_bytes(bytes(2_000_001))
+    seen = page_of(folder, video_mb=2.0, output=str(tmp_path / "elsewhere.html"))
+    assert seen.named("video") == []
+    assert {"href": "a%20run/before_after.mp4"} in seen.named("a")
+    assert "before_after.mp4 is 2 MB, too large" in seen.text
+
+
+def test_a_long_run_makes_a_small_page_soon(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", config=run_config(trainer=TrainerConfig(updates=10_000)))
+    started = time.monotonic()
+    path = write_report(ReportConfig(runs=(str(folder),)), CONFIGS)
+    assert time.monotonic() - started < 10
+    assert path.stat().st_size < 500_000
+    lag = next(
+        s
+        for chart in Seen(path.read_text()).charts
+        for s in chart["series"]
+        if s["name"].startswith("largest")
+    )
+    assert len(lag["x"]) == 100 and max(lag["y"]) == 9.0
+
+
+class TestPlace:
+    """Where the page goes; what is there already is not damaged."""
+
+    def test_another_file_is_left_alone(self, tmp_path: Path) -> None:
+        folder = write_run(tmp_path / "run")
+        (folder / "report.html").write_text("<html>somebody's own</html>")
+        with pytest.raises(InputError, match="there is another file of this name; choose another"):
+            page_of(folder)
+        assert (folder / "report.html").read_text() == "<html>somebody's own</html>"
+
+    def test_an_older_page_is_replaced(self, tmp_path: Path) -> None:
+        folder = write_run(tmp_path / "run", finished=False)
+        assert "still going" in page_of(folder).text
+        write_run(tmp_path / "other")
+        (tmp_path / "other" / "summary.json").rename(folder / "summary.json")
+        assert "finished" in page_of(folder).text
+
+    def test_no_such_place(self, tmp_path: Path) -> None:
+        folder = write_run(tmp_path / "run")
+        with pytest.raises(InputError, match="there is no folder"):
+            page_of(folder, output=str(tmp_path / "nowhere" / "page.html"))
+        with pytest.raises(InputError, match="a folder; name a file in it"):
+            page_of(folder, output=str(tmp_path))
+
+    def test_several_runs_make_a_page_here(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        runs = [write_run(tmp_path / name) for name in ("a", "b")]
+        (tmp_path / "here").mkdir()
+        monkeypatch.chdir(tmp_path / "here")
+        page_of(*runs)
+        assert (tmp_path / "here" / "report.html").is_file()
+
+    def test_runs_of_different_kinds(self, tmp_path: Path) -> None:
+        runs = write_run(tmp_path / "a"), write_world_model(tmp_path / "b")
+        with pytest.raises(InputError, match="of one kind; these are of accerl train and world-model"):
+            page_of(*runs, output=str(tmp_path / "page.html"))
+        assert not (tmp_path / "page.html").exists()

@@ -1,0 +1,144 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A run's folder as data: what is torn, missing or damaged, and a run that was taken up again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.report.read import column, newest, read_run
+from tests.report.folders import rollout_record, train_record, write_run, write_world_model
+
+
+def append(folder: Path, *records: dict[str, Any]) -> None:
+    with (folder / "metrics.jsonl").open("a") as file:
+        file.writelines(json.dumps(record) + "\n" for record in records)
+
+
+def test_a_finished_run(tmp_path: Path) -> None:
+    run = read_run(write_run(tmp_path / "run"))
+    assert run.verb == "train" and run.name == "run" and not run.torn and run.sessions == 1
+    assert {kind: len(records) for kind, records in run.records.items()} == {
+        "train": 40, "rollout": 40, "evaluation": 2,
+    }  # fmt: skip
+    assert run.result is not None and run.result["success_after"] == 0.9
+    assert run.checkpoint == tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
+
+
+def test_a_run_that_is_not_finished(tmp_path: Path) -> None:
+    run = read_run(write_run(tmp_path / "run", finished=False))
+    assert run.result is None and run.checkpoint is None and len(run.records["train"]) == 40
+
+
+def test_a_run_that_did_not_come_to_its_metrics(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", finished=False)
+    (folder / "metrics.jsonl").unlink()
+    run = read_run(folder)
+    assert run.records == {} and not run.torn
+
+
+@pytest.mark.parametrize("tail", [b'{"kind": "tra', b"\xff\xfe", b'{"kind": "evaluation", "n": 3}', b"7"])
+def test_a_last_line_that_is_no_record_is_left_out(tmp_path: Path, tail: bytes) -> None:
+    folder = write_run(tmp_path / "run")
+    with (folder / "metrics.jsonl").open("ab") as file:
+        file.write(tail)
+    run = read_run(folder)
+    assert run.torn and len(run.records["train"]) == 40 and len(run.records["evaluation"]) == 2
+
+
+def test_a_line_in_the_middle_that_is_no_record_is_named(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run")
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    lines[6] = lines[6][:30]
+    (folder / "metrics.jsonl").write_text("\n".join(lines) + "\n")
+    with pytest.raises(
+        InputError, match=r"metrics\.jsonl:7.*is not a whole record; mend or remove this line"
+    ):
+        read_run(folder)
+
+
+def test_what_is_no_run(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such folder"):
+        read_run(tmp_path / "nowhere")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="a file; name the folder of a run"):
+        read_run(tmp_path / "file")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="no run in it: there is no config.yaml"):
+        read_run(tmp_path / "empty")
+    (tmp_path / "empty" / "config.yaml").write_text("job: else\n")
+    with pytest.raises(InputError, match="its config.yaml is not one of accerl train"):
+        read_run(tmp_path / "empty")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("config.yaml", b"a: [1,", "damaged"),
+        ("config.yaml", b"- a\n", "not a mapping"),
+        ("config.yaml", b"\xff\xff", "not text, at byte 0"),
+        ("summary.json", b'{"success_before": null', "damaged"),
+        ("summary.json", b'{"success_after": 0.5, "ci95_after": [0.1]}', "no good ci95_after"),
+        ("summary.json", b'{"success_after": "much"}', "no good success_after"),
+    ],
+)
+def test_damaged_files_are_named(tmp_path: Path, name: str, content: bytes, said: str) -> None:
+    folder = write_run(tmp_path / "run")
+    (folder / name).write_bytes(content)
+    with pytest.raises(InputError, match=said) as caught:
+        read_run(folder)
+    assert name in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_damaged_trial_is_named(tmp_path: Path) -> None:
+    folder = write_world_model(tmp_path / "model")
+    assert read_run(folder).verb == "world-model"
+    (folder / "trial.json").write_text('{"passed": true, "trials": 3, "gates": {"recall": 1}}')
+    with pytest.raises(InputError, match="no good gates"):
+        read_run(folder)
+
+
+def test_a_run_that_was_taken_up_again_reads_as_one(tmp_path: Path) -> None:
+    """It died after update 40 and went on from a checkpoint of update 30, with all counters from 0."""
+    folder = write_run(tmp_path / "run", finished=False)
+    again = []
+    for update in (31, 32):
+        again.append({**train_record(update), "wall_s": 5.0 + update - 30})
+        again.append({**rollout_record(update - 30, 0, {}), "update": update, "wall_s": 5.0 + update - 30})
+    append(folder, *again)
+    run = read_run(folder)
+    assert run.sessions == 2
+    assert column(run.records["train"], "update").tolist() == list(range(1, 33))
+    # The first start wrote until second 50, when there were 1000 + 4000 env steps.
+    assert column(run.records["train"], "wall_s")[-2:].tolist() == [56.0, 57.0]
+    assert column(run.records["rollout"], "env_steps")[-2:].tolist() == [5100.0, 5200.0]
+    assert (np.diff(column(run.records["rollout"], "wall_s")) > 0).all()
+
+
+def test_counters_that_were_restored_are_not_added_up_twice(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", finished=False)
+    append(folder, {**rollout_record(41, 100, {}), "wall_s": 3.0})
+    assert newest(read_run(folder).records["rollout"], "env_steps") == 1000 + 4100
+
+
+def test_columns_hold_numbers_only() -> None:
+    records: list[dict[str, Any]] = [{"a": 1}, {}, {"a": None}, {"a": "x"}, {"a": 2.5}]
+    assert np.array_equal(column(records, "a"), [1, np.nan, np.nan, np.nan, 2.5], equal_nan=True)
+    assert newest(records, "a") == 2.5 and newest(records, "b") is None

@@ -1,0 +1,95 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Differences from the defaults, between runs, and the bound that a recipe implies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from accerl_lerobot.algorithms import PPOConfig
+from accerl_lerobot.config import RunConfig, encode, parse
+from accerl_lerobot.demos.sft import SFTConfig
+from accerl_lerobot.doctor import pace
+from accerl_lerobot.parsing import read_recipe
+from accerl_lerobot.policies.backbone import BackboneConfig
+from accerl_lerobot.report.recipe import apart, differences, flat, lag_bound, unreadable
+from accerl_lerobot.verbs import WorldModelEvalRun
+from tests.report.folders import run_config
+
+ROOT = Path(__file__).parents[2]
+
+
+def changed(config: RunConfig) -> dict[str, Any]:
+    return {field: value for field, value, _ in differences(RunConfig, encode(config))}
+
+
+def test_the_defaults_differ_in_nothing() -> None:
+    assert changed(RunConfig()) == {}
+
+
+def test_another_type_is_a_difference_and_its_own_defaults_are_none() -> None:
+    assert changed(RunConfig(algorithm=PPOConfig(clip_high=0.3))) == {
+        "algorithm.type": "ppo", "algorithm.clip_high": 0.3,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "recipes").glob("*.yaml")), ids=lambda p: p.stem)
+def test_a_recipe_differs_in_what_it_says(path: Path) -> None:
+    config = parse(RunConfig, [str(path)])
+    said = {k: v for k, v in flat(read_recipe(path)).items() if k != "job_name"}
+    found = changed(config)
+    assert said.keys() >= found.keys() - {"sft.backbone", "policy.sampler"}
+    now, usual = flat(encode(config)), flat(encode(RunConfig()))
+    assert found.keys() >= {key for key in said if key in usual and usual[key] != now[key]}
+
+
+def test_runs_apart() -> None:
+    a, b = (encode(run_config(seed=seed)) for seed in (1, 2))
+    b["algorithm"] = {"type": "ppo"}
+    b["output_dir"] = "elsewhere"
+    rows = dict(apart([a, b]))
+    assert rows["seed"] == [1, 2] and rows["algorithm.type"] == ["gipo", "ppo"]
+    assert rows["algorithm.sigma"] == [1.0, "–"] and "output_dir" not in rows
+
+
+def test_the_bound_is_the_one_that_doctor_prints() -> None:
+    config = parse(RunConfig, [str(ROOT / "recipes" / "quickstart.yaml")])
+    bound = lag_bound(RunConfig, encode(config))
+    (lag,) = [check for check in pace(config) if check.name == "lag"]
+    assert lag.text.startswith(f"at most {bound} updates")
+
+
+def test_a_recipe_of_another_version() -> None:
+    tree = encode(RunConfig())
+    tree["replay"]["colour"] = "blue"
+    assert lag_bound(RunConfig, tree) is None and "replay.colour" in unreadable(RunConfig, tree)
+    assert ("replay.colour", "blue", "–") in differences(RunConfig, tree)
+    tree["algorithm"] = {"type": "reinforce"}
+    assert ("algorithm.type", "reinforce", "gipo") in differences(RunConfig, tree)
+
+
+def test_a_room_that_is_off_unless_given() -> None:
+    config = RunConfig(sft=SFTConfig(steps=5, backbone=BackboneConfig(hidden=8)))
+    assert changed(config) == {"sft.backbone": "given", "sft.steps": 5, "sft.backbone.hidden": 8}
+
+
+def test_a_recipe_without_defaults_for_everything() -> None:
+    tree = {"path": "model/world_model", "seed": 0, "trial": {"depth": 9}}
+    assert differences(WorldModelEvalRun, tree) == [
+        ("path", "model/world_model", None),
+        ("trial.depth", 9, 6),
+    ]

@@ -1,0 +1,91 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""``accerl report`` as it is typed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from accerl_lerobot import cli
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.parsing import parse
+from accerl_lerobot.report.config import ReportConfig
+from tests.report.folders import write_run
+
+
+def test_it_prints_where_the_page_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_run(tmp_path / "run")
+    assert cli.main(["report", str(folder)]) == 0
+    assert capsys.readouterr().out == f"{folder / 'report.html'}\n"
+
+
+def test_runs_are_named_bare_or_not(tmp_path: Path) -> None:
+    assert parse(ReportConfig, ["a", "b,c", "--video_mb=0"]).runs == ("a", "b,c")
+    assert parse(ReportConfig, ["--runs=a,b", "--output=page.html"]).runs == ("a", "b")
+    assert parse(ReportConfig, ["--output=page.html", "a"]).runs == ("a",)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "runs='': name the folder of a run: accerl report RUN"),
+        (["a", "--runs=b"], "runs='b': leave out --runs or a: name them in one way"),
+        (["a", "--video_mb=-1"], "video_mb=-1.0: use 0 (link every video) or more megabytes"),
+        (["a", "--vide_mb=1"], "no such field; did you mean video_mb"),
+        (["nowhere"], "runs='nowhere': no such folder"),
+    ],
+)
+def test_mistakes_are_one_line(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["report", *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and said in err and err.count("\n") == 1
+
+
+def test_one_run_under_two_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_run(tmp_path / "run")
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["report", "run", "./run"]) == 2
+    assert capsys.readouterr().err == "accerl: runs='run,./run': name each run once\n"
+
+
+def test_others_still_take_one_recipe() -> None:
+    from accerl_lerobot.config import RunConfig
+
+    with pytest.raises(InputError, match="write --room.field=value"):
+        parse(RunConfig, ["recipes/quickstart.yaml", "another"])
+
+
+def test_help_says_what_stands_bare(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["report", "--help"]) == 0
+    assert capsys.readouterr().out.startswith("usage: accerl report RUN [RUN …] [--room.field=value …]\n")
+
+
+def test_a_page_is_made_without_torch(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run")
+    code = (
+        "import sys; from accerl_lerobot import cli\n"
+        "assert cli.main(['report', sys.argv[1]]) == 0\n"
+        "heavy = {'torch', 'lerobot', 'ray', 'transformers', 'matplotlib'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(folder)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
