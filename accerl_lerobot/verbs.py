@@ -331,9 +331,7 @@ def pull(arguments: list[str]) -> int:
 
     with redirect_stdout(sys.stderr):
         found = from_hub(config)
-    Console().say(
-        f"{found['kind']} {found['path']}, commit {found['commit']}, {found['checked']} files checked"
-    )
+    Console().say(f"{found['kind']} {found['path']} is {found['commit']}, {found['checked']} files checked")
     sys.stdout.write(json.dumps(found, indent=2) + "\n")
     return 0
 
