@@ -253,9 +253,11 @@ def _named(directory: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def _local_names(config: dict[str, Any], processor: dict[str, Any]) -> list[tuple[dict[str, Any], str, str]]:
-    """Where a checkpoint's files name a folder of this machine: (mapping, key, our folder for it)."""
+    """Where a checkpoint's files name a folder of this machine, or by its bare name one beside them, as they
+    do on the Hub: (mapping, key, our folder for it)."""
     places = [(config, key, folder) for key, folder in CONFIG_FOLDERS.items()]
     for step in processor["steps"]:
         if (option := STEP_FOLDERS.get(step.get("registry_name"))) is not None:
             places.append((step["config"], *option))
-    return [place for place in places if Path(place[0].get(place[1]) or "").is_absolute()]
+    named = [(place, place[0].get(place[1]) or "") for place in places]
+    return [place for place, name in named if Path(name).is_absolute() or name == place[2]]

@@ -35,6 +35,8 @@ VERBS = {
     "eval": ("verbs:evaluate", "success of a checkpoint, with its confidence interval"),
     "world-model": ("verbs:world_model", "learn to dream a world from a LeRobotDataset, and be tried on it"),
     "world-model-eval": ("verbs:world_model_eval", "try a world model on another dataset"),
+    "push": ("verbs:push", "a policy, world model, dataset or run to the Hub, as one commit"),
+    "pull": ("verbs:pull", "what was pushed into a new folder, pinned and checked"),
     "report": ("verbs:report", "one HTML page of a run, or of several beside each other, to look at"),
     "doctor": ("doctor:main", "resolve a recipe and check this machine"),
     "bench": ("verbs:bench", "measure: accerl bench world, policy, lag, dream, ranking, …"),

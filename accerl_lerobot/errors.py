@@ -15,6 +15,10 @@
 
 from __future__ import annotations
 
+import re
+
+TOKEN = re.compile(r"\bhf_\w{6,}")
+"""A token of the Hub, which somebody may have typed where it does not belong; it is not repeated."""
 LONGEST = 200
 """Characters of a value that are shown; a whole room may have been given where a number belongs."""
 
@@ -41,4 +45,4 @@ class InputError(ValueError):
         value = repr(self.value)
         if len(value) > LONGEST:
             value = f"{value[: LONGEST - 1]}…"
-        return " ".join(f"{self.field}={value}: {self.remedy}".split())
+        return TOKEN.sub("<token>", " ".join(f"{self.field}={value}: {self.remedy}".split()))

@@ -37,6 +37,10 @@ PRIVATE = {
     # it is told that there is no cluster to be part of. The name is historical: it is read on all systems.
     "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
 }
+_NO_TOKEN = {"HF_TOKEN": "", "HUGGING_FACE_HUB_TOKEN": "", "HF_TOKEN_PATH": os.devnull}
+TOKENLESS = {"runtime_env": {"env_vars": _NO_TOKEN}}
+"""Options of an actor that runs other people's environments: the Hub's token is not in its process, and not
+found by the client in it. No wall: what runs as the same user can read what that user can."""
 
 
 def prepare() -> None:

@@ -33,6 +33,7 @@ from accerl_lerobot import snapshot
 from accerl_lerobot.config import RunConfig
 from accerl_lerobot.engine import WorkerError, check_new, episode_key
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.ray_environment import TOKENLESS
 from accerl_lerobot.rollout.plans import budgets, whole_groups
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.watched import Watched
@@ -222,7 +223,7 @@ class Seats:
 
         c = self._config
         film = (c.evaluation.video_size, c.evaluation.video_every)
-        actor = ray.remote(RolloutWorker).options(num_cpus=0, num_gpus=0, max_concurrency=4)
+        actor = ray.remote(RolloutWorker).options(num_cpus=0, num_gpus=0, max_concurrency=4, **TOKENLESS)
         place = (c.seed, seat.index, seat.incarnation)
         made = actor.remote(c.env, c.rollout, self._tasks, *place, film, self._history, seat.budget)
         return Watched(f"rollout {seat.index}", made)

@@ -44,6 +44,7 @@ from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
+from accerl_lerobot.hub.config import PullConfig, PushConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.parsing import read_arguments
 from accerl_lerobot.policies.config import PolicyConfig
@@ -310,6 +311,31 @@ def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Cons
     return 0 if found["passed"] else 1
 
 
+def push(arguments: list[str]) -> int:
+    """``accerl push``."""
+    config: PushConfig = parse(PushConfig, arguments)
+    from accerl_lerobot.hub.push import push as to_hub
+
+    with redirect_stdout(sys.stderr):
+        found = to_hub(config)
+    done = "is there already, as" if found["unchanged"] else "is now"
+    Console().say(f"{found['kind']} {done} {found['url']} at commit {found['commit']}")
+    sys.stdout.write(json.dumps(found, indent=2) + "\n")
+    return 0
+
+
+def pull(arguments: list[str]) -> int:
+    """``accerl pull``."""
+    config: PullConfig = parse(PullConfig, arguments)
+    from accerl_lerobot.hub.pull import pull as from_hub
+
+    with redirect_stdout(sys.stderr):
+        found = from_hub(config)
+    Console().say(f"{found['kind']} {found['path']} is {found['commit']}, {found['checked']} files checked")
+    sys.stdout.write(json.dumps(found, indent=2) + "\n")
+    return 0
+
+
 def report(arguments: list[str]) -> int:
     """``accerl report``."""
     config: ReportConfig = parse(ReportConfig, arguments)
@@ -341,6 +367,8 @@ CONFIGS: dict[str, type[Any]] = {
     "eval": EvalRun,
     "world-model": WorldModelRun,
     "world-model-eval": WorldModelEvalRun,
+    "push": PushConfig,
+    "pull": PullConfig,
     "report": ReportConfig,
     "doctor": RunConfig,
     "bench world": BenchWorldConfig,

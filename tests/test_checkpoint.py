@@ -31,6 +31,7 @@ from accerl_lerobot.checkpoint import (
     RUN_STATE,
     TRAINING_STATE,
     defect,
+    displaced,
     let_go,
     newest_whole,
     relocate,
@@ -232,3 +233,13 @@ def test_a_backbone_from_the_hub_is_left_alone(tmp_path: Path):
     (tmp_path / "config.json").write_text('{"vlm_model_name": "some/backbone"}')
     relocate(tmp_path, tmp_path / "home")
     assert (tmp_path / "config.json").read_text() == '{"vlm_model_name": "some/backbone"}'
+
+
+def test_a_backbone_by_its_bare_name_is_the_one_beside(tmp_path: Path):
+    (tmp_path / BACKBONE).mkdir()
+    (tmp_path / "config.json").write_text(json.dumps({"vlm_model_name": BACKBONE}))
+    (tmp_path / "policy_preprocessor.json").write_text('{"steps": []}')
+    assert displaced(tmp_path), "LeRobot would look for it where the process runs"
+    relocate(tmp_path, tmp_path)
+    assert json.loads((tmp_path / "config.json").read_text()) == {"vlm_model_name": str(tmp_path / BACKBONE)}
+    assert not displaced(tmp_path)

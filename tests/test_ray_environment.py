@@ -15,9 +15,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -101,3 +103,54 @@ def test_a_client_without_the_token_is_refused(light_ray: None):
     stranger = connect({k: v for k, v in os.environ.items() if not k.startswith("RAY_AUTH")})
     assert stranger.returncode != 0 and "connected" not in stranger.stdout
     assert "InvalidAuthToken" in stranger.stderr
+
+
+TOKENS = """
+import json, sys
+from pathlib import Path
+from accerl_lerobot import ray_environment
+ray_environment.prepare()
+from accerl_lerobot.launch import RayEngine
+from accerl_lerobot.inference import worker as inference
+from accerl_lerobot.trainer import worker as trainer
+from tests.light_workers import LightInference, LightTrainer
+from tests.runs import tiny_run
+inference.InferenceWorker, trainer.TrainerWorker = LightInference, LightTrainer
+engine = RayEngine(tiny_run(Path("nowhere")), ("match",))
+try:
+    found = {name: Path(f"/proc/{pid}/environ").read_text() for name, pid in engine.pids().items()}
+finally:
+    engine.close()
+print(json.dumps({name: text.count(sys.argv[1]) for name, text in found.items()}))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+def test_processes_that_run_worlds_do_not_get_the_hubs_token():
+    token = "hf_notforenvironments"
+    secrets = {"HF_TOKEN": token, "HUGGING_FACE_HUB_TOKEN": token}
+    done = subprocess.run(
+        [sys.executable, "-c", TOKENS, token],
+        env={k: v for k, v in os.environ.items() if not k.startswith("RAY_AUTH")} | secrets,
+        capture_output=True,
+        text=True,
+        timeout=240,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert found["rollout 0"] == 0
+    assert found["inference"] == 2, "it may have to fetch a policy, and shows that the token was there"
+
+
+def test_a_client_in_such_a_process_finds_no_token(tmp_path: Path):
+    (tmp_path / "token").write_text("hf_storedstoredstored")
+    code = "import huggingface_hub; print(huggingface_hub.get_token())"
+
+    def token(variables: dict[str, str]) -> str:
+        environment = {k: v for k, v in os.environ.items() if not k.startswith("HF_")} | variables
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    assert token({"HF_HOME": str(tmp_path)}) == "hf_storedstoredstored"
+    assert token({"HF_HOME": str(tmp_path)} | ray_environment.TOKENLESS["runtime_env"]["env_vars"]) == "None"

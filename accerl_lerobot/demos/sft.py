@@ -31,7 +31,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.checkpoint import displaced, relocate
+from accerl_lerobot.checkpoint import BACKBONE, displaced, relocate
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.backbone import BackboneConfig, write_backbone
 from accerl_lerobot.policies.plugins import discovery, register_policies
@@ -234,18 +234,21 @@ def _stored_config(path: str) -> dict[str, Any]:
     """The ``config.json`` of a checkpoint, on this machine or on the Hub.
 
     Raises:
-        InputError: there is none.
+        InputError: there is none, or it has a backbone of its own and is not in a folder where that is set.
     """
     from huggingface_hub import hf_hub_download
 
     file = Path(path).expanduser() / "config.json"
-    if not file.is_file():
+    if not (local := file.is_file()):
         try:
             file = Path(hf_hub_download(path, "config.json"))
         except (OSError, ValueError) as error:
             remedy = "no config.json in a folder of that name, and not loadable from the Hub"
             raise InputError("sft.init_path", path, remedy) from error
     config: dict[str, Any] = json.loads(file.read_text())
+    if not local and config.get("vlm_model_name") == BACKBONE:
+        remedy = "LeRobot finds its backbone only in a folder: accerl pull it, and name that"
+        raise InputError("sft.init_path", path, remedy)
     return config
 
 

@@ -1,0 +1,106 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The list of files that goes with them, by which a pull knows that it has them all, unchanged.
+
+README.md is not on it: people edit cards on the Hub. The list is no signature: whoever may write to the
+repository may write a list as well.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from accerl_lerobot import __version__
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.hub.kinds import NEEDED
+
+MANIFEST = "accerl_manifest.json"
+CARD = "README.md"
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What a file must be."""
+
+    size: int
+    """Bytes."""
+    sha256: str | None
+    """None: only the size is known."""
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What was pushed."""
+
+    kind: str
+    files: Mapping[str, Entry]
+
+
+def entry_of(content: Path | bytes) -> Entry:
+    """Size and hash of a file, or of bytes."""
+    if isinstance(content, bytes):
+        return Entry(len(content), hashlib.sha256(content).hexdigest())
+    with content.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return Entry(content.stat().st_size, digest)
+
+
+def write_manifest(manifest: Manifest) -> bytes:
+    """As it goes to the Hub."""
+    files = {name: {"size": e.size, "sha256": e.sha256} for name, e in sorted(manifest.files.items())}
+    content = {"format": FORMAT, "kind": manifest.kind, "accerl": __version__, "files": files}
+    return (json.dumps(content, indent=1) + "\n").encode()
+
+
+def read_manifest(data: bytes, repo_id: str) -> Manifest:
+    """As it came from the Hub.
+
+    Raises:
+        InputError: it is not one of ours.
+    """
+    try:
+        content = json.loads(data)
+        if content["format"] != FORMAT:
+            raise ValueError(f"format {content['format']}")
+        entries = content["files"].items()
+        files = {str(name): Entry(int(e["size"]), str(e["sha256"])) for name, e in entries}
+        if content["kind"] not in NEEDED:
+            raise ValueError("no such kind")
+        return Manifest(content["kind"], files)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        remedy = f"its {MANIFEST} is broken ({type(error).__name__}: {error}); push it anew"
+        raise InputError("repo_id", repo_id, remedy) from error
+
+
+def verify(folder: Path, files: Mapping[str, Entry], repo_id: str) -> None:
+    """Compares files on disk with what they must be.
+
+    Raises:
+        InputError: one is missing, cut short or another.
+    """
+    for name, expected in files.items():
+        path = folder / name
+        if not path.is_file():
+            raise InputError("repo_id", repo_id, f"{name} is missing there; push it anew")
+        if (size := path.stat().st_size) != expected.size:
+            remedy = f"{name} came with {size} bytes instead of {expected.size}; pull again, or push it anew"
+            raise InputError("repo_id", repo_id, remedy)
+        if expected.sha256 is not None and entry_of(path).sha256 != expected.sha256:
+            remedy = f"{name} is not what was pushed: its sha256 is another; pull again, or push it anew"
+            raise InputError("repo_id", repo_id, remedy)

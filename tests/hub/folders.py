@@ -1,0 +1,76 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Folders that look like what is pushed, written in no time; nothing in them could be loaded."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+SUMMARY = {
+    "success_before": 0.25, "success_after": 0.75, "n_before": 40, "n_after": 40,
+    "ci95_before": [0.1419, 0.4019], "ci95_after": [0.5981, 0.8581],
+    "tasks_before": {"match": {"success": 0.25, "n": 40, "ci95": [0.1419, 0.4019]}},
+    "tasks_after": {"match": {"success": 0.75, "n": 40, "ci95": [0.5981, 0.8581]}},
+    "env_steps": 12345, "episodes": 321, "updates": 12, "lag_mean": 3.25, "rl_s": 60.0,
+    "algorithm": "gipo", "seed": 3,
+}  # fmt: skip
+
+
+def write_json(path: Path, content: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, indent=4) + "\n")
+
+
+def write_policy_folder(folder: Path, *, size: int = 3000, seed: int = 0, **config: Any) -> Path:
+    """A policy's files; `config` goes into LeRobot's."""
+    write_json(folder / "config.json", {"type": "act", "n_obs_steps": 1} | config)
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        write_json(folder / name, {"name": "any", "steps": []})
+    rng = np.random.default_rng(seed)
+    (folder / "model.safetensors").write_bytes(rng.bytes(size))
+    (folder / "value_head.safetensors").write_bytes(rng.bytes(size // 2))
+    write_json(folder / "accerl.json", {"sampler": {}, "value_head": {}, "rename_map": {}})
+    return folder
+
+
+def write_run_folder(run: Path, **policy: Any) -> Path:
+    """A run that made 12 updates, with all that a run leaves behind; names its own places, as runs do."""
+    home = run / "checkpoints" / "000012" / "pretrained_model"
+    write_policy_folder(home, **policy)
+    write_policy_folder(run / "checkpoints" / "000006" / "pretrained_model", seed=6)
+    write_json(run / "checkpoints" / "000012" / "training_state" / "training_step.json", {"step": 12})
+    os.symlink("000012", run / "checkpoints" / "last")
+    recipe = {
+        "output_dir": str(run),
+        "env": {"type": "metaworld", "task": "door-open-v3", "image_size": 64},
+        "dataset": {"repo_id": "accerl/demos", "root": str(run.parent / "my demos" / "one")},
+        "policy": {"path": "lerobot/smolvla_base"},
+        "sft": {"extra_args": [f"--dataset.root={run.parent}/data/two"]},
+        "algorithm": {"type": "gipo"},
+    }
+    (run / "config.yaml").write_text(yaml.safe_dump(recipe, sort_keys=False))
+    write_json(run / "summary.json", SUMMARY)
+    (run / "metrics.jsonl").write_text(json.dumps({"kind": "train", "note": f"saved {home}/model"}) + "\n")
+    (run / "success_curve.png").write_bytes(b"\x89PNG curve")
+    (run / "before_after.mp4").write_bytes(b"\0\0 film")
+    for name in ("tensorboard/events", "demos/meta/info.json", "sft/log.txt", "sft.log", ".hidden"):
+        (run / name).parent.mkdir(parents=True, exist_ok=True)
+        (run / name).write_text("left at home")
+    return run

@@ -1,0 +1,148 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Cards say what was measured, and how the thing is used, and their metadata is what the Hub reads."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import pytest
+from huggingface_hub import DatasetCard, ModelCard
+
+from accerl_lerobot.config import RunConfig, parse
+from accerl_lerobot.hub.card import MARK
+from accerl_lerobot.hub.config import PushConfig
+from accerl_lerobot.hub.push import staged
+from accerl_lerobot.verbs import CONFIGS
+from tests.hub.folders import write_json, write_policy_folder, write_run_folder
+
+TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
+
+
+def card_of(folder: Path, kind: str, **fields: str) -> str:
+    files, own = staged(PushConfig(path=str(folder), repo_id="alice/door", **fields), folder, kind)
+    assert not own
+    return bytes(files["README.md"]).decode()
+
+
+def test_metadata(tmp_path: Path):
+    run = write_run_folder(tmp_path / "run")
+    data = ModelCard(card_of(run / "checkpoints/last/pretrained_model", "policy")).data
+    assert data.library_name == "lerobot" and data.pipeline_tag == "robotics"
+    assert data.tags == ["accerl-lerobot", "policy", "act", "metaworld", "reinforcement-learning", "gipo"]
+    assert data.base_model == "lerobot/smolvla_base"
+    assert data.datasets is None, "the dataset was a folder, its name a label"
+    (result,) = data.eval_results
+    assert result.metric_type == "success_rate" and result.metric_value == 0.75
+    assert result.metric_args == {"n": 40, "ci95": [0.5981, 0.8581]}
+    assert result.dataset_name == "metaworld match" and result.task_type == "robotics"
+    earlier = ModelCard(card_of(run / "checkpoints/000006/pretrained_model", "policy"))
+    assert earlier.data.eval_results is None and "## Measured" not in earlier.text
+
+
+def test_numbers_films_and_recipe_for_people(tmp_path: Path):
+    run = write_run_folder(tmp_path / "run")
+    for folder, kind, prefix in (
+        (run, "run", ""),
+        (run / "checkpoints/last/pretrained_model", "policy", "accerl_run/"),
+    ):
+        text = card_of(folder, kind)
+        assert "| before RL | match | 25.0% | 40 | 14.2% to 40.2% |" in text
+        assert "| after RL | match | 75.0% | 40 | 59.8% to 85.8% |" in text
+        assert "| env steps | 12,345 |" in text and "| updates | 12 |" in text and "| seed | 3 |" in text
+        assert f'src="{prefix}before_after.mp4"' in text and f"]({prefix}success_curve.png)" in text
+        assert "task: door-open-v3" in text and str(tmp_path) not in text
+
+
+def test_an_evaluation_is_what_counts_last(tmp_path: Path):
+    policy = write_run_folder(tmp_path / "run") / "checkpoints/last/pretrained_model"
+    tasks = {t: {"success": s, "n": 50, "ci95": [0.1, 0.9]} for t, s in (("a", 0.4), ("b", 0.6))}
+    found = {"success": 0.5, "n": 100, "ci95": [0.4038, 0.5962], "tasks": tasks, "policy": str(policy)}
+    write_json(tmp_path / "eval" / "evaluation.json", found)
+    text = card_of(policy, "policy", evaluation=str(tmp_path / "eval"))
+    results = {r.dataset_config: r.metric_value for r in ModelCard(text).data.eval_results}
+    assert results == {"all tasks": 0.5, "a": 0.4, "b": 0.6}
+    assert "| accerl eval | all | 50.0% | 100 | 40.4% to 59.6% |" in text
+    assert "| accerl eval | b | 60.0% | 50 |" in text
+
+
+@pytest.mark.parametrize("kind", ["policy", "run", "world model", "success model"])
+def test_commands_in_the_card_are_commands(tmp_path: Path, kind: str):
+    folder = write_run_folder(tmp_path / "run")
+    if kind == "policy":
+        folder = folder / "checkpoints" / "last" / "pretrained_model"
+    elif kind != "run":
+        write_json(
+            folder / "config.json", {"spec": {}, "model": {}} if kind == "world model" else {"type": "x"}
+        )
+    text = card_of(folder, kind).split("```bash\n")
+    commands = [
+        line for block in text[1:] for line in block.split("```")[0].splitlines() if line[:7] == "accerl "
+    ]
+    assert any(line.startswith("accerl pull --repo_id=alice/door") for line in commands)
+    for line in commands:
+        _, verb, *arguments = shlex.split(line)
+        parse(CONFIGS[verb], [a for a in arguments if "config.yaml" not in a], recipe_class=RunConfig)
+
+
+def test_stock_lerobot_and_a_plugin_policy(tmp_path: Path):
+    run = write_run_folder(tmp_path / "run", type="smolvla_bins", vlm_model_name="org/vlm")
+    text = card_of(run / "checkpoints/last/pretrained_model", "policy")
+    assert "lerobot-eval --policy.path=door" in text and "--env.task=door-open-v3" in text
+    assert "--policy.discover_packages_path=accerl_lerobot.policies.bins_plugin" in text
+    assert "loads it from the Hub as well: `--policy.path=alice/door`" in text
+
+
+def test_of_a_policy_that_was_pulled_and_improved(tmp_path: Path):
+    start = write_policy_folder(tmp_path / "start")
+    write_json(start / "accerl_pulled.json", {"repo_id": "bob/start"})
+    run = write_run_folder(tmp_path / "run")
+    recipe = run / "config.yaml"
+    recipe.write_text(recipe.read_text().replace("lerobot/smolvla_base", str(start)))
+    assert ModelCard(card_of(run, "run")).data.base_model == "bob/start"
+
+
+def test_a_trial_is_told_as_it_went(tmp_path: Path):
+    write_json(tmp_path / "world_model" / "config.json", {"spec": {}, "model": {}})
+    gates = {
+        "auroc": {"value": 0.97123, "wanted": "above 0.9", "holds": True},
+        "recall": {"value": 0.1, "holds": False},
+    }
+    write_json(tmp_path / "trial.json", {"passed": False, "gates": gates})
+    text = card_of(tmp_path / "world_model", "world model")
+    assert (
+        "**It failed its trial**" in text
+        and "| auroc | 0.9712 | yes |" in text
+        and "| recall | 0.1 | no |" in text
+    )
+
+
+def test_the_users_own_card_is_left_alone(tmp_path: Path):
+    folder = write_policy_folder(tmp_path / "policy")
+    (folder / "README.md").write_text("# mine\n")
+    files, own = staged(PushConfig(path=str(folder), repo_id="a/b"), folder, "policy")
+    assert own and files["README.md"] == b"# mine\n"
+    (folder / "README.md").write_text(f"{MARK}\nold\n")  # ours, of an earlier push
+    assert "old" not in card_of(folder, "policy")
+
+
+def test_a_dataset_gets_lerobots_card(tmp_path: Path):
+    import shutil
+
+    shutil.copytree(TINY, tmp_path / "dataset", ignore=shutil.ignore_patterns("README.md"))
+    text = card_of(tmp_path / "dataset", "dataset")
+    card = DatasetCard(text)
+    assert card.data.task_categories == ["robotics"] and "LeRobot" in card.data.tags
+    assert MARK in text and "4 episodes, 365 frames" in text and '"codebase_version": "v3.0"' in text

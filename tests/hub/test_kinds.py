@@ -1,0 +1,103 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A folder is recognised by what is in it, and one that is not whole says what it lacks."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.hub.config import PullConfig, PushConfig
+from accerl_lerobot.hub.kinds import recognise, repo_type
+from tests.hub.folders import write_json, write_policy_folder, write_run_folder
+
+TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
+
+
+def test_kinds(tmp_path: Path):
+    assert recognise(write_policy_folder(tmp_path / "policy")) == "policy"
+    assert recognise(write_run_folder(tmp_path / "run")) == "run"
+    assert recognise(TINY) == "dataset" and repo_type("dataset") == "dataset"
+    for name, config in (
+        ("world model", {"spec": {}, "model": {}}),
+        ("success model", {"type": "success_pairs"}),
+    ):
+        write_json(tmp_path / name / "config.json", config)
+        (tmp_path / name / "model.safetensors").write_bytes(b"x")
+        assert recognise(tmp_path / name) == name and repo_type(name) == "model"
+
+
+@pytest.mark.parametrize(
+    "name", ["model.safetensors", "policy_preprocessor.json", "policy_postprocessor.json"]
+)
+def test_a_policy_that_is_not_whole(tmp_path: Path, name: str):
+    (write_policy_folder(tmp_path / "policy") / name).unlink()
+    with pytest.raises(InputError, match=f"looks like a policy but lacks {name}"):
+        recognise(tmp_path / "policy")
+
+
+def test_a_run_that_is_not_over(tmp_path: Path):
+    (write_run_folder(tmp_path / "run") / "summary.json").unlink()
+    with pytest.raises(InputError, match="looks like a run but lacks summary.json"):
+        recognise(tmp_path / "run")
+
+
+def test_a_dataset_that_is_not_whole_or_old(tmp_path: Path):
+    shutil.copytree(TINY, tmp_path / "dataset")
+    info = tmp_path / "dataset" / "meta" / "info.json"
+    info.write_text(info.read_text().replace("v3.0", "v2.1"))
+    with pytest.raises(InputError, match=r"version v2\.1; convert it to v3\.0"):
+        recognise(tmp_path / "dataset")
+    shutil.rmtree(tmp_path / "dataset" / "meta" / "episodes")
+    with pytest.raises(InputError, match="looks like a dataset but lacks meta/episodes"):
+        recognise(tmp_path / "dataset")
+
+
+def test_folders_one_above_say_which_below(tmp_path: Path):
+    run = write_run_folder(tmp_path / "run")
+    with pytest.raises(InputError, match="name the folder pretrained_model in it"):
+        recognise(run / "checkpoints" / "000012")
+    (tmp_path / "learnt" / "world_model").mkdir(parents=True)
+    with pytest.raises(InputError, match="name the folder world_model in it"):
+        recognise(tmp_path / "learnt")
+    with pytest.raises(InputError, match="a policy has config.json, model.safetensors"):
+        recognise(tmp_path)
+    with pytest.raises(InputError, match="no such folder"):
+        recognise(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize(
+    "name", [None, "", "door", "a/b/c", "../x/y", "a/..", "a/b c", "https://x/y", "/a/b"]
+)
+def test_what_is_no_name_of_a_repository(name: str | None):
+    for make in (
+        lambda: PushConfig(path="x", repo_id=name),
+        lambda: PullConfig(repo_id=name, output_dir="x"),
+    ):
+        with pytest.raises(InputError, match="user/name"):
+            make()
+
+
+def test_other_fields_are_checked():
+    with pytest.raises(InputError, match="name the folder to push"):
+        PushConfig(repo_id="a/b")
+    with pytest.raises(InputError, match="name the folder to create"):
+        PullConfig(repo_id="a/b")
+    with pytest.raises(InputError, match="repo_type='space': use model or dataset"):
+        PullConfig(repo_id="a/b", output_dir="x", repo_type="space")
+    with pytest.raises(InputError, match="say something"):
+        PushConfig(path="x", repo_id="a/b", message=" ")

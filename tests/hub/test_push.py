@@ -1,0 +1,274 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A push is one commit or none, whatever breaks, and every refusal is one line that says what to do."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from accerl_lerobot import cli
+from accerl_lerobot.hub import trouble
+from accerl_lerobot.hub.card import MARK
+from accerl_lerobot.hub.manifest import entry_of
+from tests.hub.folders import write_json, write_policy_folder, write_run_folder
+from tests.hub_server import READER, WRITER, Fault, HubServer
+
+TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
+NAME = "alice/door"
+Refusal = Callable[..., str]
+
+
+@pytest.fixture
+def policy(tmp_path: Path) -> Path:
+    return write_policy_folder(tmp_path / "policy")
+
+
+@pytest.fixture
+def pushed(capsys: pytest.CaptureFixture[str]) -> Callable[..., dict[str, Any]]:
+    def do(path: Path, *more: str) -> dict[str, Any]:
+        assert cli.main(["push", f"--path={path}", f"--repo_id={NAME}", *more]) == 0, capsys.readouterr().err
+        found: dict[str, Any] = json.loads(capsys.readouterr().out)
+        return found
+
+    return do
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Refusal:
+    """The one line of a push that is refused."""
+
+    def do(path: Path, *more: str) -> str:
+        capsys.readouterr()
+        assert cli.main(["push", f"--path={path}", f"--repo_id={NAME}", *more]) == 2
+        out, err = capsys.readouterr()
+        (line,) = [line for line in err.splitlines() if line.startswith("accerl: ")]
+        assert out == "" and "Traceback" not in err and "hf_" not in err
+        return line
+
+    return do
+
+
+def test_one_commit_that_holds_everything(
+    hub: HubServer, policy: Path, pushed: Callable[..., dict[str, Any]]
+):
+    found = pushed(policy, "--message=the best one")
+    repo = hub.repo(NAME)
+    assert len(repo.commits) == 2 and repo.messages[found["commit"]] == "the best one" and repo.private
+    files = hub.files(NAME)
+    assert set(files) - {".gitattributes", "README.md", "accerl_manifest.json"} == {
+        p.name for p in policy.iterdir()
+    }
+    manifest = json.loads(files["accerl_manifest.json"])
+    assert manifest["kind"] == "policy" and found["files"] == len(files) - 1
+    for name, entry in manifest["files"].items():
+        assert files[name] == (policy / name).read_bytes() and len(files[name]) == entry["size"]
+        assert entry_of(files[name]).sha256 == entry["sha256"]
+    assert not [line for line in hub.seen if WRITER in line], "a token has no place in an address"
+
+
+def test_the_same_again_is_no_commit(hub: HubServer, policy: Path, pushed: Callable[..., dict[str, Any]]):
+    first = pushed(policy)
+    uploaded = list(hub.uploaded)
+    again = pushed(policy)
+    assert again["commit"] == first["commit"] and again["unchanged"] and not first["unchanged"]
+    assert hub.uploaded == uploaded and len(hub.repo(NAME).commits) == 2
+
+
+def test_a_cut_upload_leaves_the_repository_as_it_was_and_goes_on(
+    hub: HubServer, policy: Path, pushed: Callable[..., dict[str, Any]], refused: Refusal
+):
+    pushed(policy)
+    before, uploaded = dict(hub.repo(NAME).branches), len(hub.uploaded)
+    write_policy_folder(policy, size=400_000, seed=1)
+    large = str(entry_of(policy / "model.safetensors").sha256)
+    hub.faults.append(Fault("PUT", large, cut_after=1000, times=6))  # the client tries six times
+    line = refused(policy)
+    assert "cannot be reached" in line and "run the same command again" in line
+    assert hub.faults[0].times == 0, "the connection was cut"
+    assert hub.repo(NAME).branches == before and len(hub.repo(NAME).commits) == 2
+    small = str(entry_of(policy / "value_head.safetensors").sha256)
+    assert hub.uploaded[uploaded:] == [small]
+    found = pushed(policy)
+    assert hub.uploaded[uploaded:] == [small, large], "the small one is there already"
+    assert hub.files(NAME)["model.safetensors"] == (policy / "model.safetensors").read_bytes()
+    assert hub.repo(NAME).branches["main"] == found["commit"] and len(hub.repo(NAME).commits) == 3
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (Fault("POST", "/commit/", status=500), "the Hub is in trouble, it answered 500"),
+        (Fault("POST", "/commit/", status=412), "somebody else wrote to it meanwhile"),
+        (Fault("POST", "/commit/", status=409), "somebody else wrote to it meanwhile"),
+        (Fault("POST", "/commit/", status=429), "fewer requests"),
+        (Fault("POST", "/commit/", status=403), "the token may not write here"),
+        (Fault("POST", "/commit/", status=401), "the Hub does not accept the token"),
+        (Fault("POST", "/commit/", cut_after=0), "cannot be reached"),
+        (Fault("POST", "/commit/", hang_s=3), "cannot be reached (ReadTimeout)"),
+        (Fault("PUT", "/lfs/", status=400, times=9), "the Hub answered 400"),
+        (Fault("POST", "/commit/", status=400, says=f"bad token {WRITER}"), "bad token <token>"),
+        (Fault("POST", "/validate-yaml", status=503), "it answered 503"),
+        (Fault("POST", "/repos/create", status=500), "it answered 500"),
+    ],
+)
+def test_whatever_breaks_there_is_no_half_a_commit(
+    hub: HubServer,
+    policy: Path,
+    pushed: Callable[..., dict[str, Any]],
+    refused: Refusal,
+    monkeypatch: pytest.MonkeyPatch,
+    fault: Fault,
+    words: str,
+):
+    monkeypatch.setattr(trouble, "SILENT_S", 1.0)
+    fault = Fault(**vars(fault))  # the table is shared
+    hub.faults.append(fault)
+    line = refused(policy)
+    assert words in line
+    if ("model", NAME) in hub.repos:
+        assert set(hub.files(NAME)) == {".gitattributes"}
+    fault.times = 0
+    pushed(policy)
+    assert hub.files(NAME)["model.safetensors"] == (policy / "model.safetensors").read_bytes()
+    assert len(hub.uploaded) == len(set(hub.uploaded)), "nothing is sent twice"
+
+
+def test_tokens(
+    hub: HubServer, policy: Path, refused: Refusal, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    monkeypatch.delenv("HF_TOKEN")
+    assert "pushing needs a token; log in with 'hf auth login', or set HF_TOKEN" in refused(policy)
+    monkeypatch.setenv("HF_TOKEN", "hf_nobodysnobodys")
+    assert "the Hub does not accept the token" in refused(policy)
+    monkeypatch.setenv("HF_TOKEN", READER)
+    assert "the token may not write here; use one with the right to write" in refused(policy)
+    assert hub.repos == {}
+    assert "no such field" in refused(policy, f"--token={WRITER}")
+
+
+def test_a_network_that_is_not_there(hub: HubServer, policy: Path, refused: Refusal, monkeypatch: Any):
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    assert "switched off by HF_HUB_OFFLINE" in refused(policy)
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
+    monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
+    assert "http://127.0.0.1:9 cannot be reached (ConnectError)" in refused(policy)
+
+
+def test_a_name_that_holds_something_else(
+    hub: HubServer, policy: Path, tmp_path: Path, pushed: Callable[..., dict[str, Any]], refused: Refusal
+):
+    hub.plant(NAME, {"meta/info.json": b"{}"}, repo_type="dataset")
+    assert "it is a dataset repository, and this is a policy" in refused(policy)
+    hub.repos.clear()
+    pushed(policy)
+    assert "it holds a policy, and this is a run" in refused(write_run_folder(tmp_path / "run"))
+    assert "it is a model repository, and this is a dataset" in refused(TINY)
+    assert len(hub.repos) == 1 and len(hub.repo(NAME).commits) == 2
+
+
+def test_what_is_private_does_not_go_where_all_can_see(
+    hub: HubServer, policy: Path, pushed: Callable[..., dict[str, Any]], refused: Refusal
+):
+    assert not pushed(policy, "--private=false")["private"] and not hub.repo(NAME).private
+    write_policy_folder(policy, seed=1)
+    assert "this repository is public: add --private=false" in refused(policy)
+    pushed(policy, "--private=false")
+
+
+def test_branches(hub: HubServer, policy: Path, pushed: Callable[..., dict[str, Any]], refused: Refusal):
+    assert "is new, and has only main" in refused(policy, "--revision=dev")
+    assert hub.repos == {}
+    first = pushed(policy)
+    line = refused(policy, "--revision=dev")
+    assert "has no such branch, but main; make it with 'hf repos branch create alice/door dev'" in line
+    hub.repo(NAME).branches["dev"] = first["commit"]
+    write_policy_folder(policy, seed=1)
+    second = pushed(policy, "--revision=dev")
+    assert hub.repo(NAME).branches == {"main": first["commit"], "dev": second["commit"]}
+    assert "has no such branch" in refused(policy, f"--revision={first['commit']}")
+
+
+def test_a_push_replaces_what_the_last_one_left_and_nothing_else(
+    hub: HubServer, policy: Path, pushed: Callable[..., dict[str, Any]]
+):
+    (policy / "notes.json").write_text("{}")
+    pushed(policy)
+    hub.plant(NAME, {"added on the Hub.txt": b"by hand"})
+    (policy / "notes.json").unlink()
+    pushed(policy)
+    assert "notes.json" not in hub.files(NAME) and hub.files(NAME)["added on the Hub.txt"] == b"by hand"
+
+
+def test_a_broken_list_of_files_is_replaced(
+    hub: HubServer, policy: Path, pushed: Callable[..., dict[str, Any]], caplog: pytest.LogCaptureFixture
+):
+    pushed(policy)
+    hub.plant(NAME, {"accerl_manifest.json": b"{"})
+    pushed(policy)
+    assert "accerl_manifest.json is broken" in caplog.text
+    assert json.loads(hub.files(NAME)["accerl_manifest.json"])["kind"] == "policy"
+
+
+def test_a_card_written_on_the_hub_stays(hub: HubServer, policy: Path, pushed: Callable[..., dict[str, Any]]):
+    pushed(policy)
+    assert MARK.encode() in hub.files(NAME)["README.md"]
+    hub.plant(NAME, {"README.md": b"# ours, edited\n"})
+    write_policy_folder(policy, seed=1)
+    pushed(policy)
+    assert hub.files(NAME)["README.md"] == b"# ours, edited\n"
+    (policy / "README.md").write_text("# mine\n")
+    pushed(policy)
+    assert hub.files(NAME)["README.md"] == b"# mine\n"
+
+
+def test_a_dataset_is_tagged_where_lerobot_looks(
+    hub: HubServer, tmp_path: Path, pushed: Callable[..., dict[str, Any]], refused: Refusal
+):
+    dataset = shutil.copytree(TINY, tmp_path / "dataset")
+    hub.faults.append(Fault("POST", "/tag/", status=500))
+    assert "it answered 500" in refused(dataset)
+    first = pushed(dataset)  # the commit is there, the tag is not
+    repo = hub.repo(NAME, "dataset")
+    assert first["unchanged"] and repo.tags == {"v3.0": first["commit"]}
+    write_json(dataset / "meta" / "more.json", {"origin": str(tmp_path)})
+    assert repo.tags == {"v3.0": pushed(dataset)["commit"]} != {"v3.0": first["commit"]}
+    repo.branches["dev"] = first["commit"]
+    write_json(dataset / "meta" / "more.json", {})
+    assert pushed(dataset, "--revision=dev")["commit"] not in repo.tags.values()
+
+
+@pytest.mark.parametrize("kind", ["run", "policy"])
+def test_no_path_of_this_machine_is_uploaded(
+    hub: HubServer, tmp_path: Path, pushed: Callable[..., dict[str, Any]], kind: str
+):
+    run = write_run_folder(tmp_path / "run", pretrained_path=str(tmp_path / "sft"), type="smolvla")
+    policy = run / "checkpoints" / "last" / "pretrained_model"
+    write_json(
+        policy / "train_config.json", {"output_dir": str(tmp_path), "dataset": {"root": str(tmp_path / "d")}}
+    )
+    assert str(tmp_path) in (run / "metrics.jsonl").read_text()
+    pushed(run if kind == "run" else policy)
+    leaks = {
+        n for n, data in hub.files(NAME).items() if str(tmp_path).encode() in data or b"my demos" in data
+    }
+    assert leaks == set()
+    assert not [line for line in hub.seen if str(tmp_path) in line]

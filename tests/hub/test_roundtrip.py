@@ -1,0 +1,233 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What is pushed comes back as it was and loads, through the real client and a Hub on this machine."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from accerl_lerobot import cli
+from accerl_lerobot.checkpoint import defect, save_checkpoint
+from accerl_lerobot.config import LaunchConfig, encode
+from accerl_lerobot.demos.sft import SFTConfig, sft_command
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.config import EvaluationConfig
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, save_pretrained
+from accerl_lerobot.trainer.config import TrainerConfig
+from tests.hub.folders import SUMMARY, write_json
+from tests.hub_server import HubServer, environment
+from tests.policies.checkpoints import write_gaussian_actor
+from tests.policies.tiny import perturb
+from tests.runs import tiny_run
+from tests.world_model.test_pixels import model
+
+ROOT = Path(__file__).parents[2]
+TINY = ROOT / "datasets" / "metaworld_tiny"
+LAST = "checkpoints/last/pretrained_model"
+
+LOAD = """
+import hashlib, json, sys
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.loading import load_adapter
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+def digest(state):
+    parts = (k.encode() + v.numpy().tobytes() for k, v in sorted(state.items()))
+    return hashlib.sha256(b"".join(parts)).hexdigest()
+found = {}
+for path, revision in json.loads(sys.argv[1]):
+    adapter = load_adapter(PolicyConfig(path=path, revision=revision, device="cpu"))
+    found[path] = [digest(adapter.policy.state_dict()), digest(adapter.value_head.state_dict())]
+stock = get_policy_class("smolvla").from_pretrained(sys.argv[2])
+make_pre_post_processors(stock.config, pretrained_path=sys.argv[2])
+found["stock"] = digest(stock.state_dict())
+print(json.dumps(found))
+"""
+
+FRAMES = """
+import hashlib, json, sys
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+def digest(dataset):
+    frames = [dataset[i] for i in range(0, len(dataset), 30)]
+    values = (f[k].numpy().tobytes() for f in frames for k in sorted(f) if hasattr(f[k], "numpy"))
+    content = hashlib.sha256(b"".join(values)).hexdigest()
+    return [len(dataset), dataset.num_episodes, frames[0]["task"], content]
+here = digest(LeRobotDataset("any/name", root=sys.argv[2]))
+print(json.dumps([here, digest(LeRobotDataset(sys.argv[1]))]))
+"""
+
+
+def accerl(*arguments: str) -> None:
+    assert cli.main(list(arguments)) == 0
+
+
+def fresh(server: HubServer, home: Path, code: str, *arguments: str) -> Any:
+    """What a new process with an empty cache prints last, as JSON."""
+    command = [sys.executable, "-c", code, *arguments]
+    variables = {k: v for k, v in os.environ.items() if not k.startswith("HF_")} | environment(server, home)
+    done = subprocess.run(command, env=variables, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return json.loads(done.stdout.strip().splitlines()[-1])
+
+
+@pytest.fixture
+def run(tiny_checkpoint: Path, tmp_path: Path) -> Path:
+    """A run, whose last checkpoint has a critic and a backbone of its own."""
+    config = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
+    adapter = load_adapter(config)
+    perturb(adapter, 0.1)
+
+    def write(directory: Path) -> int:
+        save_pretrained(adapter, directory / "pretrained_model", config)
+        return 12
+
+    save_checkpoint(tmp_path / "run" / "checkpoints", write)
+    (tmp_path / "run" / "config.yaml").write_text(f"output_dir: {tmp_path}/run\njob_name: tiny\n")
+    write_json(tmp_path / "run" / "summary.json", SUMMARY)
+    return tmp_path / "run"
+
+
+def test_policies_and_runs_load_wherever_they_are(hub: HubServer, run: Path, tmp_path: Path):
+    for name, path in (("alice/policy", run / LAST), ("alice/run", run)):
+        accerl("push", f"--path={path}", f"--repo_id={name}")
+    commit = hub.repo("alice/policy").branches["main"]
+    original = run.rename(tmp_path / "moved") / LAST  # whatever still names the old place is found out
+    accerl("pull", "--repo_id=alice/policy", f"--output_dir={tmp_path / 'policy'}")
+    accerl("pull", "--repo_id=alice/run", f"--output_dir={tmp_path / 'again'}")
+    hub.plant("alice/policy", {"model.safetensors": b"what came later"})
+    pulled, again = str(tmp_path / "policy"), str(tmp_path / "again" / LAST)
+    places = [(str(original), None), (pulled, None), (again, None), ("alice/policy", commit)]
+    found = fresh(hub, tmp_path / "home", LOAD, json.dumps(places), pulled)
+    assert {path: found[path] for path, _ in places} == dict.fromkeys(found.keys() - {"stock"}, found[pulled])
+    assert found["stock"] == found[pulled][0]
+    assert os.readlink(tmp_path / "again" / "checkpoints" / "last") == "000012"
+    assert json.loads((tmp_path / "again" / "summary.json").read_text()) == SUMMARY
+    assert (tmp_path / "again" / "config.yaml").read_text() == "output_dir: null\njob_name: tiny\n"
+    before = hub.files("alice/run")
+    accerl("push", f"--path={tmp_path / 'again'}", "--repo_id=alice/run")
+    assert hub.files("alice/run") == before, "there and back changes nothing"
+
+
+def test_a_policy_from_the_hub_can_be_improved_and_pushed_again(hub: HubServer, run: Path, tmp_path: Path):
+    accerl("push", f"--path={run / LAST}", "--repo_id=alice/policy")
+    config = PolicyConfig(path="alice/policy", device="cpu")
+    save_pretrained(load_adapter(config), tmp_path / "better", config)
+    stored = json.loads((tmp_path / "better" / "config.json").read_text())
+    assert stored["vlm_model_name"] == str(tmp_path / "better" / "backbone"), "as LeRobot wants it"
+    accerl("push", f"--path={tmp_path / 'better'}", "--repo_id=alice/better")
+    names = ("model.safetensors", "value_head.safetensors", "config.json", "policy_preprocessor.json")
+    first, second = hub.files("alice/policy"), hub.files("alice/better")
+    assert {n: first[n] for n in names} == {n: second[n] for n in names}
+
+
+def test_a_run_that_was_pulled_can_be_gone_on_with(hub: HubServer, tiny_checkpoint: Path, tmp_path: Path):
+    trainer = TrainerConfig(updates=3, batch_decisions=16)
+    launch, evaluation = LaunchConfig(engine="local"), EvaluationConfig(episodes=2, videos=0)
+    accerl("push", f"--path={tiny_checkpoint}", "--repo_id=alice/start")
+    policy = PolicyConfig(path="alice/start", device="cpu")
+    config = tiny_run(tiny_checkpoint, policy=policy, trainer=trainer, launch=launch, evaluation=evaluation)
+    (tmp_path / "recipe.yaml").write_text(yaml.safe_dump(encode(config)))
+    accerl("train", f"--config_path={tmp_path / 'recipe.yaml'}", f"--output_dir={tmp_path / 'run'}")
+    accerl("push", f"--path={tmp_path / 'run'}", "--repo_id=alice/run")
+    uploaded = hub.files("alice/run")
+    assert [n for n, data in uploaded.items() if str(tmp_path).encode() in data] == []
+    shutil.rmtree(tmp_path / "run")
+    accerl("pull", "--repo_id=alice/run", f"--output_dir={tmp_path / 'pulled'}")
+    assert defect(tmp_path / "pulled" / "checkpoints" / "000003") is None
+    accerl(
+        "train",
+        "--resume=true",
+        f"--config_path={tmp_path / 'pulled' / 'config.yaml'}",
+        "--trainer.updates=5",
+    )
+    assert os.readlink(tmp_path / "pulled" / "checkpoints" / "last") == "000005"
+    assert json.loads((tmp_path / "pulled" / "summary.json").read_text())["updates"] == 5
+    weights = tmp_path / "pulled" / LAST / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-1] + b"x")
+    assert cli.main(["push", f"--path={tmp_path / 'pulled'}", "--repo_id=alice/run"]) == 2
+    assert hub.files("alice/run") == uploaded, "what is broken is not pushed"
+
+
+def test_fine_tuning_one_with_its_own_backbone_wants_a_folder(hub: HubServer, run: Path, tmp_path: Path):
+    accerl("push", f"--path={run / LAST}", "--repo_id=alice/policy")
+    accerl("pull", "--repo_id=alice/policy", f"--output_dir={tmp_path / 'pulled'}")
+
+    def command(path: str) -> list[str]:
+        return sft_command(SFTConfig(steps=1, init_path=path), "a/b", None, tmp_path / "sft", 0, "cpu")
+
+    with pytest.raises(InputError, match="accerl pull it, and name that"):
+        command("alice/policy")
+    assert f"--policy.path={tmp_path / 'pulled'}" in command(str(tmp_path / "pulled"))
+
+
+def test_a_policy_that_is_not_there_is_an_error_of_one_line(hub: HubServer):
+    with pytest.raises(
+        InputError, match="policy.path='alice/nothing': not a directory here and not loadable"
+    ):
+        load_lerobot_config(PolicyConfig(path="alice/nothing", device="cpu"))
+
+
+def test_stock_lerobot_loads_a_policy_from_the_hub(hub: HubServer, tmp_path: Path):
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+
+    folder = write_gaussian_actor(tmp_path / "actor")
+    accerl("push", f"--path={folder}", "--repo_id=alice/actor")
+    config = PreTrainedConfig.from_pretrained("alice/actor")
+    there = get_policy_class(config.type).from_pretrained("alice/actor")
+    make_pre_post_processors(config, pretrained_path="alice/actor")
+    here = get_policy_class(config.type).from_pretrained(folder).state_dict()
+    assert here.keys() == there.state_dict().keys()
+    assert all(torch.equal(value, here[key]) for key, value in there.state_dict().items())
+
+
+def test_a_dataset_is_one_that_lerobot_finds(hub: HubServer, tmp_path: Path):
+    accerl("push", f"--path={TINY}", "--repo_id=alice/tiny")
+    accerl("pull", "--repo_id=alice/tiny", f"--output_dir={tmp_path / 'tiny'}")
+    here, there = fresh(hub, tmp_path / "home", FRAMES, "alice/tiny", str(tmp_path / "tiny"))
+    assert here == there and here[:3] == [365, 4, "Open a drawer"]
+    pulled = {p.relative_to(tmp_path / "tiny"): p.read_bytes() for p in (tmp_path / "tiny").rglob("*.*")}
+    assert {p.relative_to(TINY): p.read_bytes() for p in TINY.rglob("*.*")}.items() <= pulled.items()
+
+
+def test_world_models_and_success_models(hub: HubServer, tmp_path: Path):
+    from accerl_lerobot.world_model.store import Source, load_source, load_world_model, save_world_model
+    from accerl_lerobot.world_model.success import new_success_model
+    from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+
+    source = Source(repo_id="a/b", fingerprint="f", learnt=(0, 2), held_out=(1,))
+    world, success = model(), new_success_model(5)
+    save_world_model(tmp_path / "world_model", world, success, source)
+    accerl("push", f"--path={tmp_path / 'world_model'}", "--repo_id=alice/world")
+    accerl("push", f"--path={tmp_path / 'world_model' / 'success_model'}", "--repo_id=alice/success")
+    accerl("pull", "--repo_id=alice/world", f"--output_dir={tmp_path / 'pulled'}")
+    came, judge = load_world_model(tmp_path / "pulled")
+    assert load_source(tmp_path / "pulled") == source and came.spec == world.spec and judge is not None
+    for first, second in ((world, came), (success, judge)):
+        assert all(torch.equal(value, second.state_dict()[key]) for key, value in first.state_dict().items())
+    alone = SuccessPairsRewardModel.from_pretrained("alice/success", strict=True)
+    frames = torch.from_numpy(np.random.default_rng(0).random((2, 1, 3, 16, 16), dtype=np.float32))
+    with torch.no_grad():
+        assert torch.equal(alone.logits(frames, frames)[0], judge.logits(frames, frames)[0])
