@@ -25,7 +25,6 @@ import shutil
 import sys
 from collections.abc import Callable
 from contextlib import redirect_stdout
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -37,109 +36,14 @@ from accerl_lerobot.bench.lag import BenchLagConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.ranking import BenchRankingConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
-from accerl_lerobot.config import DatasetConfig, LaunchConfig, RunConfig, check_chunk, encode, parse
+from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.console import Console
-from accerl_lerobot.demos.record import DemosConfig
-from accerl_lerobot.demos.sft import SFTConfig
-from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.config import EvaluationConfig
 from accerl_lerobot.hub.config import PullConfig, PushConfig
-from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.parsing import read_arguments
-from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.report.config import ReportConfig
-from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
-from accerl_lerobot.world_model.config import TrialConfig, WorldModelConfig
-
-
-@dataclass(frozen=True, kw_only=True)
-class DemosRun:
-    """``accerl demos``: scripted experts, recorded."""
-
-    env: EnvConfig = field(default_factory=MetaWorldConfig)
-    demos: DemosConfig = field(default_factory=DemosConfig)
-
-
-@dataclass(frozen=True, kw_only=True)
-class SFTRun:
-    """``accerl sft``: LeRobot's own trainer on a LeRobotDataset."""
-
-    seed: int = 0
-    """0 to 99."""
-    output_dir: str | None = None
-    """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
-    job_name: str = "sft"
-    """Last part of the folder's name."""
-    device: str = "auto"
-    """cpu, cuda, or auto."""
-    env: EnvConfig | None = None
-    """When given, the dataset is checked against it first."""
-    dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    sft: SFTConfig = field(default_factory=SFTConfig)
-
-    def __post_init__(self) -> None:
-        if self.sft.init_path is None:
-            check_chunk(self.sft.policy)
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvalRun:
-    """``accerl eval``: a checkpoint on seeds that no run trains on."""
-
-    seed: int = 0
-    """0 to 99; the evaluated episodes do not depend on it."""
-    output_dir: str | None = None
-    """Folder for ``evaluation.json`` and videos; None prints only."""
-    env: EnvConfig = field(default_factory=MetaWorldConfig)
-    policy: PolicyConfig = field(default_factory=PolicyConfig)
-    rollout: RolloutConfig = field(default_factory=RolloutConfig)
-    inference: InferenceConfig = field(default_factory=InferenceConfig)
-    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
-    launch: LaunchConfig = field(default_factory=LaunchConfig)
-
-
-@dataclass(frozen=True, kw_only=True)
-class WorldModelRun:
-    """``accerl world-model``: a world model, and a success model, from a LeRobotDataset."""
-
-    seed: int = 0
-    """0 to 99."""
-    output_dir: str | None = None
-    """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
-    job_name: str = "world_model"
-    """Last part of the folder's name."""
-    env: EnvConfig = field(default_factory=MetaWorldConfig)
-    """The world it is to be a model of: its cameras, sizes and rate."""
-    dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.seed < 100:
-            raise InputError("seed", self.seed, "use 0 to 99")
-
-
-@dataclass(frozen=True, kw_only=True)
-class WorldModelEvalRun:
-    """``accerl world-model-eval``: a saved world model on another dataset."""
-
-    path: str | None = None
-    """The folder named world_model that ``accerl world-model`` wrote."""
-    seed: int = 0
-    """Of which windows are tried."""
-    output_dir: str | None = None
-    """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
-    job_name: str = "world_model_eval"
-    """Last part of the folder's name."""
-    dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    """Episodes it has not learnt from."""
-    trial: TrialConfig = field(default_factory=TrialConfig)
-
-    def __post_init__(self) -> None:
-        if self.path is None:
-            raise InputError("path", None, "name the folder world_model of an accerl world-model run")
-        if self.seed < 0:
-            raise InputError("seed", self.seed, "use 0 or more")
+from accerl_lerobot.rollout.runner import EpisodeResult
+from accerl_lerobot.verb_configs import DemosRun, EvalRun, SFTRun, WorldModelEvalRun, WorldModelRun
 
 
 def train(arguments: list[str]) -> int:

@@ -30,7 +30,7 @@ from accerl_lerobot.envs import LeRobotEnvConfig, MetaWorldConfig, SimulatedConf
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.backbone import BackboneConfig
 from accerl_lerobot.preflight import check_sft_policy, check_start
-from accerl_lerobot.verbs import DemosRun, EvalRun, SFTRun
+from accerl_lerobot.verb_configs import DemosRun, EvalRun, SFTRun
 
 ROOT = Path(__file__).parents[1]
 RECIPE = """

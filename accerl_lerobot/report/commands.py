@@ -26,12 +26,17 @@ PLUGIN = "accerl_lerobot.envs.lerobot_plugin"
 def commands(run: Run) -> list[tuple[str, str]]:
     """What each does, and the line; those that need a checkpoint only where there is one."""
     recipe = _quoted(run.path / "config.yaml")
-    found = [
+    found = []
+    if run.verb == "train" and run.result is None:
+        found.append(
+            ("Go on with it, if it has stopped", f"accerl train --resume=true --config_path={recipe}")
+        )
+    found.append(
         (
             "Run it again; choose a folder that does not exist yet",
             f"accerl {run.verb} --config_path={recipe} --output_dir={_quoted(Path(f'{run.path}-again'))}",
         )
-    ]
+    )
     if run.checkpoint is None:
         return found
     policy = f"--policy.path={_quoted(run.checkpoint)}"
@@ -40,7 +45,7 @@ def commands(run: Run) -> list[tuple[str, str]]:
     found.append(("Evaluate its policy on the seeds of this page", evaluate))
     if stock := _stock(run):
         found.append(("Evaluate it with LeRobot itself", f"lerobot-eval {policy} {stock}"))
-    found.append(("Share it on the Hub", f"hf upload USER/NAME {_quoted(run.checkpoint)}"))
+    found.append(("Share it on the Hub", f"accerl push --path={_quoted(run.checkpoint)} --repo_id=USER/NAME"))
     return found
 
 

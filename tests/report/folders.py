@@ -30,7 +30,7 @@ from accerl_lerobot.dataset_config import DatasetConfig
 from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig
 from accerl_lerobot.evaluation.stats import wilson_interval
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.verbs import WorldModelRun
+from accerl_lerobot.verb_configs import WorldModelRun
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 
 HOSTILE = "<script>document.title = 'owned'</script>\"'><img src=x onerror=\"document.title = 'owned'\">"

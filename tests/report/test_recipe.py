@@ -27,7 +27,7 @@ from accerl_lerobot.doctor import pace
 from accerl_lerobot.parsing import read_recipe
 from accerl_lerobot.policies.backbone import BackboneConfig
 from accerl_lerobot.report.recipe import apart, differences, flat, lag_bound, unreadable
-from accerl_lerobot.verbs import WorldModelEvalRun
+from accerl_lerobot.verb_configs import WorldModelEvalRun
 from tests.report.folders import run_config
 
 ROOT = Path(__file__).parents[2]

@@ -1,0 +1,118 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What the command lines of the verbs are parsed into, where it is not a whole run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from accerl_lerobot.config import DatasetConfig, LaunchConfig, check_chunk
+from accerl_lerobot.demos.record import DemosConfig
+from accerl_lerobot.demos.sft import SFTConfig
+from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.config import EvaluationConfig
+from accerl_lerobot.inference.worker import InferenceConfig
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.world_model.config import TrialConfig, WorldModelConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemosRun:
+    """``accerl demos``: scripted experts, recorded."""
+
+    env: EnvConfig = field(default_factory=MetaWorldConfig)
+    demos: DemosConfig = field(default_factory=DemosConfig)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SFTRun:
+    """``accerl sft``: LeRobot's own trainer on a LeRobotDataset."""
+
+    seed: int = 0
+    """0 to 99."""
+    output_dir: str | None = None
+    """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
+    job_name: str = "sft"
+    """Last part of the folder's name."""
+    device: str = "auto"
+    """cpu, cuda, or auto."""
+    env: EnvConfig | None = None
+    """When given, the dataset is checked against it first."""
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    sft: SFTConfig = field(default_factory=SFTConfig)
+
+    def __post_init__(self) -> None:
+        if self.sft.init_path is None:
+            check_chunk(self.sft.policy)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalRun:
+    """``accerl eval``: a checkpoint on seeds that no run trains on."""
+
+    seed: int = 0
+    """0 to 99; the evaluated episodes do not depend on it."""
+    output_dir: str | None = None
+    """Folder for ``evaluation.json`` and videos; None prints only."""
+    env: EnvConfig = field(default_factory=MetaWorldConfig)
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    rollout: RolloutConfig = field(default_factory=RolloutConfig)
+    inference: InferenceConfig = field(default_factory=InferenceConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    launch: LaunchConfig = field(default_factory=LaunchConfig)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldModelRun:
+    """``accerl world-model``: a world model, and a success model, from a LeRobotDataset."""
+
+    seed: int = 0
+    """0 to 99."""
+    output_dir: str | None = None
+    """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
+    job_name: str = "world_model"
+    """Last part of the folder's name."""
+    env: EnvConfig = field(default_factory=MetaWorldConfig)
+    """The world it is to be a model of: its cameras, sizes and rate."""
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.seed < 100:
+            raise InputError("seed", self.seed, "use 0 to 99")
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldModelEvalRun:
+    """``accerl world-model-eval``: a saved world model on another dataset."""
+
+    path: str | None = None
+    """The folder named world_model that ``accerl world-model`` wrote."""
+    seed: int = 0
+    """Of which windows are tried."""
+    output_dir: str | None = None
+    """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
+    job_name: str = "world_model_eval"
+    """Last part of the folder's name."""
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    """Episodes it has not learnt from."""
+    trial: TrialConfig = field(default_factory=TrialConfig)
+
+    def __post_init__(self) -> None:
+        if self.path is None:
+            raise InputError("path", None, "name the folder world_model of an accerl world-model run")
+        if self.seed < 0:
+            raise InputError("seed", self.seed, "use 0 or more")
