@@ -32,6 +32,7 @@ import yaml
 
 from accerl_lerobot.bench.dream import BenchDreamConfig
 from accerl_lerobot.bench.efficiency import BenchEfficiencyConfig
+from accerl_lerobot.bench.faults import BenchFaultsConfig
 from accerl_lerobot.bench.lag import BenchLagConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.ranking import BenchRankingConfig
@@ -250,7 +251,7 @@ def report(arguments: list[str]) -> int:
 
 
 def bench(arguments: list[str]) -> int:
-    """``accerl bench world``, ``policy``, ``lag``, ``dream``, ``efficiency`` and ``ranking``."""
+    """``accerl bench world``, ``policy``, ``lag``, ``dream``, ``efficiency``, ``ranking`` and ``faults``."""
     name = arguments[0] if arguments else ""
     if f"bench {name}" not in CONFIGS:
         names = [verb.split()[1] for verb in CONFIGS if verb.startswith("bench ")]
@@ -280,6 +281,7 @@ CONFIGS: dict[str, type[Any]] = {
     "bench lag": BenchLagConfig,
     "bench dream": BenchDreamConfig,
     "bench efficiency": BenchEfficiencyConfig,
+    "bench faults": BenchFaultsConfig,
     "bench ranking": BenchRankingConfig,
 }
 """Verb → what its command line is parsed into."""

@@ -1,0 +1,181 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A run in a process of its own, to be done harm to and watched: its workers, its updates, its books.
+
+Everything is seen from outside: workers are found among the run's descendants by the names that Ray gives
+them, updates in ``metrics.jsonl``. So nothing in the run knows that it is being tried.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+CLASSES = {
+    "rollout": "RolloutWorker",
+    "inference": "InferenceWorker",
+    "replay": "ReplayWorker",
+    "trainer": "TrainerWorker",
+    "dream": "DreamWorker",
+    "world learning": "WorldLearningWorker",
+}
+"""Target → how Ray calls its processes; ``driver`` is the run's own process."""
+LOOK_S = 0.05
+
+
+class Victim:
+    """One run.
+
+    Args:
+        folder: of the run.
+        arguments: of ``accerl train``, without its folder.
+        log: file for what it says.
+    """
+
+    def __init__(self, folder: Path, arguments: list[str], log: Path) -> None:
+        self.folder, self._log = folder, log
+        self._start([*arguments, f"--output_dir={folder}"])
+
+    def go_on(self) -> None:
+        """Starts it again, after its process has ended."""
+        self._start(["--resume=true", f"--config_path={self.folder / 'config.yaml'}"])
+
+    def _start(self, arguments: list[str]) -> None:
+        command = [sys.executable, "-m", "accerl_lerobot.cli", "train", *arguments]
+        with self._log.open("ab") as out:
+            # Of a session of its own: what it leaves behind is found by that.
+            self.process = subprocess.Popen(command, stdout=out, stderr=out, start_new_session=True)
+
+    def pids(self, target: str) -> list[int]:
+        """Processes of a target, as they are now."""
+        if target == "driver":
+            return [self.process.pid] if self.process.poll() is None else []
+        name = f"ray::{CLASSES[target]}"
+        return [pid for pid in descendants(self.process.pid) if title(pid).startswith(name)]
+
+    def records(self) -> list[dict[str, Any]]:
+        """What it has logged; a last line that is being written is left out."""
+        path = self.folder / "metrics.jsonl"
+        lines = path.read_text().splitlines(keepends=True) if path.is_file() else []
+        return [json.loads(line) for line in lines if line.endswith("\n")]
+
+    def updates(self) -> list[int]:
+        """Numbers of the updates that it has logged, in order."""
+        return [record["update"] for record in self.records() if record["kind"] == "train"]
+
+    def await_update(self, number: int, timeout: float) -> float:
+        """Waits until it has logged this update; returns the seconds that took.
+
+        Raises:
+            RuntimeError: it ended before, or did not get there in time.
+        """
+        started = time.monotonic()
+        while True:
+            made = self.updates()
+            if made and made[-1] >= number:
+                return time.monotonic() - started
+            self._check(started, timeout, f"update {number} was not reached")
+            time.sleep(LOOK_S)
+
+    def await_successors(self, target: str, gone: int, count: int, timeout: float) -> float:
+        """Waits until a target has as many processes as before, none of them `gone`; the seconds."""
+        started = time.monotonic()
+        while True:
+            pids = self.pids(target)
+            if len(pids) >= count and gone not in pids:
+                return time.monotonic() - started
+            self._check(started, timeout, f"no successor of {target} {gone}")
+            time.sleep(LOOK_S)
+
+    def end(self, grace: float) -> int:
+        """Asks it to stop; its exit code.
+
+        Raises:
+            subprocess.TimeoutExpired: it did not within so many seconds.
+        """
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(grace)
+
+    def kill(self) -> None:
+        """Ends it and all below it, whatever they do."""
+        for pid in [*descendants(self.process.pid), self.process.pid]:
+            hit(pid, signal.SIGKILL)
+        self.process.wait()
+
+    def _check(self, started: float, timeout: float, what: str) -> None:
+        code = self.process.poll()
+        if code is not None or time.monotonic() - started > timeout:
+            ended = f"it ended with code {code}" if code is not None else f"in {timeout:.0f} s"
+            tail = "\n".join(self._log.read_text(errors="replace").splitlines()[-8:])
+            raise RuntimeError(f"{what}: {ended}; {self._log}:\n{tail}")
+
+
+def hit(pid: int, number: int) -> bool:
+    """Sends a signal; False if there is no such process any more."""
+    try:
+        os.kill(pid, number)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def await_hit(pid: int, number: int, timeout: float = 10.0) -> bool:
+    """Whether a signal that was sent has done what it should: the process has stopped, or is gone."""
+    deadline = time.monotonic() + timeout
+    while time.monotonic() < deadline:
+        now = _stat(pid)
+        if number == signal.SIGSTOP and now is not None and now[0] == "T":
+            return True
+        if number != signal.SIGSTOP and (now is None or now[0] in "ZX"):
+            return True
+        time.sleep(0.005)
+    return False
+
+
+def descendants(pid: int) -> list[int]:
+    """All processes below one that are no zombies."""
+    parents = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and (now := _stat(int(entry.name))) is not None and now[0] not in "ZX":
+            parents[int(entry.name)] = now[1]
+    found, grown = {pid}, True
+    while grown:
+        below = {child for child, parent in parents.items() if parent in found} - found
+        found |= below
+        grown = bool(below)
+    return sorted(found - {pid})
+
+
+def title(pid: int) -> str:
+    """How a process is called; empty if there is none."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+    except OSError:
+        return ""
+
+
+def _stat(pid: int) -> tuple[str, int] | None:
+    """State and parent of a process; None if there is none."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return None
+    state, parent = text.rsplit(")", 1)[1].split()[:2]  # the name in front may hold anything
+    return state, int(parent)
