@@ -196,6 +196,7 @@ def _attempt(
     state = None if checkpoint is None else checkpoint / TRAINING_STATE
     with console.stage("starting workers"):
         engine = make_engine(config, tasks, history, state)
+    stop.listen()
     with contextlib.closing(engine):
         return Loop(config, directory, console, engine, log, tasks, times, stop).run(state)
 

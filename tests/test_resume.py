@@ -181,8 +181,8 @@ def test_what_is_no_run_is_refused(
     assert "no such file" in capsys.readouterr().err
 
 
-def test_a_run_killed_without_warning_goes_on(tiny_checkpoint: Path, tmp_path: Path):
-    """Asynchronous, all of it real, in a process of its own that gets SIGKILL."""
+def test_an_asynchronous_run_that_was_killed_and_stopped_goes_on(tiny_checkpoint: Path, tmp_path: Path):
+    """All of it real, in processes of their own, of which the first gets SIGKILL and the second SIGTERM."""
     run = tmp_path / "run"
     path = recipe(
         tmp_path,
@@ -195,16 +195,24 @@ def test_a_run_killed_without_warning_goes_on(tiny_checkpoint: Path, tmp_path: P
     )
     command = [sys.executable, "-m", "accerl_lerobot.cli", "train"]
     log = tmp_path / "log"
-    with log.open("wb") as out:
-        first = subprocess.Popen([*command, str(path), f"--output_dir={run}"], stdout=out, stderr=out)
-        deadline = time.monotonic() + 240
-        while not any(int(p.name) >= 12 for p in (run / "checkpoints").glob("0*")):
-            assert first.poll() is None and time.monotonic() < deadline, log.read_text()
-            time.sleep(0.02)
-        first.kill()
-        first.wait()
-    assert not (run / "summary.json").exists()
     again = [*command, "--resume=true", f"--config_path={run / 'config.yaml'}"]
+
+    def until(least: int, arguments: list[str], number: int) -> int:
+        """Starts it, waits for a checkpoint of so many updates, and sends a signal; its exit code."""
+        with log.open("wb") as out:
+            process = subprocess.Popen(arguments, stdout=out, stderr=out)
+            deadline = time.monotonic() + 240
+            while not any(int(p.name) >= least for p in (run / "checkpoints").glob("0*")):
+                assert process.poll() is None and time.monotonic() < deadline, log.read_text()
+                time.sleep(0.02)
+            process.send_signal(number)
+            return process.wait(60)
+
+    assert until(12, [*command, str(path), f"--output_dir={run}"], signal.SIGKILL) == -signal.SIGKILL
+    newest = max(int(p.name) for p in (run / "checkpoints").glob("0*"))
+    assert until(newest + 8, again, signal.SIGTERM) == 143, log.read_text()
+    assert "stopped by SIGTERM; to go on: accerl train --resume=true" in log.read_text()
+    assert not (run / "summary.json").exists()
     ended = subprocess.run(again, capture_output=True, text=True, timeout=300)
     assert ended.returncode == 0, ended.stderr
     train = [r for r in records(run) if r["kind"] == "train"]

@@ -16,9 +16,9 @@
     accerl bench faults --repeats=5
 
 A cell is one run in which one kind of process is hit again and again, at random moments, by one signal. Each
-hit is proved to have happened; the run has recovered when another process has its place and, but for a rollout
-worker, an update has been made that had not been made before. At the end the run is asked to stop, and its
-books are looked at: every update logged once, none missing, and every segment of replay accounted for.
+hit is proved to have happened; the run has recovered when another process has its place and, but for a
+rollout worker, an update has been made that had not been made before. At the end the run is asked to stop,
+and its books are looked at: every update logged once, none missing, every segment of replay accounted for.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class BenchFaultsConfig:
     """What is done, and to whom."""
 
     recipe: str = "recipes/quickstart.yaml"
-    """The run. Its demonstrations and SFT are cut short, unless it has a policy: what it learns is no matter."""
+    """The run. Its demonstrations and SFT are cut short, unless it has a policy: they do not matter here."""
     output_dir: str = "outputs/faults"
     """Folder of the runs and of faults.json and faults.md; must not exist."""
     targets: tuple[str, ...] = ("rollout", "inference", "replay", "trainer", "driver")

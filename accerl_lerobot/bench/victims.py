@@ -78,7 +78,7 @@ class Victim:
 
     def updates(self) -> list[int]:
         """Numbers of the updates that it has logged, in order."""
-        return [record["update"] for record in self.records() if record["kind"] == "train"]
+        return [int(record["update"]) for record in self.records() if record["kind"] == "train"]
 
     def await_update(self, number: int, timeout: float) -> float:
         """Waits until it has logged this update; returns the seconds that took.
