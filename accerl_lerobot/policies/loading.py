@@ -40,6 +40,8 @@ from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import OBS_STATE
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Model
+from accerl_lerobot.policies.files import CONFIG, FAMILY, OURS, VALUE_HEAD, WEIGHTS, check_checkpoint
+from accerl_lerobot.policies.guard import Budget, data_only, input_error
 from accerl_lerobot.policies.plugins import register_policies
 from accerl_lerobot.policies.portable import keep_names, save_backbone, tokenizer_overrides, use_backbone
 from accerl_lerobot.policies.processing import IMAGES, Processing
@@ -47,14 +49,10 @@ from accerl_lerobot.policies.samplers import SamplerConfig
 from accerl_lerobot.policies.tuning import merged_state_dict, tune
 from accerl_lerobot.policies.value_head import ValueHead
 from accerl_lerobot.policies.verify import verify_weights
+from accerl_lerobot.safety import Origin
 
 logger = logging.getLogger(__name__)
 
-CONFIG = "config.json"
-WEIGHTS = "model.safetensors"
-OURS = "accerl.json"
-VALUE_HEAD = "value_head.safetensors"
-FAMILY = "family.safetensors"
 FILES = ("*.json", WEIGHTS, "policy_*.safetensors", VALUE_HEAD, FAMILY, f"{BACKBONE}/*")
 """What is fetched of a checkpoint on the Hub."""
 MODELS = "accerl_lerobot.policies.models"
@@ -169,7 +167,7 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
         lerobot_config = PreTrainedConfig.from_pretrained(folder)
     except InputError:
         raise
-    except (OSError, ValueError, AttributeError, draccus.utils.DraccusException) as error:
+    except Exception as error:  # LeRobot takes the file at its word, and may fail over any of it
         remedy = f"its config.json is not one of this LeRobot's policies ({_brief(error)})"
         raise InputError("policy.path", config.path, remedy) from error
     lerobot_config.device = str(resolve_device(config.device))
@@ -192,10 +190,13 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
     lerobot_config = load_lerobot_config(config)
     folder = _checkpoint_folder(config)
     model_class: type[Model] = imported(POLICIES[lerobot_config.type][0])
+    budget = Budget((folder / WEIGHTS).stat().st_size, "policy.path", config.path)
     try:
-        with model_class.loading():
+        with data_only("policy", config.code_revision), model_class.loading(), budget:
             policy = get_policy_class(lerobot_config.type).from_pretrained(folder, config=lerobot_config)
     except Exception as error:
+        if (ours := input_error(error)) is not None:
+            raise ours from error
         raise InputError("policy.path", config.path, f"the weights did not load ({_brief(error)})") from error
     verify_weights(policy, model_class, folder / WEIGHTS, config.path)
     model = model_class(policy)  # type: ignore[call-arg]
@@ -205,12 +206,14 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
     overrides = {"device_processor": {"device": str(device)}, **model.processor_overrides}
     try:
         overrides |= tokenizer_overrides(lerobot_config, folder)
-        with model.loading():
+        with data_only("policy", config.code_revision), model.loading():
             pre, post = make_pre_post_processors(
                 lerobot_config, pretrained_path=str(folder), preprocessor_overrides=overrides
             )
         keep_names(lerobot_config, pre, folder)
     except Exception as error:
+        if (ours := input_error(error)) is not None:
+            raise ours from error
         remedy = f"its LeRobot processors did not load ({_brief(error)})"
         if "tokenizer_processor" in str(error) and not (folder / BACKBONE).is_dir():
             remedy += f"; a tokeniser that cannot be had from the Hub goes into {BACKBONE}/ beside {CONFIG}"
@@ -270,14 +273,15 @@ def example_observations(
 
 
 def _checkpoint_folder(config: PolicyConfig) -> Path:
-    """Where the checkpoint's files are on this machine; those of a Hub repository are fetched."""
+    """Where the checkpoint's files are, once checked; those of a Hub repository are fetched."""
     from huggingface_hub import snapshot_download
 
     if config.path is None:
         remedy = "give a LeRobot checkpoint directory or Hub id, or an sft section"
         raise InputError("policy.path", None, remedy)
     folder = Path(config.path).expanduser()
-    if not folder.exists() and not config.path.startswith((".", "/", "~")):
+    local = folder.exists()
+    if not local and not config.path.startswith((".", "/", "~")):
         try:
             folder = Path(
                 snapshot_download(config.path, revision=config.revision, allow_patterns=list(FILES))
@@ -289,6 +293,7 @@ def _checkpoint_folder(config: PolicyConfig) -> Path:
         raise InputError(
             "policy.path", config.path, "no config.json there; give the folder named pretrained_model"
         )
+    check_checkpoint(folder, Origin("policy.path", config.path), fetched=not local)
     return folder
 
 
@@ -312,7 +317,11 @@ def _load_ours(adapter: LeRobotAdapter, folder: Path) -> None:
             ", ".join(f"policy.value_head.{k}={here[k]}, there {there.get(k)}" for k in differing),
         )
     elif (folder / VALUE_HEAD).is_file():
-        adapter.value_head.load_state_dict(load_file(folder / VALUE_HEAD))
+        try:
+            adapter.value_head.load_state_dict(load_file(folder / VALUE_HEAD))
+        except RuntimeError as error:
+            remedy = f"{OURS} says another critic than it is; remove both to start anew ({_brief(error)})"
+            raise Origin("policy.path", str(folder)).refuse(VALUE_HEAD, remedy) from error
 
 
 def _save_module(module: nn.Module, path: Path) -> None:

@@ -179,8 +179,16 @@ def test_what_is_saved_dreams_the_same(tmp_path: Path):
     assert load_world_model(tmp_path / "alone")[1] is None
 
 
-@pytest.mark.parametrize("harm", ["nowhere", "config", "weights", "size"])
-def test_what_cannot_be_loaded(tmp_path: Path, harm: str):
+@pytest.mark.parametrize(
+    ("harm", "why"),
+    [
+        ("nowhere", "config.json: is missing"),
+        ("config", "config.json: spec: not a world model of accerl world-model"),
+        ("weights", "model.safetensors: not safetensors"),
+        ("size", "not a world model of accerl world-model"),
+    ],
+)
+def test_what_cannot_be_loaded(tmp_path: Path, harm: str, why: str):
     folder = tmp_path / "w"
     save_world_model(folder, model())
     if harm == "nowhere":
@@ -193,7 +201,7 @@ def test_what_cannot_be_loaded(tmp_path: Path, harm: str):
         content = json.loads((folder / "config.json").read_text())
         content["spec"]["action_dim"] = 7
         (folder / "config.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match="^path=.*not a world model of accerl world-model"):
+    with pytest.raises(InputError, match=f"^path=.*{why}"):
         load_world_model(folder)
 
 
