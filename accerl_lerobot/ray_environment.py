@@ -14,14 +14,19 @@
 """Environment variables that Ray and its workers read, set before Ray is imported: it reads them once.
 
 Every run gets a Ray of its own, which nobody else can talk to: it listens on the loopback interface only, and
-asks for a token that only this process and its children know.
+asks for a token. That lies in a file which only this user can read, and which goes when this process ends; no
+process has it in its environment, where it would be shown and inherited by whatever is started.
 """
 
 from __future__ import annotations
 
+import atexit
 import os
 import secrets
+import shutil
 import sys
+import tempfile
+from pathlib import Path
 
 WORKERS = {
     # Several CPU workers share the cores: spinning threads would cost more than they give.
@@ -40,7 +45,7 @@ PRIVATE = {
 
 
 def prepare() -> None:
-    """Sets what is not set yet; the token only if none is configured and Ray has not been imported."""
+    """Sets what is not set yet; a token only if none is configured and Ray has not been imported."""
     for key, value in WORKERS.items():
         os.environ.setdefault(key, value)
     if "ray" in sys.modules:
@@ -49,4 +54,20 @@ def prepare() -> None:
         os.environ.setdefault(key, value)
     if not any(os.environ.get(k) for k in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")):
         os.environ["RAY_AUTH_MODE"] = "token"
-        os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
+        os.environ["RAY_AUTH_TOKEN_PATH"] = str(write_token())
+
+
+def write_token() -> Path:
+    """A new token in a new folder, neither of which was ever open to others; both go with this process."""
+    folder = Path(tempfile.mkdtemp(prefix="accerl-ray-"))  # 0700 from the beginning
+    atexit.register(_remove, folder, os.getpid())
+    path = folder / "token"
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(handle, "w") as file:
+        file.write(secrets.token_hex(32))
+    return path
+
+
+def _remove(folder: Path, owner: int) -> None:
+    if os.getpid() == owner:  # a forked child that ends must not take it along
+        shutil.rmtree(folder, ignore_errors=True)

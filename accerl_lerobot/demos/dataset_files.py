@@ -13,10 +13,10 @@
 # limitations under the License.
 """What a LeRobotDataset's files say is checked before LeRobot believes it.
 
-LeRobot fills the templates of ``meta/info.json`` in with `str.format` and joins what comes out to the folder.
-Where an image's ``bytes`` are missing, Hugging Face's `datasets` opens what its ``path`` names, a file of this
-machine or an address. Parquet stores a million equal rows in a few bytes. While `checked` lasts, LeRobot's own
-classes look at the files first, wherever they come from, the Hub included.
+LeRobot fills the templates of ``meta/info.json`` in with `str.format` and joins the outcome to the folder.
+Where an image's ``bytes`` are missing, Hugging Face's `datasets` opens what its ``path`` names, a file of
+this machine or an address. Parquet stores a million equal rows in a few bytes. While `checked` lasts,
+LeRobot's own classes look at the files first, wherever they come from, the Hub included.
 """
 
 from __future__ import annotations

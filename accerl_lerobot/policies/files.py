@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from accerl_lerobot.checkpoint import BACKBONE, CONFIG_FOLDERS, PREPROCESSOR, STEP_FOLDERS
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.safety import (
     HUB_ID,
     MIB,
@@ -40,6 +41,8 @@ from accerl_lerobot.safety import (
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 OURS, VALUE_HEAD, FAMILY = "accerl.json", "value_head.safetensors", "family.safetensors"
+FILES = ("*.json", WEIGHTS, "policy_*.safetensors", VALUE_HEAD, FAMILY, f"{BACKBONE}/*")
+"""What is fetched of a checkpoint on the Hub."""
 PROCESSORS = (PREPROCESSOR, "policy_postprocessor.json")
 STEPS_MOST, FEATURES_MOST, DEPTH_MOST = 64, 100, 20
 BESIDE_MOST, FILES_MOST = 64 * MIB, 1_000
@@ -53,6 +56,34 @@ MOST = {
 }  # fmt: skip
 """What a policy's config may ask for at most, where it is time or memory and not in the weights."""
 SIDES = ("resize_imgs_with_padding", "image_resolution", "crop_shape", "resize_shape", "image_resize")
+
+
+def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
+    """Where a checkpoint's files are, once checked; those of a Hub repository are fetched.
+
+    Args:
+        path: a folder here, or a Hub id.
+        revision: of the latter.
+        field: that named it, for the error.
+
+    Raises:
+        InputError: there is no checkpoint, or it is not to be trusted, see `check_checkpoint`.
+    """
+    from huggingface_hub import snapshot_download
+
+    folder = Path(path).expanduser()
+    local = folder.exists()
+    if not local and not path.startswith((".", "/", "~")):
+        try:
+            folder = Path(snapshot_download(path, revision=revision, allow_patterns=list(FILES)))
+        except (OSError, ValueError) as error:
+            first = " ".join(str(error).split())[:160] or type(error).__name__
+            remedy = f"not a directory here and not loadable from the Hub ({first})"
+            raise InputError(field, path, remedy) from error
+    if not (folder / CONFIG).is_file():
+        raise InputError(field, path, "no config.json there; give the folder named pretrained_model")
+    check_checkpoint(folder, Origin(field, path), fetched=not local)
+    return folder
 
 
 def check_checkpoint(folder: Path, origin: Origin, *, fetched: bool = False) -> dict[str, Any]:

@@ -40,7 +40,7 @@ from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import OBS_STATE
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Model
-from accerl_lerobot.policies.files import CONFIG, FAMILY, OURS, VALUE_HEAD, WEIGHTS, check_checkpoint
+from accerl_lerobot.policies.files import CONFIG, FAMILY, OURS, VALUE_HEAD, WEIGHTS, fetched_checkpoint
 from accerl_lerobot.policies.guard import Budget, data_only, input_error
 from accerl_lerobot.policies.plugins import register_policies
 from accerl_lerobot.policies.portable import keep_names, save_backbone, tokenizer_overrides, use_backbone
@@ -53,8 +53,6 @@ from accerl_lerobot.safety import Origin
 
 logger = logging.getLogger(__name__)
 
-FILES = ("*.json", WEIGHTS, "policy_*.safetensors", VALUE_HEAD, FAMILY, f"{BACKBONE}/*")
-"""What is fetched of a checkpoint on the Hub."""
 MODELS = "accerl_lerobot.policies.models"
 POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "smolvla": (f"{MODELS}.smolvla:SmolVLA", ("flow", "noise_space")),
@@ -274,27 +272,10 @@ def example_observations(
 
 def _checkpoint_folder(config: PolicyConfig) -> Path:
     """Where the checkpoint's files are, once checked; those of a Hub repository are fetched."""
-    from huggingface_hub import snapshot_download
-
     if config.path is None:
         remedy = "give a LeRobot checkpoint directory or Hub id, or an sft section"
         raise InputError("policy.path", None, remedy)
-    folder = Path(config.path).expanduser()
-    local = folder.exists()
-    if not local and not config.path.startswith((".", "/", "~")):
-        try:
-            folder = Path(
-                snapshot_download(config.path, revision=config.revision, allow_patterns=list(FILES))
-            )
-        except (OSError, ValueError) as error:
-            remedy = f"not a directory here and not loadable from the Hub ({_brief(error)})"
-            raise InputError("policy.path", config.path, remedy) from error
-    if not (folder / CONFIG).is_file():
-        raise InputError(
-            "policy.path", config.path, "no config.json there; give the folder named pretrained_model"
-        )
-    check_checkpoint(folder, Origin("policy.path", config.path), fetched=not local)
-    return folder
+    return fetched_checkpoint(config.path, config.revision, "policy.path")
 
 
 def _load_ours(adapter: LeRobotAdapter, folder: Path) -> None:

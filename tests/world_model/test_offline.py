@@ -104,7 +104,7 @@ def test_a_saved_one_is_tried_on_another_dataset(
     assert json.loads(capsys.readouterr().out)["tried"]["episodes"] == 8
     assert {p.name for p in (tmp_path / "again").iterdir()} == {"config.yaml", "trial.json", "preview.mp4"}
     assert cli.main(["world-model-eval", "--path=nowhere", f"--output_dir={tmp_path / 'third'}"]) == 2
-    assert "path='nowhere': not a world model" in capsys.readouterr().err
+    assert "path='nowhere': config.json: is missing" in capsys.readouterr().err
     assert cli.main(["world-model-eval"]) == 2
     assert "path=None: name the folder world_model" in capsys.readouterr().err
 
