@@ -14,13 +14,14 @@
 """Environment variables that Ray and its workers read, set before Ray is imported: it reads them once.
 
 Every run gets a Ray of its own, which nobody else can talk to: it listens on the loopback interface only, and
-asks for a token. That lies in a file which only this user can read, and which goes when this process ends; no
-process has it in its environment, where it would be shown and inherited by whatever is started.
+asks for a token. That lies in a folder which only this user can enter, beside Ray's sockets and logs, and goes
+when this process ends. No process has it in its environment, which whatever is started would inherit.
 """
 
 from __future__ import annotations
 
 import atexit
+import functools
 import os
 import secrets
 import shutil
@@ -48,6 +49,9 @@ def prepare() -> None:
     """Sets what is not set yet; a token only if none is configured and Ray has not been imported."""
     for key, value in WORKERS.items():
         os.environ.setdefault(key, value)
+    if not os.environ.get("RAY_TMPDIR"):
+        # Sockets and logs: Ray's own choice is a folder that every user of the machine may write to.
+        os.environ["RAY_TMPDIR"] = str(private_folder())
     if "ray" in sys.modules:
         return
     for key, value in PRIVATE.items():
@@ -58,14 +62,22 @@ def prepare() -> None:
 
 
 def write_token() -> Path:
-    """A new token in a new folder, neither of which was ever open to others; both go with this process."""
-    folder = Path(tempfile.mkdtemp(prefix="accerl-ray-"))  # 0700 from the beginning
-    atexit.register(_remove, folder, os.getpid())
-    path = folder / "token"
+    """A new token in this process's private folder, never open to others."""
+    path = private_folder() / "token"
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(handle, "w") as file:
         file.write(secrets.token_hex(32))
     return path
+
+
+@functools.cache
+def private_folder() -> Path:
+    """A folder of mode 0700 from its beginning, which goes when this process ends."""
+    temporary = tempfile.gettempdir()
+    # A socket's path has 107 bytes at most, and Ray's part of it takes up to 70.
+    folder = Path(tempfile.mkdtemp(prefix="accerl-", dir=temporary if len(temporary) <= 16 else "/tmp"))
+    atexit.register(_remove, folder, os.getpid())
+    return folder
 
 
 def _remove(folder: Path, owner: int) -> None:

@@ -232,7 +232,9 @@ def _check_hub(config: LeRobotEnvConfig, hub_path: str | None) -> None:
         return
     if not config.trust_remote_code:
         remedy = f"{config.name} is code of {hub_path} on the Hub, which would run with your rights; read it,"
-        raise InputError("env.trust_remote_code", False, f"{remedy} then set this, and its commit in hub_path")
+        raise InputError(
+            "env.trust_remote_code", False, f"{remedy} then set this, and its commit in hub_path"
+        )
     if not _PINNED.fullmatch(hub_path) or ".." in hub_path:
         remedy = "name a commit, owner/name@COMMIT or owner/name@COMMIT:file.py with 40 hexadecimal digits"
         raise InputError("env.kwargs.hub_path", hub_path, f"{remedy}: branches can be moved to other code")
