@@ -14,8 +14,8 @@
 """Environment variables that Ray and its workers read, set before Ray is imported: it reads them once.
 
 Every run gets a Ray of its own, which nobody else can talk to: it listens on the loopback interface only, and
-asks for a token. That lies in a folder which only this user can enter, beside Ray's sockets and logs, and goes
-when this process ends. No process has it in its environment, which whatever is started would inherit.
+asks for a token. That lies in a folder which only this user can enter, beside Ray's sockets and logs, and
+goes when this process ends. No process has it in its environment, which whatever is started would inherit.
 """
 
 from __future__ import annotations

@@ -220,7 +220,7 @@ def _check_count(value: object, low: int, high: int, what: str, origin: Origin) 
 def _check_feature(name: str, feature: Any, origin: Origin) -> None:
     where = f"{INFO}: features.{name[:60]}"
     check_name(name, where, origin)
-    if not isinstance(feature, dict) or feature.get("dtype") not in DTYPES:
+    if not isinstance(feature, dict) or str(feature.get("dtype")) not in DTYPES:
         raise origin.refuse(where, f"a dtype is wanted, one of {', '.join(sorted(DTYPES))}")
     shape = feature.get("shape")
     for key in ("info", "video_info"):
