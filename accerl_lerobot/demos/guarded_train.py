@@ -27,7 +27,7 @@ import sys
 
 from accerl_lerobot.demos.dataset_files import checked
 from accerl_lerobot.demos.sft import CODE_REVISION, REFUSED
-from accerl_lerobot.policies.guard import data_only, input_error
+from accerl_lerobot.policies.guard import guarded, input_error
 from accerl_lerobot.safety import Origin
 
 
@@ -45,7 +45,7 @@ def main() -> None:
     sys.argv[1:] = [a for a in sys.argv[1:] if not a.startswith(CODE_REVISION)]
     try:
         with contextlib.ExitStack() as guards:
-            guards.enter_context(data_only("sft", code))
+            guards.enter_context(guarded("sft", code))
             guards.enter_context(checked(origin, whole=root is not None))
             if code is None:
                 guards.enter_context(fast.data_only())

@@ -14,7 +14,7 @@
 """Loading what is anybody's: no code of theirs is run, nothing is unpickled, and memory has a bound.
 
 LeRobot 0.6.1 has transformers run code from the Hub in places (`trust_remote_code=True` without a revision).
-Where transformers is not told, it asks the terminal; without safetensors it unpickles. `data_only` stands at
+Where transformers is not told, it asks the terminal; without safetensors it unpickles. `guarded` stands at
 the functions through which all of that goes, whoever calls them.
 """
 
@@ -42,7 +42,7 @@ SPANS = frozenset((torch.arange, torch.linspace, torch.randperm))
 
 
 @contextlib.contextmanager
-def data_only(room: str, code_revision: str | None = None) -> Iterator[None]:
+def guarded(room: str, code_revision: str | None = None) -> Iterator[None]:
     """While it lasts, transformers runs no code that comes with a model, and PyTorch unpickles nothing.
 
     Args:

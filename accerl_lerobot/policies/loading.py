@@ -41,7 +41,7 @@ from accerl_lerobot.policies.base import OBS_STATE
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Model
 from accerl_lerobot.policies.files import CONFIG, FAMILY, OURS, VALUE_HEAD, WEIGHTS, fetched_checkpoint
-from accerl_lerobot.policies.guard import Budget, data_only, input_error
+from accerl_lerobot.policies.guard import Budget, guarded, input_error
 from accerl_lerobot.policies.plugins import register_policies
 from accerl_lerobot.policies.portable import keep_names, save_backbone, tokenizer_overrides, use_backbone
 from accerl_lerobot.policies.processing import IMAGES, Processing
@@ -190,7 +190,7 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
     model_class: type[Model] = imported(POLICIES[lerobot_config.type][0])
     budget = Budget((folder / WEIGHTS).stat().st_size, "policy.path", config.path)
     try:
-        with data_only("policy", config.code_revision), model_class.loading(), budget:
+        with guarded("policy", config.code_revision), model_class.loading(), budget:
             policy = get_policy_class(lerobot_config.type).from_pretrained(folder, config=lerobot_config)
     except Exception as error:
         if (ours := input_error(error)) is not None:
@@ -204,7 +204,7 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
     overrides = {"device_processor": {"device": str(device)}, **model.processor_overrides}
     try:
         overrides |= tokenizer_overrides(lerobot_config, folder)
-        with data_only("policy", config.code_revision), model.loading():
+        with guarded("policy", config.code_revision), model.loading():
             pre, post = make_pre_post_processors(
                 lerobot_config, pretrained_path=str(folder), preprocessor_overrides=overrides
             )

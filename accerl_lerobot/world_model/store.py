@@ -30,7 +30,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.guard import Budget, data_only
+from accerl_lerobot.policies.guard import Budget, guarded
 from accerl_lerobot.safety import (
     Origin,
     check_not_pickled,
@@ -150,7 +150,7 @@ def _success(directory: Path, origin: Origin) -> SuccessPairsRewardModel:
     check_success_model(read_json(safe_join(directory, CONFIG, origin), origin), origin)
     weights = _weights(directory, origin)
     try:
-        with data_only("path"), Budget(file_size(weights, origin), origin.field, origin.value):
+        with guarded("path"), Budget(file_size(weights, origin), origin.field, origin.value):
             return SuccessPairsRewardModel.from_pretrained(directory, strict=True).eval()
     except InputError as error:
         raise origin.refuse(CONFIG, str(error)) from error
