@@ -262,12 +262,14 @@ def loaders(trial: Trial, at: dict[str, Path], times: int) -> None:
         trial.files(f"load world model, {part}", world / part, whole_world, share * times)
     config = PolicyConfig(path=str(policy), device="cpu")
     for part in ("config.json", "accerl.json", "policy_preprocessor.json", "policy_postprocessor.json"):
-        trial.files(f"load policy, {part}", policy / part, lambda: load_adapter(config), 2 * times)
-    for part in ("model.safetensors", "value_head.safetensors"):
         trial.files(f"load policy, {part}", policy / part, lambda: load_adapter(config), times)
+    for part in ("model.safetensors", "value_head.safetensors"):
+        trial.files(f"load policy, {part}", policy / part, lambda: load_adapter(config), times // 2)
     named = DatasetConfig(repo_id="a/b", root=str(dataset))
     for part in ("info.json", "stats.json", "tasks.parquet", "episodes/chunk-000/file-000.parquet"):
-        trial.files(f"open dataset, {part}", dataset / "meta" / part, lambda: open_metadata(named), times)
+        trial.files(
+            f"open dataset, {part}", dataset / "meta" / part, lambda: open_metadata(named), times // 2
+        )
 
 
 def main(seed: int, scratch: Path, times: int) -> dict[str, Any]:
@@ -278,7 +280,7 @@ def main(seed: int, scratch: Path, times: int) -> dict[str, Any]:
     trial = Trial(random.Random(seed), scratch)
     taken = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     resource.setrlimit(resource.RLIMIT_AS, (taken + MEMORY, taken + MEMORY))
-    loaders(trial, at, max(1, times // 10))
+    loaders(trial, at, times)
     checks(trial, at, times)
     outside = [path for path in trial.written if not Path(path).is_relative_to(scratch)]
     return {"outcomes": dict(sorted(trial.outcomes.items())), "written": sorted(outside)[:20]}
