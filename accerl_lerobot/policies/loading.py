@@ -180,8 +180,8 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
     """Loads policy, processors and critic; proves that the weights are the file's and the sampler LeRobot's.
 
     Raises:
-        InputError: see `load_lerobot_config`; or weights or processors that did not load.
-        RuntimeError: the installed LeRobot samples differently, see `PolicyAdapter.self_check`.
+        InputError: see `load_lerobot_config`; weights or processors did not load, or do not act as LeRobot's own
+            sampler does, see `PolicyAdapter.self_check`.
     """
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
@@ -216,16 +216,20 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
         if "tokenizer_processor" in str(error) and not (folder / BACKBONE).is_dir():
             remedy += f"; a tokeniser that cannot be had from the Hub goes into {BACKBONE}/ beside {CONFIG}"
         raise InputError("policy.path", config.path, remedy) from error
-    processing = Processing(pre, post, device, config.rename_map)
-    sampler = sampler_config(config, lerobot_config.type)
-    family = imported(FAMILIES[sampler.type])(model, sampler)
-    adapter = LeRobotAdapter(
-        policy, processing, model, family, ValueHead(model.width, config.value_head), config.precision
-    )
-    if (folder / OURS).is_file():
-        _load_ours(adapter, folder)
-    adapter.self_check(*example_observations(lerobot_config, config.rename_map))
-    tune(policy, model, family, config.tuning)
+    try:
+        processing = Processing(pre, post, device, config.rename_map)
+        sampler = sampler_config(config, lerobot_config.type)
+        family = imported(FAMILIES[sampler.type])(model, sampler)
+        critic = ValueHead(model.width, config.value_head)
+        adapter = LeRobotAdapter(policy, processing, model, family, critic, config.precision)
+        if (folder / OURS).is_file():
+            _load_ours(adapter, folder)
+        adapter.self_check(*example_observations(lerobot_config, config.rename_map))
+        tune(policy, model, family, config.tuning)
+    except InputError:
+        raise
+    except Exception as error:  # what its files say fits nowhere, and may fail over any of it
+        raise InputError("policy.path", config.path, f"it cannot act here ({_brief(error)})") from error
     return adapter
 
 
