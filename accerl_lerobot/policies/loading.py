@@ -180,8 +180,8 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
     """Loads policy, processors and critic; proves that the weights are the file's and the sampler LeRobot's.
 
     Raises:
-        InputError: see `load_lerobot_config`; weights or processors did not load, or do not act as LeRobot's own
-            sampler does, see `PolicyAdapter.self_check`.
+        InputError: see `load_lerobot_config`; weights or processors did not load, or do not act as LeRobot's
+            own sampler does, see `PolicyAdapter.self_check`.
     """
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
