@@ -38,7 +38,7 @@ from accerl_lerobot.errors import InputError
 DATASET = Path(__file__).parents[1] / "datasets" / "metaworld_tiny"
 MEMORY = 3 * 1024**3
 """Bytes of address space beyond what the libraries take."""
-SECONDS = 20
+SECONDS = 60
 """For a single file."""
 VALUES: tuple[Any, ...] = (
     None, True, False, 0, -1, 1, 2, 3, 7, 64, 4097, 10**6, 10**9, 2**31, 2**63, 10**30, 10**400, 0.5, -0.0,

@@ -63,8 +63,9 @@ DTYPES = {
 }  # fmt: skip
 PLAIN = {"Value", "Sequence", "List", "LargeList"}
 """Kinds of columns that `datasets` reads without opening other files."""
-INDICES = {"data_path": {"chunk_index": int, "file_index": int}}
-INDICES["video_path"] = INDICES["data_path"] | {"video_key": str}
+DATA_PLACES: dict[str, type] = {"chunk_index": int, "file_index": int}
+VIDEO_PLACES: dict[str, type] = DATA_PLACES | {"video_key": str}
+"""What the templates of ``info.json`` may have filled in."""
 
 
 def check_info(info: dict[str, Any], origin: Origin) -> None:
@@ -88,9 +89,9 @@ def check_info(info: dict[str, Any], origin: Origin) -> None:
     for key in ("chunks_size", "data_files_size_in_mb", "video_files_size_in_mb"):
         _check_count(info.get(key, 1), 1, 10**9, at(key), origin)
     if "data_path" in info:
-        check_template(info["data_path"], INDICES["data_path"], at("data_path"), origin)
+        check_template(info["data_path"], DATA_PLACES, at("data_path"), origin)
     if info.get("video_path") is not None:
-        check_template(info["video_path"], INDICES["video_path"], at("video_path"), origin)
+        check_template(info["video_path"], VIDEO_PLACES, at("video_path"), origin)
     features = info.get("features")
     if not isinstance(features, dict) or not 0 < len(features) <= FEATURES_MOST:
         raise origin.refuse(at("features"), f"1 to {FEATURES_MOST} named features are wanted")
