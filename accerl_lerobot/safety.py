@@ -25,7 +25,7 @@ import math
 import re
 import stat
 import string
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -288,15 +288,10 @@ def check_remote_code(trust: bool, revision: str | None, room: str, name: str = 
         raise InputError(f"{room}.{name}", revision, f"add {room}.trust_remote_code=true, or leave it out")
 
 
-def check_keys(mapping: Mapping[str, Any], known: Collection[str], file: str, origin: Origin) -> None:
-    """Refuses a mapping with keys that nobody reads.
-
-    Raises:
-        InputError: it has one.
-    """
-    for key in mapping:
-        if key not in known:
-            raise origin.refuse(file, f"no key {_shown(str(key))!r} here; it has {', '.join(known)}")
+def brief(error: BaseException) -> str:
+    """An error's words on one line, not more than a line's worth."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= 160 else text[:159] + "…"
 
 
 def _unsafe(name: object) -> str:

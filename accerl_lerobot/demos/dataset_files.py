@@ -31,6 +31,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.safety import (
     MIB,
     Origin,
+    brief,
     check_name,
     check_number,
     check_shape,
@@ -271,8 +272,7 @@ def _parquet(path: Path, origin: Origin) -> Iterator[pq.ParquetFile]:
     except InputError:
         raise
     except (pa.ArrowException, OSError, ValueError, KeyError, TypeError, IndexError, MemoryError) as error:
-        why = " ".join(str(error).split())[:120] or type(error).__name__
-        raise origin.refuse(path.name, f"not good parquet ({why}); get the dataset again") from error
+        raise origin.refuse(path.name, f"not good parquet ({brief(error)}); get the dataset again") from error
 
 
 def _check_plain(file: pq.ParquetFile, name: str, origin: Origin) -> None:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from accerl_lerobot.demos.dataset_files import checked
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.safety import Origin
+from accerl_lerobot.safety import Origin, brief
 
 if TYPE_CHECKING:
     from accerl_lerobot.config import DatasetConfig
@@ -57,13 +57,10 @@ def open_metadata(dataset: DatasetConfig) -> Any:
         )
         raise InputError("dataset.repo_id", dataset.repo_id, remedy) from error
     except (OSError, ValueError) as error:
-        first = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(
-            "dataset.repo_id", dataset.repo_id, f"not found locally nor on the Hub ({first})"
-        ) from error
+        remedy = f"not found locally nor on the Hub ({brief(error)})"
+        raise InputError("dataset.repo_id", dataset.repo_id, remedy) from error
     except Exception as error:  # LeRobot takes the files at their word, and may fail over any of it
-        first = (str(error).splitlines() or [type(error).__name__])[0][:160]
-        raise origin_of(dataset).refuse("meta", f"LeRobot cannot read it ({first}); get it again") from error
+        raise origin_of(dataset).refuse("meta", f"LeRobot cannot read it ({brief(error)})") from error
 
 
 def origin_of(dataset: DatasetConfig) -> Origin:

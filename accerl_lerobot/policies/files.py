@@ -30,6 +30,7 @@ from accerl_lerobot.safety import (
     HUB_ID,
     MIB,
     Origin,
+    brief,
     check_not_pickled,
     check_number,
     check_safetensors,
@@ -77,8 +78,7 @@ def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
         try:
             folder = Path(snapshot_download(path, revision=revision, allow_patterns=list(FILES)))
         except (OSError, ValueError) as error:
-            first = " ".join(str(error).split())[:160] or type(error).__name__
-            remedy = f"not a directory here and not loadable from the Hub ({first})"
+            remedy = f"not a directory here and not loadable from the Hub ({brief(error)})"
             raise InputError(field, path, remedy) from error
     if not (folder / CONFIG).is_file():
         raise InputError(field, path, "no config.json there; give the folder named pretrained_model")

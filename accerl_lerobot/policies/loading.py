@@ -49,7 +49,7 @@ from accerl_lerobot.policies.samplers import SamplerConfig
 from accerl_lerobot.policies.tuning import merged_state_dict, tune
 from accerl_lerobot.policies.value_head import ValueHead
 from accerl_lerobot.policies.verify import verify_weights
-from accerl_lerobot.safety import Origin
+from accerl_lerobot.safety import Origin, brief
 
 logger = logging.getLogger(__name__)
 
@@ -166,7 +166,7 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     except InputError:
         raise
     except Exception as error:  # LeRobot takes the file at its word, and may fail over any of it
-        remedy = f"its config.json is not one of this LeRobot's policies ({_brief(error)})"
+        remedy = f"its config.json is not one of this LeRobot's policies ({brief(error)})"
         raise InputError("policy.path", config.path, remedy) from error
     lerobot_config.device = str(resolve_device(config.device))
     _override(lerobot_config, config)
@@ -195,7 +195,7 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
     except Exception as error:
         if (ours := input_error(error)) is not None:
             raise ours from error
-        raise InputError("policy.path", config.path, f"the weights did not load ({_brief(error)})") from error
+        raise InputError("policy.path", config.path, f"the weights did not load ({brief(error)})") from error
     verify_weights(policy, model_class, folder / WEIGHTS, config.path)
     model = model_class(policy)  # type: ignore[call-arg]
     device = torch.device(lerobot_config.device)
@@ -212,7 +212,7 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
     except Exception as error:
         if (ours := input_error(error)) is not None:
             raise ours from error
-        remedy = f"its LeRobot processors did not load ({_brief(error)})"
+        remedy = f"its LeRobot processors did not load ({brief(error)})"
         if "tokenizer_processor" in str(error) and not (folder / BACKBONE).is_dir():
             remedy += f"; a tokeniser that cannot be had from the Hub goes into {BACKBONE}/ beside {CONFIG}"
         raise InputError("policy.path", config.path, remedy) from error
@@ -229,7 +229,7 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
     except InputError:
         raise
     except Exception as error:  # what its files say fits nowhere, and may fail over any of it
-        raise InputError("policy.path", config.path, f"it cannot act here ({_brief(error)})") from error
+        raise InputError("policy.path", config.path, f"it cannot act here ({brief(error)})") from error
     return adapter
 
 
@@ -305,7 +305,7 @@ def _load_ours(adapter: LeRobotAdapter, folder: Path) -> None:
         try:
             adapter.value_head.load_state_dict(load_file(folder / VALUE_HEAD))
         except RuntimeError as error:
-            remedy = f"{OURS} says another critic than it is; remove both to start anew ({_brief(error)})"
+            remedy = f"{OURS} says another critic than it is; remove both to start anew ({brief(error)})"
             raise Origin("policy.path", str(folder)).refuse(VALUE_HEAD, remedy) from error
 
 
@@ -357,9 +357,3 @@ def imported(path: str) -> Any:
     """What an entry of `POLICIES` or `FAMILIES` names."""
     module, _, name = path.partition(":")
     return getattr(importlib.import_module(module), name)
-
-
-def _brief(error: BaseException) -> str:
-    """The error's words on one line, not more than a line's worth."""
-    text = " ".join(str(error).split()) or type(error).__name__
-    return text if len(text) <= 160 else text[:159] + "…"

@@ -103,7 +103,7 @@ def load_source(directory: Path, field: str = "path") -> Source | None:
         raise
     except UNREADABLE as error:
         raise InputError(
-            field, str(directory), f"its {CONFIG} does not say what it learnt ({error})"
+            field, str(directory), f"its {CONFIG} does not say what it learnt ({brief(error)})"
         ) from error
 
 
@@ -134,11 +134,10 @@ def load_world_model(
             )
         model.load_state_dict(load_file(weights))
     except InputError as error:
-        raise origin.refuse(CONFIG, str(error)) from error
+        raise origin.refuse(CONFIG, brief(error)) from error
     except (*UNREADABLE, draccus.utils.DraccusException) as error:
-        first = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(
-            field, str(directory), f"not a world model of accerl world-model ({first})"
+            field, str(directory), f"not a world model of accerl world-model ({brief(error)})"
         ) from error
     success = None
     if safe_join(directory, SUCCESS, origin).is_dir():
@@ -153,10 +152,11 @@ def _success(directory: Path, origin: Origin) -> SuccessPairsRewardModel:
         with guarded("path"), Budget(file_size(weights, origin), origin.field, origin.value):
             return SuccessPairsRewardModel.from_pretrained(directory, strict=True).eval()
     except InputError as error:
-        raise origin.refuse(CONFIG, str(error)) from error
+        raise origin.refuse(CONFIG, brief(error)) from error
     except (*UNREADABLE, draccus.utils.DraccusException) as error:
-        first = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(origin.field, origin.value, f"the success model is broken ({first})") from error
+        raise InputError(
+            origin.field, origin.value, f"the success model is broken ({brief(error)})"
+        ) from error
 
 
 def _weights(directory: Path, origin: Origin) -> Path:
