@@ -33,6 +33,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.guard import Budget, guarded
 from accerl_lerobot.safety import (
     Origin,
+    brief,
     check_not_pickled,
     check_safetensors,
     file_size,

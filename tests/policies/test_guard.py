@@ -27,6 +27,7 @@ import torch
 from torch import nn
 
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies import guard
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.guard import SLACK, Budget, guarded, input_error
 from accerl_lerobot.policies.loading import load_adapter
@@ -191,7 +192,8 @@ def test_a_model_with_pickled_weights_only_does_not_load(theirs: Repository, tmp
         lambda: nn.TransformerEncoderLayer(10**6, 2),
     ],
 )
-def test_networks_that_no_file_could_fill_are_not_built(build: Any):
+def test_networks_that_no_file_could_fill_are_not_built(build: Any, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(guard, "CALLS_MOST", 2000)
     with (
         pytest.raises(InputError, match="^policy.path='x': its config asks for over"),
         Budget(100, "policy.path", "x"),
