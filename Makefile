@@ -8,13 +8,21 @@ SHELL := /bin/bash
 RUN ?= outputs/quickstart-$(shell date +%Y%m%d-%H%M%S)
 ARGS ?=
 
+define LIST_INSTALLED
+from importlib.metadata import distributions
+found = {f"{d.name}=={d.version.partition('+')[0]}" for d in distributions()}
+print(*sorted(x for x in found if not x.startswith("accerl-lerobot==")), sep="\n")
+endef
+export LIST_INSTALLED
+
 .DEFAULT_GOAL := help
-.PHONY: help setup quickstart test check lint format-check types format
+.PHONY: help setup quickstart test check audit lint format-check types format
 
 help:
 	@echo "make quickstart  demonstrations, SFT, asynchronous RL and evaluation on one MetaWorld task"
 	@echo "make test        the tests"
 	@echo "make check       lint, formatting and types"
+	@echo "make audit       known vulnerabilities of what is installed; asks pypi.org"
 	@echo "make format      rewrite the code as 'make check' wants it"
 	@echo "make setup       only install: .venv, and OpenGL libraries where apt-get and root are at hand"
 
@@ -44,6 +52,13 @@ format-check: setup
 
 types: setup
 	.venv/bin/mypy
+
+# Not in .ci/run: it needs a service that not every machine can reach. --strict, or what the service does not know
+# would count as audited; that includes everything where a mirror of PyPI stands in for it.
+audit: setup
+	@mkdir -p build
+	.venv/bin/python -c "$$LIST_INSTALLED" > build/installed.txt
+	.venv/bin/pip-audit --strict --progress-spinner=off --no-deps --disable-pip -r build/installed.txt
 
 format: setup
 	.venv/bin/ruff check --fix .

@@ -14,14 +14,20 @@
 """Environment variables that Ray and its workers read, set before Ray is imported: it reads them once.
 
 Every run gets a Ray of its own, which nobody else can talk to: it listens on the loopback interface only, and
-asks for a token that only this process and its children know.
+asks for a token. That lies in a folder which only this user can enter, beside Ray's sockets and logs, and
+goes when this process ends. No process has it in its environment, which whatever is started would inherit.
 """
 
 from __future__ import annotations
 
+import atexit
+import functools
 import os
 import secrets
+import shutil
 import sys
+import tempfile
+from pathlib import Path
 
 WORKERS = {
     # Several CPU workers share the cores: spinning threads would cost more than they give.
@@ -44,13 +50,40 @@ found by the client in it. No wall: what runs as the same user can read what tha
 
 
 def prepare() -> None:
-    """Sets what is not set yet; the token only if none is configured and Ray has not been imported."""
+    """Sets what is not set yet; a token only if none is configured and Ray has not been imported."""
     for key, value in WORKERS.items():
         os.environ.setdefault(key, value)
+    if not os.environ.get("RAY_TMPDIR"):
+        # Sockets and logs: Ray's own choice is a folder that every user of the machine may write to.
+        os.environ["RAY_TMPDIR"] = str(private_folder())
     if "ray" in sys.modules:
         return
     for key, value in PRIVATE.items():
         os.environ.setdefault(key, value)
     if not any(os.environ.get(k) for k in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")):
         os.environ["RAY_AUTH_MODE"] = "token"
-        os.environ["RAY_AUTH_TOKEN"] = secrets.token_hex(32)
+        os.environ["RAY_AUTH_TOKEN_PATH"] = str(write_token())
+
+
+def write_token() -> Path:
+    """A new token in this process's private folder, never open to others."""
+    path = private_folder() / "token"
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(handle, "w") as file:
+        file.write(secrets.token_hex(32))
+    return path
+
+
+@functools.cache
+def private_folder() -> Path:
+    """A folder of mode 0700 from its beginning, which goes when this process ends."""
+    temporary = tempfile.gettempdir()
+    # A socket's path has 107 bytes at most, and Ray's part of it takes up to 70.
+    folder = Path(tempfile.mkdtemp(prefix="accerl-", dir=temporary if len(temporary) <= 16 else "/tmp"))
+    atexit.register(_remove, folder, os.getpid())
+    return folder
+
+
+def _remove(folder: Path, owner: int) -> None:
+    if os.getpid() == owner:  # a forked child that ends must not take it along
+        shutil.rmtree(folder, ignore_errors=True)

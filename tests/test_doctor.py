@@ -264,6 +264,6 @@ class TestResources:
 def test_dreams_are_checked_where_there_are_any(capsys: pytest.CaptureFixture[str]) -> None:
     recipe = str(QUICKSTART.with_name("dreams.yaml"))
     assert doctor.main([recipe, "--imagination.path=nowhere"]) == 1
-    assert "FAIL  dreams     imagination.path='nowhere': not a world model" in capsys.readouterr().out
+    assert "FAIL  dreams     imagination.path='nowhere': config.json: is missing" in capsys.readouterr().out
     doctor.main([recipe, "--imagination.model=oracle"])
     assert "ok    dreams     50% of every batch; what dreams: oracle" in capsys.readouterr().out

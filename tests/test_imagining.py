@@ -274,7 +274,7 @@ def test_what_does_not_fit_is_refused_before_the_run_begins(
         return capsys.readouterr().err
 
     assert "imagination.path=None: give the folder world_model" in told()
-    assert "imagination.path='nowhere': not a world model" in told("--imagination.path=nowhere")
+    assert "imagination.path='nowhere': config.json: is missing" in told("--imagination.path=nowhere")
     paid = told(f"--imagination.path={world_model}", "--env.reward=dense")
     assert "env.reward='dense': use success with imagination.share" in paid
     looks = told(f"--imagination.path={world_model}", "--env.image_size=32", "--policy.n_action_steps=2")

@@ -17,8 +17,10 @@ from __future__ import annotations
 
 import json
 import os
+import stat
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -28,65 +30,167 @@ from tests.light_workers import light_ray
 
 __all__ = ["light_ray"]
 
-TOKEN = "RAY_AUTH_TOKEN"
+TOKEN, TOKEN_PATH = "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"
 VARIABLES = (
     *ray_environment.WORKERS,
     *ray_environment.PRIVATE,
     "RAY_AUTH_MODE",
     TOKEN,
-    "RAY_AUTH_TOKEN_PATH",
+    TOKEN_PATH,
+    "RAY_TMPDIR",
 )
 
 
 @pytest.fixture
-def bare(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+def bare(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
     """An environment in which nothing is set and Ray has not been imported."""
     for name in VARIABLES:
         monkeypatch.setenv(name, "")  # so that it is put back afterwards
         monkeypatch.delenv(name)
     monkeypatch.delitem(sys.modules, "ray", raising=False)
-    return monkeypatch
+    monkeypatch.setattr(ray_environment, "private_folder", ray_environment.private_folder.__wrapped__)
+    yield monkeypatch
 
 
 def test_every_process_makes_its_own_token(bare: pytest.MonkeyPatch):
     tokens = []
     for _ in range(2):
         ray_environment.prepare()
-        assert os.environ["RAY_AUTH_MODE"] == "token"
-        tokens.append(os.environ.pop(TOKEN))
+        assert os.environ["RAY_AUTH_MODE"] == "token" and TOKEN not in os.environ
+        tokens.append(Path(os.environ.pop(TOKEN_PATH)).read_text())
         del os.environ["RAY_AUTH_MODE"]
     assert tokens[0] != tokens[1] and all(len(bytes.fromhex(token)) == 32 for token in tokens)
 
 
-@pytest.mark.parametrize("name", ["RAY_AUTH_MODE", TOKEN, "RAY_AUTH_TOKEN_PATH"])
+def test_a_token_was_never_open_to_others(bare: pytest.MonkeyPatch):
+    """Modes are looked at when folder and file are made, before anything is in them."""
+    seen: list[tuple[bool, int]] = []
+    make, opened = os.mkdir, os.open
+
+    def mkdir(path: str, *arguments: int, **options: int) -> None:
+        make(path, *arguments, **options)
+        seen.append((True, stat.S_IMODE(os.stat(path).st_mode)))
+
+    def open_(path: str, *arguments: int, **options: int) -> int:
+        handle = opened(path, *arguments, **options)
+        found = os.fstat(handle)
+        assert found.st_size == 0
+        seen.append((False, stat.S_IMODE(found.st_mode)))
+        return handle
+
+    before = os.umask(0)
+    try:
+        bare.setattr(os, "mkdir", mkdir)
+        bare.setattr(os, "open", open_)
+        ray_environment.write_token()
+    finally:
+        os.umask(before)
+    assert seen == [(True, 0o700), (False, 0o600)]
+
+
+@pytest.mark.parametrize("end", ["pass", "raise SystemExit(3)", "1 / 0"])
+def test_the_token_goes_with_its_process(end: str):
+    code = (
+        "import os\nfrom accerl_lerobot import ray_environment\nray_environment.prepare()\n"
+        "child = os.fork()\nif child == 0: raise SystemExit(0)\nos.waitpid(child, 0)\n"
+        f"path = os.environ['RAY_AUTH_TOKEN_PATH']\nassert os.path.isfile(path)\nprint(path)\n{end}"
+    )
+    clean = {k: v for k, v in os.environ.items() if not k.startswith("RAY_")}
+    done = subprocess.run([sys.executable, "-c", code], env=clean, capture_output=True, text=True, timeout=60)
+    path = Path(done.stdout.split()[-1])
+    assert path.name == "token" and not path.parent.exists()
+
+
+@pytest.mark.parametrize("name", ["RAY_AUTH_MODE", TOKEN, TOKEN_PATH])
 def test_a_configured_token_is_left_alone(bare: pytest.MonkeyPatch, name: str):
     bare.setenv(name, "mine")
     ray_environment.prepare()
-    found = {k: os.environ[k] for k in ("RAY_AUTH_MODE", TOKEN, "RAY_AUTH_TOKEN_PATH") if k in os.environ}
+    found = {k: os.environ[k] for k in ("RAY_AUTH_MODE", TOKEN, TOKEN_PATH) if k in os.environ}
     assert found == {name: "mine"}
 
 
 def test_what_the_user_has_set_is_kept(bare: pytest.MonkeyPatch):
     bare.setenv("OMP_NUM_THREADS", "7")
+    bare.setenv("RAY_TMPDIR", "there")
     ray_environment.prepare()
+    assert os.environ["RAY_TMPDIR"] == "there"
     assert os.environ["OMP_NUM_THREADS"] == "7" and os.environ["OMP_WAIT_POLICY"] == "PASSIVE"
 
 
 def test_a_ray_that_is_imported_already_has_read_its_environment(bare: pytest.MonkeyPatch):
     bare.setitem(sys.modules, "ray", sys)
     ray_environment.prepare()
-    assert TOKEN not in os.environ and not set(ray_environment.PRIVATE) & os.environ.keys()
+    assert (
+        not {TOKEN, TOKEN_PATH} & os.environ.keys() and not set(ray_environment.PRIVATE) & os.environ.keys()
+    )
 
 
-def test_everything_listens_on_the_loopback_interface_only(light_ray: None):
-    psutil = pytest.importorskip("psutil")
-    me = psutil.Process()
-    mine = {me.pid, *(child.pid for child in me.children(recursive=True))}
-    listening = [
-        c for c in psutil.net_connections("inet") if c.status == psutil.CONN_LISTEN and c.pid in mine
+def own_processes() -> set[int]:
+    """This process and all below it."""
+    parents = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            parents[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+        except OSError:
+            continue
+    found = {os.getpid()}
+    while below := {pid for pid, parent in parents.items() if parent in found} - found:
+        found |= below
+    return found
+
+
+def listening() -> list[str]:
+    """Addresses, in the kernel's hexadecimal, at which own processes accept TCP connections."""
+    inodes = set()
+    for pid in own_processes():
+        try:
+            inodes |= {os.readlink(f) for f in Path(f"/proc/{pid}/fd").iterdir() if f.is_symlink()}
+        except OSError:
+            continue
+    rows = [
+        line.split()
+        for name in ("tcp", "tcp6")
+        for line in Path("/proc/net", name).read_text().splitlines()[1:]
     ]
-    assert len(listening) >= 4, "Ray's own processes were not found"
-    assert {c.laddr.ip for c in listening} <= {"127.0.0.1", "::ffff:127.0.0.1", "::1"}
+    return [row[1].partition(":")[0] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in inodes]
+
+
+LOOPBACK = {
+    "0100007F",
+    "0000000000000000FFFF00000100007F",
+    "00000000000000000000000001000000",
+}
+"""127.0.0.1, the same as IPv6, and ::1, as a little-endian kernel writes them."""
+
+
+@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="no /proc/net")
+def test_everything_listens_on_the_loopback_interface_only(light_ray: None):
+    addresses = listening()
+    assert len(addresses) >= 4, "Ray's own processes were not found"
+    assert set(addresses) <= LOOPBACK
+
+
+def test_its_sockets_and_logs_are_nobody_else_s(light_ray: None):
+    import ray
+
+    session = Path(ray.get_runtime_context().worker.node.get_session_dir_path())
+    folder = Path(os.environ["RAY_TMPDIR"])
+    assert session.is_relative_to(folder) and stat.S_IMODE(folder.stat().st_mode) == 0o700
+
+
+def test_workers_know_where_the_token_is_and_not_what(light_ray: None):
+    import ray
+
+    token = Path(os.environ[TOKEN_PATH]).read_text()
+    there = ray.get(ray.remote(lambda: dict(os.environ)).remote())
+    assert there[TOKEN_PATH] == os.environ[TOKEN_PATH]
+    assert TOKEN not in there and not any(token in value for value in there.values())
+    for pid in own_processes():
+        try:
+            said = Path(f"/proc/{pid}/environ").read_bytes() + Path(f"/proc/{pid}/cmdline").read_bytes()
+        except OSError:
+            continue
+        assert token.encode() not in said, pid
 
 
 def test_a_client_without_the_token_is_refused(light_ray: None):
@@ -95,14 +199,17 @@ def test_a_client_without_the_token_is_refused(light_ray: None):
     address = ray.get_runtime_context().gcs_address
     code = f"import ray; ray.init(address={address!r}, log_to_driver=False); print('connected')"
 
-    def connect(environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
+    def connect(**changes: str) -> subprocess.CompletedProcess[str]:
+        clean = {k: v for k, v in os.environ.items() if not k.startswith("RAY_AUTH")}
         command = [sys.executable, "-c", code]
-        return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+        return subprocess.run(command, env=clean | changes, capture_output=True, text=True, timeout=120)
 
-    assert connect(dict(os.environ)).stdout.strip().endswith("connected")
-    stranger = connect({k: v for k, v in os.environ.items() if not k.startswith("RAY_AUTH")})
-    assert stranger.returncode != 0 and "connected" not in stranger.stdout
-    assert "InvalidAuthToken" in stranger.stderr
+    known = connect(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN_PATH=os.environ[TOKEN_PATH])
+    assert known.stdout.strip().endswith("connected"), known.stderr
+    for strange in ({}, {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0" * 64}):
+        stranger = connect(**strange)
+        assert stranger.returncode != 0 and "connected" not in stranger.stdout
+        assert "InvalidAuthToken" in stranger.stderr
 
 
 TOKENS = """

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Stock ``lerobot-train`` with the dataset's items kept in memory; same arguments, same items, same result.
+"""`guarded_train` with the dataset's items kept in memory; same arguments, same items, same result.
 
 LeRobot 0.6.1 decodes every image of an action chunk to read the chunk's actions: 3.8 ms an item for a chunk
 of ten 64-pixel frames, several times what a tiny policy needs to learn from it. Items are remembered after
@@ -70,6 +70,8 @@ def main() -> None:
     """Runs ``lerobot-train`` on the command line's arguments."""
     from lerobot.scripts import lerobot_train
 
+    from accerl_lerobot.demos import guarded_train
+
     stock = lerobot_train.make_train_eval_datasets
 
     def cached(cfg: Any) -> tuple[Any, Any]:
@@ -81,7 +83,7 @@ def main() -> None:
         return train, evaluation
 
     lerobot_train.make_train_eval_datasets = cached
-    lerobot_train.main()
+    guarded_train.main()
 
 
 if __name__ == "__main__":

@@ -13,8 +13,8 @@
 # limitations under the License.
 """Warm start: hands a LeRobotDataset to LeRobot's own trainer and returns a LeRobot checkpoint.
 
-The trainer is stock ``lerobot-train`` in a process of its own; the exact command is logged, so that anyone
-can repeat it without us.
+The trainer is stock ``lerobot-train`` in a process of its own, under `guarded_train`; the exact command is
+logged, so that anyone can repeat it.
 """
 
 from __future__ import annotations
@@ -34,10 +34,16 @@ from typing import Any
 from accerl_lerobot.checkpoint import BACKBONE, displaced, relocate
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.backbone import BackboneConfig, write_backbone
+from accerl_lerobot.policies.files import fetched_checkpoint
 from accerl_lerobot.policies.plugins import discovery, register_policies
+from accerl_lerobot.safety import Origin, check_remote_code, read_json
 
 logger = logging.getLogger(__name__)
 
+CODE_REVISION = "--code_revision="
+"""Our one argument of the trainer."""
+REFUSED = "accerl refuses: "
+"""Begins the last line of a trainer that met something it must not use; JSON follows."""
 LOG_EVERY = 25
 """Optimiser steps between two lines of progress."""
 NO_SFT = {
@@ -70,6 +76,11 @@ class SFTConfig:
     """Fields of LeRobot's own policy config for a new policy, ``type`` among them."""
     backbone: BackboneConfig | None = None
     """Write a random backbone of this size for the new policy instead of loading one from the Hub."""
+    trust_remote_code: bool = False
+    """Whether Python code from a Hub repository that the policy names is run with your rights. It needs
+    `code_revision`. π0-FAST does without: its action tokeniser is read, not run."""
+    code_revision: str | None = None
+    """Commit of that repository, 40 hexadecimal digits: the one whose code you have read. No other is run."""
     extra_args: list[str] = field(default_factory=list)
     """Further ``lerobot-train`` arguments, e.g. ``--dataset.image_transforms.enable=true``."""
 
@@ -83,6 +94,7 @@ class SFTConfig:
                 raise InputError(f"sft.{name}", getattr(self, name), f"use at least {least}")
         if self.init_path is None and "type" not in self.policy:
             raise InputError("sft.policy", self.policy, "name LeRobot's policy type, e.g. {type: smolvla}")
+        check_remote_code(self.trust_remote_code, self.code_revision, "sft")
 
 
 def sft_command(
@@ -113,8 +125,8 @@ def sft_command(
     policy |= {name: value for name, value in preset.items() if name in known}
     if config.init_path is not None and "pretrained_backbone_weights" in known:
         policy["pretrained_backbone_weights"] = None  # the checkpoint's replace them; spares their download
-    module = "accerl_lerobot.demos.cached_train" if config.cache else "lerobot.scripts.lerobot_train"
-    command = [sys.executable, "-m", module]
+    command = [sys.executable, "-m", f"accerl_lerobot.demos.{'cached' if config.cache else 'guarded'}_train"]
+    command += [f"{CODE_REVISION}{config.code_revision}"] if config.code_revision else []
     command += [f"--policy.{key}={_as_argument(value)}" for key, value in policy.items()]
     command += discovery(kind)
     command += [f"--dataset.repo_id={repo_id}"] + ([f"--dataset.root={root}"] if root else [])
@@ -159,18 +171,20 @@ def run_sft(
         revision: Hub revision of the dataset.
 
     Raises:
-        InputError: `output_dir` exists.
+        InputError: `output_dir` exists; the checkpoint to start from, or the dataset, is not to be trusted.
         RuntimeError: the trainer failed; carries the end of its log.
     """
     if output_dir.exists():
         raise InputError("output_dir", str(output_dir), "the folder exists; choose another or remove it")
+    config = _checked_start(config)
     output_dir.parent.mkdir(parents=True, exist_ok=True)
     if config.init_path is None and config.backbone is not None:
         write_backbone(output_dir.parent / "backbone", config.backbone, texts)
     config = _with_backbone_in_place(config, output_dir.parent / "init")
     command = sft_command(config, repo_id, root, output_dir, seed, device, revision)
     logger.info("%s", shlex.join(command))
-    environment = os.environ | {
+    # Whoever holds Ray's token can run code in its workers; a trainer has no business there.
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("RAY_AUTH")} | {
         "OMP_NUM_THREADS": str(config.num_threads),
         "OMP_WAIT_POLICY": "PASSIVE",
         "TOKENIZERS_PARALLELISM": "false",
@@ -198,9 +212,20 @@ def run_sft(
             raise
     code = process.returncode
     if code != 0:
+        last = log.read_text().rstrip().rpartition("\n")[2]
+        if last.startswith(REFUSED):
+            raise InputError(*json.loads(last.removeprefix(REFUSED)))
         tail = "".join(log.read_text().splitlines(keepends=True)[-15:])
         raise RuntimeError(f"lerobot-train ended with exit code {code}; the end of {log}:\n{tail}")
     return output_dir / "checkpoints" / "last" / "pretrained_model"
+
+
+def _checked_start(config: SFTConfig) -> SFTConfig:
+    """The checkpoint to start from as a folder of this machine, once its files have been checked."""
+    if config.init_path is None:
+        return config
+    folder = fetched_checkpoint(config.init_path, None, "sft.init_path")
+    return replace(config, init_path=str(folder))
 
 
 def _with_backbone_in_place(config: SFTConfig, copy: Path) -> SFTConfig:
@@ -245,7 +270,7 @@ def _stored_config(path: str) -> dict[str, Any]:
         except (OSError, ValueError) as error:
             remedy = "no config.json in a folder of that name, and not loadable from the Hub"
             raise InputError("sft.init_path", path, remedy) from error
-    config: dict[str, Any] = json.loads(file.read_text())
+    config: dict[str, Any] = read_json(file, Origin("sft.init_path", path))
     if not local and config.get("vlm_model_name") == BACKBONE:
         remedy = "LeRobot finds its backbone only in a folder: accerl pull it, and name that"
         raise InputError("sft.init_path", path, remedy)

@@ -17,18 +17,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from accerl_lerobot.demos.dataset_files import checked
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.safety import Origin, brief
 
 if TYPE_CHECKING:
     from accerl_lerobot.config import DatasetConfig
 
 
 def open_metadata(dataset: DatasetConfig) -> Any:
-    """LeRobot's metadata of a local or Hub dataset.
+    """LeRobot's metadata of a local or Hub dataset, which is checked before LeRobot reads it.
 
     Raises:
-        InputError: it cannot be found or read.
+        InputError: it cannot be found or read, or says what a dataset may not, see `dataset_files`.
     """
     from pathlib import Path
 
@@ -44,7 +46,10 @@ def open_metadata(dataset: DatasetConfig) -> Any:
             "dataset.root", dataset.root, "no meta/info.json there; give the folder of a LeRobotDataset v3"
         )
     try:
-        return LeRobotDatasetMetadata(dataset.repo_id, root=dataset.root, revision=dataset.revision)
+        with checked(origin_of(dataset), whole=dataset.root is not None):
+            return LeRobotDatasetMetadata(dataset.repo_id, root=dataset.root, revision=dataset.revision)
+    except InputError:
+        raise
     except (CompatibilityError, NotImplementedError) as error:
         tool = f"python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={dataset.repo_id}"
         remedy = (
@@ -52,10 +57,17 @@ def open_metadata(dataset: DatasetConfig) -> Any:
         )
         raise InputError("dataset.repo_id", dataset.repo_id, remedy) from error
     except (OSError, ValueError) as error:
-        first = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(
-            "dataset.repo_id", dataset.repo_id, f"not found locally nor on the Hub ({first})"
-        ) from error
+        remedy = f"not found locally nor on the Hub ({brief(error)})"
+        raise InputError("dataset.repo_id", dataset.repo_id, remedy) from error
+    except Exception as error:  # LeRobot takes the files at their word, and may fail over any of it
+        raise origin_of(dataset).refuse("meta", f"LeRobot cannot read it ({brief(error)})") from error
+
+
+def origin_of(dataset: DatasetConfig) -> Origin:
+    """The field that names a dataset's files."""
+    if dataset.root is not None:
+        return Origin("dataset.root", dataset.root)
+    return Origin("dataset.repo_id", dataset.repo_id)
 
 
 def check_dataset(dataset: DatasetConfig, env: EnvConfig, rename_map: dict[str, str]) -> Any:

@@ -22,6 +22,7 @@ Importing this file loads no LeRobot; making the world does.
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -35,6 +36,7 @@ from accerl_lerobot.experience import TASK, Observation
 
 _STATE = "observation.state"
 _IMAGE = "observation.image"
+_PINNED = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{40}(:\w[\w./-]*\.py)?", re.ASCII)
 _NEEDS_MUJOCO = ("aloha", "libero", "libero_plus", "metaworld", "robocasa")
 
 
@@ -51,6 +53,9 @@ class LeRobotEnvConfig(EnvConfig):
     """LeRobot's own name of the environment: what ``lerobot-eval --env.type`` takes."""
     kwargs: dict[str, Any] = field(default_factory=dict)
     """Fields of LeRobot's config of that environment, such as ``task`` or ``obs_type``."""
+    trust_remote_code: bool = False
+    """Whether an environment on the Hub is run with your rights. It needs ``hub_path`` in `kwargs`, with the
+    commit whose code you have read: ``owner/name@COMMIT`` or ``owner/name@COMMIT:file.py``."""
     task: str = ""
     """Instruction text, for environments that have none of their own."""
     camera: str = "image"
@@ -94,8 +99,14 @@ class LeRobotWorld(World):
             self._lerobot_config = known[config.name](**config.kwargs)
         except (TypeError, ValueError) as error:
             raise InputError("env.kwargs", config.kwargs, str(error)) from error
+        _check_hub(config, getattr(self._lerobot_config, "hub_path", None))
         self._before, self._after = self._lerobot_config.get_env_processors()
-        self._vectors = make_env(self._lerobot_config, n_envs=1, use_async_envs=False)
+        self._vectors = make_env(
+            self._lerobot_config,
+            n_envs=1,
+            use_async_envs=False,
+            trust_remote_code=config.trust_remote_code,
+        )
         self._envs = _single_envs(self._vectors)
         self._task = ""
         self._steps = 0
@@ -206,6 +217,27 @@ class LeRobotWorld(World):
             if isinstance(text := getattr(env, name, None), str) and text:
                 return text
         return self.config.task
+
+
+def _check_hub(config: LeRobotEnvConfig, hub_path: str | None) -> None:
+    """Refuses code from the Hub that nobody asked for, or whose version is not named.
+
+    Raises:
+        InputError: see above.
+    """
+    if hub_path is None:
+        if config.trust_remote_code:
+            remedy = f"{config.name} is no environment on the Hub; leave it out"
+            raise InputError("env.trust_remote_code", True, remedy)
+        return
+    if not config.trust_remote_code:
+        remedy = f"{config.name} is code of {hub_path} on the Hub, which would run with your rights; read it,"
+        raise InputError(
+            "env.trust_remote_code", False, f"{remedy} then set this, and its commit in hub_path"
+        )
+    if not _PINNED.fullmatch(hub_path) or ".." in hub_path:
+        remedy = "name a commit, owner/name@COMMIT or owner/name@COMMIT:file.py with 40 hexadecimal digits"
+        raise InputError("env.kwargs.hub_path", hub_path, f"{remedy}: branches can be moved to other code")
 
 
 def _single_envs(vectors: dict[str, dict[int, Any]]) -> dict[str, Any]:

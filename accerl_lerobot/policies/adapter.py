@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.policies.base import Evaluation, PolicyAdapter, stack_observations
 from accerl_lerobot.policies.family import Encoded, Family, Model
@@ -127,7 +128,7 @@ class LeRobotAdapter(PolicyAdapter):
         """Largest difference between our sampler without exploration and LeRobot's own on equal noise.
 
         Raises:
-            RuntimeError: above `SELF_CHECK_TOLERANCE`, or LeRobot's internals have changed.
+            InputError: above `SELF_CHECK_TOLERANCE`, or LeRobot's internals have changed.
         """
         try:
             batch = self.processing.prepare(observations, tasks)
@@ -151,10 +152,11 @@ class LeRobotAdapter(PolicyAdapter):
             return contextlib.nullcontext()
         return torch.autocast(self.device.type, torch.bfloat16)
 
-    def _incompatible(self, what: str) -> RuntimeError:
+    def _incompatible(self, what: str) -> InputError:
         import lerobot
 
-        return RuntimeError(
+        remedy = (
             f"our adapter of {self.policy.name} does not fit LeRobot {lerobot.__version__}: it {what}, so "
             "log-probs would be those of another policy; install the LeRobot version that this package pins"
         )
+        return InputError("lerobot", lerobot.__version__, remedy)

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.samplers import SamplerConfig
+from accerl_lerobot.safety import check_remote_code
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,6 +84,11 @@ class PolicyConfig:
     """Local checkpoint directory or Hub id (``lerobot/smolvla_base``). None: the run's own SFT makes it."""
     revision: str | None = None
     """Hub revision."""
+    trust_remote_code: bool = False
+    """Whether Python code from a Hub repository that the checkpoint names, such as a vision encoder's, is run
+    with your rights. It needs `code_revision`."""
+    code_revision: str | None = None
+    """Commit of that repository, 40 hexadecimal digits: the one whose code you have read. No other is run."""
     device: str = "auto"
     """cpu, cuda, or auto."""
     precision: str = "fp32"
@@ -105,5 +111,6 @@ class PolicyConfig:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise InputError(f"policy.{name}", value, "use at least 1, or null to keep the checkpoint's")
+        check_remote_code(self.trust_remote_code, self.code_revision, "policy")
         if self.precision not in ("fp32", "bf16"):
             raise InputError("policy.precision", self.precision, "use fp32 or bf16")

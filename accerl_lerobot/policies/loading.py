@@ -40,6 +40,8 @@ from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import OBS_STATE
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Model
+from accerl_lerobot.policies.files import CONFIG, FAMILY, OURS, VALUE_HEAD, WEIGHTS, fetched_checkpoint
+from accerl_lerobot.policies.guard import Budget, guarded, input_error
 from accerl_lerobot.policies.plugins import register_policies
 from accerl_lerobot.policies.portable import keep_names, save_backbone, tokenizer_overrides, use_backbone
 from accerl_lerobot.policies.processing import IMAGES, Processing
@@ -47,16 +49,10 @@ from accerl_lerobot.policies.samplers import SamplerConfig
 from accerl_lerobot.policies.tuning import merged_state_dict, tune
 from accerl_lerobot.policies.value_head import ValueHead
 from accerl_lerobot.policies.verify import verify_weights
+from accerl_lerobot.safety import Origin, brief
 
 logger = logging.getLogger(__name__)
 
-CONFIG = "config.json"
-WEIGHTS = "model.safetensors"
-OURS = "accerl.json"
-VALUE_HEAD = "value_head.safetensors"
-FAMILY = "family.safetensors"
-FILES = ("*.json", WEIGHTS, "policy_*.safetensors", VALUE_HEAD, FAMILY, f"{BACKBONE}/*")
-"""What is fetched of a checkpoint on the Hub."""
 MODELS = "accerl_lerobot.policies.models"
 POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "smolvla": (f"{MODELS}.smolvla:SmolVLA", ("flow", "noise_space")),
@@ -169,8 +165,8 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
         lerobot_config = PreTrainedConfig.from_pretrained(folder)
     except InputError:
         raise
-    except (OSError, ValueError, AttributeError, draccus.utils.DraccusException) as error:
-        remedy = f"its config.json is not one of this LeRobot's policies ({_brief(error)})"
+    except Exception as error:  # LeRobot takes the file at its word, and may fail over any of it
+        remedy = f"its config.json is not one of this LeRobot's policies ({brief(error)})"
         raise InputError("policy.path", config.path, remedy) from error
     lerobot_config.device = str(resolve_device(config.device))
     _override(lerobot_config, config)
@@ -184,19 +180,22 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
     """Loads policy, processors and critic; proves that the weights are the file's and the sampler LeRobot's.
 
     Raises:
-        InputError: see `load_lerobot_config`; or weights or processors that did not load.
-        RuntimeError: the installed LeRobot samples differently, see `PolicyAdapter.self_check`.
+        InputError: see `load_lerobot_config`; weights or processors did not load, or do not act as LeRobot's
+            own sampler does, see `PolicyAdapter.self_check`.
     """
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
     lerobot_config = load_lerobot_config(config)
     folder = _checkpoint_folder(config)
     model_class: type[Model] = imported(POLICIES[lerobot_config.type][0])
+    budget = Budget((folder / WEIGHTS).stat().st_size, "policy.path", config.path)
     try:
-        with model_class.loading():
+        with guarded("policy", config.code_revision), model_class.loading(), budget:
             policy = get_policy_class(lerobot_config.type).from_pretrained(folder, config=lerobot_config)
     except Exception as error:
-        raise InputError("policy.path", config.path, f"the weights did not load ({_brief(error)})") from error
+        if (ours := input_error(error)) is not None:
+            raise ours from error
+        raise InputError("policy.path", config.path, f"the weights did not load ({brief(error)})") from error
     verify_weights(policy, model_class, folder / WEIGHTS, config.path)
     model = model_class(policy)  # type: ignore[call-arg]
     device = torch.device(lerobot_config.device)
@@ -205,26 +204,32 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
     overrides = {"device_processor": {"device": str(device)}, **model.processor_overrides}
     try:
         overrides |= tokenizer_overrides(lerobot_config, folder)
-        with model.loading():
+        with guarded("policy", config.code_revision), model.loading():
             pre, post = make_pre_post_processors(
                 lerobot_config, pretrained_path=str(folder), preprocessor_overrides=overrides
             )
         keep_names(lerobot_config, pre, folder)
     except Exception as error:
-        remedy = f"its LeRobot processors did not load ({_brief(error)})"
+        if (ours := input_error(error)) is not None:
+            raise ours from error
+        remedy = f"its LeRobot processors did not load ({brief(error)})"
         if "tokenizer_processor" in str(error) and not (folder / BACKBONE).is_dir():
             remedy += f"; a tokeniser that cannot be had from the Hub goes into {BACKBONE}/ beside {CONFIG}"
         raise InputError("policy.path", config.path, remedy) from error
-    processing = Processing(pre, post, device, config.rename_map)
-    sampler = sampler_config(config, lerobot_config.type)
-    family = imported(FAMILIES[sampler.type])(model, sampler)
-    adapter = LeRobotAdapter(
-        policy, processing, model, family, ValueHead(model.width, config.value_head), config.precision
-    )
-    if (folder / OURS).is_file():
-        _load_ours(adapter, folder)
-    adapter.self_check(*example_observations(lerobot_config, config.rename_map))
-    tune(policy, model, family, config.tuning)
+    try:
+        processing = Processing(pre, post, device, config.rename_map)
+        sampler = sampler_config(config, lerobot_config.type)
+        family = imported(FAMILIES[sampler.type])(model, sampler)
+        critic = ValueHead(model.width, config.value_head)
+        adapter = LeRobotAdapter(policy, processing, model, family, critic, config.precision)
+        if (folder / OURS).is_file():
+            _load_ours(adapter, folder)
+        adapter.self_check(*example_observations(lerobot_config, config.rename_map))
+        tune(policy, model, family, config.tuning)
+    except InputError:
+        raise
+    except Exception as error:  # what its files say fits nowhere, and may fail over any of it
+        raise InputError("policy.path", config.path, f"it cannot act here ({brief(error)})") from error
     return adapter
 
 
@@ -296,26 +301,11 @@ def example_observations(
 
 
 def _checkpoint_folder(config: PolicyConfig) -> Path:
-    """Where the checkpoint's files are on this machine; those of a Hub repository are fetched."""
-    from huggingface_hub import snapshot_download
-
+    """Where the checkpoint's files are, once checked; those of a Hub repository are fetched."""
     if config.path is None:
         remedy = "give a LeRobot checkpoint directory or Hub id, or an sft section"
         raise InputError("policy.path", None, remedy)
-    folder = Path(config.path).expanduser()
-    if not folder.exists() and not config.path.startswith((".", "/", "~")):
-        try:
-            folder = Path(
-                snapshot_download(config.path, revision=config.revision, allow_patterns=list(FILES))
-            )
-        except (OSError, ValueError) as error:
-            remedy = f"not a directory here and not loadable from the Hub ({_brief(error)})"
-            raise InputError("policy.path", config.path, remedy) from error
-    if not (folder / CONFIG).is_file():
-        raise InputError(
-            "policy.path", config.path, "no config.json there; give the folder named pretrained_model"
-        )
-    return folder
+    return fetched_checkpoint(config.path, config.revision, "policy.path")
 
 
 def _load_ours(adapter: LeRobotAdapter, folder: Path) -> None:
@@ -338,7 +328,11 @@ def _load_ours(adapter: LeRobotAdapter, folder: Path) -> None:
             ", ".join(f"policy.value_head.{k}={here[k]}, there {there.get(k)}" for k in differing),
         )
     elif (folder / VALUE_HEAD).is_file():
-        adapter.value_head.load_state_dict(load_file(folder / VALUE_HEAD))
+        try:
+            adapter.value_head.load_state_dict(load_file(folder / VALUE_HEAD))
+        except RuntimeError as error:
+            remedy = f"{OURS} says another critic than it is; remove both to start anew ({brief(error)})"
+            raise Origin("policy.path", str(folder)).refuse(VALUE_HEAD, remedy) from error
 
 
 def _copied(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -389,9 +383,3 @@ def imported(path: str) -> Any:
     """What an entry of `POLICIES` or `FAMILIES` names."""
     module, _, name = path.partition(":")
     return getattr(importlib.import_module(module), name)
-
-
-def _brief(error: BaseException) -> str:
-    """The error's words on one line, not more than a line's worth."""
-    text = " ".join(str(error).split()) or type(error).__name__
-    return text if len(text) <= 160 else text[:159] + "…"

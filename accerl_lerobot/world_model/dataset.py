@@ -22,7 +22,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from accerl_lerobot.demos.windows import open_metadata
+from accerl_lerobot.demos.dataset_files import checked
+from accerl_lerobot.demos.windows import open_metadata, origin_of
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.episodes import Episode
@@ -60,8 +61,9 @@ def load_episodes(
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     wanted = range(meta.total_episodes) if only is None else only
-    data = LeRobotDataset(meta.repo_id, root=meta.root, revision=meta.revision)
-    episodes = [_episode(data, meta, index, spec, source) for index in wanted]
+    with checked(origin_of(dataset)):
+        data = LeRobotDataset(meta.repo_id, root=meta.root, revision=meta.revision)
+        episodes = [_episode(data, meta, index, spec, source) for index in wanted]
     remedies = {True: "add episodes that succeed", False: "add failures, see demos.failure_share"}
     for outcome, remedy in remedies.items() if both else ():
         if not any(e.success is outcome for e in episodes):

@@ -30,12 +30,26 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.guard import Budget, guarded
+from accerl_lerobot.safety import (
+    Origin,
+    brief,
+    check_not_pickled,
+    check_safetensors,
+    file_size,
+    read_json,
+    safe_join,
+)
+from accerl_lerobot.world_model.bounds import check_pixel_model, check_spec, check_success_model
 from accerl_lerobot.world_model.config import PixelModelConfig
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
-UNREADABLE = (OSError, KeyError, TypeError, ValueError, RuntimeError, SafetensorError)
+UNREADABLE = (
+    OSError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError,
+    SafetensorError,
+)  # fmt: skip
 CONFIG, WEIGHTS, SUCCESS = "config.json", "model.safetensors", "success_model"
 
 
@@ -76,18 +90,21 @@ def load_source(directory: Path, field: str = "path") -> Source | None:
         InputError: it says something else.
     """
     try:
-        content = json.loads((directory / CONFIG).read_text()).get("source")
-        if content is None:
+        origin = Origin(field, str(directory))
+        said = read_json(safe_join(directory, CONFIG, origin), origin).get("source")
+        if said is None:
             return None
         return Source(
-            repo_id=str(content["repo_id"]),
-            fingerprint=str(content["fingerprint"]),
-            learnt=tuple(map(int, content["learnt"])),
-            held_out=tuple(map(int, content["held_out"])),
+            repo_id=str(said["repo_id"]),
+            fingerprint=str(said["fingerprint"]),
+            learnt=tuple(map(int, said["learnt"])),
+            held_out=tuple(map(int, said["held_out"])),
         )
+    except InputError:
+        raise
     except UNREADABLE as error:
         raise InputError(
-            field, str(directory), f"its {CONFIG} does not say what it learnt ({error})"
+            field, str(directory), f"its {CONFIG} does not say what it learnt ({brief(error)})"
         ) from error
 
 
@@ -103,26 +120,48 @@ def load_world_model(
     Raises:
         InputError: it is not there, its weights are not those of its config, or its success model is broken.
     """
+    origin = Origin(field, str(directory))
+    content = read_json(safe_join(directory, CONFIG, origin), origin)
+    check_spec(content.get("spec"), origin)
+    check_pixel_model(content.get("model"), origin)
+    weights = _weights(directory, origin)
     try:
-        content = json.loads((directory / CONFIG).read_text())
-        spec = content["spec"]
-        spec |= {k: tuple(spec[k]) for k in ("cameras", "image_size")} | {
-            "provides": frozenset(spec["provides"])
-        }
-        model = PixelWorldModel(WorldModelSpec(**spec), draccus.decode(PixelModelConfig, content["model"]))
-        model.load_state_dict(load_file(directory / WEIGHTS))
+        spec = dict(content["spec"])
+        spec |= {k: tuple(spec[k]) for k in ("cameras", "image_size")}
+        spec |= {"provides": frozenset(spec["provides"])}
+        with Budget(file_size(weights, origin), field, str(directory)):
+            model = PixelWorldModel(
+                WorldModelSpec(**spec), draccus.decode(PixelModelConfig, content["model"])
+            )
+        model.load_state_dict(load_file(weights))
+    except InputError as error:
+        raise origin.refuse(CONFIG, brief(error)) from error
     except (*UNREADABLE, draccus.utils.DraccusException) as error:
-        first = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(
-            field, str(directory), f"not a world model of accerl world-model ({first})"
+            field, str(directory), f"not a world model of accerl world-model ({brief(error)})"
         ) from error
     success = None
-    if (directory / SUCCESS).is_dir():
-        try:
-            success = SuccessPairsRewardModel.from_pretrained(directory / SUCCESS, strict=True).eval()
-        except (*UNREADABLE, draccus.utils.DraccusException) as error:
-            first = (str(error).splitlines() or [type(error).__name__])[0]
-            raise InputError(
-                field, str(directory / SUCCESS), f"the success model is broken ({first})"
-            ) from error
+    if safe_join(directory, SUCCESS, origin).is_dir():
+        success = _success(directory / SUCCESS, Origin(field, str(directory / SUCCESS)))
     return model.requires_grad_(False), success
+
+
+def _success(directory: Path, origin: Origin) -> SuccessPairsRewardModel:
+    check_success_model(read_json(safe_join(directory, CONFIG, origin), origin), origin)
+    weights = _weights(directory, origin)
+    try:
+        with guarded("path"), Budget(file_size(weights, origin), origin.field, origin.value):
+            return SuccessPairsRewardModel.from_pretrained(directory, strict=True).eval()
+    except InputError as error:
+        raise origin.refuse(CONFIG, brief(error)) from error
+    except (*UNREADABLE, draccus.utils.DraccusException) as error:
+        raise InputError(
+            origin.field, origin.value, f"the success model is broken ({brief(error)})"
+        ) from error
+
+
+def _weights(directory: Path, origin: Origin) -> Path:
+    check_not_pickled(directory, WEIGHTS, origin)
+    path = safe_join(directory, WEIGHTS, origin)
+    check_safetensors(path, origin)
+    return path

@@ -278,7 +278,7 @@ def test_the_command_line(tmp_path: Path):
     (start / "config.json").write_text('{"type": "smolvla"}')
     config = SFTConfig(steps=2, init_path=str(start), cache=False, extra_args=["--log_freq=1"])
     command = sft_command(config, "a/b", None, tmp_path / "sft", 0, "cuda")
-    assert command[2] == "lerobot.scripts.lerobot_train" and f"--policy.path={start}" in command
+    assert command[2] == "accerl_lerobot.demos.guarded_train" and f"--policy.path={start}" in command
     assert command[-1] == "--log_freq=1"
     assert not [a for a in command if a.startswith(("--policy.type", "--dataset.root", "--dataset.revision"))]
 

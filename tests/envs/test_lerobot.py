@@ -143,3 +143,62 @@ def test_the_expert_succeeds_through_the_plugin(plugin):
         assert not truncated and info["is_success"] == terminated
     assert reward == 1.0 and env.observation_space["pixels"].contains(seen["pixels"])
     env.close()
+
+
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+
+
+@pytest.fixture
+def arena(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    """An environment in the Hub's cache whose code leaves a mark when it is run."""
+    from huggingface_hub import constants
+
+    marker = tmp_path / "was-run"
+    snapshot = tmp_path / "models--them--arena" / "snapshots" / COMMIT
+    snapshot.mkdir(parents=True)
+    code = f"from pathlib import Path\nPath({str(marker)!r}).touch()\n"
+    (snapshot / "env.py").write_text(f"{code}def make_env(**options): raise OSError('ran')\n")
+    (snapshot.parents[1] / "refs").mkdir()
+    (snapshot.parents[1] / "refs" / "main").write_text(COMMIT)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path))
+    return marker
+
+
+@pytest.mark.parametrize(
+    ("hub_path", "trust", "said"),
+    [
+        (f"them/arena@{COMMIT}", False, "env.trust_remote_code=False: isaaclab_arena is code of them/arena"),
+        ("them/arena", True, "env.kwargs.hub_path='them/arena': name a commit"),
+        ("them/arena@main", True, "env.kwargs.hub_path='them/arena@main': name a commit"),
+        (f"them/arena@{COMMIT[:12]}:env.py", True, "env.kwargs.hub_path="),
+        (f"them/arena@{COMMIT}:../../env.py", True, "env.kwargs.hub_path="),
+        (f"them/arena@{COMMIT}:/tmp/env.py", True, "env.kwargs.hub_path="),
+        (f"them/arena@{COMMIT}\n", True, "env.kwargs.hub_path="),
+    ],
+)
+def test_environments_on_the_hub_are_not_run_unasked(arena, hub_path: str, trust: bool, said: str):
+    config = LeRobotEnvConfig(
+        name="isaaclab_arena", kwargs={"hub_path": hub_path}, trust_remote_code=trust, max_steps=5
+    )
+    with pytest.raises(InputError, match=f"^{said}"):
+        make_world(config)
+    assert not arena.exists()
+
+
+def test_an_environment_s_default_is_not_pinned(arena):
+    """LeRobot names a repository of its own accord, in its newest version."""
+    with pytest.raises(InputError, match="^env.kwargs.hub_path='nvidia/isaaclab-arena-envs': name a commit"):
+        make_world(LeRobotEnvConfig(name="isaaclab_arena", trust_remote_code=True))
+
+
+def test_an_environment_is_run_at_its_commit(arena):
+    kwargs = {"hub_path": f"them/arena@{COMMIT}:env.py"}
+    with pytest.raises(OSError, match="ran"):
+        make_world(LeRobotEnvConfig(name="isaaclab_arena", kwargs=kwargs, trust_remote_code=True))
+    assert arena.exists()
+
+
+def test_trust_that_nothing_needs(arena):
+    pytest.importorskip("gym_pusht")
+    with pytest.raises(InputError, match="^env.trust_remote_code=True: pusht is no environment on the Hub"):
+        make_world(LeRobotEnvConfig(name="pusht", trust_remote_code=True))

@@ -203,7 +203,7 @@ def test_a_changed_lerobot_fails_at_load(path: Path, monkeypatch: pytest.MonkeyP
     stock = ACTPolicy.predict_action_chunk
     with monkeypatch.context() as patch:
         patch.setattr(ACTPolicy, "predict_action_chunk", lambda self, batch: 1.001 * stock(self, batch))
-        with pytest.raises(RuntimeError, match=r"does not fit LeRobot 0\.6\.1: it differs from its sampler"):
+        with pytest.raises(InputError, match=r"does not fit LeRobot 0\.6\.1: it differs from its sampler"):
             adapter_at(path)
     forward = ACT.forward
 
@@ -214,7 +214,7 @@ def test_a_changed_lerobot_fails_at_load(path: Path, monkeypatch: pytest.MonkeyP
         return head.weight @ hidden.mT, rest
 
     monkeypatch.setattr(ACT, "forward", headless)
-    with pytest.raises(RuntimeError, match=r"cannot drive it \(KeyError: 'rows'\)"):
+    with pytest.raises(InputError, match=r"cannot drive it \(KeyError: 'rows'\)"):
         adapter_at(path)
 
 

@@ -440,10 +440,10 @@ def test_a_changed_scheduler_fails_at_load(path: Path, monkeypatch: pytest.Monke
         patch.setattr(
             DDPMScheduler, "_get_variance", lambda self, t, **options: 1.1 * stock(self, t, **options)
         )
-        with pytest.raises(RuntimeError, match="does not fit LeRobot .* it differs from its sampler"):
+        with pytest.raises(InputError, match="does not fit LeRobot .* it differs from its sampler"):
             adapter_at(path)
     monkeypatch.delattr(DiffusionModel, "_prepare_global_conditioning")
-    with pytest.raises(RuntimeError, match=r"cannot drive it \(AttributeError: .*_prepare_global"):
+    with pytest.raises(InputError, match=r"cannot drive it \(AttributeError: .*_prepare_global"):
         adapter_at(path)
 
 

@@ -207,7 +207,7 @@ def test_a_repaired_lerobot_is_noticed(path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(
         module, "TanhMultivariateNormalDiag", lambda loc, scale_diag: stock(loc, scale_diag.square())
     )
-    with pytest.raises(RuntimeError, match="differs from its sampler"):
+    with pytest.raises(InputError, match="differs from its sampler"):
         adapter_at(path)
 
 

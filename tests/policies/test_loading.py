@@ -102,9 +102,13 @@ def test_a_policy_without_a_likelihood(copied: Path, kind: str, why: str):
 
 
 def test_a_config_of_something_else(copied: Path):
-    for text in ('{"type": "smolvla", "no_such_field": 1}', "[1, 2]", "not json"):
+    for text, why in (
+        ('{"type": "smolvla", "no_such_field": 1}', "its config.json is not one of this LeRobot's policies"),
+        ("[1, 2]", "config.json: a mapping is wanted, not list"),
+        ("not json", "config.json: not good JSON"),
+    ):
         (copied / "config.json").write_text(text)
-        with pytest.raises(InputError, match="its config.json is not one of this LeRobot's policies"):
+        with pytest.raises(InputError, match=why):
             load_lerobot_config(PolicyConfig(path=str(copied)))
 
 
@@ -171,12 +175,15 @@ def test_a_loader_that_swallows_its_errors_is_caught(tiny_checkpoint: Path, monk
         adapter_at(tiny_checkpoint)
 
 
-@pytest.mark.parametrize("content", [None, b"not tensors"])
-def test_a_weights_file_that_is_none(copied: Path, content: bytes | None):
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [(None, "is missing; give a folder with the weights"), (b"not tensors", "not safetensors")],
+)
+def test_a_weights_file_that_is_none(copied: Path, content: bytes | None, why: str):
     (copied / "model.safetensors").unlink()
     if content is not None:
         (copied / "model.safetensors").write_bytes(content)
-    with pytest.raises(InputError, match="the weights did not load"):
+    with pytest.raises(InputError, match=f"^policy.path=.*model.safetensors: {why}"):
         load_adapter(PolicyConfig(path=str(copied), device="cpu"))
 
 

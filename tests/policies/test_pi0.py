@@ -29,6 +29,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies import flow
 from accerl_lerobot.policies.adapter import LeRobotAdapter
@@ -219,9 +220,7 @@ def test_a_changed_velocity_is_refused(adapter: LeRobotAdapter, monkeypatch: pyt
         return replace(encoded, context=context)
 
     monkeypatch.setattr(adapter.model, "encode", tampered)
-    with pytest.raises(
-        RuntimeError, match=r"does not fit LeRobot 0\.6\.1: it differs from its sampler by \d"
-    ):
+    with pytest.raises(InputError, match=r"does not fit LeRobot 0\.6\.1: it differs from its sampler by \d"):
         adapter.self_check(*stack_observations(requests(2)))
 
 
@@ -236,11 +235,11 @@ def test_an_incompatible_lerobot_fails_at_load(path: Path, monkeypatch: pytest.M
 
     with monkeypatch.context() as patch:
         patch.setattr(module, "euler_integrate", midpoint)
-        with pytest.raises(RuntimeError, match="differs from its sampler"):
+        with pytest.raises(InputError, match="differs from its sampler"):
             adapter_at(path)
     core = module.PI0Pytorch if hasattr(module, "PI0Pytorch") else module.PI05Pytorch
     monkeypatch.delattr(core, "embed_prefix")
-    with pytest.raises(RuntimeError, match=r"cannot drive it \(AttributeError: .*embed_prefix"):
+    with pytest.raises(InputError, match=r"cannot drive it \(AttributeError: .*embed_prefix"):
         adapter_at(path)
 
 

@@ -29,6 +29,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import stack_observations
@@ -294,7 +295,7 @@ def test_the_layout_of_training_is_another_policy_s(adapter: LeRobotAdapter, mon
     decisions = adapter.decide(asked, 0)
     monkeypatch.setattr(adapter.model, "encode", in_training_layout)
     assert log_ratio(adapter, asked, decisions).abs().max() > 1e-3
-    with pytest.raises(RuntimeError, match=r"does not fit LeRobot 0\.6\.1: it differs from its sampler"):
+    with pytest.raises(InputError, match=r"does not fit LeRobot 0\.6\.1: it differs from its sampler"):
         adapter.self_check(observations, tasks)
 
 
@@ -316,17 +317,17 @@ def test_an_incompatible_lerobot_fails_at_load(path: Path, monkeypatch: pytest.M
     ):
         with monkeypatch.context() as patch:
             patch.setattr(owner, attribute, changed)
-            with pytest.raises(RuntimeError, match="differs from its sampler"):
+            with pytest.raises(InputError, match="differs from its sampler"):
                 adapter_at(path)
     with monkeypatch.context() as patch:  # other tokens, the same chunk
         patch.setattr(core, "sample_actions_fast_kv_cache", next_one)
         patch.setattr(
             policy, "detokenize_actions", lambda self, tokens, **sizes: torch.zeros(len(tokens), 4, 2)
         )
-        with pytest.raises(RuntimeError, match="differs from its sampler"):
+        with pytest.raises(InputError, match="differs from its sampler"):
             adapter_at(path)
     monkeypatch.delattr(core, "embed_prefix_fast")
-    with pytest.raises(RuntimeError, match=r"cannot drive it \(AttributeError: .*embed_prefix_fast"):
+    with pytest.raises(InputError, match=r"cannot drive it \(AttributeError: .*embed_prefix_fast"):
         adapter_at(path)
 
 

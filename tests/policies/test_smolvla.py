@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 import torch
 
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies import flow
 from accerl_lerobot.policies.adapter import LeRobotAdapter
@@ -175,9 +176,7 @@ def test_a_changed_velocity_is_refused(adapter: LeRobotAdapter, monkeypatch: pyt
         return replace(encoded, context=context)
 
     monkeypatch.setattr(adapter.model, "encode", tampered)
-    with pytest.raises(
-        RuntimeError, match=r"does not fit LeRobot 0\.6\.1: it differs from its sampler by \d"
-    ):
+    with pytest.raises(InputError, match=r"does not fit LeRobot 0\.6\.1: it differs from its sampler by \d"):
         adapter.self_check(observations, tasks)
 
 
@@ -192,17 +191,17 @@ def test_an_incompatible_lerobot_fails_at_load(path: Path, monkeypatch: pytest.M
 
     with monkeypatch.context() as patch:
         patch.setattr(modeling_smolvla, "euler_integrate", midpoint)
-        with pytest.raises(RuntimeError, match="differs from its sampler"):
+        with pytest.raises(InputError, match="differs from its sampler"):
             adapter_at(path)
     monkeypatch.delattr(modeling_smolvla.VLAFlowMatching, "embed_prefix")
-    with pytest.raises(RuntimeError, match=r"cannot drive it \(AttributeError: .*embed_prefix"):
+    with pytest.raises(InputError, match=r"cannot drive it \(AttributeError: .*embed_prefix"):
         adapter_at(path)
 
 
 def test_weights_that_compute_nan_are_refused(adapter: LeRobotAdapter):
     with torch.no_grad():
         adapter.policy.model.action_out_proj.bias.fill_(float("nan"))
-    with pytest.raises(RuntimeError, match="differs from its sampler by nan"):
+    with pytest.raises(InputError, match="differs from its sampler by nan"):
         adapter.self_check(*stack_observations(requests(2)))
 
 

@@ -191,15 +191,15 @@ def test_a_policy_that_acts_otherwise_is_refused(adapter: LeRobotAdapter, monkey
     with monkeypatch.context() as patch:
         shifted = lambda self, batch: stock(self, batch) + 2 / BINS  # noqa: E731  one bin
         patch.setattr(type(adapter.policy), "predict_action_chunk", shifted)
-        with pytest.raises(RuntimeError, match=r"does not fit LeRobot 0\.6\.1: it differs .* by 6\.25e-02"):
+        with pytest.raises(InputError, match=r"does not fit LeRobot 0\.6\.1: it differs .* by 6\.25e-02"):
             adapter.self_check(*example)
     with monkeypatch.context() as patch:
         patch.delattr(type(adapter.policy), "hidden")
-        with pytest.raises(RuntimeError, match=r"cannot drive it \(AttributeError: .*hidden"):
+        with pytest.raises(InputError, match=r"cannot drive it \(AttributeError: .*hidden"):
             adapter.self_check(*example)
     with torch.no_grad():
         adapter.policy.model.head.bias.fill_(float("nan"))
-    with pytest.raises(RuntimeError, match="differs from its sampler by nan"):
+    with pytest.raises(InputError, match="differs from its sampler by nan"):
         adapter.self_check(*example)
 
 

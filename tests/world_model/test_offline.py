@@ -104,7 +104,7 @@ def test_a_saved_one_is_tried_on_another_dataset(
     assert json.loads(capsys.readouterr().out)["tried"]["episodes"] == 8
     assert {p.name for p in (tmp_path / "again").iterdir()} == {"config.yaml", "trial.json", "preview.mp4"}
     assert cli.main(["world-model-eval", "--path=nowhere", f"--output_dir={tmp_path / 'third'}"]) == 2
-    assert "path='nowhere': not a world model" in capsys.readouterr().err
+    assert "path='nowhere': config.json: is missing" in capsys.readouterr().err
     assert cli.main(["world-model-eval"]) == 2
     assert "path=None: name the folder world_model" in capsys.readouterr().err
 
@@ -179,8 +179,16 @@ def test_what_is_saved_dreams_the_same(tmp_path: Path):
     assert load_world_model(tmp_path / "alone")[1] is None
 
 
-@pytest.mark.parametrize("harm", ["nowhere", "config", "weights", "size"])
-def test_what_cannot_be_loaded(tmp_path: Path, harm: str):
+@pytest.mark.parametrize(
+    ("harm", "why"),
+    [
+        ("nowhere", "config.json: is missing"),
+        ("config", "config.json: spec: not a world model of accerl world-model"),
+        ("weights", "model.safetensors: not safetensors"),
+        ("size", "not a world model of accerl world-model"),
+    ],
+)
+def test_what_cannot_be_loaded(tmp_path: Path, harm: str, why: str):
     folder = tmp_path / "w"
     save_world_model(folder, model())
     if harm == "nowhere":
@@ -193,7 +201,7 @@ def test_what_cannot_be_loaded(tmp_path: Path, harm: str):
         content = json.loads((folder / "config.json").read_text())
         content["spec"]["action_dim"] = 7
         (folder / "config.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match="^path=.*not a world model of accerl world-model"):
+    with pytest.raises(InputError, match=f"^path=.*{why}"):
         load_world_model(folder)
 
 

@@ -1,0 +1,62 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Stock ``lerobot-train`` that runs no code from outside, unpickles nothing, and checks its dataset's files.
+
+Same arguments, same result. π0-FAST's action tokeniser, whose newest code LeRobot would fetch and run, is
+read by `policies.fast` instead. ``--code_revision=COMMIT`` has code from the Hub run, of this commit only.
+
+Run: ``python -m accerl_lerobot.demos.guarded_train <lerobot-train arguments>``
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+
+from accerl_lerobot.demos.dataset_files import checked
+from accerl_lerobot.demos.sft import CODE_REVISION, REFUSED
+from accerl_lerobot.policies.guard import guarded, input_error
+from accerl_lerobot.safety import Origin
+
+
+def main() -> None:
+    """Runs ``lerobot-train`` on the command line's arguments."""
+    from lerobot.scripts import lerobot_train
+
+    from accerl_lerobot.policies import fast
+
+    def given(prefix: str) -> str | None:
+        return next((a.removeprefix(prefix) for a in sys.argv[1:] if a.startswith(prefix)), None)
+
+    code, root, name = given(CODE_REVISION), given("--dataset.root="), given("--dataset.repo_id=")
+    origin = Origin("dataset.repo_id", name) if root is None else Origin("dataset.root", root)
+    sys.argv[1:] = [a for a in sys.argv[1:] if not a.startswith(CODE_REVISION)]
+    try:
+        with contextlib.ExitStack() as guards:
+            guards.enter_context(guarded("sft", code))
+            guards.enter_context(checked(origin, whole=root is not None))
+            if code is None:
+                guards.enter_context(fast.data_only())
+            lerobot_train.main()
+    except Exception as error:
+        if (refused := input_error(error)) is None:
+            raise
+        said = json.dumps([refused.field, str(refused.value), refused.remedy])
+        sys.stdout.write(f"{REFUSED}{said}\n")
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,331 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What is looked at before a file from outside is believed: its name, its size, what its header says.
+
+Checkpoints, world models and datasets may be anybody's. Everything here reads little, allocates less than the
+file is long, runs nothing, writes nothing, and either returns or raises an `InputError` that names the file.
+Free of torch and LeRobot.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import stat
+import string
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from accerl_lerobot.errors import InputError
+
+MIB = 1024**2
+JSON_MOST = 4 * MIB
+"""Bytes of a JSON file, unless it is one that is known to be larger."""
+HEADER_MOST = 16 * MIB
+"""Bytes of a safetensors header; the 4 B parameters of π0 need 0.1."""
+TENSORS_MOST, DIMS_MOST, NAME_MOST = 100_000, 8, 512
+PART_MOST, PATH_MOST = 255, 1024
+"""Bytes of one part of a file's name, and of all of it."""
+TEMPLATE_MOST = 256
+PICKLES = (".bin", ".pt", ".pth", ".pkl", ".pickle", ".ckpt")
+"""Endings of files that PyTorch unpickles, which may run whatever their author wished."""
+BITS = {
+    "F64": 64, "I64": 64, "U64": 64, "C64": 64, "F32": 32, "I32": 32, "U32": 32, "F16": 16, "BF16": 16,
+    "I16": 16, "U16": 16, "I8": 8, "U8": 8, "BOOL": 8, "F8_E4M3": 8, "F8_E5M2": 8,
+}  # fmt: skip
+"""safetensors dtype → bits of a number; those that LeRobot's checkpoints could hold."""
+REVISION = re.compile(r"[0-9a-f]{40}")
+HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}(/[A-Za-z0-9][\w.-]{0,95})?", re.ASCII)
+_DRIVE = re.compile(r"[A-Za-z]:")
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
+_WIDTH = re.compile(r"(0?[1-9])?d?")
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where files came from, as the user named it.
+
+    Example:
+        >>> raise Origin("policy.path", "runs/a").refuse("config.json", "it is empty; save it again")
+        Traceback (most recent call last):
+        accerl_lerobot.errors.InputError: policy.path='runs/a': config.json: it is empty; save it again
+    """
+
+    field: str
+    """Dotted name of the field that named it."""
+    value: str | None
+    """What it said."""
+
+    def refuse(self, file: str, why: str) -> InputError:
+        """The error to raise: a file or a key in it, and what is wrong and what to do."""
+        return InputError(self.field, self.value, f"{_shown(file)}: {why}")
+
+
+def safe_join(root: Path, name: object, origin: Origin) -> Path:
+    """`root` / `name`, where `name` was read from a file of somebody's.
+
+    Links may lead about within `root`; in the Hub's cache also to its blobs, which is how that is laid out.
+
+    Raises:
+        InputError: the name is no plain relative one, or leads out of `root`.
+    """
+    if why := _unsafe(name):
+        raise origin.refuse(str(name)[:PATH_MOST], f"{why}; only files inside the folder are read")
+    path = root / str(name)
+    try:
+        real, home = path.resolve(), root.resolve()
+    except (OSError, RuntimeError, ValueError) as error:
+        raise origin.refuse(str(name), "its links go in a circle; put the file itself there") from error
+    homes = [home]
+    if home.parent.name == "snapshots" and re.match(r"(models|datasets)--", home.parent.parent.name):
+        homes.append(home.parent.parent / "blobs")
+    if not any(real.is_relative_to(home) for home in homes):
+        raise origin.refuse(str(name), "a link that leads out of the folder; put the file itself there")
+    return path
+
+
+def check_name(name: object, what: str, origin: Origin) -> str:
+    """A name that will become part of a path, such as a camera's.
+
+    Raises:
+        InputError: it is no single plain part.
+    """
+    why = _unsafe(name) or ("it has a slash in it" if "/" in str(name) else "")
+    if why:
+        raise origin.refuse(what, f"the name {_shown(str(name))!r} cannot be part of a path: {why}")
+    return str(name)
+
+
+def check_template(template: object, fields: Mapping[str, type], what: str, origin: Origin) -> None:
+    """A path with places to be filled in by `str.format`, which can reach attributes and pad to gigabytes.
+
+    Args:
+        template: the text.
+        fields: the places there may be, and whether a number (int) or a name (str) goes there.
+        what: where it was found, for the error.
+        origin: likewise.
+
+    Raises:
+        InputError: it has other places, asks them for more than a width of one digit, or is no safe path.
+    """
+    known = ", ".join(f"{{{name}}}" for name in fields)
+    if not isinstance(template, str) or not 0 < len(template) <= TEMPLATE_MOST:
+        raise origin.refuse(what, f"not a text of up to {TEMPLATE_MOST} characters with places for {known}")
+    try:
+        parts = list(string.Formatter().parse(template))
+    except ValueError as error:
+        raise origin.refuse(what, f"{template!r} is no format ({error}); use {known}") from error
+    for _, name, spec, conversion in parts:
+        if name is None:
+            continue
+        if name not in fields or conversion is not None:
+            raise origin.refuse(what, f"{template!r} has a place {{{name}}}; only {known} may be used")
+        if not (_WIDTH.fullmatch(spec or "") if fields[name] is int else not spec):
+            raise origin.refuse(what, f"{template!r} asks for {spec!r}; use a width such as 03d, or none")
+    example = template.format(**{name: 0 if kind is int else "name" for name, kind in fields.items()})
+    if why := _unsafe(example):
+        raise origin.refuse(what, f"{template!r} is no path inside the folder: {why}")
+
+
+def read_bytes(path: Path, most: int, origin: Origin) -> bytes:
+    """A regular file's content.
+
+    Raises:
+        InputError: it is missing, something else than a file, too large, or unreadable.
+    """
+    size = file_size(path, origin)
+    if size > most:
+        remedy = f"{size} bytes, more than the {most} that such a file may have; it is not what it says"
+        raise origin.refuse(path.name, remedy)
+    try:
+        with path.open("rb") as file:
+            return file.read(most + 1)
+    except OSError as error:
+        raise origin.refuse(path.name, f"cannot be read ({error.strerror})") from error
+
+
+def file_size(path: Path, origin: Origin) -> int:
+    """Bytes of a regular file.
+
+    Raises:
+        InputError: it is missing or something else: reading a pipe or a device may never end.
+    """
+    try:
+        found = path.stat()
+    except (OSError, ValueError) as error:
+        raise origin.refuse(path.name, "is missing; give the whole folder") from error
+    if not stat.S_ISREG(found.st_mode):
+        raise origin.refuse(path.name, "not a regular file; give the whole folder")
+    return found.st_size
+
+
+def read_json(path: Path, origin: Origin, most: int = JSON_MOST) -> dict[str, Any]:
+    """The mapping in a JSON file.
+
+    Raises:
+        InputError: no such file, too large, too deep, or not a mapping in JSON.
+    """
+    raw = read_bytes(path, most, origin)
+    try:
+        content = json.loads(raw.decode())
+    except RecursionError as error:
+        raise origin.refuse(path.name, "nested too deeply; it is not what it says") from error
+    except ValueError as error:
+        raise origin.refuse(path.name, f"not good JSON ({error})") from error
+    if not isinstance(content, dict):
+        raise origin.refuse(path.name, f"a mapping is wanted, not {type(content).__name__}")
+    return content
+
+
+def check_safetensors(path: Path, origin: Origin) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """Reads a header and compares it with the file; no tensor is read.
+
+    Returns:
+        Dtype and shape by name.
+
+    Raises:
+        InputError: the header is not one, or promises what is not in the file.
+    """
+    size = file_size(path, origin)
+    try:
+        with path.open("rb") as file:
+            length = int.from_bytes(file.read(8), "little")
+            if size < 8 or not 2 <= length <= min(HEADER_MOST, size - 8):
+                remedy = f"not safetensors: a header of {length} bytes in a file of {size}; get it again"
+                raise origin.refuse(path.name, remedy)
+            header = json.loads(file.read(length).decode())
+    except OSError as error:
+        raise origin.refuse(path.name, f"cannot be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise origin.refuse(path.name, "not safetensors: its header is not JSON; get it again") from error
+    if not isinstance(header, dict) or len(header) > TENSORS_MOST:
+        raise origin.refuse(path.name, f"not safetensors with up to {TENSORS_MOST} tensors")
+    header.pop("__metadata__", None)
+    tensors, ranges = {}, []
+    for name, entry in header.items():
+        try:
+            tensors[name], found = _tensor(name, entry)
+        except (TypeError, ValueError, KeyError) as error:
+            raise origin.refuse(path.name, f"tensor {_shown(name)!r} is not whole; get it again") from error
+        ranges.append(found)
+    end = 0
+    for begin, finish in sorted(ranges):
+        if begin != end:
+            raise origin.refuse(path.name, "its tensors overlap or leave gaps; get it again")
+        end = finish
+    if 8 + length + end != size:
+        remedy = f"its tensors end at byte {8 + length + end}, the file at {size}; get it again"
+        raise origin.refuse(path.name, remedy)
+    return tensors
+
+
+def check_number(value: object, low: float, high: float, what: str, origin: Origin) -> None:
+    """A number within bounds, and no bool.
+
+    Raises:
+        InputError: it is something else.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+        raise origin.refuse(what, f"{_shown(repr(value))}; use {low:g} to {high:g}")
+
+
+def check_shape(shape: object, most: int, what: str, origin: Origin) -> None:
+    """Up to five sides of at least 1, `most` numbers in all.
+
+    Raises:
+        InputError: it is something else.
+    """
+    sides = shape if isinstance(shape, (list, tuple)) and len(shape) <= 5 else [None]
+    whole = all(isinstance(side, int) and not isinstance(side, bool) and side > 0 for side in sides)
+    if not whole or math.prod(sides) > most:
+        raise origin.refuse(what, f"shape {_shown(repr(shape))}; use up to 5 sides and {most} numbers")
+
+
+def check_not_pickled(folder: Path, weights: str, origin: Origin) -> None:
+    """Refuses a folder without `weights`, and says so where there are only weights that would be unpickled.
+
+    Raises:
+        InputError: see above.
+    """
+    if (folder / weights).is_file():
+        return
+    pickled = sorted(path.name for path in folder.iterdir() if path.suffix in PICKLES)
+    if pickled:
+        remedy = f"is missing, and {pickled[0]} is a pickle, which may run code when it is loaded; convert it"
+        raise origin.refuse(weights, f"{remedy} to safetensors where you trust it: save_pretrained does")
+    raise origin.refuse(weights, "is missing; give a folder with the weights as safetensors")
+
+
+def check_remote_code(trust: bool, revision: str | None, room: str, name: str = "code_revision") -> None:
+    """Code from the Hub is run only where it is asked for, and one version of it that is named.
+
+    Raises:
+        InputError: one of the two is missing, or the revision is not a commit.
+    """
+    if trust and revision is None:
+        remedy = "name the commit whose code you have read, 40 hexadecimal digits: it is run with your rights"
+        raise InputError(f"{room}.{name}", revision, remedy)
+    if revision is not None and not REVISION.fullmatch(revision):
+        remedy = "name a commit, 40 hexadecimal digits: branches and tags can be moved to other code"
+        raise InputError(f"{room}.{name}", revision, remedy)
+    if revision is not None and not trust:
+        raise InputError(f"{room}.{name}", revision, f"add {room}.trust_remote_code=true, or leave it out")
+
+
+def brief(error: BaseException) -> str:
+    """An error's words on one line, not more than a line's worth."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= 160 else text[:159] + "…"
+
+
+def _unsafe(name: object) -> str:
+    """Why a name must not be joined to a folder; empty if it may."""
+    if not isinstance(name, str) or not name:
+        return "not a name"
+    try:
+        size = len(name.encode())
+    except UnicodeEncodeError:
+        return "not good Unicode"
+    if size > PATH_MOST or any(len(part.encode()) > PART_MOST for part in name.split("/")):
+        return "too long"
+    if _CONTROL.search(name):
+        return "it has control characters"
+    if "\\" in name or _DRIVE.match(name):
+        return "a Windows path"
+    if name.startswith(("/", "~")):
+        return "it begins outside the folder"
+    parts = PurePosixPath(name).parts
+    if ".." in parts or not parts:
+        return "it leads out of the folder"
+    return ""
+
+
+def _tensor(name: str, entry: Any) -> tuple[tuple[str, tuple[int, ...]], tuple[int, int]]:
+    """Dtype, shape and range of a header's entry; ValueError, TypeError or KeyError if they disagree."""
+    shape, (begin, end), dtype = entry["shape"], entry["data_offsets"], entry["dtype"]
+    numbers = [*shape, begin, end]
+    if any(not isinstance(n, int) or isinstance(n, bool) or not 0 <= n < 2**48 for n in numbers):
+        raise ValueError(numbers)
+    if len(name) > NAME_MOST or len(shape) > DIMS_MOST or math.prod(shape) * BITS[dtype] != 8 * (end - begin):
+        raise ValueError(name)
+    return (dtype, tuple(shape)), (begin, end)
+
+
+def _shown(text: str) -> str:
+    return text if len(text) <= 80 else f"{text[:79]}…"

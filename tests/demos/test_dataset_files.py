@@ -1,0 +1,290 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What a dataset's files may say, and what LeRobot and `datasets` would have made of it."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+
+from accerl_lerobot.config import DatasetConfig
+from accerl_lerobot.demos import dataset_files
+from accerl_lerobot.demos.dataset_files import check_data, check_info, check_metadata, checked
+from accerl_lerobot.demos.windows import open_metadata
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.safety import Origin, read_json
+
+ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
+CAMERA = "observation.images.corner2"
+ORIGIN = Origin("dataset.root", "theirs")
+EPISODES, DATA = "meta/episodes/chunk-000/file-000.parquet", "data/chunk-000/file-000.parquet"
+
+
+@pytest.fixture
+def copied(tmp_path: Path) -> Path:
+    return Path(shutil.copytree(ROOT, tmp_path / "dataset"))
+
+
+def info() -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((ROOT / "meta/info.json").read_text())
+    return content
+
+
+def edit(root: Path, **changes: Any) -> None:
+    (root / "meta/info.json").write_text(json.dumps(info() | changes))
+
+
+def refused(root: Path, why: str) -> str:
+    """By the very call that every verb makes; LeRobot must not have read a byte of it."""
+    with pytest.raises(InputError, match=f"^dataset.root='.*': .*{why}") as caught:
+        open_metadata(DatasetConfig(repo_id="a/b", root=str(root)))
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_the_committed_one_passes():
+    check_metadata(ROOT, ORIGIN, whole=True)
+    check_data(ROOT, info(), ORIGIN)
+
+
+@pytest.mark.parametrize(
+    ("key", "template"),
+    [
+        ("data_path", "/etc/{chunk_index}"),
+        ("data_path", "../../{chunk_index}/{file_index}.parquet"),
+        ("data_path", "{chunk_index:999999999}"),
+        ("data_path", "{chunk_index.__class__.__mro__}"),
+        ("data_path", "{video_key}"),
+        ("video_path", "../{video_key}.mp4"),
+        ("video_path", "{video_key.__init__}"),
+        ("video_path", "{video_key:>999999999}"),
+    ],
+)
+def test_templates(copied: Path, key: str, template: str):
+    edit(copied, **{key: template})
+    refused(copied, f"meta/info.json: {key}: ")
+
+
+def feature(dtype: Any = "float32", shape: Any = (4,), **more: Any) -> dict[str, Any]:
+    return {"dtype": dtype, "shape": list(shape) if isinstance(shape, tuple) else shape, "names": None} | more
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"fps": 0}, "fps"),
+        ({"fps": 10**9}, "fps: 1000000000; use 1 to 10000"),
+        ({"fps": "80"}, "fps"),
+        ({"fps": True}, "fps"),
+        ({"total_frames": -1}, "total_frames"),
+        ({"total_frames": 10**30}, "total_frames"),
+        ({"total_episodes": 2.5}, "total_episodes"),
+        ({"total_episodes": 9}, "4 episodes, and meta/info.json says 9"),
+        ({"chunks_size": 0}, "chunks_size"),
+        ({"codebase_version": "v" * 100}, "codebase_version"),
+        ({"codebase_version": None}, "codebase_version"),
+        ({"features": {}}, "features"),
+        ({"features": {"../../x": feature()}}, "cannot be part of a path"),
+        ({"features": {"a/b": feature("video", (64, 64, 3))}}, "cannot be part of a path"),
+        ({"features": {"a": feature("object")}}, "a dtype is wanted"),
+        ({"features": {"a": feature([1])}}, "a dtype is wanted"),
+        ({"features": {"a": feature(shape=(10**9,))}}, "shape"),
+        ({"features": {"a": feature(shape=(1,) * 6)}}, "shape"),
+        ({"features": {"a": feature("image", (10**5, 10**5, 3))}}, "shape"),
+        ({"features": {"a": feature("video", (9000, 10, 3))}}, "an image has 3 sides of at most 8192"),
+        ({"features": {"a": feature("image", (64, 64))}}, "an image has 3 sides"),
+        ({"features": {"a": feature(info=7)}}, "info is a mapping"),
+    ],
+)
+def test_what_info_may_say(copied: Path, changes: dict[str, Any], why: str):
+    edit(copied, **changes)
+    refused(copied, f"meta/.*{why}")
+
+
+def test_cameras_of_any_usual_size():
+    for shape in ((480, 640, 3), (1080, 1920, 3), (4, 8, 1)):
+        check_info(info() | {"features": {"observation.images.top": feature("video", shape)}}, ORIGIN)
+
+
+@pytest.mark.parametrize(
+    "stats",
+    [{"action": 7}, {"action": {"mean": "x"}}, {"action": {"mean": [[1], [1, 2]]}}, {"a": {"b": [[None]]}}],
+)
+def test_statistics_are_numbers(copied: Path, stats: dict[str, Any]):
+    (copied / "meta/stats.json").write_text(json.dumps(stats))
+    refused(copied, "meta/stats.json: .*compute the statistics again|meta/stats.json: .*a mapping")
+
+
+def rewrite(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
+    with pq.ParquetFile(path) as file:
+        table = file.read()
+    pq.write_table(change(table), path)
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [
+        ("dataset_to_index", 10**9),
+        ("dataset_from_index", -1),
+        ("dataset_from_index", 300),
+        ("length", 10**8),
+        ("data/chunk_index", -1),
+        ("data/file_index", 10**15),
+        ("data/chunk_index", "../../x"),
+        ("data/chunk_index", None),
+        ("data/file_index", 0.5),
+    ],
+)
+def test_where_episodes_are(copied: Path, column: str, value: Any):
+    def change(table: pa.Table) -> pa.Table:
+        others = table.column(column).to_pylist()[1:]
+        values = [value] + [type(value)(x) if isinstance(value, (str, float)) else x for x in others]
+        return table.set_column(table.schema.get_field_index(column), column, pa.array(values))
+
+    rewrite(copied / EPISODES, change)
+    refused(copied, "meta/episodes/chunk-000/file-000.parquet: ")
+
+
+def test_columns_that_would_open_other_files(copied: Path, tmp_path: Path):
+    """`datasets` makes an image of a text in the metadata, where the file says that it is one."""
+    picture = tmp_path / "secret.png"
+    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(picture)
+    described = {"info": {"features": {"robot": {"_type": "Image"}}}}
+
+    def change(table: pa.Table) -> pa.Table:
+        table = table.append_column("robot", pa.array([str(picture)] * len(table)))
+        for name in table.schema.names:
+            if name != "robot":
+                described["info"]["features"][name] = {"_type": "Value", "dtype": "int64"}
+        return table.replace_schema_metadata({"huggingface": json.dumps(described)})
+
+    rewrite(copied / EPISODES, change)
+    refused(copied, "columns of kind Image, which name other files")
+
+
+def test_structures_do_not_belong_into_metadata(copied: Path):
+    images = pa.array([{"bytes": None, "path": "/etc/hostname"}] * 4)
+    rewrite(copied / EPISODES, lambda table: table.append_column("picture", images))
+    refused(copied, "column picture of struct<.*use numbers and texts")
+
+
+def test_a_million_equal_rows_in_a_few_bytes(copied: Path):
+    text = "x" * 60_000
+    codes = pa.DictionaryArray.from_arrays(pa.array(np.zeros(10**6, np.int32)), pa.array([text]))
+    pq.write_table(pa.table({"task_index": np.arange(10**6), "task": codes}), copied / "meta/tasks.parquet")
+    assert (copied / "meta/tasks.parquet").stat().st_size < 12 * 2**20, "and 60 GB once it is read"
+    refused(copied, "meta/tasks.parquet: (a text of more than|.*too many of them|.*of dictionary)")
+
+
+def data_with(root: Path, images: list[dict[str, Any]]) -> None:
+    def change(table: pa.Table) -> pa.Table:
+        at = table.schema.get_field_index(CAMERA)
+        rows = images + table.column(CAMERA).to_pylist()[len(images) :]
+        kind = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+        return table.set_column(at, CAMERA, pa.array(rows, kind))
+
+    rewrite(root / DATA, change)
+
+
+@pytest.mark.parametrize(
+    ("image", "why"),
+    [
+        ({"bytes": None, "path": "/etc/hostname"}, "an image without its bytes"),
+        ({"bytes": None, "path": "http://127.0.0.1:9/x.png"}, "an image without its bytes"),
+        (None, "an image without its bytes"),
+        ({"bytes": b"x", "path": "/etc/hostname"}, "cannot be part of a path"),
+        ({"bytes": b"x", "path": "../x.png"}, "cannot be part of a path"),
+        ({"bytes": b"x", "path": "zip://a::b"}, "cannot be part of a path"),
+    ],
+)
+def test_images_lie_in_their_rows(copied: Path, image: Any, why: str):
+    data_with(copied, [image])
+    with pytest.raises(InputError, match=f"^dataset.root='theirs': data/chunk-000/file-000.parquet: .*{why}"):
+        check_data(copied, info(), ORIGIN)
+
+
+def test_lerobot_would_open_the_file_that_a_row_names(copied: Path, tmp_path: Path):
+    """Why this is checked: the same dataset, with LeRobot alone and with the check."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    secret = tmp_path / "secret.png"
+    Image.fromarray(np.full((64, 64, 3), 200, np.uint8)).save(secret)
+    data_with(copied, [{"bytes": None, "path": str(secret)}])
+    read = LeRobotDataset("a/b", root=copied, video_backend="pyav")[0][CAMERA]
+    assert abs(float(read.mean()) - 200 / 255) < 0.01
+    with checked(ORIGIN), pytest.raises(InputError, match="an image without its bytes"):
+        LeRobotDataset("a/b", root=copied, video_backend="pyav")
+
+
+def test_an_image_that_unpacks_to_gigabytes(copied: Path, monkeypatch: pytest.MonkeyPatch):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    monkeypatch.setattr(dataset_files, "PIXELS_MOST", 10_000)
+    packed = io.BytesIO()
+    Image.new("RGB", (400, 300)).save(packed, "PNG")
+    data_with(copied, [{"bytes": packed.getvalue(), "path": None}])
+    before = Image.MAX_IMAGE_PIXELS
+    with checked(ORIGIN):
+        dataset = LeRobotDataset("a/b", root=copied, video_backend="pyav")
+        with pytest.raises(Image.DecompressionBombError):
+            dataset[0]
+    assert before == Image.MAX_IMAGE_PIXELS
+
+
+def test_links_out_of_the_folder(copied: Path, tmp_path: Path):
+    for part in ("meta/info.json", "meta/tasks.parquet", EPISODES):
+        (copied / part).rename(tmp_path / "outside")
+        (copied / part).symlink_to(tmp_path / "outside")
+        refused(copied, "a link that leads out of the folder")
+        (copied / part).unlink()
+        (tmp_path / "outside").rename(copied / part)
+    (copied / "data/chunk-000").rename(tmp_path / "elsewhere")
+    (copied / "data/chunk-000").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(InputError, match="a link that leads out of the folder"):
+        check_data(copied, info(), ORIGIN)
+
+
+def test_more_rows_than_frames(copied: Path):
+    shutil.copy(copied / DATA, copied / "data/chunk-000/file-001.parquet")
+    with pytest.raises(InputError, match="file-001.parquet: more rows than the 365 frames"):
+        check_data(copied, read_json(copied / "meta/info.json", ORIGIN), ORIGIN)
+
+
+@pytest.mark.parametrize("part", ["meta/tasks.parquet", EPISODES])
+def test_a_local_dataset_is_not_completed_from_the_hub(copied: Path, part: str):
+    (copied / part).unlink()
+    refused(copied, "is missing; give the whole folder|0 episodes, and meta/info.json says 4")
+
+
+def test_one_from_the_hub_is_checked_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """What has just been fetched, before LeRobot reads it."""
+    from lerobot.datasets import dataset_metadata
+
+    fetched = Path(shutil.copytree(ROOT, tmp_path / "fetched"))
+    edit(fetched, data_path="../../{chunk_index}")
+    monkeypatch.setattr(dataset_metadata, "HF_LEROBOT_HOME", tmp_path / "home")
+    monkeypatch.setattr(dataset_metadata, "get_safe_version", lambda *_: "v3.0")
+    monkeypatch.setattr(dataset_metadata, "snapshot_download", lambda *_, **__: str(fetched))
+    with pytest.raises(InputError, match="^dataset.repo_id='them/data': meta/info.json: data_path: "):
+        open_metadata(DatasetConfig(repo_id="them/data"))

@@ -1,0 +1,132 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""LeRobot's trainer runs no code that comes with a tokeniser, a policy or a dataset."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from accerl_lerobot.demos import cached_train, guarded_train, sft
+from accerl_lerobot.demos.sft import CODE_REVISION, REFUSED, SFTConfig, run_sft, sft_command
+from accerl_lerobot.errors import InputError
+from tests.policies.checkpoints import write_gaussian_actor
+from tests.policies.test_pi0_fast_loading import remote
+from tests.policies.tiny_pi import ACTIONS, COMMIT, PALIGEMMA, hub
+
+ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
+
+
+def run(
+    monkeypatch: pytest.MonkeyPatch, work: Callable[[], Any], *arguments: str, module: Any = guarded_train
+) -> Any:
+    """`work` where LeRobot's trainer would be; gives what it returns."""
+    from lerobot.scripts import lerobot_train
+
+    got: list[Any] = []
+    monkeypatch.setattr(lerobot_train, "main", lambda: got.append(work()))
+    monkeypatch.setattr(sys, "argv", ["lerobot-train", *arguments])
+    module.main()
+    return got[0]
+
+
+def tokenise() -> Any:
+    """As π0-FAST's training does: LeRobot asks for the newest code and runs it."""
+    from lerobot.processor.tokenizer_processor import ActionTokenizerProcessorStep
+
+    step = ActionTokenizerProcessorStep(action_tokenizer_name=ACTIONS, paligemma_tokenizer_name=PALIGEMMA)
+    return type(step.action_tokenizer).__name__
+
+
+@pytest.mark.parametrize("module", [guarded_train, cached_train])
+def test_pi0_fast_s_tokeniser_is_read_and_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: Any
+):
+    with hub(tmp_path):
+        marker = remote(tmp_path, monkeypatch)
+        assert run(monkeypatch, tokenise, module=module) == "FastTokenizer"
+    assert not marker.exists()
+
+
+def test_its_code_is_run_at_the_commit_that_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    with hub(tmp_path):
+        marker = remote(tmp_path, monkeypatch)
+        with pytest.raises(SystemExit):  # no such commit here, and the Hub is offline
+            run(monkeypatch, lambda: _refusing(tokenise), f"{CODE_REVISION}{'f' * 40}")
+        assert not marker.exists()
+        assert run(monkeypatch, tokenise, f"{CODE_REVISION}{COMMIT}") == "UniversalActionProcessor"
+    assert marker.exists() and sys.argv == ["lerobot-train"], "the argument is ours and not LeRobot's"
+
+
+def _refusing(work: Callable[[], Any]) -> Any:
+    try:
+        return work()
+    except OSError as error:
+        raise InputError("sft.code_revision", "", "no such commit") from error
+
+
+def test_a_refusal_is_one_line_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    said = json.dumps(["sft.trust_remote_code", "x.py", "read it"])
+    program = f"print('Traceback')\nprint({REFUSED + said!r})\nraise SystemExit(2)"
+    monkeypatch.setattr(sft, "sft_command", lambda *_: [sys.executable, "-c", program])
+    with pytest.raises(InputError) as caught:
+        run_sft(SFTConfig(steps=1), "a/b", None, tmp_path / "sft", seed=0)
+    assert str(caught.value) == "sft.trust_remote_code='x.py': read it"
+
+
+def test_a_hostile_dataset_ends_the_training_in_a_line(tmp_path: Path):
+    """The real trainer, in a process of its own."""
+    root = Path(shutil.copytree(ROOT, tmp_path / "data"))
+    info = json.loads((root / "meta/info.json").read_text())
+    (root / "meta/info.json").write_text(json.dumps(info | {"data_path": "{chunk_index:999999999}"}))
+    small = {"type": "act", "chunk_size": 4, "n_action_steps": 4, "pretrained_backbone_weights": None}
+    with pytest.raises(InputError, match="^dataset.root=.*meta/info.json: data_path: .*use a width"):
+        run_sft(SFTConfig(steps=1, policy=small), "a/b", str(root), tmp_path / "sft", seed=0)
+
+
+def test_a_hostile_start_is_refused_before_anything_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    start, marker = write_gaussian_actor(tmp_path / "start"), tmp_path / "was-run"
+    steps = {"steps": [{"class": "subprocess.Popen", "config": {"args": ["touch", str(marker)]}}]}
+    (start / "policy_preprocessor.json").write_text(json.dumps(steps))
+    monkeypatch.setattr(sft.subprocess, "Popen", None)
+    with pytest.raises(InputError, match="^sft.init_path=.*only steps with a registry_name"):
+        run_sft(SFTConfig(steps=1, init_path=str(start)), "a/b", None, tmp_path / "sft", seed=0)
+    assert not marker.exists() and not (tmp_path / "sft.log").exists()
+
+
+def test_trust_is_asked_for_with_a_commit(tmp_path: Path):
+    with pytest.raises(InputError, match="^sft.code_revision=None: name the commit"):
+        SFTConfig(trust_remote_code=True)
+    with pytest.raises(InputError, match="^sft.code_revision='main': name a commit"):
+        SFTConfig(trust_remote_code=True, code_revision="main")
+    config = SFTConfig(steps=1, policy={"type": "act"}, trust_remote_code=True, code_revision=COMMIT)
+    command = sft_command(config, "a/b", None, tmp_path / "sft", 0, "cpu")
+    assert f"{CODE_REVISION}{COMMIT}" in command
+    plain = sft_command(SFTConfig(steps=1, policy={"type": "act"}), "a/b", None, tmp_path / "sft", 0, "cpu")
+    assert not [a for a in plain if a.startswith(CODE_REVISION)]
+
+
+def test_the_trainer_does_not_get_ray_s_token(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for name in ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH", "RAY_AUTH_MODE"):
+        monkeypatch.setenv(name, "secret-of-ray")
+    program = "import os\nprint([k for k in os.environ if k.startswith('RAY_AUTH')])"
+    monkeypatch.setattr(sft, "sft_command", lambda *_: [sys.executable, "-c", program])
+    run_sft(SFTConfig(steps=1), "a/b", None, tmp_path / "sft", seed=0)
+    assert (tmp_path / "sft.log").read_text().strip() == "[]"

@@ -1,0 +1,291 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Files as somebody might send them: good ones, changed at random, and the checks and loaders that read them.
+
+Run: ``python -m tests.hostile SEED SCRATCH TIMES`` goes through it under limits of memory and time, and
+prints how many were refused and how many were found good. A test starts it in a process of its own, because a
+crash in a library would take the whole session along.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from accerl_lerobot.errors import InputError
+
+DATASET = Path(__file__).parents[1] / "datasets" / "metaworld_tiny"
+MEMORY = 3 * 1024**3
+"""Bytes of address space beyond what the libraries take."""
+SECONDS = 60
+"""For a single file."""
+VALUES: tuple[Any, ...] = (
+    None, True, False, 0, -1, 1, 2, 3, 7, 64, 4097, 10**6, 10**9, 2**31, 2**63, 10**30, 10**400, 0.5, -0.0,
+    1e308, float("nan"), float("inf"), "", "a", "..", "../../x", "/etc/passwd", "C:\\x", "a\x00b", "\ud800",
+    "x" * 5000, "{0.__class__}", "{chunk_index:999999999}", "{chunk_index.real}", "{video_key!r:>99999}", "{",
+    "}", "float32", "image", "video", "smolvla", "gaussian_actor", "act", "subprocess.Popen", "builtins.eval",
+    [], [[]], {}, [1, 2], [0, 0, 0], [10**6, 10**6, 3], ["a"], [None], {"a": 1}, {"type": "act"},
+    {"shape": [3], "dtype": "float32"},
+)  # fmt: skip
+NAMES = (
+    "..", ".", "", "/", "//", "\\", "a", "data", "C:", "C:\\", "~", "~root", "\x00", "\n", "\x7f", "\ud800",
+    "%2e%2e", "..;", "...", " ", "x" * 256, "é" * 128, "file.parquet", "CON", "{chunk_index}", "$HOME", "-rf",
+)  # fmt: skip
+
+
+class TimeLimitError(Exception):
+    """A single file took too long."""
+
+
+def changed_bytes(content: bytes, rng: random.Random) -> bytes:
+    """A few flips, cuts, insertions and copies; more often than not near the beginning, where headers are."""
+    raw = bytearray(content)
+    for _ in range(rng.choice((1, 1, 1, 2, 4, 16))):
+        near = min(len(raw), 400) if rng.random() < 0.6 else len(raw)
+        at = rng.randrange(near + 1)
+        kind = rng.randrange(6)
+        if kind == 0 and at < len(raw):
+            raw[at] ^= 1 << rng.randrange(8)
+        elif kind == 1 and at < len(raw):
+            raw[at] = rng.choice((0, 0x7F, 0xFF, 0x30, 0x39, 0x22, 0x7B, rng.randrange(256)))
+        elif kind == 2:
+            del raw[at : at + rng.choice((1, 2, 8, 64))]
+        elif kind == 3:
+            raw[at:at] = bytes(rng.randrange(256) for _ in range(rng.choice((1, 2, 8))))
+        elif kind == 4:
+            raw[at:at] = raw[at : at + rng.choice((4, 32, 256))]
+        else:
+            del raw[at:]
+    return bytes(raw)
+
+
+def changed_tree(tree: Any, rng: random.Random) -> Any:
+    """A copy in which a few values are others, keys are gone, or have other names."""
+    tree = json.loads(json.dumps(tree))
+    for _ in range(rng.choice((1, 1, 1, 2, 5))):
+        places = list(_places(tree))
+        if not places:
+            return rng.choice(VALUES)
+        holder, key = rng.choice(places)
+        kind = rng.random()
+        if kind < 0.75:
+            holder[key] = json.loads(json.dumps(rng.choice(VALUES), allow_nan=True))
+        elif kind < 0.85:
+            del holder[key]
+        elif isinstance(holder, dict):
+            holder[str(rng.choice((*VALUES, *NAMES)))[:300]] = holder.pop(key)
+        else:
+            holder.append(holder[key])
+    return tree
+
+
+def _places(tree: Any) -> Iterator[tuple[Any, Any]]:
+    keys: Any = tree.keys() if isinstance(tree, dict) else range(len(tree)) if isinstance(tree, list) else ()
+    for key in list(keys):
+        yield tree, key
+        yield from _places(tree[key])
+
+
+def hostile_names(rng: random.Random) -> Iterator[str]:
+    """Names that are put together of `NAMES`, without end."""
+    while True:
+        parts = [rng.choice(NAMES) for _ in range(rng.choice((1, 2, 2, 3, 5, 400)))]
+        first = rng.choice(("", "/", "./", "../", "\\\\host\\", "file://"))
+        yield first + rng.choice(("/", "/", "\\")).join(parts)
+
+
+def write_examples(scratch: Path) -> dict[str, Path]:
+    """A small world model, a small checkpoint and a dataset, all of them good."""
+    from accerl_lerobot.policies.config import PolicyConfig
+    from accerl_lerobot.policies.loading import load_adapter, save_pretrained
+    from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig
+    from accerl_lerobot.world_model.contract import WorldModelSpec
+    from accerl_lerobot.world_model.pixels import PixelWorldModel
+    from accerl_lerobot.world_model.store import Source, save_world_model
+    from accerl_lerobot.world_model.success_plugin.configuration_success_pairs import SuccessPairsConfig
+    from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+    from tests.policies.checkpoints import write_gaussian_actor
+
+    spec = WorldModelSpec(
+        cameras=("observation.images.front",), image_size=(8, 8), state_dim=2, action_dim=2, chunk=2, fps=10,
+        context=1, provides=frozenset({"pixels", "state"}),
+    )  # fmt: skip
+    network = NetworkConfig(channels=(8,), condition=8, planes=2)
+    world = PixelWorldModel(spec, PixelModelConfig(context=1, heads=2, network=network))
+    success = SuccessPairsRewardModel(SuccessPairsConfig(chunk=2, channels=(8,), hidden=8, device="cpu"))
+    source = Source(repo_id="a/b", fingerprint="0", learnt=(0, 1), held_out=(2,))
+    save_world_model(scratch / "world_model", world, success, source)
+    config = PolicyConfig(path=str(write_gaussian_actor(scratch / "made")), device="cpu")
+    save_pretrained(load_adapter(config), scratch / "policy", config)
+    shutil.copytree(DATASET, scratch / "dataset")
+    return {name: scratch / name for name in ("world_model", "policy", "dataset")}
+
+
+class Trial:
+    """Runs checks and loaders on changed files, and counts what became of them."""
+
+    def __init__(self, rng: random.Random, scratch: Path) -> None:
+        self.rng, self.scratch, self.outcomes = rng, scratch, Counter[str]()
+        self.written: set[str] = set()
+        signal.signal(signal.SIGALRM, _too_long)
+        sys.addaudithook(self._audit)
+
+    def one(self, name: str, run: Callable[[], object], what: object) -> None:
+        """Whatever is neither good nor refused ends all of it, with what it was made of."""
+        signal.setitimer(signal.ITIMER_REAL, SECONDS)
+        try:
+            run()
+        except InputError as error:
+            said = str(error)
+            if "\n" in said or not error.remedy or len(said) > 2000:
+                raise AssertionError(f"{name}: no line for people: {said[:500]!r}") from error
+            self.outcomes[f"{name} refused"] += 1
+        except BaseException as error:
+            error.add_note(f"{name}: {str(what)[:3000]}")
+            raise
+        else:
+            self.outcomes[f"{name} good"] += 1
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+
+    def trees(self, name: str, tree: Any, check: Callable[[Any], object], count: int) -> None:
+        """Content that has been parsed."""
+        for _ in range(count):
+            made = changed_tree(tree, self.rng)
+            if isinstance(made, dict):
+                self.one(name, lambda made=made: check(made), made)
+
+    def files(self, name: str, path: Path, check: Callable[[], object], count: int) -> None:
+        """A file's bytes, or, of JSON, every other time its content; it is put back in the end."""
+        good = path.read_bytes()
+        tree = json.loads(good) if path.suffix == ".json" else None
+        for i in range(count):
+            made = changed_bytes(good, self.rng)
+            if tree is not None and i % 2:
+                made = json.dumps(changed_tree(tree, self.rng)).encode("utf-8", "surrogatepass")
+            path.write_bytes(made)
+            self.one(name, check, f"{path.name}: {made[:2000]!r}")
+        path.write_bytes(good)
+
+    def _audit(self, event: str, arguments: tuple[Any, ...]) -> None:
+        if event == "open" and isinstance(arguments[0], (str, bytes)):
+            path, _, flags = arguments
+            if isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
+                self.written.add(os.fsdecode(path))
+        elif event in ("subprocess.Popen", "os.system", "os.exec", "socket.connect"):
+            self.written.add(f"{event} {arguments}")
+
+
+def _too_long(*_: object) -> None:
+    raise TimeLimitError(f"more than {SECONDS} s")
+
+
+def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
+    """What is called before anything is loaded."""
+    from accerl_lerobot.demos.dataset_files import check_data, check_info, check_metadata, check_stats
+    from accerl_lerobot.policies import files
+    from accerl_lerobot.safety import Origin, check_safetensors, read_json
+    from accerl_lerobot.world_model.bounds import check_pixel_model, check_spec, check_success_model
+
+    origin = Origin("path", "hostile")
+    world, policy, dataset = at["world_model"], at["policy"], at["dataset"]
+    weights = trial.scratch / "few.safetensors"
+    weights.write_bytes((policy / "value_head.safetensors").read_bytes())
+    trial.files("safetensors", weights, lambda: check_safetensors(weights, origin), 300 * times)
+    content = json.loads((world / "config.json").read_text())
+    trial.trees("spec", content["spec"], lambda t: check_spec(t, origin), 60 * times)
+    trial.trees("pixel model", content["model"], lambda t: check_pixel_model(t, origin), 60 * times)
+    said = json.loads((world / "success_model" / "config.json").read_text())
+    trial.trees("success model", said, lambda t: check_success_model(t, origin), 60 * times)
+    config = json.loads((policy / "config.json").read_text())
+    trial.trees("policy config", config, lambda t: files.check_policy_config(t, origin), 120 * times)
+    ours = json.loads((policy / "accerl.json").read_text())
+    trial.trees("accerl.json", ours, lambda t: files.check_ours(t, origin), 40 * times)
+    file = policy / "accerl.json"
+    trial.files("JSON", file, lambda: read_json(file, origin), 130 * times)
+    name = "policy_preprocessor.json"
+    trial.files("processor", policy / name, lambda: files.check_processor(policy, name, origin), 60 * times)
+    trial.files(
+        "checkpoint", policy / "config.json", lambda: files.check_checkpoint(policy, origin), 5 * times
+    )
+    info = json.loads((dataset / "meta/info.json").read_text())
+    trial.trees("info.json", info, lambda t: check_info(t, origin), 150 * times)
+    stats = {"action": json.loads((dataset / "meta/stats.json").read_text())["action"]}
+    trial.trees("stats.json", stats, lambda t: check_stats(t, origin), 100 * times)
+    for part in ("meta/info.json", "meta/tasks.parquet", "meta/episodes/chunk-000/file-000.parquet"):
+        trial.files(part, dataset / part, lambda: check_metadata(dataset, origin), 3 * times)
+    data = dataset / "data/chunk-000/file-000.parquet"
+    footer = data.read_bytes()
+    for _ in range(times // 4):  # the description of its columns is at its end
+        tail = changed_bytes(footer[-9000:][::-1], trial.rng)[::-1]
+        data.write_bytes(footer[:-9000] + tail)
+        trial.one("data", lambda: check_data(dataset, info, origin), tail[-400:])
+    data.write_bytes(footer)
+
+
+def loaders(trial: Trial, at: dict[str, Path], times: int) -> None:
+    """All of it, as a run does."""
+    from accerl_lerobot.config import DatasetConfig
+    from accerl_lerobot.demos.windows import open_metadata
+    from accerl_lerobot.policies.config import PolicyConfig
+    from accerl_lerobot.policies.loading import load_adapter
+    from accerl_lerobot.world_model.store import load_source, load_world_model
+
+    world, policy, dataset = at["world_model"], at["policy"], at["dataset"]
+
+    def whole_world() -> None:
+        load_source(world)
+        load_world_model(world)
+
+    for part, share in (("config.json", 8), ("model.safetensors", 8), ("success_model/config.json", 4)):
+        trial.files(f"load world model, {part}", world / part, whole_world, share * times)
+    config = PolicyConfig(path=str(policy), device="cpu")
+    for part in ("config.json", "accerl.json", "policy_preprocessor.json", "policy_postprocessor.json"):
+        trial.files(f"load policy, {part}", policy / part, lambda: load_adapter(config), times)
+    for part in ("model.safetensors", "value_head.safetensors"):
+        trial.files(f"load policy, {part}", policy / part, lambda: load_adapter(config), times // 2)
+    named = DatasetConfig(repo_id="a/b", root=str(dataset))
+    for part in ("info.json", "stats.json", "tasks.parquet", "episodes/chunk-000/file-000.parquet"):
+        trial.files(
+            f"open dataset, {part}", dataset / "meta" / part, lambda: open_metadata(named), times // 2
+        )
+
+
+def main(seed: int, scratch: Path, times: int) -> dict[str, Any]:
+    """Goes through all of it; gives what became of how many."""
+    os.environ["HF_DATASETS_CACHE"] = str(scratch / "cache")
+    tempfile.tempdir = str(scratch)
+    at = write_examples(scratch)
+    trial = Trial(random.Random(seed), scratch)
+    taken = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    resource.setrlimit(resource.RLIMIT_AS, (taken + MEMORY, taken + MEMORY))
+    loaders(trial, at, times)
+    checks(trial, at, times)
+    outside = [path for path in trial.written if not Path(path).is_relative_to(scratch)]
+    return {"outcomes": dict(sorted(trial.outcomes.items())), "written": sorted(outside)[:20]}
+
+
+if __name__ == "__main__":
+    found = main(int(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]))
+    sys.stdout.write(json.dumps(found) + "\n")

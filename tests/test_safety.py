@@ -1,0 +1,336 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Names, sizes and headers from outside: what is refused, and that it is said in one line."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import struct
+import subprocess
+import sys
+import threading
+from itertools import islice
+from pathlib import Path, PureWindowsPath
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.safety import (
+    HEADER_MOST,
+    Origin,
+    check_name,
+    check_not_pickled,
+    check_remote_code,
+    check_safetensors,
+    check_shape,
+    check_template,
+    read_json,
+    safe_join,
+)
+from tests.hostile import hostile_names
+
+ORIGIN = Origin("policy.path", "runs/theirs")
+INDICES = {"chunk_index": int, "file_index": int, "video_key": str}
+
+
+def test_twenty_thousand_hostile_names_stay_inside(tmp_path: Path):
+    """Either refused, or a path below the folder, here and on Windows; nothing is made on the way."""
+    root = tmp_path / "root"
+    (root / "data").mkdir(parents=True)
+    (tmp_path / "secret").write_text("secret")
+    (root / "a").symlink_to(tmp_path / "secret")
+    (root / "chunk-000").symlink_to("..")
+    before = sorted(tmp_path.rglob("*"))
+    joined = refused = 0
+    for name in islice(hostile_names(random.Random(0)), 20_000):
+        try:
+            path = safe_join(root, name, ORIGIN)
+        except InputError as error:
+            assert error.field == "policy.path" and "\n" not in str(error)
+            refused += 1
+            continue
+        joined += 1
+        assert path.resolve().is_relative_to(root.resolve()) and path != root
+        assert os.path.realpath(os.path.join(root, name)).startswith(f"{root.resolve()}/")
+        assert not PureWindowsPath(name).is_absolute() and ".." not in PureWindowsPath(name).parts
+    assert joined > 500 and refused > 5_000
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("/etc/passwd", "begins outside"),
+        ("../../etc/passwd", "leads out"),
+        ("data/../../x", "leads out"),
+        ("C:/x", "Windows path"),
+        ("a\\..\\x", "Windows path"),
+        ("a\x00b", "control characters"),
+        ("a\nb", "control characters"),
+        ("x" * 256, "too long"),
+        ("/".join(["x" * 200] * 6), "too long"),
+        ("\ud800", "not good Unicode"),
+        ("~/x", "begins outside"),
+        (".", "leads out"),
+        ("", "not a name"),
+        (None, "not a name"),
+        (7, "not a name"),
+    ],
+)
+def test_names_that_are_refused(tmp_path: Path, name: object, why: str):
+    with pytest.raises(InputError, match=f"^policy.path='runs/theirs': .*{why}") as caught:
+        safe_join(tmp_path, name, ORIGIN)
+    assert "\n" not in str(caught.value)
+
+
+def test_links_lead_about_inside_and_in_the_hub_s_cache_only(tmp_path: Path):
+    root = tmp_path / "root"
+    (root / "data").mkdir(parents=True)
+    (root / "data" / "x").write_text("x")
+    (tmp_path / "secret").write_text("secret")
+    (root / "inside").symlink_to("data/x")
+    (root / "folder").symlink_to(tmp_path)
+    (root / "circle").symlink_to("circle")
+    assert safe_join(root, "inside", ORIGIN).read_text() == "x"
+    for name in ("folder/secret", "folder"):
+        with pytest.raises(InputError, match="a link that leads out"):
+            safe_join(root, name, ORIGIN)
+    with pytest.raises(InputError, match="circle|leads out"):
+        safe_join(root, "circle/x", ORIGIN)
+    snapshot = tmp_path / "hub" / "models--a--b" / "snapshots" / "abc"
+    blobs = tmp_path / "hub" / "models--a--b" / "blobs"
+    for folder in (snapshot, blobs):
+        folder.mkdir(parents=True)
+    (blobs / "f00").write_text("{}")
+    (snapshot / "config.json").symlink_to("../../blobs/f00")
+    (snapshot / "other").symlink_to("../../../../secret")
+    assert safe_join(snapshot, "config.json", ORIGIN).read_text() == "{}"
+    with pytest.raises(InputError, match="leads out"):
+        safe_join(snapshot, "other", ORIGIN)
+
+
+@pytest.mark.parametrize(
+    "template",
+    [
+        "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "videos/{video_key}/chunk-{chunk_index:d}/file-{file_index}.mp4",
+        "all.parquet",
+        "{{literal}}/{chunk_index}",
+    ],
+)
+def test_templates_that_are_filled_in(template: str):
+    check_template(template, INDICES, "info.json: data_path", ORIGIN)
+
+
+@pytest.mark.parametrize(
+    ("template", "why"),
+    [
+        ("{chunk_index.__class__}", "only {chunk_index}"),
+        ("{chunk_index.real}", "only {chunk_index}"),
+        ("{video_key[0]}", "only {chunk_index}"),
+        ("{0}", "only {chunk_index}"),
+        ("{}", "only {chunk_index}"),
+        ("{other}", "only {chunk_index}"),
+        ("{chunk_index:999999999}", "use a width"),
+        ("{chunk_index:010d}", "use a width"),
+        ("{chunk_index:{file_index}}", "use a width"),
+        ("{chunk_index:x>9}", "use a width"),
+        ("{video_key:>99}", "use a width"),
+        ("{video_key!r}", "only {chunk_index}"),
+        ("{chunk_index", "is no format"),
+        ("}", "is no format"),
+        ("/abs/{chunk_index}", "begins outside"),
+        ("../{chunk_index}", "leads out"),
+        ("C:{chunk_index}", "Windows path"),
+        ("a" * 300, "up to 256"),
+        ("", "up to 256"),
+        (None, "up to 256"),
+    ],
+)
+def test_templates_that_are_refused(template: object, why: str):
+    with pytest.raises(InputError, match="info.json: data_path: ") as caught:
+        check_template(template, INDICES, "info.json: data_path", ORIGIN)
+    assert why in str(caught.value)
+
+
+def test_a_camera_s_name_cannot_climb():
+    assert check_name("observation.images.front", "camera", ORIGIN) == "observation.images.front"
+    for name in ("a/b", "../x", "..", "", "a\x00"):
+        with pytest.raises(InputError, match="cannot be part of a path"):
+            check_name(name, "camera", ORIGIN)
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b"{", "not good JSON"),
+        (b"\xff\xfe", "not good JSON"),
+        (b'{"a": ' + b"9" * 5000 + b"}", "not good JSON"),
+        (b"[1]", "a mapping is wanted, not list"),
+        (b"[" * 200_000, "nested too deeply"),
+        (b'{"a":' * 200_000, "nested too deeply"),
+        (b" " * 2000, "more than the 1000"),
+    ],
+)
+def test_json_that_is_refused(tmp_path: Path, content: bytes, why: str):
+    path = tmp_path / "config.json"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=f"^policy.path='runs/theirs': config.json: .*{why}"):
+        read_json(path, ORIGIN, 1000 if content.startswith(b" ") else 10**7)
+
+
+def test_what_is_no_file_is_not_waited_for(tmp_path: Path):
+    os.mkfifo(tmp_path / "config.json")
+    (tmp_path / "folder.json").mkdir()
+    found: list[str] = []
+
+    def look() -> None:
+        for name in ("config.json", "folder.json"):
+            with pytest.raises(InputError) as caught:
+                read_json(tmp_path / name, ORIGIN)
+            found.append(caught.value.remedy)
+
+    thread = threading.Thread(target=look, daemon=True)
+    thread.start()
+    thread.join(10)
+    assert len(found) == 2 and all("not a regular file" in said for said in found)
+
+
+def stored(path: Path, header: object, data: bytes = b"", length: int | None = None) -> Path:
+    raw = header if isinstance(header, bytes) else json.dumps(header).encode()
+    path.write_bytes(struct.pack("<Q", len(raw) if length is None else length) + raw + data)
+    return path
+
+
+def entry(shape: object, begin: object, end: object, dtype: object = "F32") -> dict[str, object]:
+    return {"dtype": dtype, "shape": shape, "data_offsets": [begin, end]}
+
+
+def test_a_header_is_what_safetensors_wrote(tmp_path: Path):
+    arrays = {"a": np.zeros((2, 3), np.float32), "b": np.ones(5, np.int64), "c": np.zeros((0, 4), np.float16)}
+    save_file(arrays, tmp_path / "x.safetensors", metadata={"format": "pt"})
+    assert check_safetensors(tmp_path / "x.safetensors", ORIGIN) == {
+        "a": ("F32", (2, 3)),
+        "b": ("I64", (5,)),
+        "c": ("F16", (0, 4)),
+    }
+
+
+@pytest.mark.parametrize(
+    ("header", "data", "length", "why"),
+    [
+        ({"a": entry([2], 0, 8)}, b"\0" * 8, 2**63, "a header of 9223372036854775808 bytes"),
+        ({"a": entry([2], 0, 8)}, b"\0" * 8, 1000, "a header of 1000 bytes"),
+        ({"a": entry([2], 0, 8)}, b"\0" * 8, 0, "a header of 0 bytes"),
+        (b"not json", b"", None, "its header is not JSON"),
+        (b"[" * 100_000, b"", None, "its header is not JSON"),
+        ([1], b"", None, "not safetensors"),
+        ({"a": entry([2], 0, 8)}, b"\0" * 7, None, "its tensors end at byte"),
+        ({"a": entry([2], 0, 8)}, b"\0" * 9, None, "its tensors end at byte"),
+        ({"a": entry([2**40, 2**40], 0, 8)}, b"\0" * 8, None, "tensor 'a' is not whole"),
+        ({"a": entry([2**60], 0, 2**62)}, b"", None, "tensor 'a' is not whole"),
+        ({"a": entry([-2], 0, 8)}, b"\0" * 8, None, "tensor 'a' is not whole"),
+        ({"a": entry([2.0], 0, 8)}, b"\0" * 8, None, "tensor 'a' is not whole"),
+        ({"a": entry([True], 0, 4)}, b"\0" * 4, None, "tensor 'a' is not whole"),
+        ({"a": entry([2], 0, 8, "OBJECT")}, b"\0" * 8, None, "tensor 'a' is not whole"),
+        ({"a": entry([2], 0, 8, ["F32"])}, b"\0" * 8, None, "tensor 'a' is not whole"),
+        ({"a": entry([1] * 9, 0, 4)}, b"\0" * 4, None, "tensor 'a' is not whole"),
+        ({"a" * 600: entry([1], 0, 4)}, b"\0" * 4, None, "is not whole"),
+        ({"a": {}}, b"", None, "tensor 'a' is not whole"),
+        ({"a": 7}, b"", None, "tensor 'a' is not whole"),
+        ({"a": entry([1], 0, 4), "b": entry([1], 0, 4)}, b"\0" * 4, None, "overlap or leave gaps"),
+        ({"a": entry([1], 4, 8)}, b"\0" * 8, None, "overlap or leave gaps"),
+    ],
+)
+def test_headers_that_are_refused(tmp_path: Path, header: object, data: bytes, length: int | None, why: str):
+    path = stored(tmp_path / "model.safetensors", header, data, length)
+    with pytest.raises(InputError, match="^policy.path='runs/theirs': model.safetensors: ") as caught:
+        check_safetensors(path, ORIGIN)
+    assert why in str(caught.value)
+
+
+def test_a_header_is_not_read_when_it_is_too_long(tmp_path: Path):
+    path = tmp_path / "model.safetensors"
+    with path.open("wb") as file:  # sparse: takes no room on the disk
+        file.write(struct.pack("<Q", HEADER_MOST + 1))
+        file.truncate(HEADER_MOST * 4)
+    with pytest.raises(InputError, match=f"a header of {HEADER_MOST + 1} bytes"):
+        check_safetensors(path, ORIGIN)
+
+
+def test_pickled_weights_are_named_with_the_way_out(tmp_path: Path):
+    (tmp_path / "pytorch_model.bin").write_bytes(b"\x80\x02.")
+    with pytest.raises(InputError, match="pytorch_model.bin is a pickle, which may run code.*to safetensors"):
+        check_not_pickled(tmp_path, "model.safetensors", ORIGIN)
+    (tmp_path / "pytorch_model.bin").unlink()
+    with pytest.raises(InputError, match="model.safetensors: is missing; give a folder"):
+        check_not_pickled(tmp_path, "model.safetensors", ORIGIN)
+
+
+def test_shapes_by_hand():
+    check_shape([2, 3], 6, "x", ORIGIN)
+    check_shape((), 1, "x", ORIGIN)
+    for shape in ([2, 4], [0], [-1, -1], [1.0], ["2"], [True], None, 3, [1] * 6, [10**30]):
+        with pytest.raises(InputError, match="x: shape"):
+            check_shape(shape, 6, "x", ORIGIN)
+
+
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+
+
+@pytest.mark.parametrize(
+    ("trust", "revision", "said"),
+    [
+        (True, None, "policy.code_revision=None: name the commit whose code you have read"),
+        (True, "main", "policy.code_revision='main': name a commit, 40 hexadecimal digits"),
+        (True, COMMIT[:39], "policy.code_revision="),
+        (True, COMMIT.upper(), "policy.code_revision="),
+        (True, f"{COMMIT}\n", "policy.code_revision="),
+        (False, COMMIT, "policy.code_revision=.*add policy.trust_remote_code=true"),
+    ],
+)
+def test_code_is_run_at_a_commit_or_not_at_all(trust: bool, revision: str | None, said: str):
+    with pytest.raises(InputError, match=f"^{said}"):
+        check_remote_code(trust, revision, "policy")
+
+
+def test_code_at_a_commit_and_no_code():
+    check_remote_code(True, COMMIT, "policy")
+    check_remote_code(False, None, "policy")
+
+
+TIMES = 100
+"""What `tests.hostile` multiplies its shares with: about 110,000 files."""
+
+
+def test_a_hundred_thousand_changed_files(tmp_path: Path):
+    """Each is good or refused in a line: no other error, no file, no hang, no memory beyond a limit."""
+    command = [sys.executable, "-m", "tests.hostile", "0", str(tmp_path), str(TIMES)]
+    root = Path(__file__).parents[1]
+    done = subprocess.run(
+        command, cwd=root, capture_output=True, text=True, errors="replace", timeout=600, check=False
+    )
+    assert done.returncode == 0, done.stderr[-4000:]
+    found = json.loads(done.stdout.splitlines()[-1])
+    outcomes: dict[str, int] = found["outcomes"]
+    assert sum(outcomes.values()) >= 100_000
+    assert sum(n for name, n in outcomes.items() if name.startswith(("load ", "open "))) >= 2_000
+    kinds = {name.rpartition(" ")[0] for name in outcomes}
+    assert all(outcomes.get(f"{kind} refused", 0) > 0 for kind in kinds), "a check that never refuses"
+    assert sum(n for name, n in outcomes.items() if name.endswith(" good")) > 5_000
+    assert found["written"] == []
