@@ -31,8 +31,10 @@ setup:
 
 quickstart: setup
 	.venv/bin/accerl train --config_path=recipes/quickstart.yaml --output_dir=$(RUN) $(ARGS)
+	.venv/bin/accerl report $(RUN)
 	@echo
-	@echo "Look at  $(RUN)/success_curve.png   success over env steps"
+	@echo "Look at  $(RUN)/report.html         all of it on a page"
+	@echo "         $(RUN)/success_curve.png   success over env steps"
 	@echo "         $(RUN)/before_after.mp4    the policy before RL, and after"
 	@echo "         $(RUN)/summary.json        the numbers"
 	@echo "         $(RUN)/checkpoints/last/pretrained_model   the policy, a LeRobot checkpoint"
