@@ -20,6 +20,7 @@ later. Each room's config stands beside the class it configures; what concerns t
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from accerl_lerobot.algorithms import AlgorithmConfig, GIPOConfig
@@ -153,6 +154,11 @@ class RunConfig:
         if imagination.share and self.algorithm.advantage == "group":
             remedy = "use algorithm.advantage=gae: dreams do not begin alike, so they are not compared"
             raise InputError("imagination.share", imagination.share, remedy)
+
+
+def journal_folder(config: RunConfig) -> Path | None:
+    """Where a run's journal is kept; None: nowhere."""
+    return None if config.output_dir is None else Path(config.output_dir).absolute()
 
 
 def check_chunk(policy: dict[str, Any]) -> None:

@@ -43,7 +43,7 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from accerl_lerobot.checkpoint import TRAINING_STATE, saved_version
-from accerl_lerobot.config import RunConfig
+from accerl_lerobot.config import RunConfig, journal_folder
 from accerl_lerobot.engine import Engine, Progress, Saved, WorkerError
 from accerl_lerobot.inference.worker import ServiceStoppedError
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
@@ -198,7 +198,7 @@ class RayEngine(Engine):
         replay = ray.remote(ReplayWorker).options(num_cpus=0, num_gpus=0, max_concurrency=1000)
         imagined, counted = imagination.replay if imagination.share else None, c.rollout.episodes > 0
         self._replay = self._service(
-            "replay", replay.remote(c.replay, c.seed, imagined, counted, self._state)
+            "replay", replay.remote(c.replay, c.seed, imagined, counted, self._state, journal_folder(c))
         )
         threads = {"num_cpus": 0, "num_gpus": share, "max_concurrency": 4}
         trainer = ray.remote(TrainerWorker).options(**threads)

@@ -32,12 +32,13 @@ import numpy as np
 
 from accerl_lerobot import snapshot
 from accerl_lerobot.checkpoint import PRETRAINED, TRAINING_STATE, WEIGHTS, WORLD_MODEL
-from accerl_lerobot.config import RunConfig
+from accerl_lerobot.config import RunConfig, journal_folder
 from accerl_lerobot.engine import Engine, Progress, Saved, check_new, episode_key
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Request, Segment
 from accerl_lerobot.replay import MixedReplay
+from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutRunner
 from accerl_lerobot.seeds import global_generators, restore_global_generators
@@ -80,9 +81,9 @@ class LocalEngine(Engine):
             self._acting = load_adapter(config.policy)
             self._acting.load_trainable(self._adapter.export_trainable())
         imagination = config.imagination
-        self._replay = MixedReplay(
-            config.replay, imagination.replay, imagination.share, config.rollout.episodes > 0
-        )
+        folder, counted = journal_folder(config), config.rollout.episodes > 0
+        journal = None if folder is None else Journal(folder / EPISODES)
+        self._replay = MixedReplay(config.replay, imagination.replay, imagination.share, counted, journal)
         self._dreams = self._world_learner = None
         if imagination.share:
             from accerl_lerobot.world_model.dreaming import make_imagination, make_learner

@@ -168,6 +168,7 @@ def train(config: RunConfig, directory: Path, console: Console, wanted: str | No
         config = _going_on(config, directory, checkpoint)
         console.say(f"going on from {checkpoint}")
     before_s = 0.0 if checkpoint is None else None
+    config = replace(config, output_dir=str(directory))
     times = Times(started=started, warm_s=time.monotonic() - started, before_s=before_s)
     with contextlib.ExitStack() as stack:  # flushes the log, whatever fails
         stop = stack.enter_context(Stopping())

@@ -39,6 +39,7 @@ from accerl_lerobot.bench.ranking import BenchRankingConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
 from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.console import Console
+from accerl_lerobot.demos.export import ExportConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.config import PullConfig, PushConfig
 from accerl_lerobot.parsing import read_arguments
@@ -250,6 +251,18 @@ def report(arguments: list[str]) -> int:
     return 0
 
 
+def export(arguments: list[str]) -> int:
+    """``accerl export``."""
+    config: ExportConfig = parse(ExportConfig, arguments)
+    from accerl_lerobot.demos.export import export_episodes
+
+    console = Console()
+    with redirect_stdout(sys.stderr):
+        found = export_episodes(config, console)
+    sys.stdout.write(json.dumps(found, indent=2) + "\n")
+    return 0
+
+
 def bench(arguments: list[str]) -> int:
     """``accerl bench world``, ``policy``, ``lag``, ``dream``, ``efficiency``, ``ranking`` and ``faults``."""
     name = arguments[0] if arguments else ""
@@ -275,6 +288,7 @@ CONFIGS: dict[str, type[Any]] = {
     "push": PushConfig,
     "pull": PullConfig,
     "report": ReportConfig,
+    "export": ExportConfig,
     "doctor": RunConfig,
     "bench world": BenchWorldConfig,
     "bench policy": BenchPolicyConfig,

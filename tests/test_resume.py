@@ -69,9 +69,11 @@ def summary(run: Path) -> dict[str, Any]:
     return {k: v for k, v in found.items() if k not in TIMES}
 
 
-def weights(run: Path) -> list[bytes]:
+def files(run: Path) -> list[bytes]:
+    """Weights and journal."""
     last = run / "checkpoints" / "last" / "pretrained_model"
-    return [(last / name).read_bytes() for name in ("model.safetensors", "value_head.safetensors")]
+    paths = [last / "model.safetensors", last / "value_head.safetensors", run / "episodes.jsonl"]
+    return [path.read_bytes() for path in paths]
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +122,7 @@ def test_a_run_that_was_asked_to_stop_goes_on_as_if_it_had_not(
     assert go_on(run, config="checkpoints/last/config.yaml") == 0
     assert records(run) == records(whole)
     assert summary(run) == summary(whole)
-    assert weights(run) == weights(whole)
+    assert files(run) == files(whole)
     assert (run / "before_after.mp4").is_file() and not list(run.glob(".before*"))
 
 
@@ -153,9 +155,7 @@ def test_a_run_that_fell_over_goes_on_from_its_last_whole_checkpoint(
     said = " ".join(capsys.readouterr().err.split())
     assert "passed over checkpoint 000010: training_state/replay.safetensors has" in said
     assert "going on from" in said and "000005" in said
-    assert (
-        records(run) == records(whole) and summary(run) == summary(whole) and weights(run) == weights(whole)
-    )
+    assert records(run) == records(whole) and summary(run) == summary(whole) and files(run) == files(whole)
 
 
 def test_more_updates_may_be_asked_for_and_nothing_else(whole: Path, capsys: pytest.CaptureFixture[str]):

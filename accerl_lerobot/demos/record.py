@@ -19,13 +19,10 @@ dataset, so the content does not depend on how many processes worked on it.
 
 from __future__ import annotations
 
-import collections
-import concurrent.futures
 import importlib.metadata
 import json
 import logging
 import math
-import multiprocessing
 import shutil
 import warnings
 from collections.abc import Iterator
@@ -39,6 +36,7 @@ import numpy as np
 from rich.progress import Progress
 
 from accerl_lerobot.demos.expert import Episode, make_expert, play
+from accerl_lerobot.demos.writing import in_order, new_dataset, simulators
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import World, WorldSpec
 from accerl_lerobot.envs.config import EnvConfig
@@ -52,7 +50,6 @@ _logger = logging.getLogger(__name__)
 _MAX_EPISODES = 10_000
 _MAX_TRIES = 50
 _VERSIONS = ("lerobot", "metaworld", "mujoco", "numpy")
-_Results = Iterator[tuple[Episode, int]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,42 +143,24 @@ def record_demos(env_config: EnvConfig, config: DemosConfig) -> Path:
 
 
 def _write(env_config: EnvConfig, config: DemosConfig, spec: WorldSpec, root: Path) -> dict[str, Any]:
-    context = multiprocessing.get_context("spawn")
     tally = {"episodes": 0, "frames": 0, "successes": 0, "discarded": 0}
     with (
-        concurrent.futures.ProcessPoolExecutor(
-            config.processes, context, initializer=_start, initargs=(env_config, config)
-        ) as pool,
+        simulators(config.processes, _start, env_config, config) as pool,
         Progress(transient=True) as progress,
     ):
-        episodes = _in_order(pool, config.episodes, ahead=2 * config.processes)
         # The first episodes are already being simulated while LeRobot is imported.
-        from datasets.utils.logging import disable_progress_bar
-        from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-        disable_progress_bar()  # one per episode would bury ours
-        dataset = LeRobotDataset.create(
-            config.repo_id,
-            fps=spec.fps,
-            features=features(spec),
-            root=root,
-            robot_type=env_config.type,
-            use_videos=False,
-            video_backend="pyav",  # unused, but the default probes for FFmpeg and complains at length
-        )
-        bar = progress.add_task("recording", total=config.episodes)
-        for episode, discarded in episodes:
-            for frame in frames(episode):
-                dataset.add_frame(frame)
-            dataset.save_episode()
-            tally["episodes"] += 1
-            tally["frames"] += len(episode)
-            tally["successes"] += episode.success
-            tally["discarded"] += discarded
-            progress.advance(bar)
-        dataset.finalize()
-        # The pictures are inside the parquet files; LeRobot leaves the folders they were collected in.
-        shutil.rmtree(root / "images", ignore_errors=True)
+        episodes = in_order(pool, _record_one, range(config.episodes), ahead=2 * config.processes)
+        with new_dataset(root, config.repo_id, spec, env_config.type, features(spec)) as dataset:
+            bar = progress.add_task("recording", total=config.episodes)
+            for episode, discarded in episodes:
+                for frame in frames(episode):
+                    dataset.add_frame(frame)
+                dataset.save_episode()
+                tally["episodes"] += 1
+                tally["frames"] += len(episode)
+                tally["successes"] += episode.success
+                tally["discarded"] += discarded
+                progress.advance(bar)
     return tally
 
 
@@ -224,22 +203,6 @@ def _start(env_config: EnvConfig, config: DemosConfig) -> None:
     # The experts' gains are too high on purpose, and `play` clips.
     warnings.filterwarnings("ignore", message="Constant.s. may be too high", category=UserWarning)
     _world, _env_config, _config = make_world(env_config), env_config, config
-
-
-def _in_order(pool: concurrent.futures.Executor, count: int, ahead: int) -> _Results:
-    """Results of `_record_one` for 0 … count-1, with at most `ahead` finished ones waiting in memory."""
-    waiting = collections.deque(pool.submit(_record_one, slot) for slot in range(min(ahead, count)))
-    return _drain(pool, count, waiting)
-
-
-def _drain(pool: concurrent.futures.Executor, count: int, waiting: collections.deque) -> _Results:
-    submitted = len(waiting)
-    while waiting:
-        result = waiting.popleft().result()
-        if submitted < count:
-            waiting.append(pool.submit(_record_one, submitted))
-            submitted += 1
-        yield result
 
 
 def _record_one(slot: int) -> tuple[Episode, int]:

@@ -33,6 +33,7 @@ import numpy as np
 
 from accerl_lerobot.experience import REAL, Segment
 from accerl_lerobot.replay.buffer import Replay
+from accerl_lerobot.replay.journal import Journal
 from accerl_lerobot.replay.pacing import ReplayConfig
 
 LEAST = 0.5
@@ -49,12 +50,18 @@ class MixedReplay:
         imagined: of imagined experience.
         share: of a batch's decisions, in [0, 1), that are imagined.
         patient: whether real episodes are counted.
+        journal: where real segments that are stored are noted; None: nowhere.
     """
 
     def __init__(
-        self, real: ReplayConfig, imagined: ReplayConfig, share: float, patient: bool = False
+        self,
+        real: ReplayConfig,
+        imagined: ReplayConfig,
+        share: float,
+        patient: bool = False,
+        journal: Journal | None = None,
     ) -> None:
-        self._patient = patient
+        self._patient, self._journal = patient, journal
         self.real, self.imagined, self.share = Replay(real), Replay(imagined), share
         self.real_ended = False
         self.awaited = share > 0
@@ -70,7 +77,10 @@ class MixedReplay:
 
     def insert(self, segment: Segment) -> bool:
         """See `Replay.insert`."""
-        return self._of(segment.source).insert(segment)
+        stored = self._of(segment.source).insert(segment)
+        if stored and segment.source == REAL and self._journal is not None:
+            self._journal.write(segment)
+        return stored
 
     def end_real(self) -> None:
         """No real segment will come any more."""
@@ -114,6 +124,7 @@ class MixedReplay:
             "real_ended": self.real_ended,
             "awaited": self.awaited,
             "held": self.held,
+            "journal": None if self._journal is None else self._journal.position,
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -122,6 +133,8 @@ class MixedReplay:
         self.imagined.restore(state["imagined"])
         for name in ("share", "real_ended", "awaited", "held"):
             setattr(self, name, state[name])
+        if self._journal is not None and state["journal"] is not None:
+            self._journal.cut(state["journal"])
 
     def metrics(self) -> dict[str, float]:
         """Of the real store by their names; where anything is imagined, of the other one with ``imagined_``

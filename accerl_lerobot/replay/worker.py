@@ -33,6 +33,7 @@ import numpy as np
 
 from accerl_lerobot import snapshot
 from accerl_lerobot.experience import REAL, Segment
+from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.replay.mixed import MixedReplay
 from accerl_lerobot.replay.pacing import ReplayConfig
 
@@ -62,6 +63,7 @@ class ReplayWorker:
         imagined: size and pace of imagined experience; None: there is none.
         patient: see `MixedReplay`.
         state: the ``training_state`` to go on from; None: begin.
+        directory: of the run, for the journal; None: none is kept.
     """
 
     def __init__(
@@ -71,8 +73,10 @@ class ReplayWorker:
         imagined: ReplayConfig | None = None,
         patient: bool = False,
         state: Path | None = None,
+        directory: Path | None = None,
     ) -> None:
-        self._replay = MixedReplay(config, imagined or ReplayConfig(), share=0.0, patient=patient)
+        journal = None if directory is None else Journal(directory / EPISODES)
+        self._replay = MixedReplay(config, imagined or ReplayConfig(), 0.0, patient, journal)
         # Nothing is imagined until the dreamer says so.
         self._replay.awaited = imagined is not None
         self._real: deque[Segment] = deque(maxlen=IN_TRANSIT if imagined else 0)

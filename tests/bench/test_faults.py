@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""The bench of faults: what it says of a run's books, and that it hits what it says. Its whole is run by hand."""
+"""The bench of faults: what it says of a run's books, and that it hits what it says."""
 
 from __future__ import annotations
 

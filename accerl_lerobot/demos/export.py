@@ -1,0 +1,213 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The real episodes of a run as a LeRobotDataset.
+
+    accerl export --path=RUN --root=outputs/rollouts
+
+A run looks at its worlds once per decision and keeps no pictures. Its journal says what was done in them, so
+it is done again here, a step at a time, and every step is seen. An episode that goes another way than it had
+gone, by its rewards and its outcome, is left out and counted.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from accerl_lerobot.checkpoint import CONFIG
+from accerl_lerobot.config import RunConfig, parse
+from accerl_lerobot.console import Console
+from accerl_lerobot.demos.expert import Episode
+from accerl_lerobot.demos.record import features, frames
+from accerl_lerobot.demos.writing import in_order, new_dataset, simulators
+from accerl_lerobot.envs import make_world
+from accerl_lerobot.envs.base import World
+from accerl_lerobot.envs.config import EnvConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.replay.journal import EPISODES, Done, read_journal, whole_episodes
+
+SIDECAR = Path("meta") / "accerl_rollouts.json"
+"""Inside the dataset: where it is from, and what came of it."""
+VERSION = "policy_version"
+"""Feature: updates behind the weights that chose the action."""
+TOLERANCE = 1e-4
+"""By which the rewards of a decision may differ, which are summed in another order."""
+PICKS = ("all", "successes", "failures")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportConfig:
+    """What is taken, and where to."""
+
+    path: str | None = None
+    """Folder of an ``accerl train`` run."""
+    root: str = "outputs/rollouts"
+    """Folder to create; must not exist."""
+    repo_id: str = "accerl/rollouts"
+    """Name of the dataset, ``owner/name``."""
+    pick: str = "all"
+    """all, successes or failures."""
+    last: int = 0
+    """So many of the newest of these; 0: all of them."""
+    processes: int = 2
+    """Simulator processes, 1 to 64; does not change the content."""
+
+    def __post_init__(self) -> None:
+        if self.path is None:
+            raise InputError("path", None, "name the folder of an accerl train run")
+        if self.pick not in PICKS:
+            raise InputError("pick", self.pick, f"use {', '.join(PICKS)}")
+        if self.last < 0:
+            raise InputError("last", self.last, "use 0 (all) or more episodes")
+        if not 1 <= self.processes <= 64:
+            raise InputError("processes", self.processes, "use 1 to 64")
+        if len(parts := self.repo_id.split("/")) != 2 or not all(parts):
+            raise InputError("repo_id", self.repo_id, "use the form owner/name")
+        if not self.root:
+            raise InputError("root", self.root, "name a folder to create")
+
+
+def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
+    """Writes the dataset, which appears at ``config.root`` when it is complete.
+
+    Returns:
+        ``episodes``, ``frames``, ``successes``, and ``unlike``, those that did not repeat and were left out.
+
+    Raises:
+        InputError: the folder exists, there is no run or no whole episode in it, or none can be repeated.
+    """
+    run, root = Path(str(config.path)).expanduser(), Path(config.root)
+    if root.exists():
+        raise InputError("root", config.root, "exists already: remove it or name another folder")
+    if not (run / CONFIG).is_file():
+        raise InputError("path", str(run), f"no run in it: there is no {CONFIG}")
+    settings: RunConfig = parse(RunConfig, [f"--config_path={run / CONFIG}"])
+    chosen = _chosen(run / EPISODES, config)
+    if not chosen:
+        raise InputError(
+            "path", str(run), f"no whole episode in its {EPISODES} of those asked for ({config.pick})"
+        )
+    partial = root.with_name(root.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        tally = _write(settings, config, chosen, partial, console)
+        if not tally["episodes"]:
+            remedy = "none of its episodes repeats itself: this world does not show the same again"
+            raise InputError("path", str(run), remedy)
+        about = {"export": asdict(config) | {"path": run.name}, "seed": settings.seed, **tally}
+        (partial / SIDECAR).write_text(json.dumps(about, indent=2) + "\n")
+        partial.rename(root)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+    return tally
+
+
+def _chosen(journal: Path, config: ExportConfig) -> list[list[Done]]:
+    picked = [
+        episode
+        for episode in whole_episodes(read_journal(journal))
+        if config.pick == "all" or episode[-1].success is (config.pick == "successes")
+    ]
+    return picked[-config.last :] if config.last else picked
+
+
+def _write(
+    settings: RunConfig, config: ExportConfig, chosen: list[list[Done]], root: Path, console: Console
+) -> dict[str, int]:
+    world = make_world(settings.env)
+    spec = world.spec
+    world.close()
+    tally = {"episodes": 0, "frames": 0, "successes": 0, "unlike": 0}
+    table = features(spec) | {VERSION: {"dtype": "int64", "shape": (1,), "names": None}}
+    cost = settings.rollout.decision_cost
+    with (
+        console.stage("doing it again", total=len(chosen)) as stage,
+        simulators(config.processes, _start, settings.env, cost) as pool,
+    ):
+        repeated = in_order(pool, _repeat, chosen, ahead=2 * config.processes)
+        with new_dataset(root, config.repo_id, spec, settings.env.type, table) as dataset:
+            for number, (episode, parts) in enumerate(zip(repeated, chosen, strict=True), start=1):
+                stage.update(number, f"{tally['successes']} successes")
+                if episode is None:
+                    tally["unlike"] += 1
+                    continue
+                for frame in _versioned(episode, parts):
+                    dataset.add_frame(frame)
+                dataset.save_episode()
+                tally["episodes"] += 1
+                tally["frames"] += len(episode)
+                tally["successes"] += episode.success
+    if tally["unlike"]:
+        console.say(
+            f"{tally['unlike']} of {len(chosen)} episodes did not go as they had gone, and are left out"
+        )
+    return tally
+
+
+def _versioned(episode: Episode, parts: list[Done]) -> Iterator[dict[str, Any]]:
+    versions = [v for part in parts for v, n in zip(part.versions, part.steps, strict=True) for _ in range(n)]
+    for frame, version in zip(frames(episode), versions, strict=True):
+        yield frame | {VERSION: np.array([version], np.int64)}
+
+
+_world: World
+_cost: float
+
+
+def _start(env: EnvConfig, cost: float) -> None:
+    """Makes a process ready: one world for all its episodes."""
+    global _world, _cost
+    _world, _cost = make_world(env), cost
+
+
+def _repeat(parts: list[Done]) -> Episode | None:
+    """An episode, seen at every step; None if it goes in another way."""
+    origin = parts[0].origin
+    observation = _world.reset(origin.seed, origin.task)
+    seen, rewards, success_at, done = [], [], -1, False
+    actions = np.concatenate([part.actions for part in parts])
+    for i, action in enumerate(actions):
+        if done:
+            return None
+        seen.append(observation)
+        result = _world.step_chunk(action[None])
+        rewards.append(result.rewards[0])
+        observation, done = result.observation, result.done
+        if result.success and success_at < 0:
+            success_at = i
+    if not _alike(parts, np.array(rewards), success_at >= 0):
+        return None
+    return Episode(
+        observations={key: np.stack([row[key] for row in seen]) for key in seen[0] if key != "task"},
+        actions=actions,
+        rewards=np.asarray(rewards, np.float32),
+        task=str(seen[0]["task"]),
+        done=done,
+        success_at=success_at,
+        seed=origin.seed,
+    )
+
+
+def _alike(parts: list[Done], rewards: np.ndarray, success: bool) -> bool:
+    steps = np.concatenate([part.steps for part in parts])
+    brought = np.add.reduceat(rewards, np.concatenate([[0], np.cumsum(steps)[:-1]])) - _cost
+    expected = np.concatenate([part.rewards for part in parts])
+    return success == parts[-1].success and bool(np.allclose(brought, expected, rtol=0, atol=TOLERANCE))

@@ -1,0 +1,89 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A LeRobotDataset from simulated episodes: several processes simulate, the parent writes, in order."""
+
+from __future__ import annotations
+
+import collections
+import concurrent.futures
+import multiprocessing
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from accerl_lerobot.envs.base import WorldSpec
+
+
+@contextmanager
+def simulators(
+    processes: int, start: Callable[..., None], *arguments: Any
+) -> Iterator[concurrent.futures.ProcessPoolExecutor]:
+    """So many processes, each made ready by `start`."""
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(
+        processes, context, initializer=start, initargs=arguments
+    ) as pool:
+        yield pool
+
+
+def in_order[Item, Result](
+    pool: concurrent.futures.Executor, work: Callable[[Item], Result], items: Iterable[Item], ahead: int
+) -> Iterator[Result]:
+    """Results of `work`, in the order of `items`, with at most `ahead` finished ones waiting in memory.
+
+    The first are already under way when this returns.
+    """
+    left = iter(items)
+    waiting = collections.deque(pool.submit(work, item) for _, item in zip(range(ahead), left, strict=False))
+    return _drained(pool, work, left, waiting)
+
+
+def _drained[Item, Result](
+    pool: concurrent.futures.Executor,
+    work: Callable[[Item], Result],
+    left: Iterator[Item],
+    waiting: collections.deque[concurrent.futures.Future[Result]],
+) -> Iterator[Result]:
+    while waiting:
+        result = waiting.popleft().result()
+        for item in left:
+            waiting.append(pool.submit(work, item))
+            break
+        yield result
+
+
+@contextmanager
+def new_dataset(
+    root: Path, repo_id: str, spec: WorldSpec, robot_type: str, features: dict[str, Any]
+) -> Iterator[Any]:
+    """A LeRobotDataset to be filled; complete when the context has been left."""
+    from datasets.utils.logging import disable_progress_bar
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    disable_progress_bar()  # one per episode would bury ours
+    dataset = LeRobotDataset.create(
+        repo_id,
+        fps=spec.fps,
+        features=features,
+        root=root,
+        robot_type=robot_type,
+        use_videos=False,
+        video_backend="pyav",  # unused, but the default probes for FFmpeg and complains at length
+    )
+    yield dataset
+    dataset.finalize()
+    # The pictures are inside the parquet files; LeRobot leaves the folders they were collected in.
+    shutil.rmtree(root / "images", ignore_errors=True)

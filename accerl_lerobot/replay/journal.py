@@ -1,0 +1,154 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What was done in real worlds, on disk: enough to do it again, and see it all.
+
+``RUN/episodes.jsonl`` has one line per segment that replay has stored: where it begins, the actions that were
+executed, what they brought and whose they were. Pictures are not in it; a world that is given the same seed
+and actions shows the same again, at every env step and in any size. That is what `demos.export` does.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import Origin, Segment
+
+EPISODES = "episodes.jsonl"
+"""Name of the file in a run's folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Done:
+    """A segment as the journal knows it."""
+
+    key: str
+    origin: Origin
+    actions: np.ndarray
+    """float32 (env steps, A), as they were executed, one after the other."""
+    steps: tuple[int, ...]
+    """Env steps of each decision."""
+    versions: tuple[int, ...]
+    """Of the weights behind each decision."""
+    rewards: tuple[float, ...]
+    """Of each decision, its cost taken off."""
+    ended: bool
+    """Whether the episode ended with it."""
+    success: bool
+
+
+class Journal:
+    """Appends; a segment is on its way to the disk, whatever becomes of this process, when `write` returns.
+
+    Args:
+        path: of the file, which may exist.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("ab", buffering=0)
+
+    @property
+    def position(self) -> int:
+        """Bytes so far."""
+        return os.fstat(self._file.fileno()).st_size
+
+    def write(self, segment: Segment) -> None:
+        """Notes a real segment."""
+        size = segment.actions.shape[-1]
+        actions = np.concatenate(
+            [chunk[:steps] for chunk, steps in zip(segment.actions, segment.steps, strict=True)]
+        )
+        line = {
+            "key": segment.key,
+            "task": segment.origin.task,
+            "seed": segment.origin.seed,
+            "decision": segment.origin.decision,
+            "steps": segment.steps.tolist(),
+            "versions": segment.version.tolist(),
+            "rewards": segment.reward.tolist(),
+            "ended": segment.terminated or segment.truncated,
+            "success": segment.success,
+            "action_dim": size,
+            "actions": base64.b64encode(actions.astype("<f4").tobytes()).decode(),
+        }
+        self._file.write((json.dumps(line) + "\n").encode())
+
+    def cut(self, position: int) -> None:
+        """Forgets what was written after `position`; nothing, if there is less."""
+        if self.position > position:
+            self._file.truncate(position)
+
+
+def read_journal(path: Path) -> Iterator[Done]:
+    """What is in a journal, in order; a last line that is half written is left out.
+
+    Raises:
+        InputError: there is no such file, or a line in it is broken.
+    """
+    if not path.is_file():
+        remedy = f"no {path.name} there; name the folder of an accerl train run"
+        raise InputError("path", str(path.parent), remedy)
+    with path.open("rb") as file:
+        for number, line in enumerate(file, start=1):
+            if line.endswith(b"\n"):
+                try:
+                    yield _done(json.loads(line))
+                except (ValueError, KeyError, TypeError, AttributeError) as error:
+                    said = " ".join(str(error).split())[:80]
+                    raise InputError("path", str(path), f"line {number} is broken ({said})") from error
+
+
+def _done(line: dict[str, Any]) -> Done:
+    actions = np.frombuffer(base64.b64decode(line["actions"], validate=True), "<f4")
+    actions = actions.reshape(-1, int(line["action_dim"]))
+    steps = tuple(int(n) for n in line["steps"])
+    if sum(steps) != len(actions) or not len(steps) == len(line["versions"]) == len(line["rewards"]):
+        raise ValueError("its parts are of different lengths")
+    return Done(
+        key=str(line["key"]),
+        origin=Origin(str(line["task"]), int(line["seed"]), int(line["decision"])),
+        actions=actions,
+        steps=steps,
+        versions=tuple(int(v) for v in line["versions"]),
+        rewards=tuple(float(r) for r in line["rewards"]),
+        ended=bool(line["ended"]),
+        success=bool(line["success"]),
+    )
+
+
+def whole_episodes(segments: Iterator[Done]) -> Iterator[list[Done]]:
+    """Episodes of which all segments are there, in the order of their ends.
+
+    Episodes that start alike, of a group, come one after the other: a segment goes on with the latest episode
+    of its start.
+    """
+    under_way: dict[tuple[str, int], list[Done]] = {}
+    for segment in segments:
+        name = segment.origin[:2]
+        parts = under_way.get(name, [])
+        if segment.origin.decision == 0:
+            parts = []
+        elif sum(len(part.steps) for part in parts) != segment.origin.decision:
+            continue  # what came before is not there
+        under_way[name] = parts = [*parts, segment]
+        if segment.ended:
+            yield under_way.pop(name)

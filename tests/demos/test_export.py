@@ -1,0 +1,121 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A run's episodes as a LeRobotDataset: what was done is done again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from accerl_lerobot.cli import main
+from accerl_lerobot.config import DatasetConfig, LaunchConfig, RunConfig, encode, parse
+from accerl_lerobot.demos.windows import check_dataset
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.evaluation.config import EvaluationConfig
+from accerl_lerobot.replay.journal import read_journal, whole_episodes
+from tests.runs import tiny_run
+
+
+@pytest.fixture(scope="module")
+def run(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("export")
+    config = tiny_run(
+        tiny_checkpoint,
+        env=SimulatedConfig(max_steps=10, tolerance=0.45),
+        evaluation=EvaluationConfig(episodes=2, before=False, videos=0),
+        launch=LaunchConfig(engine="local"),
+    )
+    (folder / "recipe.yaml").write_text(yaml.safe_dump(encode(config)))
+    assert main(["train", str(folder / "recipe.yaml"), f"--output_dir={folder / 'run'}"]) == 0
+    return folder / "run"
+
+
+def exported(run: Path, root: Path, *options: str) -> int:
+    return main(["export", f"--path={run}", f"--root={root}", "--processes=1", *options])
+
+
+def test_every_whole_episode_is_in_the_dataset_step_by_step(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    capsys.readouterr()
+    assert exported(run, tmp_path / "set") == 0
+    found = json.loads(capsys.readouterr().out)
+    episodes = list(whole_episodes(read_journal(run / "episodes.jsonl")))
+    assert found["episodes"] == len(episodes) > 8 and found["unlike"] == 0
+    assert found["successes"] == sum(e[-1].success for e in episodes)
+    assert 0 < found["successes"] < len(episodes), "there is something to tell apart"
+    dataset = LeRobotDataset("accerl/rollouts", root=tmp_path / "set")
+    assert dataset.num_episodes == len(episodes) and dataset.num_frames == found["frames"]
+    for index, parts in enumerate(episodes[:6]):
+        actions = np.concatenate([part.actions for part in parts])
+        start = dataset.meta.episodes[index]["dataset_from_index"]
+        rows = [dataset[start + i] for i in range(len(actions))]
+        np.testing.assert_array_equal([row["action"].numpy() for row in rows], actions)
+        versions = [v for p in parts for v, n in zip(p.versions, p.steps, strict=True) for _ in range(n)]
+        assert [int(row["policy_version"]) for row in rows] == versions
+        assert [bool(row["next.done"]) for row in rows] == [False] * (len(rows) - 1) + [True]
+        assert bool(rows[-1]["next.success"]) is parts[-1].success
+    about = json.loads((tmp_path / "set" / "meta" / "accerl_rollouts.json").read_text())
+    assert about["episodes"] == len(episodes) and about["export"]["path"] == run.name
+    settings: RunConfig = parse(RunConfig, [f"--config_path={run / 'config.yaml'}"])
+    check_dataset(DatasetConfig(repo_id="accerl/rollouts", root=str(tmp_path / "set")), settings.env, {})
+
+
+def test_some_of_them(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    capsys.readouterr()
+    assert exported(run, tmp_path / "set", "--pick=successes", "--last=3") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["episodes"], found["successes"]) == (3, 3)
+
+
+def test_what_does_not_repeat_itself_is_left_out(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    other = tmp_path / "run"
+    other.mkdir()
+    (other / "config.yaml").write_bytes((run / "config.yaml").read_bytes())
+    lines = (run / "episodes.jsonl").read_text().splitlines()
+    changed = json.loads(lines[0])
+    changed["rewards"][0] += 0.5
+    (other / "episodes.jsonl").write_text("\n".join([json.dumps(changed), *lines[1:]]) + "\n")
+    capsys.readouterr()
+    assert exported(other, tmp_path / "set") == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["unlike"] == 1 and "did not go as they had gone, and are left out" in err
+    (other / "episodes.jsonl").write_text(json.dumps(changed | {"ended": True}) + "\n")
+    assert exported(other, tmp_path / "second") == 2
+    assert "none of its episodes repeats itself" in capsys.readouterr().err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run", "set"], "nothing half made is left"
+
+
+def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    for options, message in (
+        (["--root=" + str(tmp_path)], "exists already: remove it or name another folder"),
+        (["--path=" + str(tmp_path), "--root=new"], "no run in it: there is no config.yaml"),
+        (["--pick=best"], "pick='best': use all, successes, failures"),
+        (["--last=-1"], "use 0 (all) or more episodes"),
+        (["--repo_id=name"], "use the form owner/name"),
+        (["--processes=0"], "use 1 to 64"),
+    ):
+        arguments = {"--path": str(run), "--root": str(tmp_path / "new")}
+        arguments |= dict(option.split("=", 1) for option in options)
+        assert main(["export", *(f"{key}={value}" for key, value in arguments.items())]) == 2
+        assert message in capsys.readouterr().err
+    assert main(["export"]) == 2 and "path=None: name the folder" in capsys.readouterr().err
