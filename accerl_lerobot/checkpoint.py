@@ -38,6 +38,8 @@ from typing import Any
 from accerl_lerobot.errors import InputError
 
 PRETRAINED, TRAINING_STATE, WORLD_MODEL = "pretrained_model", "training_state", "world_model"
+CHECKPOINTS = "checkpoints"
+"""Folder of a run's."""
 CONFIG, MANIFEST, LAST, WRITING = "config.yaml", "manifest.json", "last", ".writing-"
 RUN_STATE, WEIGHTS = "run", "weights"
 """Names of states in `TRAINING_STATE`: how far the run has come; what is trained, exactly as it is."""

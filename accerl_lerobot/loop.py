@@ -29,6 +29,7 @@ import numpy as np
 
 from accerl_lerobot import snapshot
 from accerl_lerobot.checkpoint import (
+    CHECKPOINTS,
     CONFIG,
     PRETRAINED,
     RUN_STATE,
@@ -48,7 +49,6 @@ from accerl_lerobot.metrics import MetricsLog, plain
 from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.stopping import StoppedError, Stopping
 
-CHECKPOINTS = "checkpoints"
 FILMED = ".before"
 """Name of the filmed episodes of the evaluation before, kept until the video is made."""
 FRUITLESS_GROUPS = 50

@@ -38,13 +38,20 @@ from typing import Any, Protocol
 import yaml
 
 from accerl_lerobot import ray_environment
-from accerl_lerobot.checkpoint import CONFIG, PRETRAINED, TRAINING_STATE, newest_whole, write_atomically
+from accerl_lerobot.checkpoint import (
+    CHECKPOINTS,
+    CONFIG,
+    PRETRAINED,
+    TRAINING_STATE,
+    newest_whole,
+    write_atomically,
+)
 from accerl_lerobot.config import RunConfig, encode
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import Engine, WorkerError
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.loop import CHECKPOINTS, Loop, Times
+from accerl_lerobot.loop import Loop, Times
 from accerl_lerobot.metrics import MetricsLog
 from accerl_lerobot.stopping import Stopping
 

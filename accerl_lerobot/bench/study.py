@@ -33,7 +33,7 @@ from typing import Any, NamedTuple
 import yaml
 from rich.table import Table
 
-from accerl_lerobot.checkpoint import PRETRAINED
+from accerl_lerobot.checkpoint import CHECKPOINTS, PRETRAINED
 from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
@@ -326,13 +326,16 @@ class _Runner:
                 raise
 
     def _one(self, folder: Path, config: RunConfig) -> None:
-        if folder.exists():  # a run that was stopped on its way
-            shutil.rmtree(folder)
         recipe, log = folder.with_suffix(".yaml"), folder.with_suffix(".log")
-        recipe.write_text(yaml.safe_dump(encode(config), sort_keys=False))
-        command = [sys.executable, "-m", "accerl_lerobot.cli", "train", f"--config_path={recipe}"]
+        command = [sys.executable, "-m", "accerl_lerobot.cli", "train"]
+        if (folder / CHECKPOINTS).is_dir() and _is_same(folder, config):  # it was stopped on its way
+            command += ["--resume=true", f"--config_path={folder / CONFIG}"]
+        else:
+            shutil.rmtree(folder, ignore_errors=True)
+            recipe.write_text(yaml.safe_dump(encode(config), sort_keys=False))
+            command.append(f"--config_path={recipe}")
         threads = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
-        with log.open("wb") as out:
+        with log.open("ab") as out:
             process = subprocess.Popen(
                 command, stdout=out, stderr=out, env=os.environ | threads, pass_fds=(self._lock,)
             )
@@ -348,9 +351,13 @@ class _Runner:
 
 def _check_same(folder: Path, config: RunConfig) -> None:
     """Refuses to count a finished run of other settings."""
-    if parse(RunConfig, [f"--config_path={folder / CONFIG}"]) != config:
+    if not _is_same(folder, config):
         remedy = f"{folder.name} in it was run with other settings; choose another folder or remove it"
         raise InputError("output_dir", str(folder.parent), remedy)
+
+
+def _is_same(folder: Path, config: RunConfig) -> bool:
+    return bool(parse(RunConfig, [f"--config_path={folder / CONFIG}"]) == config)
 
 
 def _check_newer(folder: Path, start: Path) -> None:

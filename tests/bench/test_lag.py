@@ -114,6 +114,12 @@ def test_a_study_is_run_and_goes_on_where_it_was_stopped(
     made = {run + end for run in runs for end in ("", ".log", ".yaml")} | {".lock"}
     assert {p.name for p in study.iterdir()} == made | {"lag.json", "lag.md", "lag.png"}
 
+    (study / "gipo-lag2-seed3" / "summary.json").unlink()  # as if it had been stopped just before
+    (cell_again,) = bench.bench_lag(config)["cells"]
+    assert "going on from" in (study / "gipo-lag2-seed3.log").read_text()
+    assert {**cell_again, "rl_s": 0} == {**cell, "rl_s": 0}
+    cell = cell_again
+
     ran: list[str] = []
 
     def fake(self: Any, folder: Path, run: RunConfig) -> None:
