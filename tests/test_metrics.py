@@ -155,7 +155,7 @@ def test_every_logged_number_is_explained(tiny_checkpoint: Path) -> None:
 
 
 def test_the_summary_is_explained() -> None:
-    source = (ROOT / "accerl_lerobot" / "run.py").read_text()
+    source = (ROOT / "accerl_lerobot" / "loop.py").read_text()
     assignments = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.Assign)]
     (value,) = [
         n.value for n in assignments if ast.unparse(n.targets[0]) == "summary" and "wall_s" in ast.unparse(n)

@@ -22,7 +22,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from accerl_lerobot import snapshot
 from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.checkpoint import TRAINING_STATE
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
@@ -135,19 +137,32 @@ def test_what_is_saved_is_a_whole_version(monkeypatch: pytest.MonkeyPatch, tmp_p
     stage = Stage(batches=1_000_000, updates=1_000_000)
     seen: list[tuple[int, int]] = []
 
-    def save(adapter: LinearAdapter, directory: Path, policy: PolicyConfig) -> None:
+    def copy_weights(adapter: LinearAdapter) -> dict[str, Any]:
         before = adapter.copy()
         version = stage.worker._update.version
         threading.Event().wait(0.01)
         assert all(bool((p == before[k]).all()) for k, p in adapter.copy().items())
         seen.append((version, stage.worker._update.version))
+        return before
 
+    def save(adapter: LinearAdapter, directory: Path, policy: PolicyConfig, weights: dict[str, Any]) -> None:
+        files.append(weights)
+
+    files: list[dict[str, Any]] = []
+    monkeypatch.setattr(loading, "copy_weights", copy_weights)
     monkeypatch.setattr(loading, "save_pretrained", save)
     runner = threading.Thread(target=stage.run)
     runner.start()
     while stage.worker._update.version < 3:
         threading.Event().wait(0.001)
-    saved = [stage.worker.save(str(tmp_path)) for _ in range(8)]
+    saved = [stage.worker.save(tmp_path / str(i)) for i in range(8)]
     stage._batches = 0
     runner.join()
-    assert saved == [before for before, _ in seen] == [after for _, after in seen]
+    assert [version for version, _ in saved] == [before for before, _ in seen] == [after for _, after in seen]
+    told = [record["update"] for _, records in saved for record in records]
+    assert told == [float(i + 1) for i in range(saved[-1][0])], "all records up to what was saved, once"
+    for i, (version, _) in enumerate(saved):
+        state = tmp_path / str(i) / TRAINING_STATE
+        assert snapshot.load(state / "trainer")["version"] == version
+        weights = snapshot.load(state / "weights")
+        assert all(np.array_equal(weights[k], files[i][k]) for k in files[i])
