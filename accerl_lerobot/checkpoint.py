@@ -40,7 +40,9 @@ from accerl_lerobot.errors import InputError
 PRETRAINED, TRAINING_STATE, WORLD_MODEL = "pretrained_model", "training_state", "world_model"
 CHECKPOINTS = "checkpoints"
 """Folder of a run's."""
-CONFIG, MANIFEST, LAST, WRITING = "config.yaml", "manifest.json", "last", ".writing-"
+CONFIG, MANIFEST, LAST = "config.yaml", "manifest.json", "last"
+WRITING, REPLACED = ".writing-", ".replaced-"
+"""How the names of checkpoints begin that are being written, and of those that are being replaced."""
 RUN_STATE, WEIGHTS = "run", "weights"
 """Names of states in `TRAINING_STATE`: how far the run has come; what is trained, exactly as it is."""
 STEP = "training_step.json"
@@ -71,36 +73,72 @@ def save_checkpoint(checkpoints: Path, write: Callable[[Path], int]) -> Path:
             given, and returns the version of what it wrote, the number of updates behind it.
 
     Returns:
-        ``checkpoints/NNNNNN``, left as it is if that version has been saved before, whole.
+        ``checkpoints/NNNNNN``; one of that version that was there before is replaced, since what goes with
+        the same weights need not be the same.
 
     Raises:
         Exception: whatever `write` raises; older checkpoints and ``last`` are as before.
     """
     checkpoints.mkdir(parents=True, exist_ok=True)
-    for left in checkpoints.glob(f"{WRITING}*"):  # by a process that was killed
-        shutil.rmtree(left)
+    _tidy(checkpoints)
     temporary = checkpoints / f"{WRITING}{os.getpid()}"
     try:
         temporary.mkdir()
         version = write(temporary)
         final = checkpoints / f"{version:06d}"
-        if defect(final) is not None:  # else: the same version is the same weights
-            relocate(temporary / PRETRAINED, final / PRETRAINED)
-            (temporary / TRAINING_STATE).mkdir(exist_ok=True)
-            step = json.dumps({"step": version}, indent=2)
-            (temporary / TRAINING_STATE / STEP).write_text(step + "\n")
-            write_manifest(temporary)
-            _make_durable(temporary)
-            shutil.rmtree(final, ignore_errors=True)
-            temporary.rename(final)
+        relocate(temporary / PRETRAINED, final / PRETRAINED)
+        (temporary / TRAINING_STATE).mkdir(exist_ok=True)
+        step = json.dumps({"step": version}, indent=2)
+        (temporary / TRAINING_STATE / STEP).write_text(step + "\n")
+        write_manifest(temporary)
+        _make_durable(temporary)
+        if final.exists():
+            final.rename(checkpoints / f"{REPLACED}{final.name}")
+        temporary.rename(final)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-    link = checkpoints / ".last-new"
-    link.unlink(missing_ok=True)
-    link.symlink_to(final.name)
-    link.replace(checkpoints / LAST)
-    _sync(checkpoints)
+    _point_at(final)
+    _tidy(checkpoints)
     return final
+
+
+def _tidy(checkpoints: Path) -> None:
+    """Removes what a process that was killed has left half written, and brings back what it had put aside."""
+    for left in checkpoints.glob(f"{WRITING}*"):
+        shutil.rmtree(left)
+    for aside in checkpoints.glob(f"{REPLACED}*"):
+        place = checkpoints / aside.name.removeprefix(REPLACED)
+        if place.exists():
+            shutil.rmtree(aside)
+        else:
+            aside.rename(place)
+
+
+def _point_at(checkpoint: Path) -> None:
+    """Makes it the last one."""
+    link = checkpoint.parent / ".last-new"
+    link.unlink(missing_ok=True)
+    link.symlink_to(checkpoint.name)
+    link.replace(checkpoint.parent / LAST)
+    _sync(checkpoint.parent)
+
+
+def go_back_to(checkpoint: Path) -> None:
+    """Makes it the last one: of what came after it the policy is kept, as ``abandoned-NNNNNN``."""
+    for later in _numbered(checkpoint.parent):
+        if int(later.name) > int(checkpoint.name):
+            aside = later.with_name(f"abandoned-{later.name}")
+            shutil.rmtree(aside, ignore_errors=True)
+            later.rename(aside)
+            shutil.rmtree(aside / TRAINING_STATE, ignore_errors=True)
+    _point_at(checkpoint)
+
+
+def begun(checkpoints: Path) -> bool:
+    """Whether there is a checkpoint, whole or not."""
+    if checkpoints.is_dir():
+        _tidy(checkpoints)
+    return bool(_numbered(checkpoints))
 
 
 def write_atomically(path: Path, text: str) -> None:
@@ -117,7 +155,8 @@ def write_manifest(directory: Path, without: str = MANIFEST) -> None:
     files = {
         str(path.relative_to(directory)): {"size": path.stat().st_size, "sha256": _digest(path)}
         for path in sorted(directory.rglob("*"))
-        if path.is_file() and path.relative_to(directory).parts[0] not in (MANIFEST, without)
+        if path.is_file()
+        and path.relative_to(directory).parts[0] not in (MANIFEST, f".{MANIFEST}.new", without)
     }
     write_atomically(directory / MANIFEST, json.dumps({"format": FORMAT, "files": files}, indent=2) + "\n")
 
@@ -159,6 +198,7 @@ def newest_whole(checkpoints: Path, wanted: str = LAST) -> tuple[Path, list[str]
     Raises:
         InputError: none is left.
     """
+    _tidy(checkpoints)
     numbers = _numbered(checkpoints)
     if wanted != LAST:
         if checkpoints / wanted not in numbers:

@@ -48,6 +48,7 @@ from accerl_lerobot.engine import Engine, Progress, Saved, WorkerError
 from accerl_lerobot.inference.worker import ServiceStoppedError
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seats import START_S, Seats
+from accerl_lerobot.stopping import Stopping
 from accerl_lerobot.watched import Watched
 
 logger = logging.getLogger(__name__)
@@ -59,13 +60,14 @@ BLAME_S = 10.0
 
 def start_ray() -> None:
     """A private Ray on this machine, without a dashboard; `ray_environment` says what keeps it private."""
-    ray.init(
-        address="local",
-        include_dashboard=False,
-        _node_ip_address="127.0.0.1",
-        log_to_driver=False,
-        configure_logging=False,
-    )
+    with Stopping.kept():
+        ray.init(
+            address="local",
+            include_dashboard=False,
+            _node_ip_address="127.0.0.1",
+            log_to_driver=False,
+            configure_logging=False,
+        )
 
 
 class RayEngine(Engine):
@@ -147,11 +149,15 @@ class RayEngine(Engine):
         # What the trainer has told already is heard first: all other records up to its version come with it.
         told = self._updates + (self._hear(self._trainer, self._limit) or [])
         self._updates = []
-        version, records = self._trainer.call("save", directory, timeout=self._limit)
-        for imaginer in (self._dreamer, self._learner):
+        limit = max(START_S, self._limit)  # files may be large
+        version, records = self._trainer.call("hold", timeout=limit)
+        # At once, so that little comes in that was decided by weights of later updates. Those who dream may
+        # know of more than replay then; they are told anew of what comes after.
+        self._replay.call("save", state, version, timeout=limit)
+        for imaginer in (self._learner, self._dreamer):
             if imaginer is not None:
-                imaginer.call("save", directory, timeout=self._limit)
-        self._replay.call("save", state, version, timeout=self._limit)
+                imaginer.call("save", directory, timeout=limit)
+        self._trainer.call("write", directory, timeout=limit)
         self._seats.save(state)
         self._last_change = time.monotonic()
         return Saved(version, told + records)

@@ -266,6 +266,7 @@ class LocalEngine(Engine):
             learner.step()
         elif learner.due(last) and (promotion := learner.promote(last)):
             self._dreams.swap(promotion)
+            learner.handed_over()
         self._replay.hold(learner.due(last=False) and not last)
 
     def _publish(self) -> None:

@@ -68,6 +68,17 @@ def how_to_go_on(directory: Path) -> str:
     return f"accerl train --resume=true --config_path={directory / CONFIG}"
 
 
+def heed_stop(stop: Stopping, directory: Path) -> None:
+    """Ends a run that was asked to stop.
+
+    Raises:
+        StoppedError: it was.
+    """
+    if stop.asked is not None:
+        words = f"stopped by {signal.Signals(stop.asked).name}; to go on: {how_to_go_on(directory)}"
+        raise StoppedError(stop.asked, words)
+
+
 def run_plans(
     engine: Engine,
     count: int,
@@ -202,6 +213,11 @@ class Loop:
         self.times.rl_s, self.times.warm_s = times["rl_s"], times["warm_s"]
         if self.times.before_s is None:
             self.times.before_s = times["wall_s"]
+        if version < self.config.trainer.updates:  # more are asked for than were when it ended
+            self.steps = math.inf
+        evaluate, save = self.config.evaluation.every_updates, self.config.save_every_updates
+        self.evaluated = min(self.evaluated, version // evaluate if evaluate else 0)
+        self.saved = min(self.saved, version // save if save else 0)
 
     def _summary(
         self,
@@ -260,9 +276,11 @@ class Loop:
                 if every and progress.version // every > self.evaluated:
                     self.evaluated = progress.version // every
                     self._plan_during(self.evaluated)
-                if self._is_due(progress.version) or self.stop.asked is not None:
+                asked = self.stop.asked is not None
+                if self._is_due(progress.version) or asked:
                     self._save()
-                self._heed_stop()
+                if asked:
+                    heed_stop(self.stop, self.directory)
 
     @property
     def _rl_s(self) -> float:
@@ -276,13 +294,6 @@ class Loop:
         if updates and version // updates > self.saved:
             return True
         return bool(seconds) and time.monotonic() - self._saved_at > seconds
-
-    def _heed_stop(self) -> None:
-        if self.stop.asked is not None:
-            name = signal.Signals(self.stop.asked).name
-            raise StoppedError(
-                self.stop.asked, f"stopped by {name}; to go on: {how_to_go_on(self.directory)}"
-            )
 
     def _record_updates(self, updates: list[dict[str, float]]) -> None:
         for metrics in updates:
@@ -343,7 +354,7 @@ class Loop:
 
     def _meanwhile(self, progress: Progress) -> None:
         self._record(progress)
-        self._heed_stop()
+        heed_stop(self.stop, self.directory)
 
     def _report(self, group: str, results: list[EpisodeResult], steps: float, version: int) -> dict[str, Any]:
         summary = summarise(results) | {"env_steps": steps, "group": group}

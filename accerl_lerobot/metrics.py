@@ -108,12 +108,12 @@ class MetricsLog:
     def state(self) -> dict[str, Any]:
         """All that `restore` needs: how far the file goes, and the seconds."""
         self._file.flush()
+        os.fsync(self._file.fileno())
         return {"bytes": self._path.stat().st_size, "wall_s": self.wall_s}
 
     def restore(self, state: dict[str, Any], update: int) -> None:
         """Goes on from what `state` gave, after `update` updates: what was written since is about others."""
-        if self._path.stat().st_size > state["bytes"]:
-            os.truncate(self._path, state["bytes"])
+        cut_back(self._path, state["bytes"])
         # TensorBoard forgets what older files have of this step and later ones.
         begun = self._session(status=self._session.START)
         self._board.add_event(self._event(wall_time=time.time(), step=update + 1, session_log=begun))
@@ -125,6 +125,13 @@ class MetricsLog:
         self._board.close()
         if self._wandb is not None:
             self._wandb.finish()
+
+
+def cut_back(path: Path, size: int) -> None:
+    """Shortens a file of lines to so many bytes; one that is shorter already to the end of its last line."""
+    if path.stat().st_size < size:
+        size = path.read_bytes().rfind(b"\n") + 1
+    os.truncate(path, size)
 
 
 def plain(value: Any) -> Any:

@@ -43,6 +43,8 @@ from accerl_lerobot.checkpoint import (
     CONFIG,
     PRETRAINED,
     TRAINING_STATE,
+    begun,
+    go_back_to,
     newest_whole,
     write_atomically,
 )
@@ -51,8 +53,9 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.engine import Engine, WorkerError
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.loop import Loop, Times
+from accerl_lerobot.loop import Loop, Times, heed_stop
 from accerl_lerobot.metrics import MetricsLog
+from accerl_lerobot.replay.journal import EPISODES
 from accerl_lerobot.stopping import Stopping
 
 logger = logging.getLogger(__name__)
@@ -161,6 +164,7 @@ def train(config: RunConfig, directory: Path, console: Console, wanted: str | No
         StoppedError: it was asked to stop, and has been saved.
     """
     started = time.monotonic()
+    checkpoint = None if wanted is None else _checkpoint(directory, wanted, console)
     text = yaml.safe_dump(encode(replace(config, resume=False)), sort_keys=False)
     write_atomically(directory / CONFIG, text)
     tasks = check_world(config)
@@ -168,10 +172,10 @@ def train(config: RunConfig, directory: Path, console: Console, wanted: str | No
         from accerl_lerobot.world_model.dreaming import check_imagination
 
         check_imagination(config)
-    checkpoint = None if wanted is None else _checkpoint(directory, wanted, console)
     if checkpoint is None:
         config = _warm_started(config, directory, console)
     else:
+        go_back_to(checkpoint)
         config = _going_on(config, directory, checkpoint)
         console.say(f"going on from {checkpoint}")
     before_s = 0.0 if checkpoint is None else None
@@ -185,7 +189,10 @@ def train(config: RunConfig, directory: Path, console: Console, wanted: str | No
             try:
                 return _attempt(config, directory, checkpoint, console, log, tasks, times, stop)
             except WorkerError as error:
+                heed_stop(stop, directory)
                 checkpoint = recovery.next(directory / CHECKPOINTS, console, error)
+                heed_stop(stop, directory)
+                go_back_to(checkpoint)
                 config = _going_on(config, directory, checkpoint)
 
 
@@ -204,7 +211,6 @@ def _attempt(
     state = None if checkpoint is None else checkpoint / TRAINING_STATE
     with console.stage("starting workers"):
         engine = make_engine(config, tasks, history, state)
-    stop.listen()
     with contextlib.closing(engine):
         return Loop(config, directory, console, engine, log, tasks, times, stop).run(state)
 
@@ -243,7 +249,11 @@ class Recovery:
 
 def _checkpoint(directory: Path, wanted: str, console: Console) -> Path | None:
     """The one to go on from; None if the run had not come so far."""
-    if not (directory / CHECKPOINTS).is_dir():
+    if not begun(directory / CHECKPOINTS):
+        console.say("there is no checkpoint yet: what is left of the run is begun from its warm start on")
+        for name in ("metrics.jsonl", EPISODES):
+            (directory / name).unlink(missing_ok=True)
+        shutil.rmtree(directory / "tensorboard", ignore_errors=True)
         return None
     path, passed = newest_whole(directory / CHECKPOINTS, wanted)
     for why in passed:

@@ -17,6 +17,8 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
@@ -51,19 +53,22 @@ class Stopping:
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Stopping:
-        self._before = {number: signal.getsignal(number) for number in SIGNALS}
-        self.listen()
+        if threading.current_thread() is threading.main_thread():  # Python allows it nowhere else
+            self._before = {number: signal.signal(number, self._note) for number in SIGNALS}
         return self
 
-    def listen(self) -> None:
-        """Again, where a library has put handlers of its own in their place, as Ray does when it starts."""
-        if threading.current_thread() is threading.main_thread():  # Python allows it nowhere else
-            for number in SIGNALS:
-                signal.signal(number, self._note)
-
     def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    @staticmethod
+    @contextmanager
+    def kept() -> Iterator[None]:
+        """Puts handlers back that a library replaces by its own inside, as Ray does when it starts."""
+        before = {number: signal.getsignal(number) for number in SIGNALS}
+        yield
         if threading.current_thread() is threading.main_thread():
-            for number, handler in self._before.items():
+            for number, handler in before.items():
                 signal.signal(number, handler)
 
     def _note(self, number: int, frame: FrameType | None) -> None:

@@ -140,12 +140,14 @@ class LightTrainer:
             records, self._records = self._records, []
         return records
 
-    def save(self, directory: Path) -> tuple[int, list[dict[str, float]]]:
-        if directory.name == FULL:
-            raise OSError("no space left on the device")
+    def hold(self) -> tuple[int, list[dict[str, float]]]:
         with self._lock:
             records, self._records = self._records, []
-            ledger = list(self._ledger)
-        snapshot.save(directory / TRAINING_STATE / "trainer", {"ledger": ledger})
-        (directory / TRAINING_STATE / "training_step.json").write_text(json.dumps({"step": len(ledger)}))
-        return len(ledger), records
+            self._kept = list(self._ledger)
+        return len(self._kept), records
+
+    def write(self, directory: Path) -> None:
+        if directory.name == FULL:
+            raise OSError("no space left on the device")
+        snapshot.save(directory / TRAINING_STATE / "trainer", {"ledger": self._kept})
+        (directory / TRAINING_STATE / "training_step.json").write_text(json.dumps({"step": len(self._kept)}))

@@ -30,8 +30,10 @@ from accerl_lerobot.checkpoint import (
     PRETRAINED,
     RUN_STATE,
     TRAINING_STATE,
+    begun,
     defect,
     displaced,
+    go_back_to,
     let_go,
     newest_whole,
     relocate,
@@ -109,18 +111,35 @@ def test_what_a_killed_process_left_behind_is_no_obstacle(tmp_path: Path):
     assert listing(tmp_path) == ["000001", "last"]
 
 
-def test_the_same_version_again_keeps_the_first(tmp_path: Path):
+def test_the_same_version_again_replaces_the_first(tmp_path: Path):
+    """What goes with the same weights, replay above all, need not be the same."""
     first = save_checkpoint(tmp_path, writer(5, "first"))
     again = save_checkpoint(tmp_path, writer(5, "again"))
-    assert first == again and (first / PRETRAINED / "model.safetensors").read_text() == "first"
-    assert listing(tmp_path) == ["000005", "last"]
+    assert first == again and (first / PRETRAINED / "model.safetensors").read_text() == "again"
+    assert listing(tmp_path) == ["000005", "last"] and defect(first) is None
 
 
-def test_a_broken_one_is_replaced(tmp_path: Path):
-    first = save_checkpoint(tmp_path, writer(5, "first"))
-    (first / PRETRAINED / "model.safetensors").write_text("fir")
-    save_checkpoint(tmp_path, writer(5, "again"))
-    assert (first / PRETRAINED / "model.safetensors").read_text() == "again" and defect(first) is None
+def test_one_that_was_put_aside_when_the_process_died_is_brought_back(tmp_path: Path):
+    save_checkpoint(tmp_path, state_writer(5))
+    (tmp_path / "000005").rename(tmp_path / ".replaced-000005")
+    assert newest_whole(tmp_path)[0].name == "000005"
+    (tmp_path / ".replaced-000005").mkdir()  # the new one had been put in its place
+    assert begun(tmp_path) and listing(tmp_path) == ["000005", "last"]
+
+
+def test_going_back_puts_aside_what_came_after(tmp_path: Path):
+    for version in (1, 2, 30):
+        save_checkpoint(tmp_path, state_writer(version))
+    go_back_to(tmp_path / "000002")
+    assert os.readlink(tmp_path / "last") == "000002" and newest_whole(tmp_path)[0].name == "000002"
+    assert listing(tmp_path) == ["000001", "000002", "abandoned-000030", "last"]
+    assert (tmp_path / "abandoned-000030" / PRETRAINED / "model.safetensors").is_file()
+
+
+def test_nothing_but_a_half_written_one_is_none(tmp_path: Path):
+    assert not begun(tmp_path / "checkpoints")
+    (tmp_path / ".writing-77" / PRETRAINED).mkdir(parents=True)
+    assert not begun(tmp_path) and listing(tmp_path) == []
 
 
 def state_writer(version: int) -> Callable[[Path], int]:

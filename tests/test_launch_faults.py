@@ -120,7 +120,7 @@ def test_what_cannot_be_done_is_refused_and_an_exception_in_the_trainer_ends_the
     one.plan(evaluation_plans(("match",), 2, "a"))
     with pytest.raises(ValueError, match="episode 0 of 'a' is planned twice"):
         one.plan(evaluation_plans(("match",), 1, "a"))
-    with pytest.raises(RuntimeError, match=r"trainer worker failed in save(.|\n)*no space left"):
+    with pytest.raises(RuntimeError, match=r"trainer worker failed in write(.|\n)*no space left"):
         one.save(tmp_path / FULL)
     assert len(collect(one, "a", 2)) == 2
     one._last_change -= 1e6  # as if nobody had polled for days: no reason to say that nothing moves

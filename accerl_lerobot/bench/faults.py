@@ -36,7 +36,7 @@ from typing import Any
 
 from rich.table import Table
 
-from accerl_lerobot.bench.victims import CLASSES, Victim, await_hit, descendants, hit
+from accerl_lerobot.bench.victims import CLASSES, Victim, alive, await_hit, hit
 from accerl_lerobot.checkpoint import PRETRAINED, newest_whole
 from accerl_lerobot.config import RunConfig, parse
 from accerl_lerobot.console import Console
@@ -48,6 +48,8 @@ START_S = 300.0
 """How long a run may take to its first update."""
 GRACE_S = 60.0
 """How long it may take to stop when it is asked to."""
+SPARE = 5
+"""Updates beyond the last that was logged before a hit, by which a run has recovered."""
 TIDY_S = 10.0
 """How long what it has started may outlive it."""
 ENDLESS = 1_000_000
@@ -161,20 +163,20 @@ def _cell(
     ]
     victim = Victim(folder, arguments, folder.with_suffix(".log"))
     found: dict[str, Any] = {"target": target, "fault": fault, "fired": 0, "recovered": 0, "seconds": []}
+    left: list[int] = []
     try:
         victim.await_update(7, START_S)
         for _ in range(config.repeats):
             time.sleep(rng.uniform(0.5, 3.0))
             _hit_once(victim, found, target, number, rng)
-        found["exit"] = victim.end(GRACE_S)
+        found["exit"], left = victim.end(GRACE_S)
     except (RuntimeError, subprocess.TimeoutExpired) as error:
         found["error"] = str(error)
     finally:
-        left = descendants(victim.process.pid)
         deadline = time.monotonic() + TIDY_S
-        while time.monotonic() < deadline and any(hit(pid, 0) for pid in left):
+        while time.monotonic() < deadline and any(alive(pid) for pid in left):
             time.sleep(0.1)
-        found["left_behind"] = sum(hit(pid, 0) for pid in left) if "error" not in found else 0
+        found["left_behind"] = sum(alive(pid) for pid in left)
         victim.kill()
     return found | audit(victim)
 
@@ -183,17 +185,19 @@ def _hit_once(victim: Victim, found: dict[str, Any], target: str, number: int, r
     pids = victim.pids(target)
     if not pids:
         raise RuntimeError(f"there is no process of {target} to be hit")
-    pid = rng.choice(pids)
+    pid, last = rng.choice(pids), max(victim.updates())
     started = time.monotonic()
     if not (hit(pid, number) and await_hit(pid, number)):
         raise RuntimeError(f"{target} {pid} took no notice of signal {number}")
     found["fired"] += 1
     if target == "driver":
         victim.process.wait()
+        last = max(victim.updates())
         victim.go_on()
     victim.await_successors(target, pid, len(pids), START_S)
     if target != "rollout":
-        victim.await_update(victim.updates()[-1] + 1, START_S)
+        # With some to spare: a few may have been on their way when it was hit.
+        victim.await_update(last + SPARE, START_S)
     found["recovered"] += 1
     found["seconds"].append(round(time.monotonic() - started, 2))
 

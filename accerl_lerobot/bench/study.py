@@ -337,7 +337,12 @@ class _Runner:
         threads = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
         with log.open("ab") as out:
             process = subprocess.Popen(
-                command, stdout=out, stderr=out, env=os.environ | threads, pass_fds=(self._lock,)
+                command,
+                stdout=out,
+                stderr=out,
+                env=os.environ | threads,
+                pass_fds=(self._lock,),
+                start_new_session=True,  # Ctrl-C is for the study, which asks them to stop
             )
         self._processes.add(process)
         if self._stopped:

@@ -104,14 +104,15 @@ class Victim:
             self._check(started, timeout, f"no successor of {target} {gone}")
             time.sleep(LOOK_S)
 
-    def end(self, grace: float) -> int:
-        """Asks it to stop; its exit code.
+    def end(self, grace: float) -> tuple[int, list[int]]:
+        """Asks it to stop; its exit code, and the processes that were below it.
 
         Raises:
             subprocess.TimeoutExpired: it did not within so many seconds.
         """
+        below = descendants(self.process.pid)
         self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(grace)
+        return self.process.wait(grace), below
 
     def kill(self) -> None:
         """Ends it and all below it, whatever they do."""
@@ -134,6 +135,12 @@ def hit(pid: int, number: int) -> bool:
     except ProcessLookupError:
         return False
     return True
+
+
+def alive(pid: int) -> bool:
+    """Whether there is such a process, which is no zombie."""
+    now = _stat(pid)
+    return now is not None and now[0] not in "ZX"
 
 
 def await_hit(pid: int, number: int, timeout: float = 10.0) -> bool:

@@ -32,6 +32,7 @@ import numpy as np
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Origin, Segment
+from accerl_lerobot.metrics import cut_back
 
 EPISODES = "episodes.jsonl"
 """Name of the file in a run's folder."""
@@ -64,12 +65,12 @@ class Journal:
     """
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("ab", buffering=0)
+        self._path, self._file = path, path.open("ab")
 
-    @property
-    def position(self) -> int:
-        """Bytes so far."""
-        return os.fstat(self._file.fileno()).st_size
+    def save(self) -> int:
+        """Has the disk hold it; the bytes so far."""
+        os.fsync(self._file.fileno())
+        return self._path.stat().st_size
 
     def write(self, segment: Segment) -> None:
         """Notes a real segment."""
@@ -91,11 +92,11 @@ class Journal:
             "actions": base64.b64encode(actions.astype("<f4").tobytes()).decode(),
         }
         self._file.write((json.dumps(line) + "\n").encode())
+        self._file.flush()
 
     def cut(self, position: int) -> None:
-        """Forgets what was written after `position`; nothing, if there is less."""
-        if self.position > position:
-            self._file.truncate(position)
+        """Forgets what was written after `position`."""
+        cut_back(self._path, position)
 
 
 def read_journal(path: Path) -> Iterator[Done]:

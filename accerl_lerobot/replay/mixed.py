@@ -124,7 +124,7 @@ class MixedReplay:
             "real_ended": self.real_ended,
             "awaited": self.awaited,
             "held": self.held,
-            "journal": None if self._journal is None else self._journal.position,
+            "journal": None if self._journal is None else self._journal.save(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:

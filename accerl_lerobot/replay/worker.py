@@ -148,7 +148,7 @@ class ReplayWorker:
 
     async def news(self, cursor: int) -> News:
         """Real segments since the `cursor`-th; those that nobody asked for in time are left out."""
-        new = min(self._real_count - cursor, len(self._real))
+        new = max(0, min(self._real_count - cursor, len(self._real)))
         segments = list(self._real)[len(self._real) - new :]
         return News(segments, self._real_count, self._replay.real_ended, self._closed)
 

@@ -72,6 +72,7 @@ class TrainerWorker:
             adapter.load_trainable(snapshot.load(state / WEIGHTS))
             self._update.restore(snapshot.load(state / "trainer"))
         self._lock = threading.Lock()
+        self._kept: Any = None
         self._history: deque[dict[str, float]] = deque()  # filled on one thread, emptied on another
 
     def ready(self) -> int:
@@ -120,24 +121,26 @@ class TrainerWorker:
         """One record per update since the last call."""
         return [self._history.popleft() for _ in range(len(self._history))]
 
-    def save(self, directory: Path) -> tuple[int, list[dict[str, float]]]:
-        """Writes ``pretrained_model`` and its part of ``training_state``, as they are between two updates.
-
-        The next update waits for them to be copied, and not for the files.
+    def hold(self) -> tuple[int, list[dict[str, float]]]:
+        """Keeps a copy of all that is to be saved, as it is between two updates, for `write`.
 
         Returns:
-            Their version, and the records up to it that `metrics` has not given.
+            Its version, and the records up to it that `metrics` has not given.
         """
-        from accerl_lerobot.policies.loading import copy_weights, save_pretrained
+        from accerl_lerobot.policies.loading import copy_weights
 
-        adapter = self._update.adapter
         with self._lock:
-            weights, trained, state = copy_weights(adapter), self._export(), self._update.state()
-            version, records = self._update.version, self.metrics()
-        save_pretrained(adapter, directory / PRETRAINED, self._policy, weights)
+            self._kept = copy_weights(self._update.adapter), self._export(), self._update.state()
+            return self._update.version, self.metrics()
+
+    def write(self, directory: Path) -> None:
+        """Writes what is kept: ``pretrained_model`` and its part of ``training_state``."""
+        from accerl_lerobot.policies.loading import save_pretrained
+
+        (weights, trained, state), self._kept = self._kept, None
+        save_pretrained(self._update.adapter, directory / PRETRAINED, self._policy, weights)
         snapshot.save(directory / TRAINING_STATE / WEIGHTS, trained)
         snapshot.save(directory / TRAINING_STATE / "trainer", state)
-        return version, records
 
     def _export(self) -> dict[str, Any]:
         return self._update.adapter.export_trainable()

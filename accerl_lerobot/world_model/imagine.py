@@ -204,7 +204,9 @@ class Imagination:
             self._success.load_state_dict(success)
         if isinstance(self._model, OracleModel):
             self._model.tasks = state["tasks"]
-        self._state = state["dreams"]
+        if state["dreams"] is not None:
+            device = "cpu" if self._success is None else self._success.out.weight.device
+            self._state = {name: tensor.to(device) for name, tensor in state["dreams"].items()}
         for i, row in enumerate(state["rows"]):
             if row is not None:
                 start: Start = row["start"]

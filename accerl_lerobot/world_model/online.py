@@ -163,6 +163,8 @@ class OnlineLearner:
         self._new = True
         """Whether there are episodes that `_examples` does not know."""
         self._ended = self._since = self._last_tries = 0
+        self._untried: dict[str, Any] = {}
+        """Of the state, what was otherwise before the trial whose outcome nobody has yet."""
         self._trying: float | None = None
         """When the trial began that is going on; read on another thread."""
 
@@ -233,11 +235,17 @@ class OnlineLearner:
         finally:
             self._trying = None
 
+    def handed_over(self) -> None:
+        """What was promoted last serves now."""
+        self._untried = {}
+
     def _promote(self, last: bool) -> Promotion | None:
+        self._untried = {name: getattr(self, name) for name in _STATE}
         self._since = 0
         self._last_tries += last
         held = [*self._held_offline, *self._held]
         if not held:
+            self._untried = {}
             return None
         model = copy.deepcopy(self._learner.serving)
         success = copy.deepcopy(self._success.model).eval().requires_grad_(False)
@@ -252,6 +260,7 @@ class OnlineLearner:
             self.refused += 1
             if last and self._last_tries < self.config.last_tries:
                 self.owed += self.config.try_every * self.config.steps_per_episode
+            self._untried = {}
             return None
         self.promoted += 1
         self._set_threshold(success, learnt + self._scored(model, success, list(self._held)))
@@ -270,16 +279,23 @@ class OnlineLearner:
             success.config.threshold = least or success.config.threshold
 
     def state(self) -> dict[str, Any]:
-        """A copy of all that `restore` needs; see `snapshot`. A trial that is going on is begun anew."""
+        """A copy of all that `restore` needs; see `snapshot`.
+
+        A trial that is going on, or whose outcome has not been handed over, is to be made anew.
+        """
         unfinished = {name: dict(parts) for name, parts in self._unfinished.parts.items()}
-        return {name: getattr(self, name) for name in _STATE} | {
-            "learner": self._learner.state(),
-            "success": self._success.state(),
-            "learnt": list(self._learnt),
-            "held": list(self._held),
-            "rng": copy.deepcopy(self._rng),
-            "unfinished": unfinished,
-        }
+        return (
+            {name: getattr(self, name) for name in _STATE}
+            | self._untried
+            | {
+                "learner": self._learner.state(),
+                "success": self._success.state(),
+                "learnt": list(self._learnt),
+                "held": list(self._held),
+                "rng": copy.deepcopy(self._rng),
+                "unfinished": unfinished,
+            }
+        )
 
     def restore(self, state: dict[str, Any]) -> None:
         """Goes on from what `state` gave."""

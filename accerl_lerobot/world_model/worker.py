@@ -49,6 +49,8 @@ DREAMS, LEARNER = "dreams", "world_learner"
 """Names of their states."""
 PAUSE_S = 0.02
 """How long a worker with nothing to do sleeps."""
+TAKEN_OVER_S = 30.0
+"""How long a promoted model may take to be taken over; a moment, unless nobody decides."""
 LOOK_S = 0.2
 """How often replay is asked for new real segments."""
 
@@ -98,7 +100,10 @@ class DreamWorker:
         return self._dreams.metrics()
 
     def save(self, directory: Path) -> None:
-        """Writes its part of a checkpoint."""
+        """Writes its part of a checkpoint, once it has taken over what was promoted."""
+        deadline = time.monotonic() + TAKEN_OVER_S
+        while self._promoted is not None and time.monotonic() < deadline:
+            time.sleep(PAUSE_S)
         with self._dreaming:
             saved = {"dreams": self._dreams.state(), "cursor": self._cursor}
             snapshot.save(directory / TRAINING_STATE / DREAMS, saved)
@@ -183,15 +188,18 @@ class WorldLearningWorker:
     def run(self, dreamer: Any, replay: Any) -> None:
         """Learns until replay is closed."""
         news, learner = _News(replay, self._cursor), self._learner
-        promising, held = None, False
+        promising: bool | None = None
+        held: bool | None = None
+        """What replay has been told; None: nothing by this process."""
         while not news.closed:
             with self._learning:
                 for segment in news.fresh():
                     learner.add(segment)
                 self._cursor = news.cursor
             last = news.ended
-            if held is not (learner.due(last=False) and not last):
-                held = not held
+            due = learner.due(last=False) and not last
+            if held is not due:
+                held = due
                 ray.get(replay.hold.remote(held))
             if promising is not learner.promising(last):
                 promising = learner.promising(last)
@@ -202,6 +210,7 @@ class WorldLearningWorker:
             elif learner.due(last):
                 if promotion := learner.promote(last):
                     ray.get(dreamer.promote.remote(promotion))
+                    learner.handed_over()
             else:
                 time.sleep(PAUSE_S)
 

@@ -155,7 +155,10 @@ def test_what_is_saved_is_a_whole_version(monkeypatch: pytest.MonkeyPatch, tmp_p
     runner.start()
     while stage.worker._update.version < 3:
         threading.Event().wait(0.001)
-    saved = [stage.worker.save(tmp_path / str(i)) for i in range(8)]
+    saved = []
+    for i in range(8):
+        saved.append(stage.worker.hold())
+        stage.worker.write(tmp_path / str(i))
     stage._batches = 0
     runner.join()
     assert [version for version, _ in saved] == [before for before, _ in seen] == [after for _, after in seen]
