@@ -15,12 +15,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from accerl_lerobot import snapshot
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.world_model import online
 from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, TrialConfig
@@ -209,3 +211,37 @@ def test_after_the_last_episode_one_that_serves_is_tried_once_more(monkeypatch: 
     while made.owed >= 1:
         made.step()
     assert made.due(last=True) and made.promote(last=True) is not None and not made.promising(last=True)
+
+
+def test_a_trial_whose_outcome_nobody_has_yet_is_made_again_by_who_goes_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    """A checkpoint may be written during a trial, or before what has passed serves."""
+    passes(monkeypatch, False, True)
+    made = learner(try_every=2)
+    states: list[dict[str, Any]] = []
+    calibrate = online.calibrate
+    monkeypatch.setattr(online, "calibrate", lambda *a: states.append(made.state()) or calibrate(*a))
+
+    def gone_on(state: dict[str, Any]) -> OnlineLearner:
+        snapshot.save(tmp_path / "learner", state)
+        again = learner(try_every=2)
+        again.restore(snapshot.load(tmp_path / "learner"))
+        return again
+
+    for segment in episodes(False, True, False, True):
+        made.add(segment)
+    made.step()
+    assert made.promote(last=False) is None and not made.due(last=False)
+    assert gone_on(states[0]).due(last=False), "it was in the middle of its trial"
+    assert not gone_on(made.state()).due(last=False), "it has failed, and knows it"
+    for segment in episodes(False, True):
+        made.add(segment)
+    assert made.promote(last=False) is not None
+    again = gone_on(made.state())
+    assert again.due(last=False) and again.promoted == 0, "nobody dreams of it yet"
+    made.handed_over()
+    again = gone_on(made.state())
+    assert not again.due(last=False) and again.promoted == 1
+    for one, other in zip(made._learner.model.parameters(), again._learner.model.parameters(), strict=True):
+        assert torch.equal(one, other)
