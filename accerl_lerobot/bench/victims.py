@@ -68,7 +68,9 @@ class Victim:
         if target == "driver":
             return [self.process.pid] if self.process.poll() is None else []
         name = f"ray::{CLASSES[target]}"
-        return [pid for pid in descendants(self.process.pid) if title(pid).startswith(name)]
+        found = {pid for pid in descendants(self.process.pid) if title(pid).startswith(name)}
+        # What a worker forks has its name, too, until it becomes something else.
+        return sorted(pid for pid in found if (now := _stat(pid)) is not None and now[1] not in found)
 
     def records(self) -> list[dict[str, Any]]:
         """What it has logged; a last line that is being written is left out."""
