@@ -27,6 +27,7 @@ of one. Whoever goes on from one looks at every byte first.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -36,11 +37,14 @@ from pathlib import Path
 from typing import Any
 
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.safety import Origin, safe_join
 
 PRETRAINED, TRAINING_STATE, WORLD_MODEL = "pretrained_model", "training_state", "world_model"
 CHECKPOINTS = "checkpoints"
 """Folder of a run's."""
-CONFIG, MANIFEST, LAST = "config.yaml", "manifest.json", "last"
+CONFIG, SUMMARY = "config.yaml", "summary.json"
+"""Files of a run: how it is to be, and what came of it once it has ended."""
+MANIFEST, LAST = "manifest.json", "last"
 WRITING, REPLACED = ".writing-", ".replaced-"
 """How the names of checkpoints begin that are being written, and of those that are being replaced."""
 RUN_STATE, WEIGHTS = "run", "weights"
@@ -49,6 +53,8 @@ STEP = "training_step.json"
 """LeRobot's file of how far it has come."""
 FORMAT = 1
 """Of the manifest and the training state; another one is refused."""
+UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError)
+"""What reading a manifest raises that is none."""
 BACKBONE = "backbone"
 """Folder beside the weights with the vision-language backbone's config and tokenisers."""
 FAST = f"{BACKBONE}/fast"
@@ -150,15 +156,14 @@ def write_atomically(path: Path, text: str) -> None:
     _sync(path.parent)
 
 
-def write_manifest(directory: Path, without: str = MANIFEST) -> None:
-    """Writes the size and SHA-256 of every file in a checkpoint, in one stroke; but of those in `without`."""
+def write_manifest(directory: Path) -> None:
+    """Writes the size and SHA-256 of every file in a checkpoint, in one stroke."""
     files = {
-        str(path.relative_to(directory)): {"size": path.stat().st_size, "sha256": _digest(path)}
+        str(path.relative_to(directory)): {"size": path.stat().st_size, "sha256": digest(path)}
         for path in sorted(directory.rglob("*"))
-        if path.is_file()
-        and path.relative_to(directory).parts[0] not in (MANIFEST, f".{MANIFEST}.new", without)
+        if path.is_file() and path.relative_to(directory).parts[0] not in (MANIFEST, f".{MANIFEST}.new")
     }
-    write_atomically(directory / MANIFEST, json.dumps({"format": FORMAT, "files": files}, indent=2) + "\n")
+    _write_manifest(directory, {"format": FORMAT, "files": files})
 
 
 def defect(directory: Path) -> str | None:
@@ -170,17 +175,18 @@ def defect(directory: Path) -> str | None:
         files = {str(name): (int(v["size"]), str(v["sha256"])) for name, v in manifest["files"].items()}
     except FileNotFoundError:
         return f"it has no {MANIFEST}"
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except UNREADABLE as error:
         return f"its {MANIFEST} is broken ({' '.join(str(error).split())[:80]})"
-    for name, (size, digest) in files.items():
-        path = directory / name
-        if Path(name).is_absolute() or ".." in Path(name).parts:
+    for name, (size, expected) in files.items():
+        try:
+            path = safe_join(directory, name, Origin("config_path", str(directory)))
+        except InputError:
             return f"its {MANIFEST} names {name!r}, outside of it"
         if not path.is_file():
             return f"{name} is missing"
         if path.stat().st_size != size:
             return f"{name} has {path.stat().st_size} bytes, not {size}"
-        if _digest(path) != digest:
+        if digest(path) != expected:
             return f"{name} is not what was written"
     return None
 
@@ -231,7 +237,11 @@ def let_go(checkpoints: Path, keep: int) -> None:
     """Removes the training state of all but the newest `keep` checkpoints; their policies stay."""
     having = [path for path in _numbered(checkpoints) if (path / TRAINING_STATE).is_dir()]
     for path in having[: max(0, len(having) - keep)]:
-        write_manifest(path, without=TRAINING_STATE)  # first, or one half removed would count as broken
+        # First, or one half removed would count as broken. What is left is not read, let alone vouched for.
+        with contextlib.suppress(*UNREADABLE):  # a broken manifest says nothing of it
+            manifest = _manifest(path)
+            left = {k: v for k, v in manifest["files"].items() if Path(k).parts[0] != TRAINING_STATE}
+            _write_manifest(path, manifest | {"files": left})
         shutil.rmtree(path / TRAINING_STATE)
 
 
@@ -244,7 +254,12 @@ def _manifest(directory: Path) -> Any:
     return json.loads((directory / MANIFEST).read_text())
 
 
-def _digest(path: Path) -> str:
+def _write_manifest(directory: Path, manifest: dict[str, Any]) -> None:
+    write_atomically(directory / MANIFEST, json.dumps(manifest, indent=2) + "\n")
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -297,9 +312,16 @@ def _named(directory: Path) -> tuple[dict[str, Any], dict[str, Any]]:
 def _local_names(config: dict[str, Any], processor: dict[str, Any]) -> list[tuple[dict[str, Any], str, str]]:
     """Where a checkpoint's files name a folder of this machine, or by its bare name one beside them, as they
     do on the Hub: (mapping, key, our folder for it)."""
+    named = [(place, place[0].get(place[1]) or "") for place in places_of_names(config, processor)]
+    return [place for place, name in named if Path(name).is_absolute() or name == place[2]]
+
+
+def places_of_names(
+    config: dict[str, Any], processor: dict[str, Any]
+) -> list[tuple[dict[str, Any], str, str]]:
+    """Where a policy's files may name a folder: (mapping, key, our folder for it)."""
     places = [(config, key, folder) for key, folder in CONFIG_FOLDERS.items()]
-    for step in processor["steps"]:
+    for step in processor.get("steps", []):
         if (option := STEP_FOLDERS.get(step.get("registry_name"))) is not None:
             places.append((step["config"], *option))
-    named = [(place, place[0].get(place[1]) or "") for place in places]
-    return [place for place, name in named if Path(name).is_absolute() or name == place[2]]
+    return places

@@ -33,6 +33,7 @@ from accerl_lerobot.checkpoint import (
     CONFIG,
     PRETRAINED,
     RUN_STATE,
+    SUMMARY,
     TRAINING_STATE,
     let_go,
     save_checkpoint,
@@ -46,6 +47,7 @@ from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.evaluation.pictures import before_after, success_curve
 from accerl_lerobot.evaluation.summary import summarise
 from accerl_lerobot.metrics import MetricsLog, plain
+from accerl_lerobot.resume import how_to_go_on
 from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.stopping import StoppedError, Stopping
 
@@ -61,11 +63,6 @@ _STATE = (
     "before", "evaluations", "curve", "recent", "explored", "lags", "lag_max", "mismatch_max", "during",
     "base", "groups", "steps", "evaluated", "saved",
 )  # fmt: skip
-
-
-def how_to_go_on(directory: Path) -> str:
-    """The command."""
-    return f"accerl train --resume=true --config_path={directory / CONFIG}"
 
 
 def heed_stop(stop: Stopping, directory: Path) -> None:
@@ -195,7 +192,7 @@ class Loop:
             before_after(self.directory / "before_after.mp4", filmed, results, fps=20)
         success_curve(self.directory / "success_curve.png", self.evaluations, self.curve)
         summary = plain(self._summary(self.before, after, last))
-        write_atomically(self.directory / "summary.json", json.dumps(summary, indent=2) + "\n")
+        write_atomically(self.directory / SUMMARY, json.dumps(summary, indent=2) + "\n")
         for left in self.directory.glob(f"{FILMED}.*"):
             left.unlink()
         return dict(summary)

@@ -30,6 +30,9 @@ from typing import Any
 
 import numpy as np
 
+METRICS = "metrics.jsonl"
+"""Name of the file in a run's folder."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class WandBConfig:
@@ -58,7 +61,7 @@ class MetricsLog:
         from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
         self._event, self._session, self._summary = Event, SessionLog, Summary
-        self._path = directory / "metrics.jsonl"
+        self._path = directory / METRICS
         self._file = self._path.open("a", buffering=1)
         self._board = EventFileWriter(str(directory / "tensorboard"))
         self._started = time.monotonic()

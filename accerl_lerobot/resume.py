@@ -17,12 +17,13 @@ from __future__ import annotations
 
 import fcntl
 import json
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from accerl_lerobot.checkpoint import CONFIG, LAST
+from accerl_lerobot.checkpoint import CHECKPOINTS, CONFIG, LAST, SUMMARY
 from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.errors import InputError
 
@@ -32,6 +33,11 @@ CHANGEABLE = (
     "save_keep", "trainer.updates", "trainer.num_threads", "rollout.max_restarts", "inference",
 )  # fmt: skip
 """Fields, and rooms, that may be other than before: what is learnt, and from what, is the same."""
+
+
+def how_to_go_on(directory: Path) -> str:
+    """The command that goes on with a run."""
+    return f"accerl train --resume=true --config_path={shlex.quote(str(directory / CONFIG))}"
 
 
 class Begun(NamedTuple):
@@ -57,7 +63,7 @@ def begun_run(path: Path | None, config: RunConfig) -> Begun:
         raise InputError("resume", True, f"add --config_path: {how}")
     folders = path.absolute().parents
     directory, checkpoint = folders[0], LAST
-    if len(folders) > 2 and folders[1].name == "checkpoints":
+    if len(folders) > 2 and folders[1].name == CHECKPOINTS:
         directory, checkpoint = folders[2], folders[0].name
     if not (directory / CONFIG).is_file() or not (directory / LOCK).is_file():
         raise InputError("config_path", str(path), f"no run has been begun there; {how}")
@@ -66,7 +72,7 @@ def begun_run(path: Path | None, config: RunConfig) -> Begun:
         if not any(name == free or name.startswith(f"{free}.") for free in CHANGEABLE):
             remedy = f"the run was begun with {was!r}; leave it so, or begin a new run with --policy.path"
             raise InputError(name, now, remedy)
-    summary = directory / "summary.json"
+    summary = directory / SUMMARY
     if summary.is_file() and json.loads(summary.read_text())["updates"] >= config.trainer.updates:
         remedy = f"the run {directory} has made them, and has ended; ask for more"
         raise InputError("trainer.updates", config.trainer.updates, remedy)

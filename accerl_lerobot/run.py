@@ -54,7 +54,7 @@ from accerl_lerobot.engine import Engine, WorkerError
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.loop import Loop, Times, heed_stop
-from accerl_lerobot.metrics import MetricsLog
+from accerl_lerobot.metrics import METRICS, MetricsLog
 from accerl_lerobot.replay.journal import EPISODES
 from accerl_lerobot.stopping import Stopping
 
@@ -121,8 +121,6 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
     from accerl_lerobot.demos.windows import check_dataset, task_texts
     from accerl_lerobot.policies.loading import resolve_device
 
-    if config.policy.path is not None:
-        return config
     if not config.sft.steps:
         remedy = "give a LeRobot checkpoint, or sft.steps > 0 to make one from demonstrations"
         raise InputError("policy.path", None, remedy)
@@ -251,7 +249,7 @@ def _checkpoint(directory: Path, wanted: str, console: Console) -> Path | None:
     """The one to go on from; None if the run had not come so far."""
     if not begun(directory / CHECKPOINTS):
         console.say("there is no checkpoint yet: what is left of the run is begun from its warm start on")
-        for name in ("metrics.jsonl", EPISODES):
+        for name in (METRICS, EPISODES):
             (directory / name).unlink(missing_ok=True)
         shutil.rmtree(directory / "tensorboard", ignore_errors=True)
         return None

@@ -84,7 +84,7 @@ def _encode(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
         if array.dtype.kind not in "biuf":
             raise TypeError(f"{place}: an array of {array.dtype} cannot be saved")
         name = str(len(arrays))
-        arrays[name] = np.array(array, order="C")
+        arrays[name] = np.asarray(array, order="C")
         return name
 
     if value is None or isinstance(value, (bool, int, float, str)):

@@ -37,6 +37,7 @@ from accerl_lerobot.bench.lag import BenchLagConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.ranking import BenchRankingConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
+from accerl_lerobot.checkpoint import CONFIG
 from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.export import ExportConfig
@@ -52,9 +53,8 @@ def train(arguments: list[str]) -> int:
     """``accerl train``."""
     config: RunConfig = parse(RunConfig, arguments)
     from accerl_lerobot import run
-    from accerl_lerobot.loop import how_to_go_on
     from accerl_lerobot.preflight import check_start
-    from accerl_lerobot.resume import begun_run, locked
+    from accerl_lerobot.resume import begun_run, how_to_go_on, locked
     from accerl_lerobot.stopping import StoppedError
 
     begun = begun_run(read_arguments(arguments)[0], config) if config.resume else None
@@ -200,7 +200,7 @@ def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Cons
     from accerl_lerobot.world_model.offline import gates, table
 
     directory = make_output_dir(config)
-    (directory / "config.yaml").write_text(yaml.safe_dump(encode(config), sort_keys=False))
+    (directory / CONFIG).write_text(yaml.safe_dump(encode(config), sort_keys=False))
     console = Console()
     console.say(f"run {directory}")
     try:
@@ -315,5 +315,7 @@ def _write_evaluation(out: Path, summary: dict[str, Any], results: list[EpisodeR
 
 def _discard_unused(directory: Path) -> None:
     """Removes the folder of a run that was refused before it did anything, so that its name is free again."""
-    if {path.name for path in directory.iterdir()} <= {"config.yaml", ".lock"}:
+    from accerl_lerobot.resume import LOCK
+
+    if {path.name for path in directory.iterdir()} <= {CONFIG, LOCK}:
         shutil.rmtree(directory)

@@ -211,6 +211,20 @@ def test_only_the_newest_keep_what_it_takes_to_go_on(tmp_path: Path):
         newest_whole(tmp_path, "000003")
 
 
+def test_what_is_let_go_vouches_for_nothing_else(tmp_path: Path):
+    for version in (1, 2):
+        save_checkpoint(tmp_path, state_writer(version))
+    (tmp_path / "000001" / PRETRAINED / "model.safetensors").write_text("WEIGHTS")
+    let_go(tmp_path, keep=1)
+    assert defect(tmp_path / "000001") == "pretrained_model/model.safetensors is not what was written"
+    save_checkpoint(tmp_path, state_writer(3))
+    (tmp_path / "000002" / "manifest.json").write_text("{")
+    let_go(tmp_path, keep=1)
+    assert not (tmp_path / "000002" / TRAINING_STATE).exists() and "is broken" in str(
+        defect(tmp_path / "000002")
+    )
+
+
 def test_one_that_was_being_let_go_when_the_process_died_is_no_obstacle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -36,8 +36,9 @@ from typing import Any
 
 from rich.table import Table
 
+from accerl_lerobot.bench.study import as_markdown, as_table, last_words
 from accerl_lerobot.bench.victims import CLASSES, Victim, alive, await_hit, hit
-from accerl_lerobot.checkpoint import PRETRAINED, newest_whole
+from accerl_lerobot.checkpoint import CHECKPOINTS, LAST, PRETRAINED, newest_whole
 from accerl_lerobot.config import RunConfig, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
@@ -136,12 +137,11 @@ def _policy(config: BenchFaultsConfig, recipe: RunConfig, root: Path, console: C
     with console.stage("a policy to begin with"):
         made = Victim(root / "start", [*arguments, *short, "--evaluation.videos=0"], root / "start.log")
         if code := made.process.wait():
-            tail = "\n".join((root / "start.log").read_text().splitlines()[-8:])
-            raise RuntimeError(f"its run ended with code {code}:\n{tail}")
+            raise RuntimeError(f"its run ended with code {code}:\n{last_words(root / 'start.log')}")
     return [
         *arguments,
         "--sft.steps=0",
-        f"--policy.path={root / 'start' / 'checkpoints' / 'last' / PRETRAINED}",
+        f"--policy.path={root / 'start' / CHECKPOINTS / LAST / PRETRAINED}",
     ]
 
 
@@ -214,7 +214,7 @@ def audit(victim: Victim) -> dict[str, Any]:
         }
         books = rollout[-1]["replay_inserted_segments"] == sum(held.values())
     try:
-        saved = newest_whole(victim.folder / "checkpoints")[0].name
+        saved = newest_whole(victim.folder / CHECKPOINTS)[0].name
     except InputError as error:
         saved = str(error)
     return {
@@ -228,18 +228,12 @@ def audit(victim: Victim) -> dict[str, Any]:
 
 def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
-    shown = Table(title="what a run survives")
-    for column in _COLUMNS:
-        shown.add_column(column)
-    for cell in result["cells"]:
-        shown.add_row(*_row(cell))
-    return shown
+    return as_table("what a run survives", _COLUMNS, [_row(cell) for cell in result["cells"]])
 
 
 def markdown(result: dict[str, Any]) -> str:
     """`table` for the docs."""
-    lines = [_COLUMNS, ["---"] * len(_COLUMNS), *(_row(cell) for cell in result["cells"])]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    return as_markdown(_COLUMNS, [_row(cell) for cell in result["cells"]])
 
 
 _COLUMNS = [

@@ -33,14 +33,13 @@ from typing import Any, NamedTuple
 import yaml
 from rich.table import Table
 
-from accerl_lerobot.checkpoint import CHECKPOINTS, PRETRAINED
+from accerl_lerobot.checkpoint import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.stats import Rate
 from accerl_lerobot.resume import locked
 
-CONFIG, SUMMARY = "config.yaml", "summary.json"
 IN_USE = "a study, or a run of one that was killed, still writes there; wait for it or end it"
 LOG_LINES = 12
 """Of a run that failed, shown in the error."""
@@ -133,7 +132,12 @@ def tabled(
 ) -> Table:
     """Rows for people; the title ends with the success of each warm start."""
     starts = ", ".join(f"{s:.0%}" for s in result["starts"].values())
-    shown = Table(title=f"{title} {starts}")
+    return as_table(f"{title} {starts}", columns, rows)
+
+
+def as_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    """Rows for people."""
+    shown = Table(title=title)
     for column in columns:
         shown.add_column(column)
     for row in rows:
@@ -263,7 +267,7 @@ class Study:
         if self.config.updates is not None:
             chosen.append(f"--trainer.updates={self.config.updates}")
         if self.starts[cell.seed].policy.path is None:
-            checkpoint = self.start(cell.seed) / "checkpoints" / "last" / PRETRAINED
+            checkpoint = self.start(cell.seed) / CHECKPOINTS / LAST / PRETRAINED
             chosen += ["--sft.steps=0", f"--policy.path={checkpoint}"]
         return self._parse(cell.seed, chosen, self.folder(cell))
 
@@ -350,8 +354,12 @@ class _Runner:
         code = process.wait()
         self._processes.discard(process)
         if code:
-            tail = "\n".join(log.read_text().splitlines()[-LOG_LINES:])
-            raise RuntimeError(f"the run {folder.name} failed, see {log}:\n{tail}")
+            raise RuntimeError(f"the run {folder.name} failed, see {log}:\n{last_words(log)}")
+
+
+def last_words(log: Path) -> str:
+    """The end of what a run has said."""
+    return "\n".join(log.read_text(errors="replace").splitlines()[-LOG_LINES:])
 
 
 def _check_same(folder: Path, config: RunConfig) -> None:

@@ -25,8 +25,13 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from accerl_lerobot.bench.study import last_words
+from accerl_lerobot.checkpoint import CONFIG
+from accerl_lerobot.metrics import METRICS
 
 CLASSES = {
     "rollout": "RolloutWorker",
@@ -55,7 +60,7 @@ class Victim:
 
     def go_on(self) -> None:
         """Starts it again, after its process has ended."""
-        self._start(["--resume=true", f"--config_path={self.folder / 'config.yaml'}"])
+        self._start(["--resume=true", f"--config_path={self.folder / CONFIG}"])
 
     def _start(self, arguments: list[str]) -> None:
         command = [sys.executable, "-m", "accerl_lerobot.cli", "train", *arguments]
@@ -74,7 +79,7 @@ class Victim:
 
     def records(self) -> list[dict[str, Any]]:
         """What it has logged; a last line that is being written is left out."""
-        path = self.folder / "metrics.jsonl"
+        path = self.folder / METRICS
         lines = path.read_text().splitlines(keepends=True) if path.is_file() else []
         return [json.loads(line) for line in lines if line.endswith("\n")]
 
@@ -82,29 +87,26 @@ class Victim:
         """Numbers of the updates that it has logged, in order."""
         return [int(record["update"]) for record in self.records() if record["kind"] == "train"]
 
-    def await_update(self, number: int, timeout: float) -> float:
-        """Waits until it has logged this update; returns the seconds that took.
+    def await_update(self, number: int, timeout: float) -> None:
+        """Waits until it has logged this update.
 
         Raises:
             RuntimeError: it ended before, or did not get there in time.
         """
-        started = time.monotonic()
-        while True:
-            made = self.updates()
-            if made and made[-1] >= number:
-                return time.monotonic() - started
-            self._check(started, timeout, f"update {number} was not reached")
-            time.sleep(LOOK_S)
+        self._await(lambda: self.updates()[-1:] >= [number], timeout, f"update {number} was not reached")
 
-    def await_successors(self, target: str, gone: int, count: int, timeout: float) -> float:
-        """Waits until a target has as many processes as before, none of them `gone`; the seconds."""
-        started = time.monotonic()
-        while True:
+    def await_successors(self, target: str, gone: int, count: int, timeout: float) -> None:
+        """Waits until a target has as many processes as before, none of them `gone`.
+
+        Raises:
+            RuntimeError: see `await_update`.
+        """
+
+        def there() -> bool:
             pids = self.pids(target)
-            if len(pids) >= count and gone not in pids:
-                return time.monotonic() - started
-            self._check(started, timeout, f"no successor of {target} {gone}")
-            time.sleep(LOOK_S)
+            return len(pids) >= count and gone not in pids
+
+        self._await(there, timeout, f"no successor of {target} {gone}")
 
     def end(self, grace: float) -> tuple[int, list[int]]:
         """Asks it to stop; its exit code, and the processes that were below it.
@@ -122,12 +124,15 @@ class Victim:
             hit(pid, signal.SIGKILL)
         self.process.wait()
 
-    def _check(self, started: float, timeout: float, what: str) -> None:
-        code = self.process.poll()
-        if code is not None or time.monotonic() - started > timeout:
+    def _await(self, there: Callable[[], bool], timeout: float, otherwise: str) -> None:
+        deadline = time.monotonic() + timeout
+        while not there():
+            code = self.process.poll()
+            if code is None and time.monotonic() <= deadline:
+                time.sleep(LOOK_S)
+                continue
             ended = f"it ended with code {code}" if code is not None else f"in {timeout:.0f} s"
-            tail = "\n".join(self._log.read_text(errors="replace").splitlines()[-8:])
-            raise RuntimeError(f"{what}: {ended}; {self._log}:\n{tail}")
+            raise RuntimeError(f"{otherwise}: {ended}; {self._log}:\n{last_words(self._log)}")
 
 
 def hit(pid: int, number: int) -> bool:

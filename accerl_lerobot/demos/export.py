@@ -23,7 +23,6 @@ gone, by its rewards and its outcome, is left out and counted.
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -36,7 +35,14 @@ from accerl_lerobot.config import RunConfig, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.expert import Episode
 from accerl_lerobot.demos.record import features, frames
-from accerl_lerobot.demos.writing import in_order, new_dataset, simulators
+from accerl_lerobot.demos.writing import (
+    appearing,
+    check_free,
+    check_target,
+    in_order,
+    new_dataset,
+    simulators,
+)
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import World
 from accerl_lerobot.envs.config import EnvConfig
@@ -76,12 +82,7 @@ class ExportConfig:
             raise InputError("pick", self.pick, f"use {', '.join(PICKS)}")
         if self.last < 0:
             raise InputError("last", self.last, "use 0 (all) or more episodes")
-        if not 1 <= self.processes <= 64:
-            raise InputError("processes", self.processes, "use 1 to 64")
-        if len(parts := self.repo_id.split("/")) != 2 or not all(parts):
-            raise InputError("repo_id", self.repo_id, "use the form owner/name")
-        if not self.root:
-            raise InputError("root", self.root, "name a folder to create")
+        check_target(self.root, self.repo_id, self.processes)
 
 
 def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
@@ -93,9 +94,7 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
     Raises:
         InputError: the folder exists, there is no run or no whole episode in it, or none can be repeated.
     """
-    run, root = Path(str(config.path)).expanduser(), Path(config.root)
-    if root.exists():
-        raise InputError("root", config.root, "exists already: remove it or name another folder")
+    run, root = Path(str(config.path)).expanduser(), check_free(config.root)
     if not (run / CONFIG).is_file():
         raise InputError("path", str(run), f"no run in it: there is no {CONFIG}")
     settings: RunConfig = parse(RunConfig, [f"--config_path={run / CONFIG}"])
@@ -104,19 +103,13 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
         raise InputError(
             "path", str(run), f"no whole episode in its {EPISODES} of those asked for ({config.pick})"
         )
-    partial = root.with_name(root.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    try:
+    with appearing(root) as partial:
         tally = _write(settings, config, chosen, partial, console)
         if not tally["episodes"]:
             remedy = "none of its episodes repeats itself: this world does not show the same again"
             raise InputError("path", str(run), remedy)
         about = {"export": asdict(config) | {"path": run.name}, "seed": settings.seed, **tally}
         (partial / SIDECAR).write_text(json.dumps(about, indent=2) + "\n")
-        partial.rename(root)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
     return tally
 
 

@@ -23,7 +23,6 @@ import importlib.metadata
 import json
 import logging
 import math
-import shutil
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -36,7 +35,14 @@ import numpy as np
 from rich.progress import Progress
 
 from accerl_lerobot.demos.expert import Episode, make_expert, play
-from accerl_lerobot.demos.writing import in_order, new_dataset, simulators
+from accerl_lerobot.demos.writing import (
+    appearing,
+    check_free,
+    check_target,
+    in_order,
+    new_dataset,
+    simulators,
+)
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import World, WorldSpec
 from accerl_lerobot.envs.config import EnvConfig
@@ -95,12 +101,7 @@ class DemosConfig:
             raise InputError("demos.failure_share", self.failure_share, "use a share between 0 and 1")
         if self.max_steps < 1:
             raise InputError("demos.max_steps", self.max_steps, "use at least 1 env step")
-        if not 1 <= self.processes <= 64:
-            raise InputError("demos.processes", self.processes, "use 1 to 64")
-        if len(parts := self.repo_id.split("/")) != 2 or not all(parts):
-            raise InputError("demos.repo_id", self.repo_id, "use the form owner/name")
-        if not self.root:
-            raise InputError("demos.root", self.root, "name a folder to create")
+        check_target(self.root, self.repo_id, self.processes, "demos.")
         demo_seed(self.seed, 0)
 
 
@@ -115,17 +116,13 @@ def record_demos(env_config: EnvConfig, config: DemosConfig) -> Path:
     Raises:
         InputError: the folder exists, the environment has no scripted expert, or its expert keeps failing.
     """
-    root = Path(config.root)
-    if root.exists():
-        raise InputError("demos.root", config.root, "exists already: remove it or name another folder")
+    root = check_free(config.root, "demos.")
     env_config = env_config.shortened(config.max_steps)
     world = make_world(env_config)
     spec = world.spec
     make_expert(env_config, world, spec.tasks[0])  # refuses an environment without experts before any work
     world.close()
-    partial = root.with_name(root.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    try:
+    with appearing(root) as partial:
         tally = _write(env_config, config, spec, partial)
         sidecar = {
             "env": draccus.encode(env_config, EnvConfig),
@@ -134,10 +131,6 @@ def record_demos(env_config: EnvConfig, config: DemosConfig) -> Path:
             "versions": {name: importlib.metadata.version(name) for name in _VERSIONS if find_spec(name)},
         }
         (partial / SIDECAR).write_text(json.dumps(sidecar, indent=2) + "\n")
-        partial.rename(root)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
     _logger.info("%s: %s", root, tally)
     return root
 

@@ -25,6 +25,45 @@ from pathlib import Path
 from typing import Any
 
 from accerl_lerobot.envs.base import WorldSpec
+from accerl_lerobot.errors import InputError
+
+
+def check_target(root: str, repo_id: str, processes: int, prefix: str = "") -> None:
+    """Refuses what no dataset can be written by; `prefix` begins the names of the fields.
+
+    Raises:
+        InputError: a name is not one, or there are no processes, or too many.
+    """
+    if not 1 <= processes <= 64:
+        raise InputError(f"{prefix}processes", processes, "use 1 to 64")
+    if len(parts := repo_id.split("/")) != 2 or not all(parts):
+        raise InputError(f"{prefix}repo_id", repo_id, "use the form owner/name")
+    if not root:
+        raise InputError(f"{prefix}root", root, "name a folder to create")
+
+
+def check_free(root: str, prefix: str = "") -> Path:
+    """The folder of a dataset that is to be written.
+
+    Raises:
+        InputError: it exists.
+    """
+    if Path(root).exists():
+        raise InputError(f"{prefix}root", root, "exists already: remove it or name another folder")
+    return Path(root)
+
+
+@contextmanager
+def appearing(root: Path) -> Iterator[Path]:
+    """A folder to be filled, which becomes `root` when the context is left, or goes if there was an error."""
+    partial = root.with_name(f"{root.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        yield partial
+        partial.rename(root)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
 
 
 @contextmanager

@@ -26,9 +26,9 @@ from typing import Any
 
 import yaml
 
-from accerl_lerobot.checkpoint import PRETRAINED
+from accerl_lerobot.checkpoint import CHECKPOINTS, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.hub.kinds import POLICY, RECIPE, RUN, SUCCESS_MODEL, SUMMARY, WORLD_MODEL, read_json
+from accerl_lerobot.hub.kinds import POLICY, RECIPE, RUN, SUCCESS_MODEL, WORLD_MODEL, read_json
 
 FOLDER = "accerl_run"
 """Where a policy or world model carries what is known of its run."""
@@ -98,7 +98,7 @@ def _known(folder: Path, kind: str) -> tuple[dict[str, Any], dict[str, Path]]:
 
 
 def _run_of(folder: Path, kind: str) -> Path | None:
-    if kind == POLICY and folder.name == PRETRAINED and folder.parents[1].name == "checkpoints":
+    if kind == POLICY and folder.name == PRETRAINED and folder.parents[1].name == CHECKPOINTS:
         run, sign = folder.parents[2], RECIPE
     elif kind in (WORLD_MODEL, SUCCESS_MODEL):
         run, sign = folder.parents[0 if kind == WORLD_MODEL else 1], TRIAL
@@ -125,7 +125,7 @@ def _evaluation(path: Path, folder: Path, kind: str) -> dict[str, Any]:
     if "success" not in found or "ci95" not in found:
         raise InputError("evaluation", str(path), "not what accerl eval writes; name its output_dir")
     measured = Path(str(found.get("policy"))).expanduser().resolve()
-    pushed = folder.resolve() if kind == POLICY else (folder / "checkpoints" / "last" / PRETRAINED).resolve()
+    pushed = folder.resolve() if kind == POLICY else (folder / CHECKPOINTS / LAST / PRETRAINED).resolve()
     if measured != pushed:
         raise InputError("evaluation", str(path), f"it is of another policy, {found.get('policy')}")
     return found

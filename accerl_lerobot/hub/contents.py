@@ -22,7 +22,15 @@ from dataclasses import asdict
 from pathlib import Path
 
 from accerl_lerobot import checkpoint as checkpoints
-from accerl_lerobot.checkpoint import BACKBONE, CONFIG_FOLDERS, PREPROCESSOR, PRETRAINED, defect
+from accerl_lerobot.checkpoint import (
+    BACKBONE,
+    CHECKPOINTS,
+    CONFIG_FOLDERS,
+    LAST,
+    PREPROCESSOR,
+    PRETRAINED,
+    defect,
+)
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.kinds import CONFIG, DATASET, POLICY, RUN, read_json
 from accerl_lerobot.hub.manifest import CARD, MANIFEST, entry_of
@@ -83,7 +91,7 @@ def walk(folder: Path) -> Iterator[tuple[str, Path]]:
 
 
 def _last(run: Path) -> Path:
-    return (run / "checkpoints" / "last").resolve()
+    return (run / CHECKPOINTS / LAST).resolve()
 
 
 def _of_a_run(run: Path, include: Sequence[str]) -> Files:

@@ -19,14 +19,15 @@ import json
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.checkpoint import PREPROCESSOR, PRETRAINED
+from accerl_lerobot.checkpoint import CHECKPOINTS, PREPROCESSOR, PRETRAINED, SUMMARY
+from accerl_lerobot.checkpoint import CONFIG as RECIPE
 from accerl_lerobot.errors import InputError
 
 POLICY, WORLD_MODEL, SUCCESS_MODEL = "policy", "world model", "success model"
 DATASET, RUN = "dataset", "run"
 
 CONFIG, WEIGHTS, POSTPROCESSOR = "config.json", "model.safetensors", "policy_postprocessor.json"
-INFO, RECIPE, SUMMARY = "meta/info.json", "config.yaml", "summary.json"
+INFO = "meta/info.json"
 LAST = f"checkpoints/last/{PRETRAINED}"
 NEEDED = {
     POLICY: (CONFIG, WEIGHTS, PREPROCESSOR, POSTPROCESSOR),
@@ -90,7 +91,7 @@ def _likely(folder: Path) -> str | None:
     if "type" in config:
         # LeRobot stores how far a policy looks back, and nothing like it of a reward model.
         return POLICY if "n_obs_steps" in config else SUCCESS_MODEL
-    if (folder / "checkpoints").is_dir() and (folder / RECIPE).is_file():
+    if (folder / CHECKPOINTS).is_dir() and (folder / RECIPE).is_file():
         return RUN
     return None
 

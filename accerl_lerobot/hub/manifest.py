@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from accerl_lerobot import __version__
+from accerl_lerobot.checkpoint import digest
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.kinds import NEEDED
 
@@ -56,9 +57,7 @@ def entry_of(content: Path | bytes) -> Entry:
     """Size and hash of a file, or of bytes."""
     if isinstance(content, bytes):
         return Entry(len(content), hashlib.sha256(content).hexdigest())
-    with content.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return Entry(content.stat().st_size, digest)
+    return Entry(content.stat().st_size, digest(content))
 
 
 def write_manifest(manifest: Manifest) -> bytes:

@@ -26,7 +26,7 @@ from typing import Any
 
 import yaml
 
-from accerl_lerobot.checkpoint import CONFIG_FOLDERS, STEP_FOLDERS
+from accerl_lerobot.checkpoint import places_of_names
 
 AWAY = "LOCAL"
 """Stands for the folders above a file that was on the pusher's machine."""
@@ -97,10 +97,7 @@ def own_names(config: dict[str, Any], processor: dict[str, Any], has: set[str]) 
     Returns:
         The folders of this machine that they go on naming.
     """
-    places = [(config, key, own) for key, own in CONFIG_FOLDERS.items()]
-    for step in processor.get("steps", []):
-        if (option := STEP_FOLDERS.get(step.get("registry_name"))) is not None:
-            places.append((step["config"], *option))
+    places = places_of_names(config, processor)
     local = [place for place in places if Path(place[0].get(place[1]) or "").is_absolute()]
     for fields, key, own in local:
         if own in has:

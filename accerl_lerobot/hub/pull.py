@@ -30,8 +30,16 @@ from huggingface_hub import HfApi
 from huggingface_hub.errors import RepositoryNotFoundError
 from huggingface_hub.hf_api import RepoFile
 
+from accerl_lerobot.checkpoint import (
+    CHECKPOINTS,
+    LAST,
+    PREPROCESSOR,
+    PRETRAINED,
+    defect,
+    relocate,
+    write_manifest,
+)
 from accerl_lerobot.checkpoint import MANIFEST as OF_CHECKPOINT
-from accerl_lerobot.checkpoint import PREPROCESSOR, PRETRAINED, defect, relocate, write_manifest
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.config import REPO_TYPES, PullConfig
 from accerl_lerobot.hub.contents import RECORD
@@ -154,7 +162,7 @@ def _receive(folder: Path, home: Path, expected: dict[str, Entry], repo_id: str)
     elif kind == RUN:
         (folder / LOCK).touch()  # so a run is known that can be gone on with
         for checkpoint in (p for p in folder.glob("checkpoints/*") if not p.is_symlink()):
-            _arrive(checkpoint, home / "checkpoints" / checkpoint.name, repo_id)
+            _arrive(checkpoint, home / CHECKPOINTS / checkpoint.name, repo_id)
     unchecked = expected.keys() - files.keys() - {CARD, MANIFEST, ".gitattributes"}
     return {"kind": kind, "files": len(expected), "checked": len(files), "unchecked": len(unchecked)}
 
@@ -190,5 +198,5 @@ def _move_in(policy: Path, home: Path, repo_id: str) -> None:
 def _link_last(run: Path) -> None:
     """A repository has no links; the checkpoint that came is the last one."""
     numbers = sorted(p.name for p in run.glob("checkpoints/*") if p.is_dir())
-    if numbers and "last" not in numbers:
-        (run / "checkpoints" / "last").symlink_to(numbers[-1])
+    if numbers and LAST not in numbers:
+        (run / CHECKPOINTS / LAST).symlink_to(numbers[-1])

@@ -18,19 +18,19 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
+from accerl_lerobot.checkpoint import CONFIG
 from accerl_lerobot.report.read import Run
+from accerl_lerobot.resume import how_to_go_on
 
 PLUGIN = "accerl_lerobot.envs.lerobot_plugin"
 
 
 def commands(run: Run) -> list[tuple[str, str]]:
     """What each does, and the line; those that need a checkpoint only where there is one."""
-    recipe = _quoted(run.path / "config.yaml")
+    recipe = _quoted(run.path / CONFIG)
     found = []
     if run.verb == "train" and run.result is None:
-        found.append(
-            ("Go on with it, if it has stopped", f"accerl train --resume=true --config_path={recipe}")
-        )
+        found.append(("Go on with it, if it has stopped", how_to_go_on(run.path)))
     found.append(
         (
             "Run it again; choose a folder that does not exist yet",

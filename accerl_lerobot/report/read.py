@@ -28,11 +28,13 @@ from typing import Any
 import numpy as np
 import yaml
 
+from accerl_lerobot.checkpoint import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.metrics import METRICS
 
 Record = dict[str, Any]
 
-CONFIG, METRICS, SUMMARY, TRIAL = "config.yaml", "metrics.jsonl", "summary.json", "trial.json"
+TRIAL = "trial.json"
 
 
 def _is_number(value: Any) -> bool:
@@ -142,7 +144,7 @@ def read_run(path: Path) -> Run:
         raise InputError("runs", str(path), remedy)
     lines, torn = _lines(path / METRICS)
     records, sessions = _continuous(lines)
-    newest = path / "checkpoints" / "last" / "pretrained_model"
+    newest = path / CHECKPOINTS / LAST / PRETRAINED
     return Run(
         path=path,
         verb=verb,
