@@ -139,8 +139,9 @@ class RayEngine(Engine):
         in_turn = schedule != ASYNCHRONOUS
         rollout = self._config.rollout
         self._seats.in_turn, self._schedule = in_turn, schedule
-        self._replay.call("follow", schedule, timeout=self._limit)
-        self._trainer.call("follow", schedule, timeout=self._limit)
+        # The trainer first: who takes turns waits for it to hand over its weights.
+        for worker in (self._trainer, self._replay):
+            worker.call("follow", schedule, timeout=self._limit)
         together = rollout.workers * rollout.worlds if in_turn else 0
         self._inference.call("lock_step", together, timeout=self._limit)
 

@@ -14,7 +14,8 @@
 """A policy made of nothing but time: it takes as long as it is told to, and its weights are two numbers.
 
 What a service in front of an accelerator costs is slept, t(B) = a + bB for a batch of B, so that the
-machinery around it is measured and not the processor that runs it. Densities, gradients and versions are real.
+machinery around it is measured and not the processor that runs it. Densities, gradients and versions are
+real.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ class Turns:
 
     def __init__(self, schedule: Schedule = ASYNCHRONOUS) -> None:
         self.schedule: Schedule = schedule
-        self._learning = False
+        self._drawn = self._learnt = 0
 
     def may_collect(self, ready: bool) -> bool:
         """Whether who has brought a segment may go on.
@@ -57,9 +57,13 @@ class Turns:
         return self.schedule == ASYNCHRONOUS or not self._learning
 
     def drawn(self) -> None:
-        """The trainer has a batch."""
-        self._learning = True
+        """The trainer has another batch."""
+        self._drawn += 1
 
     def learnt(self) -> None:
-        """It has learned from it, and every reader has the weights."""
-        self._learning = False
+        """It has learned from one, and in turn every reader has the weights."""
+        self._learnt += 1
+
+    @property
+    def _learning(self) -> bool:
+        return self._drawn > self._learnt

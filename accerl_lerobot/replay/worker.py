@@ -154,7 +154,7 @@ class ReplayWorker:
                     return segments
 
     async def learnt(self) -> None:
-        """The trainer's word, where it takes turns, that it has learned from its batch."""
+        """The trainer's word that it has learned from a batch."""
         async with self._changed:
             self._turns.learnt()
             self._changed.notify_all()

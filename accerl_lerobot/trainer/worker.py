@@ -89,8 +89,8 @@ class TrainerWorker:
         # A checkpoint need not hold a critic: all start from this one.
         publisher.publish(self._update.version, self._export())
         upcoming = replay.sample.remote(n, self._update.version)
+        asked = time.monotonic()
         while self._update.version < config.updates:
-            asked = time.monotonic()
             segments = ray.get(upcoming)
             if not segments:
                 break
@@ -112,9 +112,10 @@ class TrainerWorker:
                     "publish_s": time.monotonic() - updated,
                 }
                 self._history.append(metrics)
+            asked = time.monotonic()
             if self._in_turn:
                 publisher.flush()
-                ray.get(replay.learnt.remote())
+            replay.learnt.remote()
         version = self._update.version
         if version < config.updates and (config.hold_back or not config.publishes(version)):
             # It has ended early, and what is evaluated is to be what is saved.
