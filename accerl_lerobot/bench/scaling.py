@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""How collecting grows with the number of worlds: R(N) decisions a second of N worlds, through the whole engine.
+"""How collecting grows with the number of worlds: R(N) decisions a second of N worlds, through all workers.
 
     E(N) = R(N) / (N · R(1))
 

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import pytest
 
+from accerl_lerobot.bench import async_vs_sync
 from accerl_lerobot.bench.async_vs_sync import ARMS, BenchAsyncVsSyncConfig, bench_async_vs_sync
 from accerl_lerobot.bench.async_vs_sync import compare as compare_schedules
 from accerl_lerobot.bench.async_vs_sync import table as schedules_table
@@ -34,6 +35,9 @@ from accerl_lerobot.config import RunConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.rollout.runner import RolloutConfig
+from tests.light_workers import light_ray
+
+__all__ = ["light_ray"]
 
 
 def block(schedule: str, rate: float, processors: float = 0.2, waits: float = 0.5) -> Block:
@@ -101,11 +105,12 @@ def test_books_that_do_not_add_up_are_an_error():
             books(run, rollout, {"inserted_decisions": inserted, "dropped_nonfinite": 0.0})
 
 
-def test_a_small_run_of_everything(tmp_path: Path):
+def test_a_small_run_of_everything(light_ray: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     small = {"worlds": 2, "latency_ms": 5.0, "update_ms": 20.0, "image_size": 16, "decide_ms": 1.0}
     config = BenchAsyncVsSyncConfig(
         **small, cvs=(0.5,), seconds=0.2, rounds=1, learning_updates=2, seeds=(0,), output_dir=str(tmp_path)
     )
+    monkeypatch.setattr(async_vs_sync, "TRIALS", 4)
     result = bench_async_vs_sync(config)
     (law,) = result["laws"]
     assert [b["schedule"] for b in law["blocks"]] == [*ARMS, *reversed(ARMS)]
@@ -121,7 +126,7 @@ def test_a_small_run_of_everything(tmp_path: Path):
         Console().rich.print(schedules_table(result))
 
 
-def test_a_small_run_of_scaling(tmp_path: Path):
+def test_a_small_run_of_scaling(light_ray: None, tmp_path: Path):
     config = BenchScalingConfig(
         counts=(1, 2), latency_ms=5.0, image_size=16, seconds=0.2, blocks=1, output_dir=str(tmp_path)
     )
