@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from accerl_lerobot.algorithms import AlgorithmConfig, GIPOConfig
 from accerl_lerobot.dataset_config import DatasetConfig
@@ -37,6 +37,7 @@ from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.transport.endpoint import FIELD, Transport
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 
 __all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "check_chunk", "decode", "encode", "parse"]
@@ -48,6 +49,11 @@ class LaunchConfig:
 
     engine: str = "ray"
     """ray: asynchronous workers. local: the same parts in one process, deterministic, for tests."""
+    transport: Transport = "auto"
+    """How rollout workers and dreams reach inference and replay. shared_memory: observations are written once,
+    where the other process reads them. ray: copied into messages, to any node. auto: shared memory where both
+    are on one node and the system has it, else Ray.
+    """
     stall_s: float = 300.0
     """How long, in seconds, a worker may owe an answer or a world a step, and a run stand still; > 0.
 
@@ -61,6 +67,8 @@ class LaunchConfig:
     def __post_init__(self) -> None:
         if self.engine not in ("ray", "local"):
             raise InputError("launch.engine", self.engine, "use ray or local")
+        if self.transport not in get_args(Transport):
+            raise InputError(FIELD, self.transport, f"use {' or '.join(get_args(Transport))}")
         if not self.stall_s > 0:
             raise InputError("launch.stall_s", self.stall_s, "use a positive number of seconds")
         if self.max_recoveries < 0:
