@@ -50,9 +50,9 @@ class LaunchConfig:
     engine: str = "ray"
     """ray: asynchronous workers. local: the same parts in one process, deterministic, for tests."""
     transport: Transport = "auto"
-    """How rollout workers and dreams reach inference and replay. shared_memory: observations are written once,
-    where the other process reads them. ray: copied into messages, to any node. auto: shared memory where both
-    are on one node and the system has it, else Ray.
+    """How rollout workers and dreams reach inference and replay. shared_memory: a message is written where
+    the other process reads it. ray: it is copied, to any node. auto: shared memory between processes of one
+    node, if the system has it, and Ray otherwise.
     """
     stall_s: float = 300.0
     """How long, in seconds, a worker may owe an answer or a world a step, and a run stand still; > 0.

@@ -20,9 +20,9 @@
 
     ends        with the process; an exception fails every caller that waits or comes later, and ends the run
 
-One thread does all of it: it waits for callers and for the batcher's clock at once, runs the forward pass, and
-replies; what is sent to it meanwhile lies in shared memory. Ray's calls come in on the event loop beside it,
-which only hands them over.
+One thread does all of it: it waits for callers and for the batcher's clock at once, runs the forward pass and
+replies; what is sent meanwhile lies in shared memory. Ray's calls come in on the event loop beside it, which
+only hands them over.
 """
 
 from __future__ import annotations

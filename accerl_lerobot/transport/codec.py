@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -285,10 +286,12 @@ def _builder(node: Any, arrays: list[Any], values: list[None]) -> Build:
 
 
 def _leaf(what: int, rest: list[Any], arrays: list[Any]) -> Build:
-    dtype = np.dtype(rest[0]) if type(rest[0]) is str else np.dtype(object)
-    shape = tuple(rest[1]) if what == ARRAY else ()
-    if dtype.kind not in NUMBERS or not all(type(length) is int and length >= 0 for length in shape):
+    name, shape = rest[0], tuple(rest[1]) if what == ARRAY else ()
+    # NumPy takes many texts for a dtype, and parses some of them as Python.
+    fits = type(name) is str and re.fullmatch(rf"[<>|][{NUMBERS}]\d{{1,2}}", name)
+    if not fits or not all(type(length) is int and length >= 0 for length in shape):
         raise ValueError(f"an array of {rest!r}")
+    dtype = np.dtype(name)
     arrays.append((shape, dtype))
     if what == ARRAY:
         return lambda value, array: array()

@@ -99,17 +99,7 @@ class SharedMemoryCaller(Caller):
 
     def __init__(self, name: str, address: Address) -> None:
         super().__init__(name)
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._socket.settimeout(CONNECT_S)
-        try:
-            self._socket.connect(f"\0{address.name}")
-            mine = same_user(self._socket)
-        except OSError as error:
-            self._socket.close()
-            raise ServiceStoppedError(f"{name}: it cannot be connected to: {error}") from error
-        if not mine:
-            self._socket.close()
-            raise ServiceStoppedError(f"{name}: another user's process has taken its place")
+        self._socket = _connected(name, address)
         self._slots: list[Slot] = []
         self._free: list[int] = []
         self._under_way: dict[int, int] = {}
@@ -184,6 +174,28 @@ class SharedMemoryCaller(Caller):
 
     def _gone(self, reason: object) -> ServiceStoppedError:
         return ServiceStoppedError(f"{self.name} is gone: {reason}")
+
+
+def _connected(name: str, address: Address) -> socket.socket:
+    """A socket whose other end is a service of this user."""
+    end = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    end.setblocking(False)
+    deadline = time.monotonic() + CONNECT_S
+    while True:
+        try:
+            end.connect(f"\0{address.name}")
+            mine = same_user(end)
+            break
+        except OSError as error:
+            # Many may wait to be let in while the service is at something long.
+            if not isinstance(error, BlockingIOError) or time.monotonic() > deadline:
+                end.close()
+                raise ServiceStoppedError(f"{name} cannot be connected to: {error}") from error
+        time.sleep(0.01)
+    if not mine:
+        end.close()
+        raise ServiceStoppedError(f"{name}: another user's process has taken its place")
+    return end
 
 
 class SharedMemoryServer(Server):
@@ -289,7 +301,8 @@ class _Connection:
         """A message, once; nothing if it was answered here because it cannot be read."""
         if slot is not None and token.slot < SLOTS and token.slot not in self._busy:
             self._slots[token.slot] = slot
-        if token.what != ASK or token.slot not in self._slots or token.slot in self._busy:
+        known = token.what == ASK and token.slot in self._slots and token.slot not in self._busy
+        if not known or token.start + token.size > self._slots[token.slot].size:
             raise DamagedMessageError(f"a token that makes no sense: {token}")
         self._busy.add(token.slot)
         asked = _AskedThere(self, token)

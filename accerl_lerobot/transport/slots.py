@@ -60,7 +60,7 @@ class Slot:
     """Shared memory of a fixed size, which lasts as long as somebody refers to it or to a view of it.
 
     Args:
-        file: of it; a mapping does not need it any more.
+        file: of it; not needed any more, as the mapping keeps one of its own.
 
     Raises:
         DamagedMessageError: it is not one that `new_file` makes.
