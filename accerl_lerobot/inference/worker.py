@@ -42,7 +42,7 @@ from accerl_lerobot.checkpoint import WEIGHTS
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import Batcher
-from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.transport.contract import Asked, Server, stopped
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
 
@@ -77,25 +77,30 @@ class InferenceWorker:
         config: batching.
         version: of the weights it begins with.
         state: the ``training_state`` that holds these; None: they are the checkpoint's.
+        load: makes the adapter; None: of LeRobot's checkpoint.
     """
 
     def __init__(
-        self, policy: PolicyConfig, config: InferenceConfig, version: int = 0, state: Path | None = None
+        self,
+        policy: PolicyConfig,
+        config: InferenceConfig,
+        version: int = 0,
+        state: Path | None = None,
+        load: Load | None = None,
     ) -> None:
         import torch
 
-        from accerl_lerobot.policies.loading import load_adapter
-
         torch.set_num_threads(config.num_threads)
-        self._adapter = load_adapter(policy)
+        self._adapter = loader(load)(policy)
         self._batcher: Batcher[Asked] = Batcher(config.max_batch, config.max_wait_s)
         self._server = Server(self._take)
         self._version = version
         if state is not None:
             self._adapter.load_trainable(snapshot.load(state / WEIGHTS))
         self._received = -1
-        # Shared by two threads: appending and popping are atomic, and only the newest set is kept.
+        # Shared by two threads: appending and popping are atomic, and only the newest of each is kept.
         self._published: deque[tuple[int, dict[str, np.ndarray]]] = deque(maxlen=1)
+        self._together: deque[int] = deque(maxlen=1)
         self._failure: BaseException | None = None
         self._over = False
         self._busy_s = self._busy_told_s = 0.0
@@ -129,6 +134,11 @@ class InferenceWorker:
             self._published.append((version, tensors))
             self._server.wake()
         return version
+
+    async def lock_step(self, observations: int) -> None:
+        """See `Batcher.lock_step`."""
+        self._together.append(observations)
+        self._server.wake()
 
     async def serve(self) -> None:
         """Serves until the process ends; an exception here ends the run."""
@@ -164,6 +174,8 @@ class InferenceWorker:
         try:
             while not self._over:
                 self._server.poll(self._patience())
+                if self._together:
+                    self._batcher.lock_step(self._together.popleft())
                 self._swap()
                 if self._batcher.due(time.monotonic()):
                     batch = self._batcher.take(time.monotonic())

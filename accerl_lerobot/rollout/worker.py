@@ -42,7 +42,9 @@ from accerl_lerobot.transport.endpoint import Endpoint
 PARTS = 2
 """A worker's worlds are asked for in so many parts: one is stepped while the other's decisions are made."""
 AT_THE_DOOR = 2
-"""Messages to replay that may be waiting; then segments stay here, and exploring worlds pause."""
+"""Messages to replay that may be waiting before exploring worlds pause."""
+QUEUE = 32
+"""Messages to replay that may be waiting before segments stay here: no transport carries any number."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +98,7 @@ class RolloutWorker:
             budget=budget,
         )
         self._spent = False
+        self._at_the_door = AT_THE_DOOR
         # Shared by the two threads: appending to and popping from a deque is atomic.
         self._results: deque[EpisodeResult] = deque()
         self._training = threading.Event()
@@ -118,14 +121,16 @@ class RolloutWorker:
         """Answers once the worlds exist; returns this process's id."""
         return os.getpid()
 
-    def report(self, training: bool, plans: list[EpisodePlan]) -> Report:
+    def report(self, training: bool, plans: list[EpisodePlan], in_turn: bool = False) -> Report:
         """Takes orders and reports. One call at a time, so that orders cannot overtake each other.
 
         Args:
             training: whether training episodes are run between planned ones, from now on.
             plans: evaluation episodes to queue; they are taken before any training episode.
+            in_turn: exploring worlds pause until replay lets them go on after each segment, from now on.
         """
         self._plans.queue(plans)
+        self._at_the_door = 1 if in_turn else AT_THE_DOOR
         (self._training.set if training else self._training.clear)()
         episodes = [self._results.popleft() for _ in range(len(self._results))]
         entered = self._entered
@@ -151,7 +156,7 @@ class RolloutWorker:
             self._spent = self._plans.spent and not self._runner.exploring and not at_the_door
             self._give_up(due, idle)
             idle = [slot for slot in idle if not self._begin(slot, due)]
-            sendable = [slot for slot in due if len(at_the_door) < AT_THE_DOOR or not due[slot].explore]
+            sendable = [slot for slot in due if len(at_the_door) < self._at_the_door or not due[slot].explore]
             for start in range(0, len(sendable), size):
                 slots = sendable[start : start + size]
                 under_way[deciding.send([due.pop(slot) for slot in slots])] = slots
@@ -161,7 +166,7 @@ class RolloutWorker:
 
     def _bring(self, door: Caller, at_the_door: set[int], size: int) -> None:
         """Brings segments to replay; those of a whole group may come at once, and its pace is for a few."""
-        while self._outbox and len(at_the_door) < AT_THE_DOOR:
+        while self._outbox and len(at_the_door) < QUEUE:
             at_the_door.add(door.send(self._outbox[:size]))
             del self._outbox[:size]
 

@@ -369,8 +369,6 @@ def test_a_service_that_takes_nothing_is_not_waited_for_for_ever(stage, monkeypa
     caller: Caller = one.caller()
     with pytest.raises(TimeoutError, match=r"service: 1 of 1 replies did not come within 0\.05 s"):
         caller.ask(["nobody polls"], 0.05)
-    with pytest.raises(
-        ServiceStoppedError, match="service cannot be connected to: .*unavailable"
-    ):
+    with pytest.raises(ServiceStoppedError, match="service cannot be connected to: .*unavailable"):
         for _ in range(10 * SLOTS):
             one.caller()
