@@ -57,7 +57,7 @@ from accerl_lerobot.transport.slots import (
 logger = logging.getLogger(__name__)
 
 CONNECT_S = 30.0
-"""How long a service may take to be connected to, and to take a token."""
+"""How long a service may take to be connected to."""
 
 
 class Address(NamedTuple):
@@ -100,6 +100,9 @@ class SharedMemoryCaller(Caller):
     def __init__(self, name: str, address: Address) -> None:
         super().__init__(name)
         self._socket = _connected(name, address)
+        # Cheaper than a timeout of the socket, which costs a system call whenever it is changed.
+        self._readable = select.poll()
+        self._readable.register(self._socket, select.POLLIN)
         self._slots: list[Slot] = []
         self._free: list[int] = []
         self._under_way: dict[int, int] = {}
@@ -119,31 +122,25 @@ class SharedMemoryCaller(Caller):
         encoded.write(self._slots[index].memory, 0)
         self._sent += 1
         self._under_way[self._sent] = index
-        self._socket.settimeout(CONNECT_S)
         try:
             send(self._socket, Token(ASK, index, self._sent, 0, encoded.size, time.monotonic()), file)
-        except TimeoutError as error:
-            raise TimeoutError(f"{self.name} has not taken a message for {CONNECT_S:g} s") from error
         except OSError as error:
             raise self._gone(error) from error
         return self._sent
 
     def done(self, timeout: float) -> list[tuple[int, object]]:
         replies: list[tuple[int, object]] = []
-        self._socket.settimeout(timeout)
-        while True:
-            try:
+        try:
+            while self._readable.poll(0 if replies else 1000 * timeout):
                 received = receive(self._socket)
-            except (TimeoutError, BlockingIOError):
-                return replies
-            except OSError as error:
-                raise self._gone(error) from error
-            if received is None:
-                raise self._gone("its end of the connection is closed")
-            replies += self._read(*received)
-            if not self._under_way:
-                return replies
-            self._socket.settimeout(0.0)
+                if received is None:
+                    raise self._gone("its end of the connection is closed")
+                replies += self._read(*received)
+                if not self._under_way:
+                    break
+        except (OSError, DamagedMessageError) as error:
+            raise self._gone(error) from error
+        return replies
 
     def forget(self, ticket: int) -> None:
         if ticket in self._under_way:
@@ -323,7 +320,7 @@ class _Connection:
         encoded.write(self._slots[asked.slot].memory, start)
         self._busy.discard(asked.slot)
         try:
-            send(self.socket, asked._replace(what=what, start=start, size=encoded.size), file)
+            send(self.socket, Token(what, asked.slot, asked.ticket, start, encoded.size, asked.sent), file)
         except OSError:  # it has died, or does not read although it may have few messages under way
             self._drop(self)
 
