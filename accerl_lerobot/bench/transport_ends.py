@@ -11,20 +11,22 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""The two ends of what `transport` measures: callers and a service as Ray's actors, and peers for the floors.
+"""The two ends of what `transport` measures: callers and a service, which are Ray's actors.
 
-Every arm is measured in a process of its own, by a clock around one call after the other.
+All arms are measured in the same processes, by a clock around one call after the other: Ray gives its workers
+a lower priority than others have, which on a busy machine is most of what a call costs.
 """
 
 from __future__ import annotations
 
 import mmap
-import multiprocessing
+import os
+import secrets
 import socket
+import struct
 import threading
 import time
 from collections.abc import Callable
-from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
@@ -49,6 +51,10 @@ from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
 
 LONG_S = 120.0
 """What takes that long hangs."""
+SIZE = struct.Struct("<Q")
+LARGEST = 1 << 20
+"""Bytes of an observation at most."""
+REPLY = sum(array.nbytes for array in (decision().chunk, *decision().latent.values(), decision().log_prob))
 BEGIN_S = 0.05
 """How long before the first call callers are told when it is."""
 
@@ -72,24 +78,42 @@ class Answering:
         threading.Thread(target=serve, daemon=True).start()
         return server.address
 
+    async def floor(self) -> str:
+        """Where a `Floor` connects to, once."""
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        name = f"accerl-{secrets.token_hex(16)}"
+        listener.bind(f"\0{name}")
+        listener.listen(1)
+        threading.Thread(target=serve_floor, args=(listener,), daemon=True).start()
+        return name
+
     async def decide(self, requests: list[Request]) -> list[Decision]:
         """Ray's way in."""
         return [self._decision] * len(requests)
 
 
 class Calling:
-    """One caller; becomes a Ray actor."""
+    """One caller; becomes a Ray actor.
 
-    def __init__(self, endpoints: dict[str, Endpoint]) -> None:
+    Args:
+        endpoints: of the service, by arm.
+        floor: where the floors' other end is; None: they are not measured here.
+    """
+
+    def __init__(self, endpoints: dict[str, Endpoint], floor: str | None) -> None:
+        self._floor = None if floor is None else Floor(floor)
         self._callers = {arm: endpoint.connect() for arm, endpoint in endpoints.items()}
         self._method = endpoints[RAY].method
 
     def measure(self, arm: str, size: str, seed: int, calls: int, begin: float) -> tuple[list[float], float]:
         """Seconds of each call, and the moment of the last one's end, on `time.monotonic`."""
         message = [request_of(size, seed)]
-        if arm == RAY_PUT:
+        if arm in FLOORS:
+            assert self._floor is not None
+            call: Callable[[], Any] = self._floor.call(arm, message[0])
+        elif arm == RAY_PUT:
             # One that is already in the store is not copied again when a call is made.
-            call: Callable[[], Any] = lambda: ray.get(self._method.remote(ray.put(message)), timeout=LONG_S)  # noqa: E731
+            call = lambda: ray.get(self._method.remote(ray.put(message)), timeout=LONG_S)  # noqa: E731
         else:
             call = lambda: _one(self._callers[arm], message)  # noqa: E731
         time.sleep(max(0.0, begin - time.monotonic()))
@@ -115,7 +139,7 @@ def timed(call: Callable[[], Any], calls: int) -> list[float]:
 
 
 class Crowd:
-    """A service, so many callers and a peer for the floors, while the context lasts.
+    """A service and so many callers, while the context lasts.
 
     Args:
         callers: processes.
@@ -124,7 +148,6 @@ class Crowd:
 
     def __init__(self, callers: int, seed: int) -> None:
         self._count, self._seed = callers, seed
-        self._floors = Floors(decision())
         self._started = False
 
     def __enter__(self) -> Crowd:
@@ -137,12 +160,11 @@ class Crowd:
         way = {"name": "answering", "method": self._service.decide}
         ends = {RAY: Endpoint(**way), SHARED_MEMORY: Endpoint(**way, address=address)}
         actor = ray.remote(Calling).options(num_cpus=0)
-        self._callers = [actor.remote(ends) for _ in range(self._count)]
-        self._floors.start()
+        floor = ray.get(self._service.floor.remote(), timeout=LONG_S)
+        self._callers = [actor.remote(ends, None if i else floor) for i in range(self._count)]
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._floors.close()
         for actor in (*self._callers, self._service):
             ray.kill(actor)
         if self._started:
@@ -150,9 +172,6 @@ class Crowd:
 
     def measure(self, arm: str, size: str, callers: int, calls: int) -> tuple[list[list[float]], float]:
         """Seconds of each call of each caller, and from the beginning of the first to the end of the last."""
-        if arm in FLOORS:
-            seconds = self._floors.measure(arm, request_of(size, self._seed), calls)
-            return [seconds], sum(seconds)
         begin = time.monotonic() + BEGIN_S
         asked = [
             caller.measure.remote(arm, size, self._seed, calls, begin) for caller in self._callers[:callers]
@@ -161,47 +180,29 @@ class Crowd:
         return [seconds for seconds, _ in found], max(end for _, end in found) - begin
 
 
-class Floors:
-    """What no transport can beat, with a process at the other end that does nothing else."""
+class Floor:
+    """What no transport can beat: bare pipes and a bare socket between the same two processes."""
 
-    def __init__(self, reply: Decision) -> None:
-        self._reply = sum(array.nbytes for array in (reply.chunk, *reply.latent.values(), reply.log_prob))
-
-    def start(self) -> None:
-        """Starts the other end."""
-        context = multiprocessing.get_context("spawn")
-        there, self._to = context.Pipe(duplex=False)
-        self._from, back = context.Pipe(duplex=False)
-        self._token, token = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    def __init__(self, name: str) -> None:
+        self._token = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._token.settimeout(LONG_S)
-        self._memory = mmap.mmap(-1, 1 << 20)
-        self._peers = [
-            context.Process(target=_reply_to_bytes, args=(there, back, self._reply), daemon=True),
-            context.Process(target=_reply_to_tokens, args=(token,), daemon=True),
-        ]
-        for peer in self._peers:
-            peer.start()
-        for end in (there, back, token):
-            end.close()
+        self._token.connect(f"\0{name}")
+        there, self._to = os.pipe()
+        self._from, back = os.pipe()
+        socket.send_fds(self._token, [b"pipes"], [there, back])
+        os.close(there)
+        os.close(back)
+        self._memory = mmap.mmap(-1, LARGEST)
 
-    def close(self) -> None:
-        """Ends it."""
-        for end in (self._to, self._from, self._token):
-            end.close()
-        for peer in self._peers:
-            peer.join(LONG_S)
-
-    def measure(self, arm: str, request: Request, calls: int) -> list[float]:
-        """Seconds of each call."""
+    def call(self, arm: str, request: Request) -> Callable[[], None]:
+        """One call of an arm."""
         source = np.concatenate([np.ravel(array).view(np.uint8) for array in arrays_of(request)])
         target, raw = np.frombuffer(self._memory, np.uint8, len(source)), source.tobytes()
-        reply = bytearray(self._reply)
+        reply = memoryview(bytearray(REPLY))
 
         def pipe() -> None:
-            self._to.send_bytes(raw)
-            if not self._from.poll(LONG_S):
-                raise TimeoutError(f"pipe: no bytes within {LONG_S:g} s")
-            self._from.recv_bytes_into(reply)
+            os.write(self._to, SIZE.pack(len(raw)) + raw)
+            read_all(self._from, reply)
 
         def slot() -> None:
             target[:] = source
@@ -211,20 +212,33 @@ class Floors:
         def memcpy() -> None:
             target[:] = source
 
-        return timed({PIPE: pipe, MEMCPY: memcpy}.get(arm, slot), calls)
+        return {PIPE: pipe, MEMCPY: memcpy}.get(arm, slot)
 
 
-def _reply_to_bytes(there: Connection, back: Connection, size: int) -> None:
-    buffer, reply = bytearray(1 << 20), bytes(size)
-    try:
-        while there.poll(LONG_S * 10):
-            there.recv_bytes_into(buffer)
-            back.send_bytes(reply)
-    except (EOFError, OSError):
-        return
+def serve_floor(listener: socket.socket) -> None:
+    """The other end of a `Floor`, on threads that end with it."""
+    token, _ = listener.accept()
+    _, (there, back), _, _ = socket.recv_fds(token, 16, 2)
+
+    def tokens() -> None:
+        while token.recv(1):
+            token.send(b"x")
+
+    def pipes() -> None:
+        head, buffer, reply = memoryview(bytearray(SIZE.size)), memoryview(bytearray(LARGEST)), bytes(REPLY)
+        while read_all(there, head):
+            read_all(there, buffer[: SIZE.unpack(head)[0]])
+            os.write(back, reply)
+
+    for serve in (tokens, pipes):
+        threading.Thread(target=serve, daemon=True).start()
 
 
-def _reply_to_tokens(token: socket.socket) -> None:
-    token.settimeout(LONG_S * 10)
-    while token.recv(1):
-        token.send(b"x")
+def read_all(file: int, into: memoryview) -> bool:
+    """Fills it; False at the end of the file."""
+    while into:
+        count = os.readv(file, [into])
+        if not count:
+            return False
+        into = into[count:]
+    return True
