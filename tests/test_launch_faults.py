@@ -127,7 +127,7 @@ def test_both_transports_play_the_same_episodes(engine):
         one.train()
         assert drive(one)[-1].replay["trained_decisions"] >= 12 * 16
         one.close()
-    assert played[0] == played[1] and len({line[2] for line in played[0]}) > 5
+    assert played[0] == played[1] and len({line[2] for line in played[0]}) > 2
 
 
 def test_what_cannot_be_done_is_refused_and_an_exception_in_the_trainer_ends_the_run(engine, tmp_path: Path):
