@@ -39,6 +39,7 @@ from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.ranking import BenchRankingConfig
 from accerl_lerobot.bench.scaling import BenchScalingConfig
 from accerl_lerobot.bench.throughput import BenchThroughputConfig
+from accerl_lerobot.bench.transport import BenchTransportConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
 from accerl_lerobot.checkpoint import CONFIG
 from accerl_lerobot.config import RunConfig, encode, parse
@@ -267,7 +268,7 @@ def export(arguments: list[str]) -> int:
 
 
 def bench(arguments: list[str]) -> int:
-    """``accerl bench`` of what is named."""
+    """``accerl bench NAME``; see `CONFIGS` for the names."""
     name = arguments[0] if arguments else ""
     if f"bench {name}" not in CONFIGS:
         names = [verb.split()[1] for verb in CONFIGS if verb.startswith("bench ")]
@@ -304,6 +305,7 @@ CONFIGS: dict[str, type[Any]] = {
     "bench efficiency": BenchEfficiencyConfig,
     "bench faults": BenchFaultsConfig,
     "bench ranking": BenchRankingConfig,
+    "bench transport": BenchTransportConfig,
 }
 """Verb → what its command line is parsed into."""
 

@@ -30,6 +30,8 @@ import pytest
 from accerl_lerobot import snapshot
 from accerl_lerobot.checkpoint import TRAINING_STATE
 from accerl_lerobot.experience import Decision, Request
+from accerl_lerobot.transport.on_loop import serve_on_loop
+from accerl_lerobot.transport.shared_memory import Address
 
 
 @pytest.fixture(scope="session")
@@ -63,11 +65,14 @@ class LightInference:
     async def serve(self) -> None:
         await self._broken
 
+    async def listen(self) -> Address:
+        return serve_on_loop(self.decide).address
+
     async def fail(self) -> None:
         self._broken.set_exception(ArithmeticError("the forward pass fell over"))
 
     async def decide(self, requests: list[Request]) -> list[Decision]:
-        from accerl_lerobot.inference.worker import ServiceStoppedError
+        from accerl_lerobot.transport.contract import ServiceStoppedError
 
         if self._broken.done():
             raise ServiceStoppedError("the inference service has stopped")

@@ -162,6 +162,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--env.max_steps=0"], "env.max_steps=0: use 1 to 500 env steps"),
     (["--seed=100"], "seed=100: use 0 to 99"),
     (["--launch.engine=slurm"], "launch.engine='slurm': use ray or local"),
+    (["--launch.transport=tcp"], "launch.transport='tcp': use one of auto, ray, shared_memory"),
     (["--rollout.group_size=1"], "rollout.group_size=1: groups of one have no comparison; use 0"),
     (["--rollout.group_advantage=gae"], "rollout.group_advantage='gae': use one of grpo, rloo, grpo_no_std"),
     (
