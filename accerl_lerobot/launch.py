@@ -50,6 +50,7 @@ from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seats import START_S, Seats
 from accerl_lerobot.stopping import Stopping
 from accerl_lerobot.watched import Watched
+from accerl_lerobot.weights.publisher import ReaderLostError
 
 logger = logging.getLogger(__name__)
 
@@ -252,7 +253,8 @@ class RayEngine(Engine):
         try:
             result = ray.get(reference)
         except RayError as error:
-            if isinstance(error, RayTaskError) and isinstance(error.cause, RayError | ServiceStoppedError):
+            innocent = RayError | ServiceStoppedError | ReaderLostError
+            if isinstance(error, RayTaskError) and isinstance(error.cause, innocent):
                 self._blame()
             if self._seats.restart_worker(worker, error):
                 return

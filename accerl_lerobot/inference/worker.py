@@ -43,6 +43,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.weights.reader import Received, SharedMemoryReader
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +105,11 @@ class InferenceWorker:
         if state is not None:
             self._adapter.load_trainable(snapshot.load(state / WEIGHTS))
         self._received = -1
-        self._published: tuple[int, dict[str, np.ndarray]] | None = None
+        self._published: Received | None = None
+        self._reader: SharedMemoryReader | None = None
+        self._broken: BaseException | None = None
+        self._swap_s = self._publish_to_served_s = 0.0
+        self._unserved_since: float | None = None
         self._failure: BaseException | None = None
         self._busy_s = 0.0
         self._since = time.monotonic()
@@ -126,13 +131,35 @@ class InferenceWorker:
         self._wake.set()
         return await waiting.future
 
-    async def receive_weights(self, version: int, tensors: dict[str, np.ndarray]) -> int:
+    async def receive_weights(self, version: int, tensors: dict[str, np.ndarray], published_s: float) -> int:
         """Takes a published set; it serves from the next batch on. What is not newer is ignored."""
-        if version > self._received:
-            self._received = version
-            self._published = (version, tensors)
-            self._wake.set()
+        self._offer(Received(version=version, tensors=tensors, published_s=published_s))
         return version
+
+    async def open_weights(self, address: str) -> bool:
+        """Receives weights through shared memory from now on; False if that is not to be had from here."""
+        loop = asyncio.get_running_loop()
+        try:
+            self._reader = SharedMemoryReader(
+                address,
+                deliver=lambda received: loop.call_soon_threadsafe(self._offer, received),
+                failed=lambda error: loop.call_soon_threadsafe(self._break, error),
+            )
+        except OSError:
+            return False
+        return True
+
+    def _offer(self, received: Received) -> None:
+        if received.version > self._received:
+            self._received = received.version
+            self._published = received
+            self._wake.set()
+        else:
+            received.release()
+
+    def _break(self, error: BaseException) -> None:
+        self._broken = error
+        self._wake.set()
 
     async def serve(self) -> None:
         """Serves until the process ends; an exception here ends the run."""
@@ -144,16 +171,25 @@ class InferenceWorker:
                     await self._serve_batch(self._batcher.take(time.monotonic()))
         except BaseException as error:
             self._failure = error
+            if self._reader is not None:
+                self._reader.close()
             while batch := self._batcher.take(time.monotonic()):
                 _fail(batch, error)
             raise
 
     async def metrics(self) -> dict[str, float]:
-        """Batching statistics, the version served and the busy share since the last call."""
+        """Batching statistics, the version served, the busy share since the last call, and of the last
+        swap of weights how long it took and how long after their publication they served first."""
         now = time.monotonic()
         share, self._busy_s = self._busy_s / max(1e-9, now - self._since), 0.0
         self._since = now
-        return {**self._batcher.stats.metrics(), "version": float(self._version), "busy_share": share}
+        return {
+            **self._batcher.stats.metrics(),
+            "version": float(self._version),
+            "busy_share": share,
+            "swap_s": self._swap_s,
+            "publish_to_served_s": self._publish_to_served_s,
+        }
 
     async def _wait(self) -> None:
         """Returns when a batch is due or weights have arrived.
@@ -164,18 +200,25 @@ class InferenceWorker:
         while True:
             self._wake.clear()
             deadline, now = self._batcher.next_deadline(), time.monotonic()
-            if self._published is not None or (deadline is not None and now >= deadline):
+            arrived = self._published is not None or self._broken is not None
+            if arrived or (deadline is not None and now >= deadline):
                 return
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._wake.wait(), None if deadline is None else deadline - now)
 
     async def _swap(self) -> None:
+        if self._broken is not None:
+            raise self._broken
         if self._published is None:
             return
-        version, tensors = self._published
-        self._published = None
-        await asyncio.get_running_loop().run_in_executor(self._pool, self._adapter.load_trainable, tensors)
-        self._version = version
+        received, self._published = self._published, None
+        started = time.monotonic()
+        await asyncio.get_running_loop().run_in_executor(
+            self._pool, self._adapter.load_trainable, received.tensors, received.changed
+        )
+        received.release()
+        self._swap_s = time.monotonic() - started
+        self._version, self._unserved_since = received.version, received.published_s
 
     async def _serve_batch(self, batch: list[_Waiting]) -> None:
         requests = [r for waiting in batch for r in waiting.requests]
@@ -187,7 +230,10 @@ class InferenceWorker:
         except BaseException as error:
             _fail(batch, error)
             raise
-        self._busy_s += time.monotonic() - started
+        now = time.monotonic()
+        self._busy_s += now - started
+        if self._unserved_since is not None:
+            self._publish_to_served_s, self._unserved_since = now - self._unserved_since, None
         start = 0
         for waiting in batch:
             if not waiting.future.done():  # the caller may have been cancelled meanwhile
