@@ -67,6 +67,7 @@ class Publisher(ABC):
     def __init__(self, slabs: int, make: Callable[[int], Slab]) -> None:
         self._limit, self._make = slabs, make
         self._slabs: list[Slab] = []
+        """By slot; one that has become too small is replaced in its slot."""
         self._changed = threading.Condition()
         self._version: int | None = None
         self._writing: Slab | None = None
@@ -182,13 +183,15 @@ class Publisher(ABC):
             large = [slab for slab in free if len(slab) >= size]
             if large:
                 return large[0]
-            for slab in free:
-                self._slabs.remove(slab)
-                slab.close()
-            assert len(self._slabs) < self._limit, "a slab is always free"
+            assert free or len(self._slabs) < self._limit, "a slab is always free"
+            self._writing = free[0] if free else None
         made = self._make(size)
         with self._changed:
-            self._slabs.append(made)
+            if free:
+                self._slabs[self._slabs.index(free[0])] = made
+                free[0].close()
+            else:
+                self._slabs.append(made)
         return made
 
     def _unused(self) -> list[Slab]:

@@ -32,6 +32,7 @@ from accerl_lerobot.weights.changes import Changes
 from accerl_lerobot.weights.channel import Tensors
 from accerl_lerobot.weights.shared_memory import (
     APPLIED,
+    CONFIRMED,
     FORMAT,
     NOT_ONLY_CHANGES,
     TALK_S,
@@ -40,6 +41,9 @@ from accerl_lerobot.weights.shared_memory import (
     make_socket,
 )
 from accerl_lerobot.weights.slab import Layout, Slab, TornSetError, aligned, digest
+
+CONFIRM_S = 60.0
+"""How long the trainer's process may take to read a set once, among all else that it does."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +79,7 @@ class SharedMemoryReader:
     ) -> None:
         self._deliver, self._failed = deliver, failed
         self._slabs: dict[int, Slab] = {}
+        """By slot."""
         self._layout = Layout({}, 0, b"{}")
         self._own = np.zeros(0, np.uint8)
         """The last set, if changes against it may come."""
@@ -104,25 +109,25 @@ class SharedMemoryReader:
 
     def _run(self) -> None:
         try:
-            while (received := self._receive()) is not None:
-                self._deliver(received)
+            while True:
+                self._deliver(self._receive())
         except BaseException as error:
-            if not self._closing:
+            # The trainer's end is not ours: whoever watches it knows why.
+            if not (self._closing or isinstance(error, ConnectionError)):
                 self._failed(error)
+        finally:
             self._socket.close()  # so that the trainer hears of it
 
-    def _receive(self) -> Received | None:
-        """The next set, once it is checked; None at the end.
+    def _receive(self) -> Received:
+        """The next set, once it is checked.
 
         Raises:
             TornSetError: it is not what was published.
+            ConnectionError: there will be no more.
         """
-        try:
-            data, fds, _, _ = socket.recv_fds(self._socket, FORMAT.size, 1, socket.MSG_CMSG_CLOEXEC)
-        except ConnectionError:
-            return None
+        data, fds, _, _ = socket.recv_fds(self._socket, FORMAT.size, 1, socket.MSG_CMSG_CLOEXEC)
         if not data:
-            return None
+            raise ConnectionResetError("the publisher has ended")
         message = Message.unpack(data)
         slab = self._slab(message, fds)
         layout = self._layout_of(message, slab)
@@ -131,7 +136,7 @@ class SharedMemoryReader:
         else:
             whole, changes = self._own, _changes(message, layout, slab)
             self._advance(message, changes)
-        if digest(message.version, layout, whole) != message.digest:
+        if digest(message.version, layout, whole) != self._confirmed(message):
             raise TornSetError(f"weights of version {message.version} are not what their digest says")
         if message.keep:
             if changes is None:
@@ -151,15 +156,31 @@ class SharedMemoryReader:
             nbytes=layout.size if changes is None else changes.nbytes,
         )
 
+    def _confirmed(self, message: Message) -> bytes:
+        """The digest that the publisher has reckoned."""
+        self._socket.settimeout(CONFIRM_S)
+        try:
+            data = self._socket.recv(CONFIRMED.size)
+        except TimeoutError as error:
+            raise TimeoutError(
+                f"the digest of weights of version {message.version} did not come within {CONFIRM_S:g} s"
+            ) from error
+        if not data:
+            raise ConnectionResetError("the publisher has ended")
+        self._socket.settimeout(None)
+        version, found = CONFIRMED.unpack(data)
+        assert version == message.version
+        return bytes(found)
+
     def _slab(self, message: Message, fds: list[int]) -> Slab:
-        for serial in [serial for serial in self._slabs if serial < message.oldest]:
-            self._slabs.pop(serial).close()
         if fds:
+            if message.slot in self._slabs:
+                self._slabs.pop(message.slot).close()
             size = os.fstat(fds[0]).st_size
-            self._slabs[message.serial] = Slab(size, fds[0], writable=False)
-        if message.serial not in self._slabs:
+            self._slabs[message.slot] = Slab(size, fds[0], writable=False)
+        if message.slot not in self._slabs:
             raise TornSetError(f"weights of version {message.version} came without their memory")
-        return self._slabs[message.serial]
+        return self._slabs[message.slot]
 
     def _layout_of(self, message: Message, slab: Slab) -> Layout:
         end = message.size + message.text

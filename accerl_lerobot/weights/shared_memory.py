@@ -14,7 +14,8 @@
 """Weights from the trainer to readers on the same machine through memory that both map.
 
     trainer ──copies──► slab ◄──reads── reader ──copies──► its parameters, then lets the slab go
-       └── version, digest and, once, the slab's file descriptor over a Unix socket ──┘
+       └── version and, once, the slab's file descriptor over a Unix socket ──┘
+       └── the digest, which both have reckoned meanwhile ────────────────────┘
 
 The socket's name is an abstract one and slabs have none at all, so nothing is left behind whoever is killed.
 Both sides talk to processes of the same user only. A slab that a reader holds is never written to: with R
@@ -24,12 +25,14 @@ are sent.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import secrets
 import selectors
 import socket
 import struct
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -47,9 +50,8 @@ _PEER = struct.Struct("3i")
 class Message(NamedTuple):
     """A set that lies in a slab; the slab's file descriptor comes with the first one about it."""
 
-    serial: int
-    oldest: int
-    """Slabs with a smaller serial number are gone."""
+    slot: int
+    """Of the slab; one that comes for a slot takes the place of the one before."""
     version: int
     published_s: float
     size: int
@@ -61,7 +63,6 @@ class Message(NamedTuple):
     """How many words the changes have, or `NOT_ONLY_CHANGES`."""
     base: int
     """The version that they are against."""
-    digest: bytes
 
     def pack(self) -> bytes:
         """For the socket."""
@@ -73,7 +74,9 @@ class Message(NamedTuple):
         return cls(*FORMAT.unpack(data))
 
 
-FORMAT = struct.Struct("<QQqdQQ?qq16s")
+FORMAT = struct.Struct("<QqdQQ?qq")
+CONFIRMED = struct.Struct("<q16s")
+"""What follows every message: version, and digest of the whole set."""
 APPLIED = struct.Struct("<q")
 """What a reader answers: the version that it has applied, so that it does not hold the slab any more."""
 
@@ -99,8 +102,8 @@ class _Reader:
     """One of them as the publisher sees it."""
 
     connection: socket.socket
-    known: set[int] = field(default_factory=set)
-    """Serial numbers of the slabs that it has mapped."""
+    known: dict[int, Slab] = field(default_factory=dict)
+    """Slot → slab that it has mapped."""
     holds: Shipment | None = None
     applied: int | None = None
 
@@ -173,10 +176,14 @@ class SharedMemoryPublisher(Publisher):
                 return
             if self._changes:
                 self._base = before
-        data = shipment.slab.memory[: shipment.layout.size]
-        shipment.digest = digest(shipment.version, shipment.layout, data)
         if self._changes:
             self._difference = self._compare(shipment)
+        self._send_newest()  # readers reckon the digest while it is reckoned here
+        data = shipment.slab.memory[: shipment.layout.size]
+        shipment.digest = digest(shipment.version, shipment.layout, data)
+        for reader in self._readers:
+            if reader.holds is shipment:
+                self._confirm(reader, shipment)
         self._spare()
 
     def _compare(self, shipment: Shipment) -> Changes | None:
@@ -200,18 +207,19 @@ class SharedMemoryPublisher(Publisher):
             return
         for reader in self._readers:
             if reader.holds is None and reader.applied != shipment.version:
-                self._send(reader, shipment)
+                self._announce(reader, shipment)
+                if shipment.digest:
+                    self._confirm(reader, shipment)
 
-    def _send(self, reader: _Reader, shipment: Shipment) -> None:
+    def _announce(self, reader: _Reader, shipment: Shipment) -> None:
         slab, layout = shipment.slab, shipment.layout
         base = -1 if self._base is None else self._base.version
         found = self._difference if reader.applied == base else None
         with self._changed:
-            oldest = min(slab.serial for slab in self._slabs)
+            slot = self._slabs.index(slab)
             reader.holds = shipment
         message = Message(
-            serial=slab.serial,
-            oldest=oldest,
+            slot=slot,
             version=shipment.version,
             published_s=shipment.published_s,
             size=layout.size,
@@ -219,22 +227,21 @@ class SharedMemoryPublisher(Publisher):
             keep=self._changes,
             changed=NOT_ONLY_CHANGES if found is None else len(found.where),
             base=base,
-            digest=shipment.digest,
         )
-        fds = [] if slab.fd is None or slab.serial in reader.known else [slab.fd]
-        try:
+        fds = [] if slab.fd is None or reader.known.get(slot) is slab else [slab.fd]
+        with _lost():
             socket.send_fds(reader.connection, [message.pack()], fds)
-        except OSError as error:
-            raise ReaderLostError(f"a reader of the weights has gone: {error}") from error
-        reader.known.add(slab.serial)
+        reader.known[slot] = slab
+
+    def _confirm(self, reader: _Reader, shipment: Shipment) -> None:
+        with _lost():
+            reader.connection.send(CONFIRMED.pack(shipment.version, shipment.digest))
 
     def _hear(self, reader: _Reader) -> None:
-        try:
+        with _lost():
             data = reader.connection.recv(APPLIED.size)
-        except OSError as error:
-            raise ReaderLostError(f"a reader of the weights has gone: {error}") from error
-        if not data:
-            raise ReaderLostError("a reader of the weights has gone")
+            if not data:
+                raise ConnectionResetError("it has ended")
         with self._changed:
             (reader.applied,) = APPLIED.unpack(data)
             reader.holds = None
@@ -262,3 +269,12 @@ class SharedMemoryPublisher(Publisher):
         parts = [f"{missing} readers have not connected"] if missing else []
         parts += [f"not applied by readers {', '.join(late)}"] if late else []
         return "; ".join(parts)
+
+
+@contextlib.contextmanager
+def _lost() -> Iterator[None]:
+    """Says what it means that the socket does not work any more."""
+    try:
+        yield
+    except OSError as error:
+        raise ReaderLostError(f"a reader of the weights has gone: {error}") from error

@@ -24,7 +24,6 @@ Memory that is to be shared is a memfd: it has no name, and goes with the last p
 from __future__ import annotations
 
 import fcntl
-import itertools
 import json
 import mmap
 import os
@@ -38,7 +37,6 @@ import xxhash
 ALIGNMENT = 64
 _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 """A memfd that could shrink would end its readers with SIGBUS."""
-_serials = itertools.count()
 
 
 class TornSetError(RuntimeError):
@@ -117,7 +115,7 @@ class Slab:
     """
 
     def __init__(self, size: int, fd: int | None = None, *, writable: bool = True) -> None:
-        self.fd, self.serial = fd, next(_serials)
+        self.fd = fd
         protection = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
         sharing = mmap.MAP_SHARED if fd is not None else mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
         # Populated: a copy into pages that are not there yet takes several times as long.
