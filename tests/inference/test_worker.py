@@ -28,6 +28,9 @@ from accerl_lerobot.experience import TASK, Decision, Request
 from accerl_lerobot.inference.worker import InferenceConfig, InferenceWorker, ServiceStoppedError
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.weights import shared_memory
+from accerl_lerobot.weights.publisher import ReaderLostError
+from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
 
 NAMES = ("a", "b", "c")
 
@@ -307,3 +310,62 @@ def test_a_caller_who_gave_up_does_not_disturb_the_others(play):
         assert (await worker.decide(requests(2)))[0].value == 2.0
 
     play(scene, adapter, max_batch=2, max_wait_s=1.0)
+
+
+def test_weights_through_shared_memory_are_swapped_in_and_let_go_of(play):
+    publisher = SharedMemoryPublisher(1)
+
+    async def scene(worker, adapter):
+        assert await worker.open_weights(publisher.address)
+        for version in range(30):
+            publisher.publish(version, weights(version))
+            await asyncio.to_thread(publisher.flush, 20)  # applied, though nobody has asked for a decision
+            (decision,) = await worker.decide(requests(0))
+            assert decision.version == version and set(decision.chunk.ravel()) == {version}
+        metrics = await worker.metrics()
+        assert metrics["publish_to_served_s"] >= metrics["swap_s"] > 0
+
+    play(scene, max_batch=1, max_wait_s=0.0)
+    publisher.close()
+
+
+def test_nobody_at_the_address_is_an_answer_and_no_error(play):
+    async def scene(worker, adapter):
+        assert not await worker.open_weights("accerl-weights-nobody")
+
+    play(scene)
+
+
+def test_a_torn_set_ends_the_service_and_is_never_served(play, monkeypatch: pytest.MonkeyPatch):
+    publisher = SharedMemoryPublisher(1)
+    monkeypatch.setattr(shared_memory, "digest", lambda *_: bytes(16))
+
+    async def scene(worker, adapter):
+        assert await worker.open_weights(publisher.address)
+        publisher.publish(1, weights(1))
+        with pytest.raises(ServiceStoppedError, match="version 1 are not what their digest says"):
+            while True:
+                (decision,) = await worker.decide(requests(0))
+                assert decision.version == 0
+        assert adapter.loaded == []
+        with pytest.raises(ReaderLostError):
+            await asyncio.to_thread(publisher.flush, 20)
+
+    play(scene, max_batch=1, max_wait_s=0.0)
+    publisher.close()
+
+
+def test_a_service_that_fails_is_heard_of_by_the_trainer(play):
+    publisher = SharedMemoryPublisher(1)
+
+    async def scene(worker, adapter):
+        assert await worker.open_weights(publisher.address)
+        adapter.broken = ValueError("no such weights")
+        publisher.publish(1, weights(1))
+        with pytest.raises(ReaderLostError):
+            await asyncio.to_thread(publisher.flush, 20)
+        with pytest.raises(ServiceStoppedError, match="no such weights"):
+            await worker.decide(requests(0))
+
+    play(scene, max_batch=1)
+    publisher.close()
