@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from accerl_lerobot.algorithms import AlgorithmConfig, GIPOConfig
 from accerl_lerobot.dataset_config import DatasetConfig
@@ -35,6 +35,7 @@ from accerl_lerobot.metrics import WandBConfig
 from accerl_lerobot.parsing import decode, encode, parse
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.replay.pacing import ReplayConfig
+from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
@@ -48,6 +49,10 @@ class LaunchConfig:
 
     engine: str = "ray"
     """ray: asynchronous workers. local: the same parts in one process, deterministic, for tests."""
+    schedule: Schedule = ASYNCHRONOUS
+    """asynchronous: nobody waits for anybody. synchronous: a batch is collected, by all worlds in lock step,
+    then learned from. overlap: the next one is collected meanwhile. These two are for measuring what the
+    first gains."""
     stall_s: float = 300.0
     """How long, in seconds, a worker may owe an answer or a world a step, and a run stand still; > 0.
 
@@ -61,6 +66,13 @@ class LaunchConfig:
     def __post_init__(self) -> None:
         if self.engine not in ("ray", "local"):
             raise InputError("launch.engine", self.engine, "use ray or local")
+        if self.schedule not in get_args(Schedule):
+            raise InputError("launch.schedule", self.schedule, f"use {' or '.join(get_args(Schedule))}")
+        if self.schedule != ASYNCHRONOUS and self.engine == "local":
+            remedy = (
+                "with launch.engine=local all is done in one process, in a schedule of its own; leave it out"
+            )
+            raise InputError("launch.schedule", self.schedule, remedy)
         if not self.stall_s > 0:
             raise InputError("launch.stall_s", self.stall_s, "use a positive number of seconds")
         if self.max_recoveries < 0:
@@ -151,6 +163,12 @@ class RunConfig:
                 imagination.replay.check(
                     batch_decisions=batch, segment_decisions=longest, field="imagination.replay"
                 )
+        if imagination.share and self.launch.schedule != ASYNCHRONOUS:
+            remedy = "use asynchronous: those who dream take no turns"
+            raise InputError("launch.schedule", self.launch.schedule, remedy)
+        if self.rollout.episodes and self.launch.schedule != ASYNCHRONOUS:
+            remedy = "use asynchronous, or leave out rollout.episodes: worlds that have ended are waited for"
+            raise InputError("launch.schedule", self.launch.schedule, remedy)
         if imagination.share and self.algorithm.advantage == "group":
             remedy = "use algorithm.advantage=gae: dreams do not begin alike, so they are not compared"
             raise InputError("imagination.share", imagination.share, remedy)

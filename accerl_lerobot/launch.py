@@ -46,6 +46,8 @@ from accerl_lerobot.checkpoint import TRAINING_STATE, saved_version
 from accerl_lerobot.config import RunConfig, journal_folder
 from accerl_lerobot.engine import Engine, Progress, Saved, WorkerError
 from accerl_lerobot.inference.worker import ServiceStoppedError
+from accerl_lerobot.policies.config import Load
+from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seats import START_S, Seats
 from accerl_lerobot.stopping import Stopping
@@ -79,6 +81,7 @@ class RayEngine(Engine):
         tasks: the training tasks.
         history: env steps that an observation holds, the policy's ``n_obs_steps``.
         state: the ``training_state`` to go on from, but for episodes under way, which are lost; None: begin.
+        load: makes the policy's adapter, in the processes that have one; None: of LeRobot's checkpoint.
 
     Raises:
         InputError: the state is of a run in one process.
@@ -86,9 +89,14 @@ class RayEngine(Engine):
     """
 
     def __init__(
-        self, config: RunConfig, tasks: tuple[str, ...], history: int = 1, state: Path | None = None
+        self,
+        config: RunConfig,
+        tasks: tuple[str, ...],
+        history: int = 1,
+        state: Path | None = None,
+        load: Load | None = None,
     ) -> None:
-        self._config, self._state = config, state
+        self._config, self._state, self._load = config, state, load
         self._services: list[Watched] = []
         self._seats = Seats(config, tasks, history, state)
         self._updates: list[dict[str, float]] = []
@@ -98,6 +106,7 @@ class RayEngine(Engine):
         self._dreamer: Watched | None = None
         self._learner: Watched | None = None
         self._real_ended = False
+        self._schedule: Schedule = ASYNCHRONOUS
         self._training = self._done = self._closed = False
         self._version = 0 if state is None else saved_version(state)
         self._last_change = time.monotonic()
@@ -117,11 +126,25 @@ class RayEngine(Engine):
 
     def train(self) -> None:
         self._training, self._last_change = True, time.monotonic()
+        self.follow(self._config.launch.schedule)
         self._trainer.work = self._trainer.actor.run.remote(self._replay.actor, [self._inference.actor])
         if self._dreamer is not None:
             self._dreamer.work = self._dreamer.actor.run.remote(self._inference.actor, self._replay.actor)
         if self._learner is not None and self._dreamer is not None:
             self._learner.work = self._learner.actor.run.remote(self._dreamer.actor, self._replay.actor)
+
+    def follow(self, schedule: Schedule) -> None:
+        """From now on, collecting and learning take turns like this, see `replay.turns`."""
+        if schedule == self._schedule:
+            return
+        in_turn = schedule != ASYNCHRONOUS
+        rollout = self._config.rollout
+        self._seats.in_turn, self._schedule = in_turn, schedule
+        # The trainer first: who takes turns waits for it to hand over its weights.
+        for worker in (self._trainer, self._replay):
+            worker.call("follow", schedule, timeout=self._limit)
+        together = rollout.workers * rollout.worlds if in_turn else 0
+        self._inference.call("lock_step", together, timeout=self._limit)
 
     def poll(self) -> Progress:
         self._ask()
@@ -200,7 +223,7 @@ class RayEngine(Engine):
         share = 0.0 if c.policy.device == "cpu" or not gpus else 1 / math.ceil(users / gpus)
         inference = ray.remote(InferenceWorker).options(num_cpus=0, num_gpus=share, max_concurrency=1000)
         self._inference = self._service(
-            "inference", inference.remote(c.policy, c.inference, self._version, self._state)
+            "inference", inference.remote(c.policy, c.inference, self._version, self._state, self._load)
         )
         replay = ray.remote(ReplayWorker).options(num_cpus=0, num_gpus=0, max_concurrency=1000)
         imagined, counted = imagination.replay if imagination.share else None, c.rollout.episodes > 0
@@ -209,7 +232,7 @@ class RayEngine(Engine):
         )
         threads = {"num_cpus": 0, "num_gpus": share, "max_concurrency": 4}
         trainer = ray.remote(TrainerWorker).options(**threads)
-        learns = trainer.remote(c.policy, c.algorithm, c.trainer, c.seed, self._state)
+        learns = trainer.remote(c.policy, c.algorithm, c.trainer, c.seed, self._state, self._load)
         self._trainer = self._service("trainer", learns)
         if imagination.share:
             from accerl_lerobot.world_model.worker import DreamWorker, WorldLearningWorker
@@ -274,6 +297,7 @@ class RayEngine(Engine):
     def _finish(self, version: int) -> None:
         """The trainer has made its updates; its records and those of replay are completed."""
         self._done, self._version = True, version
+        self.follow(ASYNCHRONOUS)
         self._updates += self._hear(self._trainer, self._limit) or []
         self._updates += self._trainer.call("metrics", timeout=self._limit)
         self._replay.call("close", timeout=self._limit)

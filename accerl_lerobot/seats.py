@@ -86,6 +86,8 @@ class Seats:
         self._config, self._tasks, self._history = config, tasks, history
         self._past: dict[str, float] = {"restarts": 0.0}
         self._peers: tuple[Any, Any] | None = None
+        self.in_turn = False
+        """Whether worlds wait for replay after each segment."""
         self._seats = [
             Seat(index=index, budget=budget, spent=budget == 0)
             for index, budget in enumerate(budgets(config.rollout))
@@ -117,7 +119,7 @@ class Seats:
     def ask(self, training: bool) -> None:
         """Has each report, unless it owes a report already."""
         for seat in self._seats:
-            if seat.worker.ask("report", training, seat.unsent):
+            if seat.worker.ask("report", training, seat.unsent, self.in_turn):
                 seat.unsent = []
 
     def listen(self) -> list[EpisodeResult]:

@@ -17,6 +17,9 @@ Time is passed in and never read, so the same code serves a real clock and a tes
 starts with its *oldest* request: counting from the newest would let a steady trickle postpone the answer
 forever, and a clock that is set only once would serve every later request alone.
 
+In lock step, all worlds are decided for together: requests wait until as many are here as there are worlds,
+however long that takes, and are then served in as many batches as they need.
+
 What must hold: first in, first out; a request is neither split nor reordered nor forgotten; a request waits
 for at most `max_wait_s` plus the time the batches before it take.
 """
@@ -86,6 +89,11 @@ class Batcher[R: Sized]:
         self.stats = BatcherStats()
         self._waiting: deque[tuple[R, float]] = deque()
         self._observations = 0
+        self._together = self._left = 0
+
+    def lock_step(self, observations: int) -> None:
+        """From now on so many observations wait for each other; 0: none do."""
+        self._together, self._left = observations, 0
 
     def __len__(self) -> int:
         """Requests that wait."""
@@ -119,11 +127,14 @@ class Batcher[R: Sized]:
 
     def next_deadline(self) -> float | None:
         """When the next batch is due if nothing more arrives; a moment in the past if it is full, None if
-        empty."""
+        empty or in lock step with others that are not here yet."""
         if not self._waiting:
             return None
+        if self._together and not self._left:
+            return self._waiting[0][1] if self._observations >= self._together else None
         oldest = self._waiting[0][1]
-        return oldest if self._observations >= self.max_batch else oldest + self.max_wait_s
+        now = self._left or self._observations >= self.max_batch
+        return oldest if now else oldest + self.max_wait_s
 
     def take(self, now: float) -> list[R]:
         """Removes the next batch, due or not: the oldest requests, as many as fit, at least one.
@@ -136,13 +147,17 @@ class Batcher[R: Sized]:
         """
         batch: list[R] = []
         size = 0
-        while self._waiting and (not batch or size + len(self._waiting[0][0]) <= self.max_batch):
+        if self._together and not self._left:
+            self._left = self._observations
+        most = min(self.max_batch, self._left or self.max_batch)
+        while self._waiting and (not batch or size + len(self._waiting[0][0]) <= most):
             request, since = self._waiting.popleft()
             batch.append(request)
             size += len(request)
             self.stats.wait_sum_s += now - since
             self.stats.wait_max_s = max(self.stats.wait_max_s, now - since)
         self._observations -= size
+        self._left = max(0, self._left - size)
         if batch:
             self.stats.batches += 1
             self.stats.requests += len(batch)

@@ -42,7 +42,7 @@ from accerl_lerobot.checkpoint import WEIGHTS
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import Batcher
-from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.weights.reader import Received, SharedMemoryReader
 
 
@@ -87,17 +87,21 @@ class InferenceWorker:
         config: batching.
         version: of the weights it begins with.
         state: the ``training_state`` that holds these; None: they are the checkpoint's.
+        load: makes the adapter; None: of LeRobot's checkpoint.
     """
 
     def __init__(
-        self, policy: PolicyConfig, config: InferenceConfig, version: int = 0, state: Path | None = None
+        self,
+        policy: PolicyConfig,
+        config: InferenceConfig,
+        version: int = 0,
+        state: Path | None = None,
+        load: Load | None = None,
     ) -> None:
         import torch
 
-        from accerl_lerobot.policies.loading import load_adapter
-
         torch.set_num_threads(config.num_threads)
-        self._adapter = load_adapter(policy)
+        self._adapter = loader(load)(policy)
         self._batcher: Batcher[_Waiting] = Batcher(config.max_batch, config.max_wait_s)
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="forward")
         self._wake = asyncio.Event()
@@ -159,6 +163,11 @@ class InferenceWorker:
 
     def _break(self, error: BaseException) -> None:
         self._broken = error
+        self._wake.set()
+
+    async def lock_step(self, observations: int) -> None:
+        """See `Batcher.lock_step`."""
+        self._batcher.lock_step(observations)
         self._wake.set()
 
     async def serve(self) -> None:

@@ -15,11 +15,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.samplers import SamplerConfig
 from accerl_lerobot.safety import check_remote_code
+
+if TYPE_CHECKING:
+    from accerl_lerobot.policies.base import PolicyAdapter
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,3 +119,15 @@ class PolicyConfig:
         check_remote_code(self.trust_remote_code, self.code_revision, "policy")
         if self.precision not in ("fp32", "bf16"):
             raise InputError("policy.precision", self.precision, "use fp32 or bf16")
+
+
+Load = Callable[[PolicyConfig], "PolicyAdapter"]
+
+
+def loader(load: Load | None) -> Load:
+    """What makes a worker's adapter: `load`, or what loads LeRobot's checkpoints."""
+    if load is not None:
+        return load
+    from accerl_lerobot.policies.loading import load_adapter
+
+    return load_adapter

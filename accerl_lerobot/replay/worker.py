@@ -15,7 +15,8 @@
 
 consumes    segments from rollout workers and from dreams
 produces    batches of segments for the trainer
-waits for   the pace: `insert` until rollouts are not too far ahead, `sample` for enough that is new
+waits for   the pace: `insert` until rollouts are not too far ahead, `sample` for enough that is new;
+            and, where they take turns, each for the other
 unblocked   by the other side, or by `close`
 """
 
@@ -36,6 +37,7 @@ from accerl_lerobot.experience import REAL, Segment
 from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.replay.mixed import MixedReplay
 from accerl_lerobot.replay.pacing import ReplayConfig
+from accerl_lerobot.replay.turns import Schedule, Turns
 
 IN_TRANSIT = 1024
 """Newest real segments that are kept for those who dream, who ask for them several times a second."""
@@ -83,6 +85,8 @@ class ReplayWorker:
         self._real_count = 0
         self._rng = np.random.default_rng(seed)
         self._changed = asyncio.Condition()
+        self._turns = Turns()
+        self._batch = 0  # decisions the trainer asked for last
         self._closed = False
         self._insert_wait_s = self._sample_wait_s = 0.0
         self._episodes: list[dict[str, float]] = []
@@ -104,7 +108,7 @@ class ReplayWorker:
             await self._changed.wait_for(lambda: self._closed)
 
     async def insert(self, segments: list[Segment]) -> bool:
-        """Stores segments of one source once the pace allows it.
+        """Stores segments of one source once the pace allows it; returns when more may be collected.
 
         Returns:
             False when the run is over and they were not stored.
@@ -124,17 +128,19 @@ class ReplayWorker:
                     if segment.episode:
                         self._episodes.append(segment.episode)
             self._changed.notify_all()
+            await self._changed.wait_for(lambda: self._closed or self._turns.may_collect(self._ready))
         return True
 
     async def sample(self, num_decisions: int, trainer_version: int) -> list[Segment]:
         """A batch once the pace allows it; empty when the run is over, or nothing will come any more."""
         started = time.monotonic()
+        self._batch = num_decisions
         async with self._changed:
             while True:
                 await self._changed.wait_for(
                     lambda: (
                         self._closed
-                        or self._replay.may_sample(num_decisions)
+                        or (self._turns.may_draw() and self._replay.may_sample(num_decisions))
                         or self._replay.exhausted(num_decisions)
                     )
                 )
@@ -143,8 +149,21 @@ class ReplayWorker:
                 segments = self._replay.sample(num_decisions, trainer_version, self._rng)
                 self._changed.notify_all()
                 if segments:
+                    self._turns.drawn()
                     self._sample_wait_s += time.monotonic() - started
                     return segments
+
+    async def learnt(self) -> None:
+        """The trainer's word that it has learned from a batch."""
+        async with self._changed:
+            self._turns.learnt()
+            self._changed.notify_all()
+
+    async def follow(self, schedule: Schedule) -> None:
+        """From now on, turns are taken like this."""
+        async with self._changed:
+            self._turns.schedule = schedule
+            self._changed.notify_all()
 
     async def news(self, cursor: int) -> News:
         """Real segments since the `cursor`-th; those that nobody asked for in time are left out."""
@@ -178,6 +197,10 @@ class ReplayWorker:
             "real_count": self._real_count,
         }
         await asyncio.to_thread(snapshot.save, directory / "replay", state)
+
+    @property
+    def _ready(self) -> bool:
+        return self._batch > 0 and self._replay.may_sample(self._batch)
 
     async def close(self) -> None:
         """Ends all waiting; nothing is stored or drawn any more."""

@@ -97,6 +97,7 @@ class RolloutWorker:
             budget=budget,
         )
         self._spent = False
+        self._at_the_door = AT_THE_DOOR
         # Shared by the two threads: appending to and popping from a deque is atomic.
         self._results: deque[EpisodeResult] = deque()
         self._training = threading.Event()
@@ -119,14 +120,16 @@ class RolloutWorker:
         """Answers once the worlds exist; returns this process's id."""
         return os.getpid()
 
-    def report(self, training: bool, plans: list[EpisodePlan]) -> Report:
+    def report(self, training: bool, plans: list[EpisodePlan], in_turn: bool = False) -> Report:
         """Takes orders and reports. One call at a time, so that orders cannot overtake each other.
 
         Args:
             training: whether training episodes are run between planned ones, from now on.
             plans: evaluation episodes to queue; they are taken before any training episode.
+            in_turn: exploring worlds pause until replay lets them go on after each segment, from now on.
         """
         self._plans.queue(plans)
+        self._at_the_door = 1 if in_turn else AT_THE_DOOR
         (self._training.set if training else self._training.clear)()
         episodes = [self._results.popleft() for _ in range(len(self._results))]
         entered = self._entered
@@ -149,7 +152,7 @@ class RolloutWorker:
             self._spent = self._plans.spent and not self._runner.exploring and not door
             self._give_up(due, idle)
             idle = [slot for slot in idle if not self._begin(slot, due)]
-            sendable = [slot for slot in due if len(door) < AT_THE_DOOR or not due[slot].explore]
+            sendable = [slot for slot in due if len(door) < self._at_the_door or not due[slot].explore]
             for start in range(0, len(sendable), size):
                 slots = sendable[start : start + size]
                 under_way[inference.decide.remote([due.pop(slot) for slot in slots])] = slots

@@ -33,7 +33,8 @@ import ray
 from accerl_lerobot import snapshot
 from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.checkpoint import PRETRAINED, TRAINING_STATE, WEIGHTS
-from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.config import Load, PolicyConfig, loader
+from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.weights.held_back import HeldBack
 from accerl_lerobot.weights.publisher import Publisher
@@ -49,6 +50,7 @@ class TrainerWorker:
         config: the optimiser.
         seed: of torch's global generator.
         state: the ``training_state`` to go on from; None: begin.
+        load: makes the adapter; None: of LeRobot's checkpoint.
     """
 
     def __init__(
@@ -58,22 +60,23 @@ class TrainerWorker:
         config: TrainerConfig,
         seed: int,
         state: Path | None = None,
+        load: Load | None = None,
     ) -> None:
         import torch
 
-        from accerl_lerobot.policies.loading import load_adapter
         from accerl_lerobot.trainer.update import Update
 
         torch.set_num_threads(config.num_threads)
         torch.manual_seed(seed)
         self._policy, self._config = policy, config
-        adapter = load_adapter(policy)
+        adapter = loader(load)(policy)
         self._update = Update(adapter, algorithm, config)
         if state is not None:
             adapter.load_trainable(snapshot.load(state / WEIGHTS))
             self._update.restore(snapshot.load(state / "trainer"))
         self._lock = threading.Lock()
         self._kept: Any = None
+        self._in_turn = False
         self._history: deque[dict[str, float]] = deque()  # filled on one thread, emptied on another
 
     def ready(self) -> int:
@@ -103,8 +106,8 @@ class TrainerWorker:
         held = HeldBack(self._config.hold_back)
         n, config = self._config.batch_decisions, self._config
         upcoming = replay.sample.remote(n, self._update.version)
+        asked = time.monotonic()
         while self._update.version < config.updates:
-            asked = time.monotonic()
             segments = ray.get(upcoming)
             if not segments:
                 break
@@ -125,6 +128,10 @@ class TrainerWorker:
                     "publish_s": time.monotonic() - updated,
                 }
                 self._history.append(metrics)
+            asked = time.monotonic()
+            if self._in_turn:
+                publisher.flush()
+            replay.learnt.remote()
         version = self._update.version
         if version < config.updates and (config.hold_back or not config.publishes(version)):
             # It has ended early, and what is evaluated is to be what is saved.
@@ -141,6 +148,10 @@ class TrainerWorker:
     def metrics(self) -> list[dict[str, float]]:
         """One record per update since the last call."""
         return [self._history.popleft() for _ in range(len(self._history))]
+
+    def follow(self, schedule: Schedule) -> None:
+        """From now on, turns are taken with those who collect like this."""
+        self._in_turn = schedule != ASYNCHRONOUS
 
     def hold(self) -> tuple[int, list[dict[str, float]]]:
         """Keeps a copy of all that is to be saved, as it is between two updates, for `write`.

@@ -170,3 +170,26 @@ def test_nonsense_is_refused() -> None:
             make_batcher(max_wait_s=wait)
     with pytest.raises(ValueError, match="without observations"):
         make_batcher().add("", now=0.0)
+
+
+def test_in_lock_step_all_are_waited_for_and_served_in_as_many_batches_as_they_need() -> None:
+    batcher = make_batcher(max_batch=2)
+    batcher.lock_step(5)
+    batcher.add("ab", now=0.0)
+    batcher.add("cd", now=1.0)  # a full batch waits for those that are not here
+    assert not batcher.due(now=1e6) and batcher.next_deadline() is None
+    batcher.add("e", now=2.0)
+    assert batcher.due(now=2.0)
+    assert batcher.take(now=2.0) == ["ab"]
+    batcher.add("f", now=2.0)  # of the next round
+    assert batcher.due(now=2.0) and batcher.take(now=2.0) == ["cd"]
+    assert batcher.due(now=2.0) and batcher.take(now=2.0) == ["e"]
+    assert not batcher.due(now=1e6) and len(batcher) == 1
+
+
+def test_who_waits_is_served_when_lock_step_ends() -> None:
+    batcher = make_batcher()
+    batcher.lock_step(5)
+    batcher.add("ab", now=0.0)
+    batcher.lock_step(0)
+    assert batcher.next_deadline() == WAIT and batcher.due(now=WAIT)

@@ -1,0 +1,246 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The asynchronous engine around worlds and a policy that are made of time, measured a block at a time.
+
+Each world is a process of its own, as in a real run, and so are the service, the replay and the trainer; what
+takes time in them is slept. So 64 worlds are measured on two cores, as long as what is not slept leaves cores
+idle: `Block.processors` says so.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from accerl_lerobot.bench.host import Processors
+from accerl_lerobot.config import LaunchConfig, RunConfig
+from accerl_lerobot.engine import Progress
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.inference.worker import InferenceConfig
+from accerl_lerobot.policies.simulated import SimulatedPolicyConfig, load_simulated
+from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.replay.turns import Schedule
+from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.trainer.config import TrainerConfig
+
+EPISODE = 16
+"""Decisions of an episode."""
+CHUNK = 4
+SETTLE = 2
+"""Updates after a change that are not counted."""
+MOST_BUSY = 0.6
+"""Share of all cores above which the processors, and not what is slept, may be what is measured."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MachineryConfig:
+    """Sizes and durations of what is simulated."""
+
+    worlds: int = 64
+    """Worlds, each a process; at least 1."""
+    latency_ms: float = 200.0
+    """Mean time a world takes from a decision to its next observation, in milliseconds; above 0."""
+    latency_cv: float = 0.5
+    """Standard deviation of that over its mean, lognormal; 0: always the mean."""
+    image_size: int = 64
+    """Height and width of the one image of an observation, 8 to 480; 317 makes it 301 KB."""
+    segment_length: int = 4
+    """Decisions of a segment; 16 is a multiple of it."""
+    decide_ms: float = 8.0
+    """a of t(B) = a + bB, the time of a forward pass for B observations, in milliseconds."""
+    decide_each_ms: float = 0.1
+    """b of it."""
+    max_batch: int = 64
+    """Largest B."""
+    update_ms: float = 800.0
+    """Time of an update, in milliseconds; it learns from one segment of each world."""
+
+    def __post_init__(self) -> None:
+        if self.worlds < 1:
+            raise InputError("worlds", self.worlds, "use at least 1")
+        if not self.latency_ms > 0:
+            raise InputError("latency_ms", self.latency_ms, "use a positive time")
+        if self.segment_length < 1 or EPISODE % self.segment_length:
+            raise InputError("segment_length", self.segment_length, f"use a divisor of {EPISODE}")
+
+    @property
+    def batch(self) -> int:
+        """Decisions an update learns from."""
+        return self.worlds * self.segment_length
+
+    @property
+    def world_bound(self) -> float:
+        """Decisions a second that the worlds cannot exceed: a reset costs them one latency more."""
+        cycle = self.latency_ms * (1 + 1 / EPISODE) + self.decide_ms + self.decide_each_ms
+        return 1000 * self.worlds / cycle
+
+    @property
+    def service_bound(self) -> float:
+        """Decisions a second that the service cannot exceed."""
+        largest = min(self.max_batch, self.worlds)
+        service = self.decide_ms + self.decide_each_ms * largest
+        return 1000 * largest / service if service else float("inf")
+
+    @property
+    def trainer_bound(self) -> float:
+        """Decisions a second that the trainer cannot exceed."""
+        return 1000 * self.batch / self.update_ms if self.update_ms else float("inf")
+
+    @property
+    def bound(self) -> float:
+        """Decisions a second that no schedule can exceed."""
+        return min(self.world_bound, self.service_bound, self.trainer_bound)
+
+    def run_config(self, *, updates: int = 1_000_000, seed: int = 0) -> RunConfig:
+        """A run of it."""
+        batch = self.batch
+        return RunConfig(
+            seed=seed,
+            env=SimulatedConfig(
+                max_steps=EPISODE * CHUNK,
+                terminate_on_success=False,
+                reward="dense",
+                image_size=self.image_size,
+                frame_ms=self.latency_ms,
+                latency="lognormal" if self.latency_cv else "constant",
+                latency_cv=self.latency_cv,
+            ),
+            rollout=RolloutConfig(workers=self.worlds, worlds=1, segment_length=self.segment_length),
+            inference=InferenceConfig(max_batch=self.max_batch),
+            replay=ReplayConfig(
+                capacity=8 * batch, min_decisions=batch, ahead=2 * batch, samples_per_insert=1.0
+            ),
+            trainer=TrainerConfig(
+                updates=updates,
+                batch_decisions=batch,
+                micro_batch=2 * batch,
+                lr=0.02,
+                value_lr=0.02,
+                value_warmup_updates=2,
+                probe_every=0,
+            ),
+            launch=LaunchConfig(stall_s=120.0),
+        )
+
+    @property
+    def load(self) -> Any:
+        """Its policy, for `RayEngine`."""
+        policy = SimulatedPolicyConfig(
+            decide_ms=self.decide_ms,
+            decide_each_ms=self.decide_each_ms,
+            update_ms=self.update_ms,
+            chunk=CHUNK,
+        )
+        return functools.partial(load_simulated, policy)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Block:
+    """What was measured in some seconds."""
+
+    schedule: str
+    seconds: float
+    updates: int
+    decisions_per_s: float
+    """Learned from, each once."""
+    lag_mean: float
+    lag_max: float
+    trainer_waits: float
+    """Share of its time in which the trainer had no batch: its bubble."""
+    publishing: float
+    """Share of its time in which it handed over weights."""
+    batch_size: float
+    """Observations decided for together."""
+    request_wait_ms: float
+    """From the arrival of a request to its forward pass, on average."""
+    inference_busy: float
+    """Share of its time that the service decided."""
+    processors: float
+    """How busy all cores were, whoever used them."""
+
+
+class Machinery:
+    """An engine that has begun to train; ``with`` it, or close it.
+
+    Args:
+        config: of what.
+    """
+
+    def __init__(self, config: MachineryConfig) -> None:
+        from accerl_lerobot.launch import RayEngine
+
+        self.config = config
+        self.engine = RayEngine(config.run_config(), ("match",), load=config.load)
+        self.engine.train()
+
+    def __enter__(self) -> Machinery:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.engine.close()
+
+    def block(self, schedule: Schedule, seconds: float) -> Block:
+        """Measures at least so many seconds of a schedule, in whole updates, after a change has settled."""
+        self.engine.follow(schedule)
+        self._updates(SETTLE, 0.0)
+        processors, before = Processors(), self.engine.poll().inference
+        updates, polls = self._updates(1, seconds)
+        after = polls[-1].inference
+        total = sum(_seconds(u) for u in updates)
+        batches = after["batches"] - before["batches"]
+        requests = _observations(after) - _observations(before)
+        return Block(
+            schedule=schedule,
+            seconds=total,
+            updates=len(updates),
+            decisions_per_s=sum(u["decisions"] for u in updates) / total,
+            lag_mean=sum(u["lag_mean"] for u in updates) / len(updates),
+            lag_max=max(u["lag_max"] for u in updates),
+            trainer_waits=sum(u["wait_s"] for u in updates) / total,
+            publishing=sum(u["publish_s"] for u in updates) / total,
+            batch_size=requests / batches if batches else 0.0,
+            request_wait_ms=1000 * (_waited(after) - _waited(before)) / requests if requests else 0.0,
+            inference_busy=sum(p.inference["busy_share"] for p in polls) / len(polls),
+            processors=processors.share(),
+        )
+
+    def _updates(self, count: int, seconds: float) -> tuple[list[dict[str, float]], list[Progress]]:
+        """Polls until there are so many updates, which took so long."""
+        updates: list[dict[str, float]] = []
+        polls: list[Progress] = []
+        while len(updates) < count or sum(_seconds(u) for u in updates) < seconds:
+            progress = self.engine.poll()
+            updates += progress.updates
+            polls.append(progress)
+        return updates, polls
+
+
+def as_rows(blocks: list[Block]) -> list[dict[str, Any]]:
+    """For JSON."""
+    return [asdict(block) for block in blocks]
+
+
+def _seconds(update: dict[str, float]) -> float:
+    return update["wait_s"] + update["update_s"] + update["publish_s"]
+
+
+def _observations(inference: dict[str, float]) -> float:
+    """Of all requests so far; each has one."""
+    return inference["batches"] * inference["batch_size_mean"]
+
+
+def _waited(inference: dict[str, float]) -> float:
+    return inference["wait_mean_s"] * _observations(inference)

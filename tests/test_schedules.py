@@ -1,0 +1,166 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Schedules: who waits for whom, on paper and in a run."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+from typing import Any
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.config import LaunchConfig, RunConfig
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.inference.worker import InferenceConfig
+from accerl_lerobot.policies.simulated import SimulatedPolicyConfig, load_simulated
+from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.replay.turns import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Turns
+from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.world_model.imagination_config import ImaginationConfig
+from tests.light_workers import light_ray
+from tests.replay.segments import make_segment
+from tests.replay.test_worker import BATCH, play, start, waits
+from tests.runs import drive
+
+__all__ = ["light_ray"]
+
+
+@pytest.mark.parametrize(
+    ("schedule", "allowed"),
+    [(ASYNCHRONOUS, [True, True, True, True]), (OVERLAP, [True, True, True, False]),
+     (SYNCHRONOUS, [True, False, False, False])],
+)  # fmt: skip
+def test_who_may_collect(schedule: Any, allowed: list[bool]):
+    found = []
+    for learning in (False, True):
+        for ready in (False, True):
+            turns = Turns(schedule)
+            if learning:
+                turns.drawn()
+            found.append(turns.may_collect(ready))
+            # Nobody is kept while nothing happens that would end it.
+            assert found[-1] or (ready and turns.may_draw()) or learning
+    assert found == allowed
+
+
+def test_a_batch_is_drawn_when_the_one_before_has_been_learned_from():
+    for schedule, at_once in ((ASYNCHRONOUS, True), (OVERLAP, False), (SYNCHRONOUS, False)):
+        turns = Turns(schedule)
+        assert turns.may_draw()
+        turns.drawn()
+        assert turns.may_draw() is at_once
+        turns.learnt()
+        assert turns.may_draw()
+
+
+def test_in_turn_who_brings_the_last_segment_waits_until_it_is_learned_from():
+    async def scene(worker: Any) -> None:
+        await worker.follow(SYNCHRONOUS)
+        asked = start(worker.sample(BATCH, 0))
+        assert await waits(asked)
+        assert await worker.insert([make_segment("a", 4)])  # half a batch: go on
+        last = start(worker.insert([make_segment("b", 4)]))
+        assert await waits(last) and len(await asked) == 2
+        following = start(worker.sample(BATCH, 1))  # asked for while it learns
+        assert await waits(last) and await waits(following)
+        await worker.learnt()
+        assert await last
+        assert await waits(following)  # nothing new yet
+
+    play(scene, ReplayConfig(capacity=64, min_decisions=8, ahead=16, samples_per_insert=1.0))
+
+
+def test_with_overlap_one_batch_is_collected_meanwhile():
+    async def scene(worker: Any) -> None:
+        await worker.follow(OVERLAP)
+        asked = start(worker.sample(BATCH, 0))
+        await waits(asked)
+        assert await worker.insert([make_segment("a", 8)])
+        assert len(await asked) == 1
+        following = start(worker.sample(BATCH, 1))
+        assert await worker.insert([make_segment("b", 4)])
+        last = start(worker.insert([make_segment("c", 4)]))
+        assert await waits(last) and await waits(following)
+        await worker.learnt()
+        assert len(await following) == 2 and await last
+
+    play(scene, ReplayConfig(capacity=64, min_decisions=8, ahead=16, samples_per_insert=1.0))
+
+
+def test_those_kept_waiting_go_when_the_schedule_changes_or_the_run_ends():
+    async def scene(worker: Any) -> None:
+        await worker.follow(SYNCHRONOUS)
+        asked = start(worker.sample(BATCH, 0))
+        await waits(asked)
+        kept = start(worker.insert([make_segment("a", 8)]))
+        assert await waits(kept)
+        await worker.follow(ASYNCHRONOUS)
+        assert await asyncio.wait_for(kept, 5)
+
+    play(scene)
+
+
+def run_of(schedule: Any, updates: int = 6) -> RunConfig:
+    return RunConfig(
+        env=SimulatedConfig(max_steps=16, terminate_on_success=False, frame_ms=3.0, latency="lognormal"),
+        rollout=RolloutConfig(workers=2, worlds=2, segment_length=4, decision_cost=0.0),
+        inference=InferenceConfig(max_batch=3),
+        replay=ReplayConfig(capacity=256, min_decisions=16, ahead=16, samples_per_insert=1.0),
+        trainer=TrainerConfig(updates=updates, batch_decisions=16, probe_every=0),
+        launch=LaunchConfig(schedule=schedule, stall_s=60.0),
+    )
+
+
+@pytest.mark.parametrize("schedule", [SYNCHRONOUS, OVERLAP, ASYNCHRONOUS])
+def test_a_run_in_turn(light_ray: None, schedule: Any):
+    """Episodes of one segment each, of all four worlds: a batch is exactly what they do in one round."""
+    from accerl_lerobot.launch import RayEngine
+
+    load = functools.partial(load_simulated, SimulatedPolicyConfig(decide_ms=1.0, update_ms=30.0))
+    engine = RayEngine(run_of(schedule), ("match",), load=load)
+    try:
+        engine.train()
+        history = drive(engine)
+        updates = [update for progress in history for update in progress.updates]
+        assert [u["update"] for u in updates] == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+        lags = [u["lag_max"] for u in updates]
+        if schedule == SYNCHRONOUS:
+            assert lags == [0.0] * 6
+        if schedule == OVERLAP:
+            assert lags[0] == 0.0 and set(lags[1:]) <= {0.0, 1.0} and 1.0 in lags
+        end = history[-1]
+        if schedule != ASYNCHRONOUS:
+            # In lock step all four decide together, in two batches of at most three.
+            assert end.inference["batch_size_mean"] == pytest.approx(2.0, abs=0.25)
+        # Nothing is lost on the way from the worlds to the trainer.
+        assert end.replay["trained_decisions"] == 6 * 16
+        assert np.isfinite([u["loss"] for u in updates]).all()
+    finally:
+        engine.close()
+
+
+def test_schedules_that_cannot_be_are_refused():
+    with pytest.raises(InputError, match=r"launch\.schedule.*use asynchronous or overlap or synchronous"):
+        LaunchConfig(schedule="sometimes")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"launch\.schedule.*engine=local"):
+        LaunchConfig(schedule=OVERLAP, engine="local")
+    launch = LaunchConfig(schedule=SYNCHRONOUS)
+    with pytest.raises(InputError, match=r"launch\.schedule.*rollout\.episodes"):
+        RunConfig(launch=launch, rollout=RolloutConfig(episodes=8))
+    with pytest.raises(InputError, match=r"launch\.schedule.*dream"):
+        RunConfig(launch=launch, imagination=ImaginationConfig(share=0.5, path="somewhere"))
