@@ -55,7 +55,7 @@ class Stage:
     def __init__(self, batches: int = 1000, **config: Any) -> None:
         self.asked: list[tuple[int, int]] = []
         self.received: list[tuple[int, dict[str, np.ndarray]]] = []
-        self.replay = Handle(sample=self._sample)
+        self.replay = Handle(sample=self._sample, learnt=lambda: None)
         self.reader = Handle(
             receive_weights=lambda version, tensors, _: self.received.append((version, copied(tensors))),
         )
