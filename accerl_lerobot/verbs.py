@@ -36,6 +36,7 @@ from accerl_lerobot.bench.faults import BenchFaultsConfig
 from accerl_lerobot.bench.lag import BenchLagConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.ranking import BenchRankingConfig
+from accerl_lerobot.bench.weights import BenchWeightsConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
 from accerl_lerobot.checkpoint import CONFIG
 from accerl_lerobot.config import RunConfig, encode, parse
@@ -264,7 +265,8 @@ def export(arguments: list[str]) -> int:
 
 
 def bench(arguments: list[str]) -> int:
-    """``accerl bench world``, ``policy``, ``lag``, ``dream``, ``efficiency``, ``ranking`` and ``faults``."""
+    """``accerl bench world``, ``policy``, ``lag``, ``dream``, ``efficiency``, ``ranking``, ``faults`` and
+    ``weights``."""
     name = arguments[0] if arguments else ""
     if f"bench {name}" not in CONFIGS:
         names = [verb.split()[1] for verb in CONFIGS if verb.startswith("bench ")]
@@ -297,6 +299,7 @@ CONFIGS: dict[str, type[Any]] = {
     "bench efficiency": BenchEfficiencyConfig,
     "bench faults": BenchFaultsConfig,
     "bench ranking": BenchRankingConfig,
+    "bench weights": BenchWeightsConfig,
 }
 """Verb → what its command line is parsed into."""
 

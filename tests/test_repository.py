@@ -40,7 +40,15 @@ HEADER = (
     '# Licensed under the Apache License, Version 2.0 (the "License");\n'
 )
 LONGEST_FILE = 400
-SHELLS = {"launch.py", "seats.py", "watched.py", "doctor.py", "ray_channel.py", "worker.py"}
+SHELLS = {
+    "launch.py",
+    "seats.py",
+    "watched.py",
+    "doctor.py",
+    "ray_channel.py",
+    "weights_readers.py",
+    "worker.py",
+}
 """Files that may import Ray; all others are testable without it."""
 
 LIGHT = [
