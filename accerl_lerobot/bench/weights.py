@@ -236,7 +236,7 @@ def _block(
 
 
 def _update(tensors: Tensors, share: float, rng: np.random.Generator) -> None:
-    """Writes all values, as an optimiser does, so that caches are as after one; that share of them changes."""
+    """Writes all values, as an optimiser does, so that caches are as after one; a share of them changes."""
     for tensor in tensors.values():
         tensor += share == 1
         if 0 < share < 1:
