@@ -70,6 +70,7 @@ class Publisher(ABC):
         """By slot; one that has become too small is replaced in its slot."""
         self._changed = threading.Condition()
         self._version: int | None = None
+        self._layout = Layout.of({})
         self._writing: Slab | None = None
         self._pending: Shipment | None = None
         self._current: Shipment | None = None
@@ -90,7 +91,10 @@ class Publisher(ABC):
         """
         self._check()
         check_grows(version, self._version)
-        now, layout = time.monotonic(), Layout.of(tensors)
+        now = time.monotonic()
+        if not self._layout.fits(tensors):
+            self._layout = Layout.of(tensors)
+        layout = self._layout
         self._writing = self._free(self._size(layout))
         self._writing.fill(layout, tensors)
         with self._changed:

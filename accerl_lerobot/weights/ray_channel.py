@@ -102,7 +102,7 @@ class RayPublisher(Publisher):
                     return
             shipment = self._take()
             if shipment is not None:
-                tensors = shipment.layout.views(shipment.slab.memory)
+                tensors = shipment.slab.views(shipment.layout)
                 self._stored = (shipment.version, ray.put(tensors), shipment.published_s)
                 self._spare()
                 with self._changed:

@@ -80,7 +80,7 @@ class SharedMemoryReader:
         self._deliver, self._failed = deliver, failed
         self._slabs: dict[int, Slab] = {}
         """By slot."""
-        self._layout = Layout({}, 0, b"{}")
+        self._layout = Layout.of({})
         self._own = np.zeros(0, np.uint8)
         """The last set, if changes against it may come."""
         self._own_version = -1
@@ -99,13 +99,15 @@ class SharedMemoryReader:
         self._thread.start()
 
     def close(self) -> None:
-        """Stops receiving; what was delivered stays valid until it is let go of."""
+        """Stops receiving; arrays that were delivered stay valid."""
         self._closing = True
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         if self._thread is not threading.current_thread():
             self._thread.join(TALK_S)
         self._socket.close()
+        for slab in self._slabs.values():
+            slab.close()
 
     def _run(self) -> None:
         try:
@@ -133,9 +135,11 @@ class SharedMemoryReader:
         layout = self._layout_of(message, slab)
         if message.changed == NOT_ONLY_CHANGES:
             whole, changes = slab.memory[: layout.size], None
+            tensors = slab.views(layout)
         else:
             whole, changes = self._own, _changes(message, layout, slab)
             self._advance(message, changes)
+            tensors = layout.views(whole)
         if digest(message.version, layout, whole) != self._confirmed(message):
             raise TornSetError(f"weights of version {message.version} are not what their digest says")
         if message.keep:
@@ -144,7 +148,6 @@ class SharedMemoryReader:
                     self._own = np.empty_like(whole)
                 np.copyto(self._own, whole)
             self._own_version = message.version
-        tensors = layout.views(whole)
         for tensor in tensors.values():
             tensor.flags.writeable = False
         return Received(

@@ -87,6 +87,13 @@ class Layout:
         places = {n: Place(dtype, tuple(shape), at) for n, (dtype, shape, at) in json.loads(text).items()}
         return cls(places, max((aligned(p.offset + p.nbytes) for p in places.values()), default=0), text)
 
+    def fits(self, tensors: Mapping[str, np.ndarray]) -> bool:
+        """Whether these lie like that."""
+        return len(self.places) == len(tensors) and all(
+            name == other and place.shape == tensor.shape and place.dtype == tensor.dtype.str
+            for (name, place), (other, tensor) in zip(self.places.items(), tensors.items(), strict=True)
+        )
+
     @property
     def end(self) -> int:
         """Bytes of data and layout; changes begin here."""
@@ -116,6 +123,7 @@ class Slab:
 
     def __init__(self, size: int, fd: int | None = None, *, writable: bool = True) -> None:
         self.fd = fd
+        self._seen: tuple[Layout, dict[str, np.ndarray]] | None = None
         protection = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
         sharing = mmap.MAP_SHARED if fd is not None else mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
         # Populated: a copy into pages that are not there yet takes several times as long.
@@ -140,9 +148,15 @@ class Slab:
     def __len__(self) -> int:
         return len(self.memory)
 
+    def views(self, layout: Layout) -> dict[str, np.ndarray]:
+        """See `Layout.views`; made once, as long as the layout is the same one."""
+        if self._seen is None or self._seen[0] is not layout:
+            self._seen = (layout, layout.views(self.memory))
+        return dict(self._seen[1])
+
     def fill(self, layout: Layout, tensors: Mapping[str, np.ndarray]) -> None:
         """Copies a set into it."""
-        for view, tensor in zip(layout.views(self.memory).values(), tensors.values(), strict=True):
+        for view, tensor in zip(self.views(layout).values(), tensors.values(), strict=True):
             np.copyto(view, tensor)
         self.memory[layout.size : layout.size + len(layout.text)] = np.frombuffer(layout.text, np.uint8)
 
@@ -151,7 +165,7 @@ class Slab:
         if self.fd is not None:
             os.close(self.fd)
             self.fd = None
-        self.memory = self.memory[:0].copy()
+        self._seen, self.memory = None, self.memory[:0].copy()
 
 
 def digest(version: int, layout: Layout, data: np.ndarray) -> bytes:
