@@ -152,6 +152,9 @@ class RunConfig:
                 f"use more than trainer.hold_back, {self.trainer.hold_back}, or all is thrown away as too old"
             )
             raise InputError("replay.max_lag", self.replay.max_lag, remedy)
+        if self.trainer.publish_changes and self.launch.engine == "local":
+            remedy = "launch.engine=local is one process, where nothing is sent; leave the field out"
+            raise InputError("trainer.publish_changes", True, remedy)
         batch, imagination = self.trainer.batch_decisions, self.imagination
         if self.trainer.updates:
             # Of both, as a batch is all real before anything is imagined, and all imagined after the last

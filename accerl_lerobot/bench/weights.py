@@ -60,7 +60,8 @@ class BenchWeightsConfig:
     """What is published, to how many."""
 
     sizes_mb: tuple[int, ...] = (1, 16, 256, 1024)
-    """Sizes of a set of float32 weights, in MiB. The largest needs about 12 times its size in memory."""
+    """Sizes of a set of float32 weights, in MiB. With two readers the largest needs about 15 times
+    its size in memory."""
     readers: tuple[int, ...] = (1, 2)
     """How many processes read; each at least 1."""
     tensors: int = 64

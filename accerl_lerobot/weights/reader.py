@@ -106,8 +106,6 @@ class SharedMemoryReader:
         if self._thread is not threading.current_thread():
             self._thread.join(TALK_S)
         self._socket.close()
-        for slab in self._slabs.values():
-            slab.close()
 
     def _run(self) -> None:
         try:
@@ -119,6 +117,8 @@ class SharedMemoryReader:
                 self._failed(error)
         finally:
             self._socket.close()  # so that the trainer hears of it
+            for slab in self._slabs.values():
+                slab.close()
 
     def _receive(self) -> Received:
         """The next set, once it is checked.
