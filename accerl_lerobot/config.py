@@ -55,9 +55,9 @@ class LaunchConfig:
     then learned from. overlap: the next one is collected meanwhile. These two are for measuring what the
     first gains."""
     transport: Transport = "auto"
-    """How rollout workers and dreams reach inference and replay. shared_memory: a message is written where
-    the other process reads it. ray: it is copied, to any node. auto: shared memory between processes of one
-    node, if the system has it, and Ray otherwise.
+    """How rollout workers and dreams reach inference and replay, and weights reach inference. shared_memory:
+    a message is written where the other process reads it. ray: it is copied, to any node. auto: shared memory
+    between processes of one node, if the system has it, and Ray otherwise.
     """
     stall_s: float = 300.0
     """How long, in seconds, a worker may owe an answer or a world a step, and a run stand still; > 0.
@@ -160,6 +160,9 @@ class RunConfig:
                 f"use more than trainer.hold_back, {self.trainer.hold_back}, or all is thrown away as too old"
             )
             raise InputError("replay.max_lag", self.replay.max_lag, remedy)
+        if self.trainer.publish_changes and self.launch.engine == "local":
+            remedy = "launch.engine=local is one process, where nothing is sent; leave the field out"
+            raise InputError("trainer.publish_changes", True, remedy)
         batch, imagination = self.trainer.batch_decisions, self.imagination
         if self.trainer.updates:
             # Of both, as a batch is all real before anything is imagined, and all imagined after the last

@@ -53,6 +53,7 @@ from accerl_lerobot.stopping import Stopping
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from accerl_lerobot.transport.endpoint import Endpoint, listens
 from accerl_lerobot.watched import Watched
+from accerl_lerobot.weights.publisher import ReaderLostError
 
 logger = logging.getLogger(__name__)
 
@@ -128,7 +129,10 @@ class RayEngine(Engine):
     def train(self) -> None:
         self._training, self._last_change = True, time.monotonic()
         self.follow(self._config.launch.schedule)
-        self._trainer.work = self._trainer.actor.run.remote(self._replay.actor, [self._inference.actor])
+        readers = [self._inference.actor]
+        self._trainer.work = self._trainer.actor.run.remote(
+            self._replay.actor, readers, self._config.launch.transport
+        )
         if self._dreamer is not None:
             self._dreamer.work = self._dreamer.actor.run.remote(*self._endpoints, self._replay.actor)
         if self._learner is not None and self._dreamer is not None:
@@ -285,7 +289,8 @@ class RayEngine(Engine):
         try:
             result = ray.get(reference)
         except RayError as error:
-            if isinstance(error, RayTaskError) and isinstance(error.cause, RayError | ServiceStoppedError):
+            innocent = RayError | ServiceStoppedError | ReaderLostError
+            if isinstance(error, RayTaskError) and isinstance(error.cause, innocent):
                 self._blame()
             if self._seats.restart_worker(worker, error):
                 return

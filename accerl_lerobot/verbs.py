@@ -40,6 +40,7 @@ from accerl_lerobot.bench.ranking import BenchRankingConfig
 from accerl_lerobot.bench.scaling import BenchScalingConfig
 from accerl_lerobot.bench.throughput import BenchThroughputConfig
 from accerl_lerobot.bench.transport import BenchTransportConfig
+from accerl_lerobot.bench.weights import BenchWeightsConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
 from accerl_lerobot.checkpoint import CONFIG
 from accerl_lerobot.config import RunConfig, encode, parse
@@ -300,12 +301,13 @@ CONFIGS: dict[str, type[Any]] = {
     "bench throughput": BenchThroughputConfig,
     "bench scaling": BenchScalingConfig,
     "bench async-vs-sync": BenchAsyncVsSyncConfig,
+    "bench transport": BenchTransportConfig,
+    "bench weights": BenchWeightsConfig,
     "bench lag": BenchLagConfig,
     "bench dream": BenchDreamConfig,
     "bench efficiency": BenchEfficiencyConfig,
     "bench faults": BenchFaultsConfig,
     "bench ranking": BenchRankingConfig,
-    "bench transport": BenchTransportConfig,
 }
 """Verb → what its command line is parsed into."""
 

@@ -78,7 +78,9 @@ class LightInference:
             raise ServiceStoppedError("the inference service has stopped")
         return [_decision(request, self._version) for request in requests]
 
-    async def receive_weights(self, version: int, tensors: dict[str, np.ndarray]) -> int:
+    async def receive_weights(
+        self, version: int, tensors: dict[str, np.ndarray], published_s: float = 0.0
+    ) -> int:
         self._version = version
         return version
 
@@ -120,7 +122,7 @@ class LightTrainer:
     def idle(self) -> None:
         self._idle = True
 
-    def run(self, replay: Any, readers: list[Any]) -> int:
+    def run(self, replay: Any, readers: list[Any], transport: str) -> int:
         import ray
 
         n = self._config.batch_decisions

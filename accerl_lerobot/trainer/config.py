@@ -61,6 +61,10 @@ class TrainerConfig:
     betas: tuple[float, float] = (0.9, 0.95)
     publish_every: int = 1
     """Updates between two publications of the weights."""
+    publish_changes: bool = False
+    """Whether only the values that differ from the set before are sent, where that is less and the workers
+    are on one machine. It pays where an update leaves most values as they are, as where little is trained at
+    a time; an optimiser with momentum moves nearly every float32 value in every update."""
     hold_back: int = 0
     """Updates by which published weights are held back: lag on purpose, to study it; 0: none."""
     probe_every: int = 25

@@ -14,7 +14,7 @@
 """The trainer process: the run's clock.
 
 consumes    batches of segments from replay, the next one drawn while the current one is learned from
-produces    weights, published every `publish_every` updates without waiting for anyone
+produces    weights, published every `publish_every` updates without waiting for more than a copy of them
 waits for   a batch
 ends        after `updates` updates, or when replay is closed
 """
@@ -37,7 +37,8 @@ from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.weights.held_back import HeldBack
-from accerl_lerobot.weights.ray_channel import RayPublisher
+from accerl_lerobot.weights.publisher import Publisher
+from accerl_lerobot.weights.ray_channel import make_publisher
 
 
 class TrainerWorker:
@@ -82,12 +83,28 @@ class TrainerWorker:
         """Answers once the policy is loaded; returns this process's id."""
         return os.getpid()
 
-    def run(self, replay: Any, readers: list[Any]) -> int:
-        """Trains; returns the number of updates made."""
-        publisher, held = RayPublisher(readers), HeldBack(self._config.hold_back)
+    def run(self, replay: Any, readers: list[Any], transport: str = "auto") -> int:
+        """Trains; returns the number of updates made.
+
+        Args:
+            replay: actor handle.
+            readers: actor handles; where the weights go.
+            transport: see `make_publisher`.
+        """
+        publisher = make_publisher(readers, transport, changes=self._config.publish_changes)
+        try:
+            # A checkpoint need not hold a critic: all start from this one.
+            publisher.publish(self._update.version, self._update.adapter.view_trainable())
+            self._train(replay, publisher)
+            publisher.flush()
+        finally:
+            publisher.close()
+        return self._update.version
+
+    def _train(self, replay: Any, publisher: Publisher) -> None:
+        """Makes the updates."""
+        held = HeldBack(self._config.hold_back)
         n, config = self._config.batch_decisions, self._config
-        # A checkpoint need not hold a critic: all start from this one.
-        publisher.publish(self._update.version, self._export())
         upcoming = replay.sample.remote(n, self._update.version)
         asked = time.monotonic()
         while self._update.version < config.updates:
@@ -103,8 +120,7 @@ class TrainerWorker:
                 updated = time.monotonic()
                 version = self._update.version
                 if config.publishes(version):
-                    for due in held.push(version, self._export(), last=version == config.updates):
-                        publisher.publish(*due)
+                    self._publish(publisher, held, last=version == config.updates)
                 metrics |= {
                     "update": float(self._update.version),
                     "wait_s": waited,
@@ -119,10 +135,15 @@ class TrainerWorker:
         version = self._update.version
         if version < config.updates and (config.hold_back or not config.publishes(version)):
             # It has ended early, and what is evaluated is to be what is saved.
-            for due in held.push(version, self._export(), last=True):
-                publisher.publish(*due)
-        publisher.flush()
-        return self._update.version
+            self._publish(publisher, held, last=True)
+
+    def _publish(self, publisher: Publisher, held: HeldBack, last: bool) -> None:
+        """Hands the weights of now over, or those that are old enough."""
+        if not held.updates:
+            publisher.publish(self._update.version, self._update.adapter.view_trainable())
+            return
+        for due in held.push(self._update.version, self._export(), last=last):
+            publisher.publish(*due)
 
     def metrics(self) -> list[dict[str, float]]:
         """One record per update since the last call."""
