@@ -36,6 +36,7 @@ from accerl_lerobot.bench.faults import BenchFaultsConfig
 from accerl_lerobot.bench.lag import BenchLagConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.ranking import BenchRankingConfig
+from accerl_lerobot.bench.timeline import BenchTimelineConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
 from accerl_lerobot.checkpoint import CONFIG
 from accerl_lerobot.config import RunConfig, encode, parse
@@ -46,6 +47,7 @@ from accerl_lerobot.hub.config import PullConfig, PushConfig
 from accerl_lerobot.parsing import read_arguments
 from accerl_lerobot.report.config import ReportConfig
 from accerl_lerobot.rollout.runner import EpisodeResult
+from accerl_lerobot.timeline.config import TimelineConfig
 from accerl_lerobot.verb_configs import DemosRun, EvalRun, SFTRun, WorldModelEvalRun, WorldModelRun
 
 
@@ -251,6 +253,17 @@ def report(arguments: list[str]) -> int:
     return 0
 
 
+def timeline(arguments: list[str]) -> int:
+    """``accerl timeline``."""
+    config: TimelineConfig = parse(TimelineConfig, arguments)
+    from accerl_lerobot.timeline.show import show_timelines, table
+
+    found = show_timelines(config)
+    Console().rich.print(table(found))
+    sys.stdout.write(json.dumps(found, indent=2) + "\n")
+    return 0
+
+
 def export(arguments: list[str]) -> int:
     """``accerl export``."""
     config: ExportConfig = parse(ExportConfig, arguments)
@@ -264,7 +277,7 @@ def export(arguments: list[str]) -> int:
 
 
 def bench(arguments: list[str]) -> int:
-    """``accerl bench world``, ``policy``, ``lag``, ``dream``, ``efficiency``, ``ranking`` and ``faults``."""
+    """``accerl bench world`` and so on, see `CONFIGS`."""
     name = arguments[0] if arguments else ""
     if f"bench {name}" not in CONFIGS:
         names = [verb.split()[1] for verb in CONFIGS if verb.startswith("bench ")]
@@ -288,6 +301,7 @@ CONFIGS: dict[str, type[Any]] = {
     "push": PushConfig,
     "pull": PullConfig,
     "report": ReportConfig,
+    "timeline": TimelineConfig,
     "export": ExportConfig,
     "doctor": RunConfig,
     "bench world": BenchWorldConfig,
@@ -297,6 +311,7 @@ CONFIGS: dict[str, type[Any]] = {
     "bench efficiency": BenchEfficiencyConfig,
     "bench faults": BenchFaultsConfig,
     "bench ranking": BenchRankingConfig,
+    "bench timeline": BenchTimelineConfig,
 }
 """Verb → what its command line is parsed into."""
 

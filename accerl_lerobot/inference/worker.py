@@ -43,6 +43,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,11 +87,18 @@ class InferenceWorker:
         config: batching.
         version: of the weights it begins with.
         state: the ``training_state`` that holds these; None: they are the checkpoint's.
+        timeline: folder of the timeline; None: none is kept.
     """
 
     def __init__(
-        self, policy: PolicyConfig, config: InferenceConfig, version: int = 0, state: Path | None = None
+        self,
+        policy: PolicyConfig,
+        config: InferenceConfig,
+        version: int = 0,
+        state: Path | None = None,
+        timeline: Path | None = None,
     ) -> None:
+        self._clock = open_clock(timeline, "inference")
         import torch
 
         from accerl_lerobot.policies.loading import load_adapter
@@ -108,6 +116,7 @@ class InferenceWorker:
         self._failure: BaseException | None = None
         self._busy_s = 0.0
         self._since = time.monotonic()
+        self._clock.enter(WAIT_IN)
 
     async def ready(self) -> int:
         """Answers once the policy is loaded; returns this process's id."""
@@ -138,6 +147,7 @@ class InferenceWorker:
         """Serves until the process ends; an exception here ends the run."""
         try:
             while True:
+                self._clock.enter(WAIT_IN)
                 await self._wait()
                 await self._swap()
                 if self._batcher.due(time.monotonic()):
@@ -150,6 +160,7 @@ class InferenceWorker:
 
     async def metrics(self) -> dict[str, float]:
         """Batching statistics, the version served and the busy share since the last call."""
+        self._clock.beat()
         now = time.monotonic()
         share, self._busy_s = self._busy_s / max(1e-9, now - self._since), 0.0
         self._since = now
@@ -174,12 +185,14 @@ class InferenceWorker:
             return
         version, tensors = self._published
         self._published = None
+        self._clock.enter(WEIGHT_SYNC)
         await asyncio.get_running_loop().run_in_executor(self._pool, self._adapter.load_trainable, tensors)
         self._version = version
 
     async def _serve_batch(self, batch: list[_Waiting]) -> None:
         requests = [r for waiting in batch for r in waiting.requests]
         started = time.monotonic()
+        self._clock.enter(COMPUTE)
         try:
             decisions = await asyncio.get_running_loop().run_in_executor(
                 self._pool, self._adapter.decide, requests, self._version
@@ -188,6 +201,7 @@ class InferenceWorker:
             _fail(batch, error)
             raise
         self._busy_s += time.monotonic() - started
+        self._clock.enter(TRANSPORT)
         start = 0
         for waiting in batch:
             if not waiting.future.done():  # the caller may have been cancelled meanwhile

@@ -36,6 +36,7 @@ from accerl_lerobot.experience import REAL, Segment
 from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.replay.mixed import MixedReplay
 from accerl_lerobot.replay.pacing import ReplayConfig
+from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
 
 IN_TRANSIT = 1024
 """Newest real segments that are kept for those who dream, who ask for them several times a second."""
@@ -64,6 +65,7 @@ class ReplayWorker:
         patient: see `MixedReplay`.
         state: the ``training_state`` to go on from; None: begin.
         directory: of the run, for the journal; None: none is kept.
+        timeline: folder of the timeline; None: none is kept.
     """
 
     def __init__(
@@ -74,7 +76,9 @@ class ReplayWorker:
         patient: bool = False,
         state: Path | None = None,
         directory: Path | None = None,
+        timeline: Path | None = None,
     ) -> None:
+        self._clock = open_clock(timeline, "replay")
         journal = None if directory is None else Journal(directory / EPISODES)
         self._replay = MixedReplay(config, imagined or ReplayConfig(), 0.0, patient, journal)
         # Nothing is imagined until the dreamer says so.
@@ -93,6 +97,7 @@ class ReplayWorker:
             # Those who dream were saved before, and may not have been told of the last ones.
             self._real.extend(self._replay.real.segments)
             self._real_count = saved["real_count"]
+        self._clock.enter(WAIT_IN)
 
     async def ready(self) -> int:
         """Answers once this process is up; returns its id."""
@@ -117,12 +122,14 @@ class ReplayWorker:
                 self._insert_wait_s += time.monotonic() - started
             if self._closed:
                 return False
+            self._clock.enter(COMPUTE)
             for segment in segments:
                 if self._replay.insert(segment) and source == REAL:
                     self._real.append(segment)
                     self._real_count += 1
                     if segment.episode:
                         self._episodes.append(segment.episode)
+            self._clock.enter(WAIT_IN)
             self._changed.notify_all()
         return True
 
@@ -140,7 +147,9 @@ class ReplayWorker:
                 )
                 if self._closed or self._replay.exhausted(num_decisions):
                     return []
+                self._clock.enter(COMPUTE)
                 segments = self._replay.sample(num_decisions, trainer_version, self._rng)
+                self._clock.enter(WAIT_IN)
                 self._changed.notify_all()
                 if segments:
                     self._sample_wait_s += time.monotonic() - started
@@ -172,11 +181,13 @@ class ReplayWorker:
 
     async def save(self, directory: Path, version: int) -> None:
         """Writes its part of ``training_state``, as it was when the trainer had made `version` updates."""
+        self._clock.enter(CHECKPOINT)
         state = {
             "replay": self._replay.state(version),
             "rng": copy.deepcopy(self._rng),
             "real_count": self._real_count,
         }
+        self._clock.enter(WAIT_IN)
         await asyncio.to_thread(snapshot.save, directory / "replay", state)
 
     async def close(self) -> None:
@@ -187,6 +198,7 @@ class ReplayWorker:
 
     async def metrics(self) -> dict[str, float]:
         """Counters and seconds waited at either door; episodes since the last call as means."""
+        self._clock.beat()
         episodes, self._episodes = self._episodes, []
         means = {
             f"episode_{k}": float(np.mean([e[k] for e in episodes]))

@@ -31,6 +31,7 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import ray
@@ -39,6 +40,7 @@ from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.experience import Decision, Request, Segment
 from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig, RolloutRunner
+from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, open_clock
 
 PARTS = 2
 """A worker's worlds are asked for in so many parts: one is stepped while the other's decisions are made."""
@@ -73,6 +75,7 @@ class RolloutWorker:
         film: see `RolloutRunner`.
         history: env steps that an observation holds.
         budget: exploring episodes at most; None: no end.
+        timeline: folder of the timeline; None: none is kept.
     """
 
     def __init__(
@@ -86,7 +89,9 @@ class RolloutWorker:
         film: tuple[int, int],
         history: int = 1,
         budget: int | None = None,
+        timeline: Path | None = None,
     ) -> None:
+        self._clock = open_clock(timeline, f"rollout {index}")
         self._plans = EpisodePlans(
             config,
             tasks,
@@ -106,7 +111,7 @@ class RolloutWorker:
         name = f"rollout{index}.{incarnation}"
         self._runner = RolloutRunner(
             worlds,
-            lambda: self._plans.next(exploring=self._training.is_set()),
+            self._next,
             config,
             name,
             self._outbox.append,
@@ -114,6 +119,7 @@ class RolloutWorker:
             film,
             self._plans.groups,
         )
+        self._clock.enter(WAIT_IN)
 
     def ready(self) -> int:
         """Answers once the worlds exist; returns this process's id."""
@@ -126,6 +132,7 @@ class RolloutWorker:
             training: whether training episodes are run between planned ones, from now on.
             plans: evaluation episodes to queue; they are taken before any training episode.
         """
+        self._clock.beat()
         self._plans.queue(plans)
         (self._training.set if training else self._training.clear)()
         episodes = [self._results.popleft() for _ in range(len(self._results))]
@@ -151,20 +158,31 @@ class RolloutWorker:
             idle = [slot for slot in idle if not self._begin(slot, due)]
             sendable = [slot for slot in due if len(door) < AT_THE_DOOR or not due[slot].explore]
             for start in range(0, len(sendable), size):
+                self._clock.enter(TRANSPORT)
                 slots = sendable[start : start + size]
                 under_way[inference.decide.remote([due.pop(slot) for slot in slots])] = slots
             if not under_way:
+                self._clock.enter(WAIT_OUT if due else WAIT_IN)
                 time.sleep(0.005)
                 continue
+            self._clock.enter(WAIT_IN)
             done, _ = ray.wait(list(under_way), num_returns=1, timeout=0.5)
             for reference in done:
+                self._clock.enter(TRANSPORT)
                 slots = under_way.pop(reference)
                 for slot, decision in zip(slots, ray.get(reference), strict=True):
                     self._advance(slot, decision, due, idle)
+                self._clock.enter(TRANSPORT)
                 # The segments of a whole group may come at once; replay's pace is for a few at a time.
                 for start in range(0, len(self._outbox), size):
                     door.append(replay.insert.remote(self._outbox[start : start + size]))
                 self._outbox.clear()
+
+    def _next(self) -> EpisodePlan | None:
+        plan = self._plans.next(exploring=self._training.is_set())
+        if plan is not None:
+            self._clock.enter(COMPUTE)
+        return plan
 
     def _begin(self, slot: int, due: dict[int, Request]) -> bool:
         with self._in_world():
@@ -174,6 +192,7 @@ class RolloutWorker:
         return request is not None
 
     def _advance(self, slot: int, decision: Decision, due: dict[int, Request], idle: list[int]) -> None:
+        self._clock.enter(COMPUTE)
         with self._in_world():
             request = self._runner.advance(slot, decision)
         if request is None:

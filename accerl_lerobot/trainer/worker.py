@@ -34,6 +34,7 @@ from accerl_lerobot import snapshot
 from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.checkpoint import PRETRAINED, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.weights.held_back import HeldBack
 from accerl_lerobot.weights.ray_channel import RayPublisher
@@ -48,6 +49,7 @@ class TrainerWorker:
         config: the optimiser.
         seed: of torch's global generator.
         state: the ``training_state`` to go on from; None: begin.
+        timeline: folder of the timeline; None: none is kept.
     """
 
     def __init__(
@@ -57,7 +59,9 @@ class TrainerWorker:
         config: TrainerConfig,
         seed: int,
         state: Path | None = None,
+        timeline: Path | None = None,
     ) -> None:
+        self._clock = open_clock(timeline, "trainer")
         import torch
 
         from accerl_lerobot.policies.loading import load_adapter
@@ -74,6 +78,7 @@ class TrainerWorker:
         self._lock = threading.Lock()
         self._kept: Any = None
         self._history: deque[dict[str, float]] = deque()  # filled on one thread, emptied on another
+        self._clock.enter(WAIT_IN)
 
     def ready(self) -> int:
         """Answers once the policy is loaded; returns this process's id."""
@@ -84,20 +89,27 @@ class TrainerWorker:
         publisher, held = RayPublisher(readers), HeldBack(self._config.hold_back)
         n, config = self._config.batch_decisions, self._config
         # A checkpoint need not hold a critic: all start from this one.
+        self._clock.enter(WEIGHT_SYNC)
         publisher.publish(self._update.version, self._export())
         upcoming = replay.sample.remote(n, self._update.version)
         while self._update.version < config.updates:
             asked = time.monotonic()
+            self._clock.enter(WAIT_IN)
+            ray.wait([upcoming])
+            self._clock.enter(TRANSPORT)
             segments = ray.get(upcoming)
             if not segments:
                 break
             waited = time.monotonic() - asked
             if self._update.version + 1 < config.updates:
                 upcoming = replay.sample.remote(n, self._update.version + 1)
+            self._clock.enter(CHECKPOINT)
             with self._lock:
+                self._clock.enter(COMPUTE)
                 started = time.monotonic()
                 metrics = self._update.step(segments)
                 updated = time.monotonic()
+                self._clock.enter(WEIGHT_SYNC)
                 version = self._update.version
                 if config.publishes(version):
                     for due in held.push(version, self._export(), last=version == config.updates):
@@ -114,11 +126,14 @@ class TrainerWorker:
             # It has ended early, and what is evaluated is to be what is saved.
             for due in held.push(version, self._export(), last=True):
                 publisher.publish(*due)
+        self._clock.enter(WEIGHT_SYNC)
         publisher.flush()
+        self._clock.enter(WAIT_IN)
         return self._update.version
 
     def metrics(self) -> list[dict[str, float]]:
         """One record per update since the last call."""
+        self._clock.beat()
         return [self._history.popleft() for _ in range(len(self._history))]
 
     def hold(self) -> tuple[int, list[dict[str, float]]]:

@@ -37,6 +37,7 @@ import ray
 from accerl_lerobot import snapshot
 from accerl_lerobot.checkpoint import TRAINING_STATE, WORLD_MODEL
 from accerl_lerobot.experience import Segment
+from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
 from accerl_lerobot.world_model.dreaming import make_imagination, make_learner
 from accerl_lerobot.world_model.online import Promotion
 
@@ -61,9 +62,11 @@ class DreamWorker:
     Args:
         config: the run; its ``policy.path`` must be set.
         state: the ``training_state`` to go on from; None: begin.
+        timeline: folder of the timeline; None: none is kept.
     """
 
-    def __init__(self, config: RunConfig, state: Path | None = None) -> None:
+    def __init__(self, config: RunConfig, state: Path | None = None, timeline: Path | None = None) -> None:
+        self._clock = open_clock(timeline, "dream")
         import torch
 
         torch.set_num_threads(config.trainer.num_threads)
@@ -80,6 +83,7 @@ class DreamWorker:
             saved = snapshot.load(state / DREAMS)
             self._dreams.restore(saved["dreams"])
             self._cursor = saved["cursor"]
+        self._clock.enter(WAIT_IN)
 
     def ready(self) -> int:
         """Answers once the world model is loaded; returns this process's id."""
@@ -97,6 +101,7 @@ class DreamWorker:
 
     def metrics(self) -> dict[str, float]:
         """See `Imagination.metrics`."""
+        self._clock.beat()
         return self._dreams.metrics()
 
     def save(self, directory: Path) -> None:
@@ -114,7 +119,9 @@ class DreamWorker:
         news, told = _News(replay, self._cursor), None
         door: list[Any] = []
         while not news.closed:
+            self._clock.enter(CHECKPOINT)
             with self._dreaming:
+                self._clock.enter(COMPUTE)
                 promising = self._swap()
                 for segment in news.fresh():
                     self._dreams.remember(segment)
@@ -123,18 +130,27 @@ class DreamWorker:
             if told != (self._dreams.on, promising):
                 told = (self._dreams.on, promising)
                 ray.get(replay.mix.remote(self._share if self._dreams.on else 0.0, any(told)))
+            self._clock.enter(TRANSPORT)
             done, door = ray.wait(door, num_returns=len(door), timeout=0) if door else ([], [])
             if not all(ray.get(list(done))):
                 return
+            self._clock.enter(COMPUTE)
             with self._dreaming:
                 requests = [] if len(door) >= AT_THE_DOOR else self._dreams.requests()
             if not requests:
+                self._clock.enter(WAIT_OUT if len(door) >= AT_THE_DOOR else WAIT_IN)
                 time.sleep(PAUSE_S)
                 continue
             parts = [requests[i : i + self._batch] for i in range(0, len(requests), self._batch)]
-            answers = ray.get([inference.decide.remote(part) for part in parts])
+            self._clock.enter(TRANSPORT)
+            asked = [inference.decide.remote(part) for part in parts]
+            self._clock.enter(WAIT_IN)
+            answers = ray.get(asked)
+            self._clock.enter(CHECKPOINT)
             with self._dreaming:
+                self._clock.enter(COMPUTE)
                 self._dreams.advance([decision for answer in answers for decision in answer])
+                self._clock.enter(TRANSPORT)
                 if self._outbox:
                     door.append(replay.insert.remote(list(self._outbox)))
                     self._outbox.clear()
@@ -145,7 +161,9 @@ class DreamWorker:
             promoted, self._promoted = self._promoted, None
             promising = self._promising
         if promoted is not None:
+            self._clock.enter(WEIGHT_SYNC)
             self._dreams.swap(promoted)
+            self._clock.enter(COMPUTE)
         return promising
 
 
@@ -155,9 +173,11 @@ class WorldLearningWorker:
     Args:
         config: the run; its ``policy.path`` must be set.
         state: the ``training_state`` to go on from; None: begin.
+        timeline: folder of the timeline; None: none is kept.
     """
 
-    def __init__(self, config: RunConfig, state: Path | None = None) -> None:
+    def __init__(self, config: RunConfig, state: Path | None = None, timeline: Path | None = None) -> None:
+        self._clock = open_clock(timeline, "world learning")
         import torch
 
         torch.set_num_threads(config.trainer.num_threads)
@@ -170,6 +190,7 @@ class WorldLearningWorker:
             saved = snapshot.load(state / LEARNER)
             self._learner.restore(saved["learner"])
             self._cursor = saved["cursor"]
+        self._clock.enter(WAIT_IN)
 
     def ready(self) -> int:
         """Answers once the world model and its dataset are loaded; returns this process's id."""
@@ -177,6 +198,7 @@ class WorldLearningWorker:
 
     def metrics(self) -> dict[str, float]:
         """See `OnlineLearner.metrics`."""
+        self._clock.beat()
         return self._learner.metrics()
 
     def save(self, directory: Path) -> None:
@@ -192,6 +214,7 @@ class WorldLearningWorker:
         held: bool | None = None
         """What replay has been told; None: nothing by this process."""
         while not news.closed:
+            self._clock.enter(TRANSPORT)
             with self._learning:
                 for segment in news.fresh():
                     learner.add(segment)
@@ -205,13 +228,18 @@ class WorldLearningWorker:
                 promising = learner.promising(last)
                 ray.get(dreamer.expect.remote(promising))
             if learner.owed >= 1:
+                self._clock.enter(CHECKPOINT)
                 with self._learning:
+                    self._clock.enter(COMPUTE)
                     learner.step()
             elif learner.due(last):
+                self._clock.enter(COMPUTE)
                 if promotion := learner.promote(last):
+                    self._clock.enter(WEIGHT_SYNC)
                     ray.get(dreamer.promote.remote(promotion))
                     learner.handed_over()
             else:
+                self._clock.enter(WAIT_IN)
                 time.sleep(PAUSE_S)
 
 

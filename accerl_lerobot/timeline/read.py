@@ -1,0 +1,220 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A run's timeline as rows of intervals, and how its workers' time divides among the states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from accerl_lerobot.checkpoint import CONFIG
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.timeline.parts import Section, read_sections
+from accerl_lerobot.timeline.states import ROLES, STATES, TIMELINE, TRAINING, role_of
+
+ABSENT = len(STATES)
+"""State of a worker of which there is no process, or whose older entries are not kept."""
+Shares = dict[str, dict[str, float]]
+"""Role → state → share of the time of its workers; states that they have not been in are left out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One worker, all processes that it has been."""
+
+    worker: str
+    times: np.ndarray
+    """int64 (n + 1,), nanoseconds since the timeline began; n intervals lie between them."""
+    states: np.ndarray
+    """uint8 (n,), of each interval."""
+    older_ns: np.ndarray
+    """int64 (states,), time in each state before what is kept."""
+    kept_from: int
+    """Nothing after this is missing."""
+
+    @property
+    def role(self) -> str:
+        """What is before the number in its name."""
+        return role_of(self.worker)
+
+    def until(self, at: np.ndarray) -> np.ndarray:
+        """Time in each state up to so many nanoseconds since the timeline began, of what is kept.
+
+        Args:
+            at: (m,).
+
+        Returns:
+            float64 (m, states).
+        """
+        spent = np.diff(self.times)
+        found = np.empty((len(at), len(STATES)))
+        for state in range(len(STATES)):
+            so_far = np.concatenate([[0], np.cumsum(np.where(self.states == state, spent, 0))])
+            found[:, state] = np.interp(at, self.times, so_far)
+        return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timeline:
+    """What the workers of a run did when."""
+
+    run: Path
+    rows: tuple[Row, ...]
+    """By role, then by number."""
+
+    @property
+    def seconds(self) -> float:
+        """From the beginning of the first worker to the end of the last."""
+        return max(int(row.times[-1]) for row in self.rows) / 1e9
+
+    def during(self, state: int = TRAINING) -> tuple[float, float]:
+        """From where the driver first is in a state to where it last is, in seconds; all if it never is."""
+        for row in self.rows:
+            at = np.flatnonzero(row.states == state)
+            if row.role == "driver" and len(at):
+                return float(row.times[at[0]]) / 1e9, float(row.times[at[-1] + 1]) / 1e9
+        return 0.0, self.seconds
+
+    def shares(self, window: tuple[float, float] | None = None) -> Shares:
+        """How the time of each role divides.
+
+        Args:
+            window: of which part, in seconds since the timeline began, and of what is kept of it; None: all,
+                exactly.
+        """
+        spent: dict[str, np.ndarray] = {}
+        for row in self.rows:
+            if window is None:
+                own = row.older_ns + row.until(row.times[-1:])[0]
+            else:
+                first, last = row.until(1e9 * np.array(window))
+                own = last - first
+            spent[row.role] = spent.get(row.role, 0) + own
+        return {role: divided(own) for role, own in spent.items() if own.sum() > 0}
+
+
+def divided(spent: np.ndarray) -> dict[str, float]:
+    """Shares by state, of time in each."""
+    return {STATES[i]: float(spent[i] / spent.sum()) for i in np.flatnonzero(spent)}
+
+
+def shares(
+    run_directory: Path, start_s: float | None = None, seconds: float | None = None, *, training: bool = False
+) -> Shares:
+    """How the time of each role of a run divides among the states; `states.bubble` adds up the waiting.
+
+    Args:
+        run_directory: the run's folder.
+        start_s: where to begin, in seconds since the timeline began; None: at its beginning.
+        seconds: how long; None: to the end.
+        training: only what lies within the training, if the driver has recorded any. Entries that are too
+            many to be kept are missing, as in any window.
+
+    Raises:
+        InputError: there is no timeline, it is damaged, or the window is not within it.
+    """
+    timeline = read_timeline(run_directory)
+    if start_s is None and seconds is None and not training:
+        return timeline.shares()
+    start, end = window_of(timeline, start_s, seconds)
+    if training:
+        first, last = timeline.during(TRAINING)
+        start, end = max(start, first), min(end, last)
+    return timeline.shares((start, end))
+
+
+def window_of(timeline: Timeline, start_s: float | None, seconds: float | None) -> tuple[float, float]:
+    """The part of a timeline that is asked for.
+
+    Raises:
+        InputError: it is not within the run.
+    """
+    whole = timeline.seconds
+    start = 0.0 if start_s is None else start_s
+    if not 0 <= start < whole:
+        remedy = f"use 0 or more, below {whole:.1f}, the seconds of {timeline.run}"
+        raise InputError("start_s", start_s, remedy)
+    if seconds is not None and not 0 < seconds < float("inf"):
+        raise InputError("seconds", seconds, "use a positive number of seconds")
+    return start, whole if seconds is None else min(whole, start + seconds)
+
+
+def read_timeline(run_directory: Path) -> Timeline:
+    """Reads what the workers of a run have left.
+
+    Raises:
+        InputError: it is no run, has no timeline, or this is damaged.
+    """
+    folder = run_directory / TIMELINE
+    if not run_directory.is_dir():
+        remedy = "a file; name the folder of a run" if run_directory.exists() else "no such folder"
+        raise InputError("runs", str(run_directory), remedy)
+    sections = read_sections(folder)
+    if not sections and not (run_directory / CONFIG).is_file() and not folder.is_dir():
+        remedy = f"no run in it: there is no {CONFIG}, which every run writes first"
+        raise InputError("runs", str(run_directory), remedy)
+    if not sections:
+        remedy = "a run without a timeline: it was made with launch.timeline=false, or no worker has begun"
+        raise InputError("runs", str(run_directory), remedy)
+    return Timeline(run=run_directory, rows=_rows(sections))
+
+
+def _rows(sections: list[Section]) -> tuple[Row, ...]:
+    """One for each worker, on a common axis.
+
+    Clocks of one machine agree to the nanosecond, so that its sections are set to the calendar together, by
+    what the first of them noted.
+    """
+    sections = sorted(sections, key=lambda s: s.head.wall_ns)
+    offsets: dict[str, int] = {}
+    for section in sections:
+        offsets.setdefault(section.head.node, section.head.wall_ns - section.head.clock_ns)
+    begins = [s.head.clock_ns + offsets[s.head.node] for s in sections]
+    workers: dict[str, list[tuple[Section, int]]] = {}
+    for section, begun in zip(sections, begins, strict=True):
+        workers.setdefault(section.head.worker, []).append((section, begun - min(begins)))
+    rows = (_row(worker, own) for worker, own in workers.items())
+    return tuple(sorted(rows, key=lambda row: _place(row.worker)))
+
+
+def _row(worker: str, sections: list[tuple[Section, int]]) -> Row:
+    times, states = np.empty(0, np.int64), np.empty(0, np.uint8)
+    older, kept_from = np.zeros(len(STATES), np.int64), 0
+    for section, begun in sections:
+        own = section.times + begun
+        if len(times):
+            # What its process before still noted while it was being ended is cut off.
+            left = max(1, int(np.searchsorted(times, own[0])))
+            times, states = times[:left], np.append(states[: left - 1], np.uint8(ABSENT))
+        times, states = np.concatenate([times, own]), np.concatenate([states, section.states])
+        older += section.head.totals_ns
+        if section.head.at_ns:
+            kept_from = int(own[0])
+    # Beats are no changes of state.
+    change = np.flatnonzero(np.diff(states, prepend=-1) != 0)
+    return Row(
+        worker=worker,
+        times=np.append(times[:-1][change], times[-1]),
+        states=states[change],
+        older_ns=older,
+        kept_from=kept_from,
+    )
+
+
+def _place(worker: str) -> tuple[int, int, str]:
+    role = role_of(worker)
+    number = worker[len(role) :].strip()
+    return ROLES.index(role) if role in ROLES else len(ROLES), int(number or 0), role
