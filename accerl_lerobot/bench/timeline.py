@@ -15,10 +15,10 @@
 
     accerl bench timeline --run=RUN
 
-Three arms, in turns, forth and back (A B C C B A): ``on`` enters states of a clock that writes to disk, ``off``
-of one that records nothing, and ``floor`` only asks for the time, which no recorder can do without. With a
-run, the cost of an entry times the entries a second of each of its workers is the share of its time that
-recording takes.
+Three arms, in turns, forth and back (A B C C B A): ``on`` enters states of a clock that writes to disk,
+``off`` of one that records nothing, and ``floor`` only asks for the time, which no recorder can do without.
+With a run, the cost of an entry times the entries a second of each of its workers is the share of its time
+that recording takes.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ class TimelineConfig:
     """First second that is drawn, since the first worker began; 0 or more. None: such that the window is in
     the middle of the training."""
     seconds: float | None = None
-    """How much is drawn, above 0. None: about eight updates of the slowest run, 1 to 60 seconds."""
+    """How much is drawn, above 0. None: about sixteen updates of the slowest run, 2 to 60 seconds."""
     trace_seconds: float = 60.0
     """How much of each run ``timeline.json`` has, around the middle of what is drawn; above 0."""
     output: str | None = None

@@ -191,7 +191,8 @@ def _rows(sections: list[Section]) -> tuple[Row, ...]:
 
 
 def _row(worker: str, sections: list[tuple[Section, int]]) -> Row:
-    times, states = np.empty(0, np.int64), np.empty(0, np.uint8)
+    times: np.ndarray = np.empty(0, np.int64)
+    states: np.ndarray = np.empty(0, np.uint8)
     older, kept_from = np.zeros(len(STATES), np.int64), 0
     for section, begun in sections:
         own = section.times + begun

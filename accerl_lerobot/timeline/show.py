@@ -21,6 +21,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
+from rich.markup import escape
 from rich.table import Table
 
 from accerl_lerobot.checkpoint import write_atomically
@@ -33,9 +35,9 @@ from accerl_lerobot.timeline.trace import trace
 
 PICTURE, TRACE = "timeline.png", "timeline.json"
 """Names in a run's folder."""
-TURNS = 8
+TURNS = 16
 """Updates that are drawn."""
-LEAST_S, MOST_S = 1.0, 60.0
+LEAST_S, MOST_S = 2.0, 60.0
 """Of a window that nobody has chosen."""
 
 
@@ -84,17 +86,22 @@ def choose_windows(
 
 def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
-    spent = {state for run in result["runs"] for own in run["shares"].values() for state in own}
-    states = [state for state in STATES if state in spent]
-    shown = Table(title="per cent of the training, and of it waiting; waiting in what is drawn")
-    for heading in ("run", "role", *states, "bubble", "drawn"):
-        shown.add_column(heading, justify="left" if heading in ("run", "role") else "right")
+    roles = [own for run in result["runs"] for role, own in run["shares"].items() if role != "driver"]
+    states = [state for state in STATES if any(state in own for own in roles)]
+    shown = Table(
+        title="per cent of the training; bubble: of it waiting, and of what is drawn", box=SIMPLE_HEAD
+    )
+    shown.add_column("role", no_wrap=True)
+    for heading in (*states, "bubble", "drawn"):
+        shown.add_column(heading, justify="right", no_wrap=True)
     for run in result["runs"]:
+        shown.add_row(f"[bold]{escape(Path(run['run']).resolve().name)}[/bold]")
         for role, own in run["shares"].items():
-            cells = [f"{100 * own[state]:.1f}" if state in own else "" for state in states]
-            waits = [run[name].get(role) for name in ("bubble", "window_bubble")]
-            cells += ["" if wait is None else f"{100 * wait:.1f}" for wait in waits]
-            shown.add_row(Path(run["run"]).resolve().name, role, *cells)
+            if role != "driver":
+                cells = [f"{100 * own[state]:.1f}" if state in own else "" for state in states]
+                waits = [run[name].get(role) for name in ("bubble", "window_bubble")]
+                cells += ["" if wait is None else f"{100 * wait:.1f}" for wait in waits]
+                shown.add_row(f" {role}", *cells)
     return shown
 
 

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""The states of a worker, which is in exactly one at any time; ``docs/performance.md`` says what they mean."""
+"""The states of a worker, which is in exactly one at any time; see ``docs/performance.md``."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ class Watch:
         for path in [path for paths in part_paths(self._folder).values() for path in paths]:
             with contextlib.suppress(FileNotFoundError):  # its worker has begun another meanwhile
                 self._follow(path, spent)
-        found = {}
+        found: dict[str, float] = {}
         for role, own in spent.items():
             if own.sum() > 0:
                 parts, name = divided(own), f"timeline_{role.replace(' ', '_')}"
