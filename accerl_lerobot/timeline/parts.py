@@ -31,6 +31,7 @@ from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,7 +44,25 @@ BITS = 4
 PART_BYTES = 4_000_000
 SUFFIX = ".bin"
 BOOT = Path("/proc/sys/kernel/random/boot_id")
-"""Tells one machine's monotonic clock from another's, and from its own before a restart."""
+"""Tells one machine's monotonic clock from another's, and from its own before a restart; without such a
+file all are taken for one."""
+
+
+class Moment(NamedTuple):
+    """A moment by two clocks."""
+
+    node: str
+    """Whose monotonic clock it is."""
+    clock_ns: int
+    """By that."""
+    wall_ns: int
+    """By the calendar, in nanoseconds since 1970."""
+
+
+def this_moment() -> Moment:
+    """Now, here."""
+    node = BOOT.read_text().strip() if BOOT.is_file() else ""
+    return Moment(node, time.monotonic_ns(), time.time_ns())
 
 
 class Parts:
@@ -52,25 +71,17 @@ class Parts:
     Args:
         folder: of the timeline.
         worker: its name.
-        clock_ns: when the section begins, by the monotonic clock; None: now.
+        begins: when the section does; None: now.
         part_bytes: after which another part begins.
     """
 
     def __init__(
-        self, folder: Path, worker: str, clock_ns: int | None = None, part_bytes: int = PART_BYTES
+        self, folder: Path, worker: str, begins: Moment | None = None, part_bytes: int = PART_BYTES
     ) -> None:
-        self.clock_ns, wall_ns = time.monotonic_ns(), time.time_ns()
-        if clock_ns is not None:
-            self.clock_ns = clock_ns
+        begins = begins or this_moment()
+        self.clock_ns = begins.clock_ns
         self._folder, self._part_bytes = folder, part_bytes
-        self._head = {
-            "timeline": FORMAT,
-            "worker": worker,
-            "pid": os.getpid(),
-            "node": BOOT.read_text().strip() if BOOT.is_file() else "",
-            "clock_ns": self.clock_ns,
-            "wall_ns": wall_ns,
-        }
+        self._head = {"timeline": FORMAT, "worker": worker, "pid": os.getpid(), **begins._asdict()}
         self._slug = worker.replace(" ", "-")
         self._part = 0
         folder.mkdir(parents=True, exist_ok=True)
@@ -124,12 +135,8 @@ class Head:
     """First line of a part."""
 
     worker: str
-    pid: int
-    node: str
-    clock_ns: int
-    """When the section began, by the monotonic clock of `node`."""
-    wall_ns: int
-    """The same moment in nanoseconds since 1970."""
+    begins: Moment
+    """When the section did."""
     at_ns: int
     """When the part begins, since the section did."""
     state: int
@@ -195,13 +202,12 @@ def read_head(path: Path) -> tuple[Head | None, int]:
         if told["timeline"] != FORMAT:
             raise ValueError(f"format {told['timeline']}, not {FORMAT}")
         totals = [int(told["totals_ns"].get(name, 0)) for name in STATES]
-        numbers = {name: int(told[name]) for name in ("pid", "clock_ns", "wall_ns", "at_ns")}
         head = Head(
             worker=str(told["worker"]),
-            node=str(told["node"]),
+            begins=Moment(str(told["node"]), int(told["clock_ns"]), int(told["wall_ns"])),
+            at_ns=int(told["at_ns"]),
             state=STATES.index(told["state"]),
             totals_ns=np.array(totals, dtype=np.int64),
-            **numbers,
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise _damaged(path, " ".join(str(error).split())[:80]) from error

@@ -132,6 +132,9 @@ def shares(
     start, end = window_of(timeline, start_s, seconds)
     if training:
         first, last = timeline.during(TRAINING)
+        if start >= last or end <= first:
+            remedy = f"the training of {run_directory} is from {first:.1f} to {last:.1f}"
+            raise InputError("start_s", start_s, remedy)
         start, end = max(start, first), min(end, last)
     return timeline.shares((start, end))
 
@@ -178,11 +181,12 @@ def _rows(sections: list[Section]) -> tuple[Row, ...]:
     Clocks of one machine agree to the nanosecond, so that its sections are set to the calendar together, by
     what the first of them noted.
     """
-    sections = sorted(sections, key=lambda s: s.head.wall_ns)
+    sections = sorted(sections, key=lambda section: section.head.begins.wall_ns)
+    moments = [section.head.begins for section in sections]
     offsets: dict[str, int] = {}
-    for section in sections:
-        offsets.setdefault(section.head.node, section.head.wall_ns - section.head.clock_ns)
-    begins = [s.head.clock_ns + offsets[s.head.node] for s in sections]
+    for moment in moments:
+        offsets.setdefault(moment.node, moment.wall_ns - moment.clock_ns)
+    begins = [moment.clock_ns + offsets[moment.node] for moment in moments]
     workers: dict[str, list[tuple[Section, int]]] = {}
     for section, begun in zip(sections, begins, strict=True):
         workers.setdefault(section.head.worker, []).append((section, begun - min(begins)))

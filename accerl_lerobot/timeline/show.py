@@ -30,7 +30,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.timeline.config import TimelineConfig
 from accerl_lerobot.timeline.picture import MARK, draw
 from accerl_lerobot.timeline.read import Timeline, read_timeline, window_of
-from accerl_lerobot.timeline.states import COMPUTE, STATES, bubble
+from accerl_lerobot.timeline.states import COMPUTE, ROLES, STATES, bubble
 from accerl_lerobot.timeline.trace import trace
 
 PICTURE, TRACE = "timeline.png", "timeline.json"
@@ -85,24 +85,26 @@ def choose_windows(
 
 
 def table(result: dict[str, Any]) -> Table:
-    """`result` for people."""
-    roles = [own for run in result["runs"] for role, own in run["shares"].items() if role != "driver"]
-    states = [state for state in STATES if any(state in own for own in roles)]
-    shown = Table(
-        title="per cent of the training; bubble: of it waiting, and of what is drawn", box=SIMPLE_HEAD
-    )
-    shown.add_column("role", no_wrap=True)
-    for heading in (*states, "bubble", "drawn"):
-        shown.add_column(heading, justify="right", no_wrap=True)
-    for run in result["runs"]:
+    """`result` for people, without the driver, whose time does not divide into work and waiting."""
+    runs = result["runs"]
+    roles = [role for role in ROLES if role != "driver" and any(role in run["shares"] for run in runs)]
+    shown = Table(title="per cent of the training", box=SIMPLE_HEAD)
+    for heading in ("", *roles):
+        shown.add_column(heading, justify="right" if heading else "left")
+    for run in runs:
+        spent = {state for role in roles for state in run["shares"].get(role, {})}
+        rows = {state: {role: own.get(state) for role, own in run["shares"].items()} for state in STATES}
         shown.add_row(f"[bold]{escape(Path(run['run']).resolve().name)}[/bold]")
-        for role, own in run["shares"].items():
-            if role != "driver":
-                cells = [f"{100 * own[state]:.1f}" if state in own else "" for state in states]
-                waits = [run[name].get(role) for name in ("bubble", "window_bubble")]
-                cells += ["" if wait is None else f"{100 * wait:.1f}" for wait in waits]
-                shown.add_row(f" {role}", *cells)
+        for name, row in rows.items():
+            if name in spent:
+                shown.add_row(name, *(_per_cent(row.get(role)) for role in roles))
+        for name, key in (("bubble", "bubble"), ("… of what is drawn", "window_bubble")):
+            shown.add_row(name, *(_per_cent(run[key].get(role)) for role in roles))
     return shown
+
+
+def _per_cent(share: float | None) -> str:
+    return "" if share is None else f"{100 * share:.1f}"
 
 
 def _written(timeline: Timeline, window: tuple[float, float], trace_seconds: float) -> dict[str, Any]:

@@ -16,17 +16,31 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from accerl_lerobot.timeline.parts import part_paths, read_entries, read_head
 from accerl_lerobot.timeline.read import divided
-from accerl_lerobot.timeline.states import STATES, bubble, role_of
+from accerl_lerobot.timeline.states import bubble, role_of
+
+
+@dataclass
+class _Place:
+    """How far a section has been read."""
+
+    path: Path
+    """Of its newest part."""
+    byte: int
+    at_ns: int
+    state: int
+    totals: np.ndarray
+    role: str
 
 
 class Watch:
-    """Follows a timeline while it is written.
+    """Tells how the time of each role has divided since it was last asked.
 
     Args:
         folder: of the timeline; need not be there.
@@ -34,16 +48,19 @@ class Watch:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._read: dict[Path, tuple[int, int, int, str]] = {}
-        """Of each part, bytes read, the last entry's time and state, role."""
+        self._places: dict[tuple[str, int], _Place] = {}
         self.news()
 
     def news(self) -> dict[str, float]:
         """``timeline_<role>_<state>_share`` and ``timeline_<role>_bubble`` since the last call."""
         spent: dict[str, np.ndarray] = {}
-        for path in [path for paths in part_paths(self._folder).values() for path in paths]:
-            with contextlib.suppress(FileNotFoundError):  # its worker has begun another meanwhile
-                self._follow(path, spent)
+        for section, paths in part_paths(self._folder).items():
+            before = self._places.get(section)
+            with contextlib.suppress(FileNotFoundError):  # its worker has begun another part meanwhile
+                if (place := _read_on(paths[-1], before)) is not None:
+                    self._places[section] = place
+                    new = place.totals if before is None else place.totals - before.totals
+                    spent[place.role] = spent.get(place.role, 0) + new
         found: dict[str, float] = {}
         for role, own in spent.items():
             if own.sum() > 0:
@@ -52,15 +69,19 @@ class Watch:
                 found[f"{name}_bubble"] = bubble(parts)
         return found
 
-    def _follow(self, path: Path, spent: dict[str, np.ndarray]) -> None:
-        if path not in self._read:
-            head, start = read_head(path)
-            if head is None:
-                return
-            self._read[path] = (start, head.at_ns, head.state, role_of(head.worker))
-        start, last, state, role = self._read[path]
-        times, states, start = read_entries(path, start, last)
-        if len(times):
-            own = spent.setdefault(role, np.zeros(len(STATES), np.int64))
-            np.add.at(own, np.append(np.uint8(state), states[:-1]), np.diff(times, prepend=last))
-            self._read[path] = (start, int(times[-1]), int(states[-1]), role)
+
+def _read_on(path: Path, before: _Place | None) -> _Place | None:
+    """Reads what is new in a section's newest part; a new part's first line has what went before it."""
+    if before is not None and before.path == path:
+        byte, at, state, totals, role = before.byte, before.at_ns, before.state, before.totals, before.role
+    else:
+        head, byte = read_head(path)
+        if head is None:
+            return None
+        at, state, totals, role = head.at_ns, head.state, head.totals_ns, role_of(head.worker)
+    times, states, byte = read_entries(path, byte, at)
+    if len(times):
+        totals = totals.copy()
+        np.add.at(totals, np.append(np.uint8(state), states[:-1]), np.diff(times, prepend=at))
+        at, state = int(times[-1]), int(states[-1])
+    return _Place(path, byte, at, state, totals, role)
