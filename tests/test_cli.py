@@ -289,7 +289,5 @@ def test_demos_refuses_an_existing_folder(tmp_path: Path, capsys: pytest.Capture
 
 def test_bench_without_a_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["bench"]) == 2
-    assert (
-        capsys.readouterr().err
-        == "accerl: bench='': name what is measured: world, policy, lag, dream, efficiency, faults, ranking\n"
-    )
+    names = "world, policy, lag, dream, efficiency, faults, ranking, timeline"
+    assert capsys.readouterr().err == f"accerl: bench='': name what is measured: {names}\n"

@@ -27,11 +27,11 @@ from rich.table import Table
 
 from accerl_lerobot.checkpoint import write_atomically
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.timeline.chrome import trace
 from accerl_lerobot.timeline.config import TimelineConfig
 from accerl_lerobot.timeline.picture import MARK, draw
 from accerl_lerobot.timeline.read import Timeline, read_timeline, window_of
 from accerl_lerobot.timeline.states import COMPUTE, ROLES, STATES, bubble
-from accerl_lerobot.timeline.trace import trace
 
 PICTURE, TRACE = "timeline.png", "timeline.json"
 """Names in a run's folder."""

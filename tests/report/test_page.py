@@ -198,8 +198,8 @@ def test_the_time_of_every_role_divides_as_the_timeline_says(tmp_path: Path) -> 
         "timeline_driver_training_share": 1.0, "timeline_driver_bubble": 0.0,
     }  # fmt: skip
     text = page_of(write_run(tmp_path / "run", rollout=shares)).text
-    assert "rollout compute 50 % wait in 40 % transport 10 %" in text
-    assert "trainer compute 25 % wait in 75 %" in text
+    assert "rollout compute: 50 % wait in: 40 % transport: 10 %" in text
+    assert "trainer compute: 25 % wait in: 75 %" in text
     assert "driver" not in text and "deciding" not in text
 
 

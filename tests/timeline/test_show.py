@@ -29,12 +29,12 @@ from rich.console import Console
 from accerl_lerobot.cli import main
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.timeline import COMPUTE, RECOVERY, TRAINING, WAIT_IN
+from accerl_lerobot.timeline.chrome import COLOURS, trace
 from accerl_lerobot.timeline.config import TimelineConfig
 from accerl_lerobot.timeline.picture import COLUMNS, columns
 from accerl_lerobot.timeline.read import read_timeline
 from accerl_lerobot.timeline.show import choose_windows, show_timelines, table
 from accerl_lerobot.timeline.states import STATES
-from accerl_lerobot.timeline.trace import COLOURS, trace
 from tests.timeline.folders import write_worker
 
 
