@@ -100,7 +100,7 @@ def bench_timeline(config: BenchTimelineConfig) -> dict[str, Any]:
 
 
 def entries_per_s(run: Path) -> dict[str, float]:
-    """Changes of state a second of each worker, in the training.
+    """Changes of state a second of each worker, since the last start of the training.
 
     Raises:
         InputError: the run has no timeline.
@@ -108,7 +108,7 @@ def entries_per_s(run: Path) -> dict[str, float]:
     from accerl_lerobot.timeline.read import read_timeline
 
     timeline = read_timeline(run)
-    first, last = timeline.during()
+    first, last = timeline.training()[-1]
     found = {}
     for row in timeline.rows:
         first_kept = max(1e9 * first, row.kept_from)

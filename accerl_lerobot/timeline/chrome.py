@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.timeline.read import ABSENT, Timeline
+from accerl_lerobot.timeline.read import ABSENT, Timeline, Window
 from accerl_lerobot.timeline.states import STATES
 
 COLOURS = (
@@ -33,7 +33,7 @@ COLOURS = (
 """Of the states: names that the viewers know."""
 
 
-def trace(timeline: Timeline, window: tuple[float, float]) -> dict[str, Any]:
+def trace(timeline: Timeline, window: Window) -> dict[str, Any]:
     """The trace of a part of a timeline.
 
     Args:

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from accerl_lerobot.report.words import percent
-from accerl_lerobot.timeline.read import Row, Timeline
-from accerl_lerobot.timeline.states import STATES, TRAINING, bubble
+from accerl_lerobot.timeline.read import Row, Timeline, Window
+from accerl_lerobot.timeline.states import STATES, bubble
 
 PALETTE = (
     "#3a7d44", "#dfe3e8", "#f0b429", "#5b8def", "#9b5de5", "#8d6e63", "#d64545", "#a8c8a0", "#7fb8c9",
@@ -35,7 +35,7 @@ MARK = "accerl timeline"
 """In a picture's metadata: made by us, and may be replaced."""
 
 
-def draw(path: Path, parts: Sequence[tuple[Timeline, tuple[float, float]]]) -> None:
+def draw(path: Path, parts: Sequence[tuple[Timeline, Window]]) -> None:
     """Draws runs above each other, on one scale of time.
 
     Args:
@@ -99,7 +99,7 @@ def columns(row: Row, start: float, end: float) -> np.ndarray:
 
 def _bubbles(ax: Any, timeline: Timeline, right: float) -> None:
     """Beside the rows of each role, how much of the training it waited."""
-    shares = timeline.shares(timeline.during(TRAINING))
+    shares = timeline.shares(timeline.training())
     places: dict[str, list[int]] = {}
     for number, row in enumerate(timeline.rows):
         places.setdefault(row.role, []).append(number)

@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,10 +24,12 @@ import numpy as np
 from accerl_lerobot.checkpoint import CONFIG
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.timeline.parts import Section, read_sections
-from accerl_lerobot.timeline.states import ROLES, STATES, TIMELINE, TRAINING, role_of
+from accerl_lerobot.timeline.states import CHECKPOINT, ROLES, STATES, TIMELINE, TRAINING, role_of
 
 ABSENT = len(STATES)
 """State of a worker of which there is no process, or whose older entries are not kept."""
+Window = tuple[float, float]
+"""First and last second, since the timeline began."""
 Shares = dict[str, dict[str, float]]
 """Role → state → share of the time of its workers; states that they have not been in are left out."""
 
@@ -80,28 +83,32 @@ class Timeline:
         """From the beginning of the first worker to the end of the last."""
         return max(int(row.times[-1]) for row in self.rows) / 1e9
 
-    def during(self, state: int = TRAINING) -> tuple[float, float]:
-        """From where the driver first is in a state to where it last is, in seconds; all if it never is."""
+    def training(self) -> list[Window]:
+        """When the driver trained, checkpoints on the way included, for each start; all if it never did."""
+        found: list[Window] = []
         for row in self.rows:
-            at = np.flatnonzero(row.states == state)
-            if row.role == "driver" and len(at):
-                return float(row.times[at[0]]) / 1e9, float(row.times[at[-1] + 1]) / 1e9
-        return 0.0, self.seconds
+            if row.role == "driver":
+                learns = np.isin(row.states, (TRAINING, CHECKPOINT))
+                ends = np.flatnonzero(np.diff(learns, prepend=False, append=False)).reshape(-1, 2)
+                found += [
+                    (float(row.times[first]) / 1e9, float(row.times[last]) / 1e9)
+                    for first, last in ends
+                    if (row.states[first:last] == TRAINING).any()
+                ]
+        return found or [(0.0, self.seconds)]
 
-    def shares(self, window: tuple[float, float] | None = None) -> Shares:
+    def shares(self, windows: Sequence[Window] | None = None) -> Shares:
         """How the time of each role divides.
 
         Args:
-            window: of which part, in seconds since the timeline began, and of what is kept of it; None: all,
-                exactly.
+            windows: of which parts, of what is kept of them; None: all, exactly.
         """
         spent: dict[str, np.ndarray] = {}
         for row in self.rows:
-            if window is None:
+            if windows is None:
                 own = row.older_ns + row.until(row.times[-1:])[0]
             else:
-                first, last = row.until(1e9 * np.array(window))
-                own = last - first
+                own = np.diff(row.until(1e9 * np.ravel(windows)), axis=0)[::2].sum(axis=0)
             spent[row.role] = spent.get(row.role, 0) + own
         return {role: divided(own) for role, own in spent.items() if own.sum() > 0}
 
@@ -120,8 +127,8 @@ def shares(
         run_directory: the run's folder.
         start_s: where to begin, in seconds since the timeline began; None: at its beginning.
         seconds: how long; None: to the end.
-        training: only what lies within the training, if the driver has recorded any. Entries that are too
-            many to be kept are missing, as in any window.
+        training: only what lies within the training, if the driver has recorded any. What is too old to be
+            kept is missing, as in any window.
 
     Raises:
         InputError: there is no timeline, it is damaged, or the window is not within it.
@@ -130,16 +137,15 @@ def shares(
     if start_s is None and seconds is None and not training:
         return timeline.shares()
     start, end = window_of(timeline, start_s, seconds)
-    if training:
-        first, last = timeline.during(TRAINING)
-        if start >= last or end <= first:
-            remedy = f"the training of {run_directory} is from {first:.1f} to {last:.1f}"
-            raise InputError("start_s", start_s, remedy)
-        start, end = max(start, first), min(end, last)
-    return timeline.shares((start, end))
+    windows = timeline.training() if training else [(start, end)]
+    within = [(max(start, first), min(end, last)) for first, last in windows if start < last and first < end]
+    if not within:
+        when = " and ".join(f"{first:.1f} to {last:.1f}" for first, last in windows)
+        raise InputError("start_s", start_s, f"the training of {run_directory} is from {when}")
+    return timeline.shares(within)
 
 
-def window_of(timeline: Timeline, start_s: float | None, seconds: float | None) -> tuple[float, float]:
+def window_of(timeline: Timeline, start_s: float | None, seconds: float | None) -> Window:
     """The part of a timeline that is asked for.
 
     Raises:

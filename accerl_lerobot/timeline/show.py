@@ -30,7 +30,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.timeline.chrome import trace
 from accerl_lerobot.timeline.config import TimelineConfig
 from accerl_lerobot.timeline.picture import MARK, draw
-from accerl_lerobot.timeline.read import Timeline, read_timeline, window_of
+from accerl_lerobot.timeline.read import Timeline, Window, read_timeline, window_of
 from accerl_lerobot.timeline.states import COMPUTE, ROLES, STATES, bubble
 
 PICTURE, TRACE = "timeline.png", "timeline.json"
@@ -46,8 +46,8 @@ def show_timelines(config: TimelineConfig) -> dict[str, Any]:
 
     Returns:
         ``picture``, and of each run, in ``runs``, ``run``, ``trace``, ``window_s`` (what is drawn),
-        ``training_s``, ``shares`` and ``bubble`` by role, in the training, and ``window_bubble``, in what is
-        drawn.
+        ``training_s`` (when it trained, for each start), ``shares`` and ``bubble`` by role, in the training,
+        and ``window_bubble``, in what is drawn.
 
     Raises:
         InputError: a run has no timeline, the window is not within one, or the picture has no place.
@@ -71,7 +71,7 @@ def show_timelines(config: TimelineConfig) -> dict[str, Any]:
 
 def choose_windows(
     timelines: Sequence[Timeline], start_s: float | None, seconds: float | None
-) -> list[tuple[float, float]]:
+) -> list[Window]:
     """Which seconds of each run are drawn; all as long, if the runs are.
 
     Raises:
@@ -107,14 +107,14 @@ def _per_cent(share: float | None) -> str:
     return "" if share is None else f"{100 * share:.1f}"
 
 
-def _written(timeline: Timeline, window: tuple[float, float], trace_seconds: float) -> dict[str, Any]:
+def _written(timeline: Timeline, window: Window, trace_seconds: float) -> dict[str, Any]:
     """Writes a run's trace; what is said of the run."""
     centre = sum(window) / 2
     around = max(0.0, centre - trace_seconds / 2), min(timeline.seconds, centre + trace_seconds / 2)
     path = timeline.run / TRACE
     write_atomically(path, json.dumps(trace(timeline, around)) + "\n")
-    training = timeline.during()
-    spent, drawn = timeline.shares(training), timeline.shares(window)
+    training = timeline.training()
+    spent, drawn = timeline.shares(training), timeline.shares([window])
     return {
         "run": str(timeline.run),
         "trace": str(path),
@@ -128,7 +128,7 @@ def _written(timeline: Timeline, window: tuple[float, float], trace_seconds: flo
 
 def _turns(timeline: Timeline) -> float:
     """Seconds of so many updates."""
-    first, last = timeline.during()
+    first, last = _longest(timeline)
     length = last - first
     for row in timeline.rows:
         if row.role == "trainer":
@@ -141,10 +141,15 @@ def _turns(timeline: Timeline) -> float:
 
 def _middle(timeline: Timeline, seconds: float) -> float:
     """Where a window in the middle of the training begins, of that of it which is kept of all workers."""
-    first, last = timeline.during()
+    first, last = _longest(timeline)
     kept = max(row.kept_from for row in timeline.rows) / 1e9
     first = max(first, min(kept, last - seconds))
     return max(0.0, (first + last - seconds) / 2)
+
+
+def _longest(timeline: Timeline) -> Window:
+    """Of the training, what went on without a new start."""
+    return max(timeline.training(), key=lambda window: window[1] - window[0])
 
 
 def _check_place(picture: Path) -> None:

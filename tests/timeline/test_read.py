@@ -80,6 +80,15 @@ def test_a_part_that_is_not_within_the_training(run: Path) -> None:
         shares(run, 8.5, training=True)
 
 
+def test_a_run_that_was_gone_on_with_has_trained_twice(run: Path) -> None:
+    write_worker(run, "driver", [(RECOVERY, 5), (CHECKPOINT, 1), (RECOVERY, 1), (TRAINING, 3)], at_s=100)
+    write_worker(run, "trainer", [(RECOVERY, 6), (COMPUTE, 4)], at_s=100)
+    timeline = read_timeline(run)
+    assert timeline.training() == [(2.0, 8.0), (107.0, 110.0)]
+    assert shares(run, training=True)["trainer"] == pytest.approx({"wait_in": 3 / 9, "compute": 6 / 9})
+    assert shares(run, 50.0, training=True)["trainer"] == pytest.approx({"compute": 1.0})
+
+
 def test_a_worker_that_was_started_again_is_one_row_with_a_gap(tmp_path: Path) -> None:
     write_worker(tmp_path, "rollout 3", [(COMPUTE, 2)])
     write_worker(tmp_path, "rollout 3", [(RECOVERY, 1), (COMPUTE, 1)], at_s=4)
