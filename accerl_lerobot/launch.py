@@ -43,7 +43,7 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from accerl_lerobot.checkpoint import TRAINING_STATE, saved_version
-from accerl_lerobot.config import RunConfig, journal_folder
+from accerl_lerobot.config import RunConfig, journal_folder, timeline_folder
 from accerl_lerobot.engine import Engine, Progress, Saved, WorkerError
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
@@ -221,33 +221,35 @@ class RayEngine(Engine):
         from accerl_lerobot.replay.worker import ReplayWorker
         from accerl_lerobot.trainer.worker import TrainerWorker
 
-        c = self._config
+        c, timeline = self._config, timeline_folder(self._config)
         gpus = ray.available_resources().get("GPU", 0)
         imagination = c.imagination
         users = 2 + (imagination.share > 0) + imagination.learns
         share = 0.0 if c.policy.device == "cpu" or not gpus else 1 / math.ceil(users / gpus)
         inference = ray.remote(InferenceWorker).options(num_cpus=0, num_gpus=share, max_concurrency=1000)
         self._inference = self._service(
-            "inference", inference.remote(c.policy, c.inference, self._version, self._state, self._load)
+            "inference",
+            inference.remote(c.policy, c.inference, self._version, self._state, self._load, timeline),
         )
         replay = ray.remote(ReplayWorker).options(num_cpus=0, num_gpus=0, max_concurrency=1000)
         imagined, counted = imagination.replay if imagination.share else None, c.rollout.episodes > 0
         self._replay = self._service(
-            "replay", replay.remote(c.replay, c.seed, imagined, counted, self._state, journal_folder(c))
+            "replay",
+            replay.remote(c.replay, c.seed, imagined, counted, self._state, journal_folder(c), timeline),
         )
         threads = {"num_cpus": 0, "num_gpus": share, "max_concurrency": 4}
         trainer = ray.remote(TrainerWorker).options(**threads)
-        learns = trainer.remote(c.policy, c.algorithm, c.trainer, c.seed, self._state, self._load)
+        learns = trainer.remote(c.policy, c.algorithm, c.trainer, c.seed, self._state, self._load, timeline)
         self._trainer = self._service("trainer", learns)
         if imagination.share:
             from accerl_lerobot.world_model.worker import DreamWorker, WorldLearningWorker
 
             self._dreamer = self._service(
-                "dream", ray.remote(DreamWorker).options(**threads).remote(c, self._state)
+                "dream", ray.remote(DreamWorker).options(**threads).remote(c, self._state, timeline)
             )
             if imagination.learns:
                 learner = ray.remote(WorldLearningWorker).options(**threads)
-                self._learner = self._service("world learning", learner.remote(c, self._state))
+                self._learner = self._service("world learning", learner.remote(c, self._state, timeline))
         self._seats.start()
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
         for worker, reference in ready:

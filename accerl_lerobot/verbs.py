@@ -39,6 +39,7 @@ from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.ranking import BenchRankingConfig
 from accerl_lerobot.bench.scaling import BenchScalingConfig
 from accerl_lerobot.bench.throughput import BenchThroughputConfig
+from accerl_lerobot.bench.timeline import BenchTimelineConfig
 from accerl_lerobot.bench.transport import BenchTransportConfig
 from accerl_lerobot.bench.weights import BenchWeightsConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
@@ -51,6 +52,7 @@ from accerl_lerobot.hub.config import PullConfig, PushConfig
 from accerl_lerobot.parsing import read_arguments
 from accerl_lerobot.report.config import ReportConfig
 from accerl_lerobot.rollout.runner import EpisodeResult
+from accerl_lerobot.timeline.config import TimelineConfig
 from accerl_lerobot.verb_configs import DemosRun, EvalRun, SFTRun, WorldModelEvalRun, WorldModelRun
 
 
@@ -256,6 +258,17 @@ def report(arguments: list[str]) -> int:
     return 0
 
 
+def timeline(arguments: list[str]) -> int:
+    """``accerl timeline``."""
+    config: TimelineConfig = parse(TimelineConfig, arguments)
+    from accerl_lerobot.timeline.show import show_timelines, table
+
+    found = show_timelines(config)
+    Console().rich.print(table(found))
+    sys.stdout.write(json.dumps(found, indent=2) + "\n")
+    return 0
+
+
 def export(arguments: list[str]) -> int:
     """``accerl export``."""
     config: ExportConfig = parse(ExportConfig, arguments)
@@ -294,6 +307,7 @@ CONFIGS: dict[str, type[Any]] = {
     "push": PushConfig,
     "pull": PullConfig,
     "report": ReportConfig,
+    "timeline": TimelineConfig,
     "export": ExportConfig,
     "doctor": RunConfig,
     "bench world": BenchWorldConfig,
@@ -303,6 +317,7 @@ CONFIGS: dict[str, type[Any]] = {
     "bench async-vs-sync": BenchAsyncVsSyncConfig,
     "bench transport": BenchTransportConfig,
     "bench weights": BenchWeightsConfig,
+    "bench timeline": BenchTimelineConfig,
     "bench lag": BenchLagConfig,
     "bench dream": BenchDreamConfig,
     "bench efficiency": BenchEfficiencyConfig,

@@ -99,7 +99,7 @@ class LightTrainer:
     """Takes batches and learns nothing from them but what they were; breaks or idles on request."""
 
     def __init__(
-        self, policy: Any, algorithm: Any, config: Any, seed: int, state: Path | None = None, load: Any = None
+        self, policy: Any, algorithm: Any, config: Any, seed: int, state: Path | None = None, *_: Any
     ) -> None:
         if policy.path == NO_WEIGHTS:
             raise FileNotFoundError("no weights there")

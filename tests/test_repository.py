@@ -53,6 +53,7 @@ LIGHT = [
     "accerl_lerobot.inference.batcher",
     "accerl_lerobot.replay.worker",
     "accerl_lerobot.rollout.worker",
+    "accerl_lerobot.timeline",
     "accerl_lerobot.trainer.config",
     "accerl_lerobot.weights.ray_channel",
 ]

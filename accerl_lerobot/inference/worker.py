@@ -43,6 +43,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
+from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.contract import Asked, Server, stopped
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
 from accerl_lerobot.weights.reader import Received, SharedMemoryReader
@@ -79,6 +80,7 @@ class InferenceWorker:
         version: of the weights it begins with.
         state: the ``training_state`` that holds these; None: they are the checkpoint's.
         load: makes the adapter; None: of LeRobot's checkpoint.
+        timeline: folder of the timeline; None: none is kept.
     """
 
     def __init__(
@@ -88,7 +90,9 @@ class InferenceWorker:
         version: int = 0,
         state: Path | None = None,
         load: Load | None = None,
+        timeline: Path | None = None,
     ) -> None:
+        self._clock = open_clock(timeline, "inference")
         import torch
 
         torch.set_num_threads(config.num_threads)
@@ -110,6 +114,7 @@ class InferenceWorker:
         self._over = False
         self._busy_s = self._busy_told_s = 0.0
         self._since = time.monotonic()
+        self._clock.enter(WAIT_IN)
 
     async def ready(self) -> int:
         """Answers once the policy is loaded; returns this process's id."""
@@ -187,6 +192,7 @@ class InferenceWorker:
     async def metrics(self) -> dict[str, float]:
         """Batching statistics, the version served, the busy share since the last call, and of the last
         swap of weights how long it took and how long after their publication they served first."""
+        self._clock.beat()
         now, busy_s = time.monotonic(), self._busy_s
         share = (busy_s - self._busy_told_s) / max(1e-9, now - self._since)
         self._since, self._busy_told_s = now, busy_s
@@ -202,6 +208,7 @@ class InferenceWorker:
         batch: list[Asked] = []
         try:
             while not self._over:
+                self._clock.enter(WAIT_IN)
                 self._server.poll(self._patience())
                 if self._together:
                     self._batcher.lock_step(self._together.popleft())
@@ -237,6 +244,7 @@ class InferenceWorker:
         if self._broken is not None:
             raise self._broken
         if self._published:
+            self._clock.enter(WEIGHT_SYNC)
             received, started = self._published.popleft(), time.monotonic()
             self._adapter.load_trainable(received.tensors, received.changed)
             received.release()
@@ -247,9 +255,11 @@ class InferenceWorker:
         batch = [asked for asked in batch if not asked.gone]
         requests = [request for asked in batch for request in asked.message]
         started = time.monotonic()
+        self._clock.enter(COMPUTE)
         decisions = self._adapter.decide(requests, self._version) if requests else []
         now = time.monotonic()
         self._busy_s += now - started
+        self._clock.enter(TRANSPORT)
         if self._unserved_since is not None:
             self._publish_to_served_s, self._unserved_since = now - self._unserved_since, None
         start = 0

@@ -35,6 +35,7 @@ from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.checkpoint import PRETRAINED, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
+from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.weights.held_back import HeldBack
 from accerl_lerobot.weights.publisher import Publisher
@@ -51,6 +52,7 @@ class TrainerWorker:
         seed: of torch's global generator.
         state: the ``training_state`` to go on from; None: begin.
         load: makes the adapter; None: of LeRobot's checkpoint.
+        timeline: folder of the timeline; None: none is kept.
     """
 
     def __init__(
@@ -61,7 +63,9 @@ class TrainerWorker:
         seed: int,
         state: Path | None = None,
         load: Load | None = None,
+        timeline: Path | None = None,
     ) -> None:
+        self._clock = open_clock(timeline, "trainer")
         import torch
 
         from accerl_lerobot.trainer.update import Update
@@ -78,6 +82,7 @@ class TrainerWorker:
         self._kept: Any = None
         self._in_turn = False
         self._history: deque[dict[str, float]] = deque()  # filled on one thread, emptied on another
+        self._clock.enter(WAIT_IN)
 
     def ready(self) -> int:
         """Answers once the policy is loaded; returns this process's id."""
@@ -91,14 +96,17 @@ class TrainerWorker:
             readers: actor handles; where the weights go.
             transport: see `make_publisher`.
         """
+        self._clock.enter(WEIGHT_SYNC)
         publisher = make_publisher(readers, transport, changes=self._config.publish_changes)
         try:
             # A checkpoint need not hold a critic: all start from this one.
             publisher.publish(self._update.version, self._update.adapter.view_trainable())
             self._train(replay, publisher)
+            self._clock.enter(WEIGHT_SYNC)
             publisher.flush()
         finally:
             publisher.close()
+            self._clock.enter(WAIT_IN)
         return self._update.version
 
     def _train(self, replay: Any, publisher: Publisher) -> None:
@@ -108,16 +116,22 @@ class TrainerWorker:
         upcoming = replay.sample.remote(n, self._update.version)
         asked = time.monotonic()
         while self._update.version < config.updates:
+            self._clock.enter(WAIT_IN)
+            ray.wait([upcoming])
+            self._clock.enter(TRANSPORT)
             segments = ray.get(upcoming)
             if not segments:
                 break
             waited = time.monotonic() - asked
             if self._update.version + 1 < config.updates:
                 upcoming = replay.sample.remote(n, self._update.version + 1)
+            self._clock.enter(CHECKPOINT)
             with self._lock:
+                self._clock.enter(COMPUTE)
                 started = time.monotonic()
                 metrics = self._update.step(segments)
                 updated = time.monotonic()
+                self._clock.enter(WEIGHT_SYNC)
                 version = self._update.version
                 if config.publishes(version):
                     self._publish(publisher, held, last=version == config.updates)
@@ -130,6 +144,7 @@ class TrainerWorker:
                 self._history.append(metrics)
             asked = time.monotonic()
             if self._in_turn:
+                self._clock.enter(WEIGHT_SYNC)
                 publisher.flush()
             replay.learnt.remote()
         version = self._update.version
@@ -147,6 +162,7 @@ class TrainerWorker:
 
     def metrics(self) -> list[dict[str, float]]:
         """One record per update since the last call."""
+        self._clock.beat()
         return [self._history.popleft() for _ in range(len(self._history))]
 
     def follow(self, schedule: Schedule) -> None:
