@@ -140,6 +140,12 @@ class RunConfig:
                 f"use more than trainer.hold_back, {self.trainer.hold_back}, or all is thrown away as too old"
             )
             raise InputError("replay.max_lag", self.replay.max_lag, remedy)
+        if self.trainer.ranks > 1 and self.launch.engine == "local":
+            remedy = "launch.engine=local is one process; use launch.engine=ray, or 1"
+            raise InputError("trainer.ranks", self.trainer.ranks, remedy)
+        if self.trainer.cpu_offload and self.policy.device == "cpu":
+            remedy = "policy.device=cpu has everything there already; leave the field out"
+            raise InputError("trainer.cpu_offload", True, remedy)
         batch, imagination = self.trainer.batch_decisions, self.imagination
         if self.trainer.updates:
             # Of both, as a batch is all real before anything is imagined, and all imagined after the last

@@ -92,7 +92,7 @@ class LightTrainer:
     """Takes batches and learns nothing from them but what they were; breaks or idles on request."""
 
     def __init__(
-        self, policy: Any, algorithm: Any, config: Any, seed: int, state: Path | None = None
+        self, policy: Any, algorithm: Any, config: Any, seed: int, state: Path | None, peers: Any
     ) -> None:
         if policy.path == NO_WEIGHTS:
             raise FileNotFoundError("no weights there")

@@ -31,6 +31,7 @@ from torch import Tensor, nn
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Decision, Request
 from accerl_lerobot.policies.value_head import Value
+from accerl_lerobot.tensors import part_of, whole
 
 if TYPE_CHECKING:
     from accerl_lerobot.envs.base import WorldSpec
@@ -96,6 +97,10 @@ class PolicyAdapter(nn.Module, ABC):
         """V only, (B,), without gradient."""
 
     @abstractmethod
+    def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
+        """A few decisions as `evaluate` takes them, for those who want to see what it runs."""
+
+    @abstractmethod
     def trainable(self) -> dict[str, nn.Parameter]:
         """What the trainer updates and publishes, by name; the critic's begin with ``value_head.``"""
 
@@ -117,11 +122,12 @@ class PolicyAdapter(nn.Module, ABC):
         with torch.no_grad():
             for name, parameter in parameters.items():
                 # A copy first: arrays out of Ray's store are read-only, which torch cannot express.
-                parameter.copy_(torch.tensor(tensors[name]))
+                parameter.copy_(part_of(torch.tensor(tensors[name]), parameter))
 
     def export_trainable(self) -> dict[str, np.ndarray]:
         """A copy of `trainable` as NumPy arrays, safe to hand to another thread."""
-        return {k: p.detach().to("cpu", torch.float32).numpy().copy() for k, p in self.trainable().items()}
+        named = {name: whole(parameter.detach()) for name, parameter in self.trainable().items()}
+        return {name: tensor.to("cpu", torch.float32).numpy().copy() for name, tensor in named.items()}
 
 
 def stack_observations(requests: Sequence[Request]) -> tuple[dict[str, np.ndarray], list[str]]:

@@ -25,6 +25,7 @@ import os
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,7 @@ from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.checkpoint import PRETRAINED, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.peers import Learner, Peers
 from accerl_lerobot.weights.held_back import HeldBack
 from accerl_lerobot.weights.ray_channel import RayPublisher
 
@@ -48,6 +50,7 @@ class TrainerWorker:
         config: the optimiser.
         seed: of torch's global generator.
         state: the ``training_state`` to go on from; None: begin.
+        peers: handles of the other ranks.
     """
 
     def __init__(
@@ -57,20 +60,11 @@ class TrainerWorker:
         config: TrainerConfig,
         seed: int,
         state: Path | None = None,
+        peers: Sequence[Any] = (),
     ) -> None:
-        import torch
-
-        from accerl_lerobot.policies.loading import load_adapter
-        from accerl_lerobot.trainer.update import Update
-
-        torch.set_num_threads(config.num_threads)
-        torch.manual_seed(seed)
         self._policy, self._config = policy, config
-        adapter = load_adapter(policy)
-        self._update = Update(adapter, algorithm, config)
-        if state is not None:
-            adapter.load_trainable(snapshot.load(state / WEIGHTS))
-            self._update.restore(snapshot.load(state / "trainer"))
+        self._peers = Peers(peers, config)
+        self._update = self._peers.begin(Learner(policy, algorithm, config, seed, state))
         self._lock = threading.Lock()
         self._kept: Any = None
         self._history: deque[dict[str, float]] = deque()  # filled on one thread, emptied on another
@@ -88,7 +82,7 @@ class TrainerWorker:
         upcoming = replay.sample.remote(n, self._update.version)
         while self._update.version < config.updates:
             asked = time.monotonic()
-            segments = ray.get(upcoming)
+            batch, segments = upcoming, ray.get(upcoming)
             if not segments:
                 break
             waited = time.monotonic() - asked
@@ -96,7 +90,8 @@ class TrainerWorker:
                 upcoming = replay.sample.remote(n, self._update.version + 1)
             with self._lock:
                 started = time.monotonic()
-                metrics = self._update.step(segments)
+                with self._peers.joining("step", batch):
+                    metrics = self._update.step(segments)
                 updated = time.monotonic()
                 version = self._update.version
                 if config.publishes(version):
@@ -130,7 +125,9 @@ class TrainerWorker:
         from accerl_lerobot.policies.loading import copy_weights
 
         with self._lock:
-            self._kept = copy_weights(self._update.adapter), self._export(), self._update.state()
+            with self._peers.joining("lend_state"):
+                adapter = self._update.adapter
+                self._kept = copy_weights(adapter), adapter.export_trainable(), self._update.state()
             return self._update.version, self.metrics()
 
     def write(self, directory: Path) -> None:
@@ -143,4 +140,7 @@ class TrainerWorker:
         snapshot.save(directory / TRAINING_STATE / "trainer", state)
 
     def _export(self) -> dict[str, Any]:
-        return self._update.adapter.export_trainable()
+        if not self._peers.lending:
+            return self._update.adapter.export_trainable()
+        with self._peers.joining("lend_weights"):
+            return self._update.adapter.export_trainable()
