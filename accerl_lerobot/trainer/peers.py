@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import ray
-from ray.exceptions import GetTimeoutError, RayError
+from ray.exceptions import GetTimeoutError, RayActorError, RayError
 
 from accerl_lerobot import snapshot
 from accerl_lerobot.algorithms import AlgorithmConfig
@@ -215,7 +215,7 @@ class Peers:
         done, silent = ray.wait(calls, num_returns=len(calls), timeout=BLAME_S)
         failures = {call: error for call in done if (error := _error(call)) is not None}
         # A process that is gone made the others fail; what they say of it is only that it is gone.
-        gone = [call for call, error in failures.items() if isinstance(error, ray.exceptions.RayActorError)]
+        gone = [call for call, error in failures.items() if isinstance(error, RayActorError)]
         if not gone and silent:
             return RankError(f"trainer {self._names(silent, calls)} did not do {method}: no answer")
         for call in gone or failures:

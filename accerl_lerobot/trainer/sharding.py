@@ -17,8 +17,9 @@ The adapter is the module that is shared out: `evaluate` and `values` gather its
 What is gathered and let go of at once is a *block*: one of the network's repeated modules, whose weights are
 used inside its own forward pass and nowhere else. LeRobot's policies do not make that plain: SmolVLA, π0 and
 theirs run the inside of a layer without calling the layer, attention reads weights of linear layers that it
-never calls, and embeddings are tied. So one evaluation is watched, and a layer that is not called itself
-falls into the largest of its parts that are. All that is left over belongs to the adapter as a whole.
+never calls, caches carry gradients past a layer's output, and embeddings are tied. So one evaluation is
+watched, and a layer that is no block falls into the largest of its parts that are. What is left over belongs
+to the adapter as a whole.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def arrange(adapter: PolicyAdapter, config: TrainerConfig) -> None:
         return
     seen = Watch(adapter)
     if config.activation_checkpointing:
-        forgetful = [block for block in seen.blocks if block not in seen.stateful and list(block.children())]
+        forgetful = [block for block in seen.blocks if list(block.children())]
         if not forgetful:
             remedy = "no block of this policy can be computed again by itself; leave the field out"
             raise InputError("trainer.activation_checkpointing", True, remedy)
@@ -141,13 +142,13 @@ class Watch(TorchFunctionMode):
 
     Attributes:
         blocks: see the top of this file; none within another.
-        stateful: modules that were handed something that may remember the call, such as a key-value cache.
     """
 
     def __init__(self, adapter: PolicyAdapter) -> None:
         super().__init__()
-        self.stateful: set[nn.Module] = set()
         self._called: set[nn.Module] = set()
+        self._leaky: set[nn.Module] = set()
+        """Modules that were handed something in which a call can leave tensors, such as a key-value cache."""
         self._stack: list[nn.Module] = []
         self._around: dict[Tensor, set[nn.Module]] = {}
         """The modules whose calls enclose every use of a parameter."""
@@ -183,7 +184,7 @@ class Watch(TorchFunctionMode):
         self._called.add(module)
         self._stack.append(module)
         if not _plain((arguments, options)):
-            self.stateful.add(module)
+            self._leaky.add(module)
 
     def _leave(self, module: nn.Module, arguments: Any, output: Any) -> None:
         self._stack.pop()
@@ -198,7 +199,9 @@ class Watch(TorchFunctionMode):
     def _is_block(self, module: nn.Module) -> bool:
         """Called, of more than vectors, and no weight of it is used or held anywhere else."""
         parameters = list(module.parameters())
-        if module not in self._called or all(p.dim() < 2 for p in parameters):
+        # Gradients that come by way of a cache pass by a module's output, where FSDP waits for them; and what
+        # is computed again would be put there again.
+        if module not in self._called or module in self._leaky or all(p.dim() < 2 for p in parameters):
             return False
         inside = set(module.modules())
         return all(module in self._around.get(p, (module,)) and self._owners[p] <= inside for p in parameters)

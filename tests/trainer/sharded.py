@@ -184,7 +184,7 @@ def work(rank: int, size: int, place: Any, names: Sequence[str], states: Path, r
             config = config_of(case, sharding, size)
             result = run(case, config, group)
             result["resumed"] = run(case, config, group, snapshot.load(states / name))
-            snapshot.save(results / f"{name}.{sharding}.{rank}", result)
+            snapshot.save(results / f"{name}-{sharding}-{rank}", result)
     group.leave()
 
 
