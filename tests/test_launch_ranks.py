@@ -18,6 +18,7 @@ One run learns with two ranks, is saved, and loses a rank that hangs; another on
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 from collections.abc import Iterator
@@ -30,7 +31,7 @@ import torch
 from safetensors.torch import load_file
 
 from accerl_lerobot import snapshot
-from accerl_lerobot.checkpoint import PRETRAINED, TRAINING_STATE, WEIGHTS
+from accerl_lerobot.checkpoint import PRETRAINED, STEP, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.config import RunConfig
 from accerl_lerobot.engine import WorkerError
 from accerl_lerobot.evaluation.config import evaluation_plans
@@ -113,7 +114,9 @@ def test_one_rank_goes_on_from_what_two_have_saved(story: Story):
     updates = story.version + 4
     trainer = replace(TWO, updates=updates, ranks=1, sharding="none")
     config = replace(story.config, trainer=trainer)
-    engine = RayEngine(config, ("match",), state=story.saved / TRAINING_STATE)
+    state = story.saved / TRAINING_STATE
+    (state / STEP).write_text(json.dumps({"step": story.version}))
+    engine = RayEngine(config, ("match",), state=state)
     try:
         assert "trainer rank 1" not in engine.pids()
         engine.plan(evaluation_plans(("match",), 2, "before"))

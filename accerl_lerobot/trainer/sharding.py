@@ -183,7 +183,7 @@ class Watch(TorchFunctionMode):
     def _enter(self, module: nn.Module, arguments: tuple[Any, ...], options: dict[str, Any]) -> None:
         self._called.add(module)
         self._stack.append(module)
-        if not _plain((arguments, options)):
+        if not _plain((arguments, tuple(options.values()))):
             self._leaky.add(module)
 
     def _leave(self, module: nn.Module, arguments: Any, output: Any) -> None:
@@ -227,9 +227,7 @@ def _tensors(value: Any) -> Iterator[Tensor]:
 
 
 def _plain(value: Any) -> bool:
-    """Whether it is made of tensors and numbers, none of which a call can leave something in."""
-    if isinstance(value, dict):
-        return all(map(_plain, value.values()))
-    if isinstance(value, (tuple, list)):
+    """Whether it is made of tensors and numbers, none of which a call can leave another tensor in."""
+    if isinstance(value, tuple):
         return all(map(_plain, value))
     return value is None or isinstance(value, (Tensor, str, int, float, torch.dtype, torch.device))
