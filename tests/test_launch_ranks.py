@@ -38,6 +38,7 @@ from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.launch import RayEngine
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.runs import collect, drive, polls, tiny_run
+from tests.test_ray_environment import LOOPBACK, listening
 
 UPDATES = 12
 TWO = TrainerConfig(
@@ -57,6 +58,8 @@ class Story:
     served: int
     """Version of the weights that inference had."""
     error: str
+    addresses: set[str]
+    """At which its processes accepted connections."""
 
 
 @pytest.fixture(scope="module")
@@ -72,13 +75,13 @@ def story(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> It
             updates += progress.updates
             if progress.version >= UPDATES:
                 break
-        saved = engine.save(directory)
+        saved, addresses = engine.save(directory), set(listening())
         served = int(progress.inference["version"])
         os.kill(pids["trainer rank 1"], signal.SIGSTOP)
         with pytest.raises(WorkerError) as lost:
             drive(engine)
         updates += saved.updates
-        yield Story(config, directory, saved.version, updates, served, str(lost.value))
+        yield Story(config, directory, saved.version, updates, served, str(lost.value), addresses)
     finally:
         engine.close()
 
@@ -103,6 +106,10 @@ def test_the_checkpoint_is_whole_and_has_moved(story: Story, tiny_checkpoint: Pa
     trained = snapshot.load(story.saved / TRAINING_STATE / WEIGHTS)
     named = {k.removeprefix("policy."): v for k, v in trained.items() if k.startswith("policy.")}
     assert all(np.array_equal(after[k].numpy(), named[k]) for k in after if k in named) and len(named) > 20
+
+
+def test_ranks_listen_on_the_loopback_interface_only(story: Story):
+    assert story.addresses and story.addresses <= LOOPBACK
 
 
 def test_a_rank_that_hangs_is_named(story: Story):

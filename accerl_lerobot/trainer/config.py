@@ -36,7 +36,8 @@ class TrainerConfig:
     batch_decisions: int = 128
     """Decisions of one update; whole segments are drawn until there are at least as many."""
     micro_batch: int = 1024
-    """Decisions per backward pass; smaller saves memory, and costs one more forward pass for the values."""
+    """Decisions per backward pass of a rank; smaller saves memory, and costs one more forward pass for the
+    values."""
     lr: float = 1e-4
     """Peak learning rate of the policy, [0, 1); 0 freezes it."""
     value_lr: float = 1e-3

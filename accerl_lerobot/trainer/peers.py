@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -196,10 +196,9 @@ class Peers:
             raise
         self._collect(method, calls, self._config.rank_timeout_s)
 
-    @property
-    def lending(self) -> bool:
-        """Whether weights are in parts, so that it takes all ranks to have them whole."""
-        return self._config.zero
+    def lending(self, method: str) -> AbstractContextManager[None]:
+        """As `joining`, for what takes all ranks only where each keeps a part of the weights."""
+        return self.joining(method) if self._config.zero else nullcontext()
 
     def _collect(self, method: str, calls: list[Any], timeout_s: float) -> list[Any]:
         try:

@@ -113,10 +113,6 @@ class Group(Ranks):
         for parameter in parameters:
             dist.broadcast(parameter.data, src=0)
 
-    def leave(self) -> None:
-        """Ends the group for this rank; none may be at work."""
-        dist.destroy_process_group()
-
 
 def host(address: str, size: int, timeout_s: float) -> tuple[dist.Store, Meeting]:
     """Opens a meeting place on one of this machine's addresses, and on no other.

@@ -125,7 +125,7 @@ class TrainerWorker:
         from accerl_lerobot.policies.loading import copy_weights
 
         with self._lock:
-            with self._peers.joining("lend_state"):
+            with self._peers.lending("lend_state"):
                 adapter = self._update.adapter
                 self._kept = copy_weights(adapter), adapter.export_trainable(), self._update.state()
             return self._update.version, self.metrics()
@@ -140,7 +140,5 @@ class TrainerWorker:
         snapshot.save(directory / TRAINING_STATE / "trainer", state)
 
     def _export(self) -> dict[str, Any]:
-        if not self._peers.lending:
-            return self._update.adapter.export_trainable()
-        with self._peers.joining("lend_weights"):
+        with self._peers.lending("lend_weights"):
             return self._update.adapter.export_trainable()

@@ -185,7 +185,7 @@ def work(rank: int, size: int, place: Any, names: Sequence[str], states: Path, r
             result = run(case, config, group)
             result["resumed"] = run(case, config, group, snapshot.load(states / name))
             snapshot.save(results / f"{name}-{sharding}-{rank}", result)
-    group.leave()
+    torch.distributed.destroy_process_group()
 
 
 def joined(rank: int, size: int, place: Any) -> ranks.Group:

@@ -30,8 +30,10 @@ import torch
 from accerl_lerobot import snapshot
 from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.config import LaunchConfig, RunConfig
+from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.preflight import check_start
 from accerl_lerobot.trainer.batch import turns
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.ranks import Ranks
@@ -288,3 +290,10 @@ def test_more_ranks_than_gpus_are_refused_with_the_arithmetic():
         InputError, match=r"trainer\.ranks=4: .* 4 ranks on 3 GPUs leave 1 without; use at most 3"
     ):
         config.gpu_shares(3, 1)
+
+
+def test_a_run_with_more_ranks_than_gpus_does_not_begin(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    trainer = TrainerConfig(ranks=2, sharding="ddp")
+    with pytest.raises(InputError, match=r"trainer\.ranks=2: .* 2 ranks on 1 GPUs leave 1 without"):
+        check_start(RunConfig(trainer=trainer, policy=PolicyConfig(path="nowhere"), sft=SFTConfig(steps=0)))

@@ -103,7 +103,7 @@ def work(rank: int, size: int, place: Any, folder: Path) -> None:
     for name, case in CASES.items():
         config = TrainerConfig(**LEARNING.__dict__ | case.config)
         snapshot.save(folder / f"{name}-{rank}", learn(case, folder, config, group))
-    group.leave()
+    torch.distributed.destroy_process_group()
 
 
 @pytest.fixture(scope="module")
