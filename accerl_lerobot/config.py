@@ -167,6 +167,12 @@ class RunConfig:
         if self.trainer.publish_changes and self.launch.engine == "local":
             remedy = "launch.engine=local is one process, where nothing is sent; leave the field out"
             raise InputError("trainer.publish_changes", True, remedy)
+        if self.trainer.ranks > 1 and self.launch.engine == "local":
+            remedy = "launch.engine=local is one process; use launch.engine=ray, or 1"
+            raise InputError("trainer.ranks", self.trainer.ranks, remedy)
+        if self.trainer.cpu_offload and self.policy.device == "cpu":
+            remedy = "policy.device=cpu has everything there already; leave the field out"
+            raise InputError("trainer.cpu_offload", True, remedy)
         batch, imagination = self.trainer.batch_decisions, self.imagination
         if self.trainer.updates:
             # Of both, as a batch is all real before anything is imagined, and all imagined after the last

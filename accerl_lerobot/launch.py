@@ -33,7 +33,6 @@ handles and never hold the conductor.
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -107,6 +106,8 @@ class RayEngine(Engine):
         self._imagination_metrics: dict[str, float] = {}
         self._dreamer: Watched | None = None
         self._learner: Watched | None = None
+        self._ranks: list[Watched] = []
+        """The trainer's, but the first."""
         self._real_ended = False
         self._schedule: Schedule = ASYNCHRONOUS
         self._training = self._done = self._closed = False
@@ -219,13 +220,14 @@ class RayEngine(Engine):
     def _start(self) -> None:
         from accerl_lerobot.inference.worker import InferenceWorker
         from accerl_lerobot.replay.worker import ReplayWorker
+        from accerl_lerobot.trainer.peers import TrainerRank
         from accerl_lerobot.trainer.worker import TrainerWorker
 
         c, timeline = self._config, timeline_folder(self._config)
         gpus = ray.available_resources().get("GPU", 0)
         imagination = c.imagination
-        users = 2 + (imagination.share > 0) + imagination.learns
-        share = 0.0 if c.policy.device == "cpu" or not gpus else 1 / math.ceil(users / gpus)
+        users = 1 + (imagination.share > 0) + imagination.learns
+        of_rank, share = c.trainer.gpu_shares(0 if c.policy.device == "cpu" else gpus, users)
         inference = ray.remote(InferenceWorker).options(num_cpus=0, num_gpus=share, max_concurrency=1000)
         self._inference = self._service(
             "inference",
@@ -238,9 +240,13 @@ class RayEngine(Engine):
             replay.remote(c.replay, c.seed, imagined, counted, self._state, journal_folder(c), timeline),
         )
         threads = {"num_cpus": 0, "num_gpus": share, "max_concurrency": 4}
-        trainer = ray.remote(TrainerWorker).options(**threads)
-        learns = trainer.remote(c.policy, c.algorithm, c.trainer, c.seed, self._state, self._load, timeline)
-        self._trainer = self._service("trainer", learns)
+        learner = (c.policy, c.algorithm, c.trainer, c.seed, self._state, self._load)
+        peer = ray.remote(TrainerRank).options(num_cpus=0, num_gpus=of_rank)
+        for rank in range(1, c.trainer.ranks):
+            self._ranks.append(self._service(f"trainer rank {rank}", peer.remote(rank, *learner)))
+        trainer = ray.remote(TrainerWorker).options(**threads | {"num_gpus": of_rank})
+        handles = [rank.actor for rank in self._ranks]
+        self._trainer = self._service("trainer", trainer.remote(*learner, timeline, handles))
         if imagination.share:
             from accerl_lerobot.world_model.worker import DreamWorker, WorldLearningWorker
 
@@ -248,8 +254,8 @@ class RayEngine(Engine):
                 "dream", ray.remote(DreamWorker).options(**threads).remote(c, self._state, timeline)
             )
             if imagination.learns:
-                learner = ray.remote(WorldLearningWorker).options(**threads)
-                self._learner = self._service("world learning", learner.remote(c, self._state, timeline))
+                dreamt = ray.remote(WorldLearningWorker).options(**threads)
+                self._learner = self._service("world learning", dreamt.remote(c, self._state, timeline))
         self._seats.start()
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
         for worker, reference in ready:
@@ -324,6 +330,8 @@ class RayEngine(Engine):
         self._updates += self._hear(self._trainer) or []
         self._replay_metrics = self._hear(self._replay) or self._replay_metrics
         self._inference_metrics = self._hear(self._inference) or self._inference_metrics
+        for rank in self._ranks:
+            self._hear(rank)
         for imaginer in (self._dreamer, self._learner):
             if imaginer is not None:
                 self._imagination_metrics |= self._hear(imaginer) or {}

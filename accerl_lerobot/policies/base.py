@@ -31,6 +31,7 @@ from torch import Tensor, nn
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Decision, Request
 from accerl_lerobot.policies.value_head import Value
+from accerl_lerobot.tensors import in_parts, part_of, whole
 
 if TYPE_CHECKING:
     from accerl_lerobot.envs.base import WorldSpec
@@ -96,6 +97,10 @@ class PolicyAdapter(nn.Module, ABC):
         """V only, (B,), without gradient."""
 
     @abstractmethod
+    def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
+        """A few decisions as `evaluate` takes them, for those who want to see what it runs."""
+
+    @abstractmethod
     def trainable(self) -> dict[str, nn.Parameter]:
         """What the trainer updates and publishes, by name; the critic's begin with ``value_head.``"""
 
@@ -136,7 +141,8 @@ class PolicyAdapter(nn.Module, ABC):
 
         On a CPU they are the parameters' own memory, else copies of them.
         """
-        return {k: p.detach().to("cpu", torch.float32).numpy() for k, p in self.trainable().items()}
+        named = {name: whole(parameter.detach()) for name, parameter in self.trainable().items()}
+        return {name: tensor.to("cpu", torch.float32).numpy() for name, tensor in named.items()}
 
     def export_trainable(self) -> dict[str, np.ndarray]:
         """A copy of `trainable` as NumPy arrays, safe to hand to another thread."""
@@ -145,10 +151,10 @@ class PolicyAdapter(nn.Module, ABC):
 
 def _copy(parameter: nn.Parameter, tensor: np.ndarray) -> None:
     """Arrays that were received are read-only, which torch cannot express: NumPy copies where it can."""
-    if parameter.device.type == "cpu" and parameter.dtype == torch.float32:
+    if parameter.device.type == "cpu" and parameter.dtype == torch.float32 and not in_parts(parameter):
         np.copyto(parameter.detach().numpy(), tensor)
     else:
-        parameter.copy_(torch.tensor(tensor))
+        parameter.copy_(part_of(torch.tensor(tensor), parameter))
 
 
 def stack_observations(requests: Sequence[Request]) -> tuple[dict[str, np.ndarray], list[str]]:

@@ -25,6 +25,7 @@ import os
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +34,11 @@ import ray
 from accerl_lerobot import snapshot
 from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.checkpoint import PRETRAINED, TRAINING_STATE, WEIGHTS
-from accerl_lerobot.policies.config import Load, PolicyConfig, loader
+from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.peers import Learner, Peers
 from accerl_lerobot.weights.held_back import HeldBack
 from accerl_lerobot.weights.publisher import Publisher
 from accerl_lerobot.weights.ray_channel import make_publisher
@@ -53,6 +55,7 @@ class TrainerWorker:
         state: the ``training_state`` to go on from; None: begin.
         load: makes the adapter; None: of LeRobot's checkpoint.
         timeline: folder of the timeline; None: none is kept.
+        peers: handles of the other ranks.
     """
 
     def __init__(
@@ -64,20 +67,12 @@ class TrainerWorker:
         state: Path | None = None,
         load: Load | None = None,
         timeline: Path | None = None,
+        peers: Sequence[Any] = (),
     ) -> None:
         self._clock = open_clock(timeline, "trainer")
-        import torch
-
-        from accerl_lerobot.trainer.update import Update
-
-        torch.set_num_threads(config.num_threads)
-        torch.manual_seed(seed)
         self._policy, self._config = policy, config
-        adapter = loader(load)(policy)
-        self._update = Update(adapter, algorithm, config)
-        if state is not None:
-            adapter.load_trainable(snapshot.load(state / WEIGHTS))
-            self._update.restore(snapshot.load(state / "trainer"))
+        self._peers = Peers(peers, config)
+        self._update = self._peers.begin(Learner(policy, algorithm, config, seed, state, load))
         self._lock = threading.Lock()
         self._kept: Any = None
         self._in_turn = False
@@ -100,7 +95,7 @@ class TrainerWorker:
         publisher = make_publisher(readers, transport, changes=self._config.publish_changes)
         try:
             # A checkpoint need not hold a critic: all start from this one.
-            publisher.publish(self._update.version, self._update.adapter.view_trainable())
+            publisher.publish(self._update.version, self._view())
             self._train(replay, publisher)
             self._clock.enter(WEIGHT_SYNC)
             publisher.flush()
@@ -119,7 +114,7 @@ class TrainerWorker:
             self._clock.enter(WAIT_IN)
             ray.wait([upcoming])
             self._clock.enter(TRANSPORT)
-            segments = ray.get(upcoming)
+            batch, segments = upcoming, ray.get(upcoming)
             if not segments:
                 break
             waited = time.monotonic() - asked
@@ -129,7 +124,8 @@ class TrainerWorker:
             with self._lock:
                 self._clock.enter(COMPUTE)
                 started = time.monotonic()
-                metrics = self._update.step(segments)
+                with self._peers.joining("step", batch):
+                    metrics = self._update.step(segments)
                 updated = time.monotonic()
                 self._clock.enter(WEIGHT_SYNC)
                 version = self._update.version
@@ -155,7 +151,7 @@ class TrainerWorker:
     def _publish(self, publisher: Publisher, held: HeldBack, last: bool) -> None:
         """Hands the weights of now over, or those that are old enough."""
         if not held.updates:
-            publisher.publish(self._update.version, self._update.adapter.view_trainable())
+            publisher.publish(self._update.version, self._view())
             return
         for due in held.push(self._update.version, self._export(), last=last):
             publisher.publish(*due)
@@ -178,7 +174,9 @@ class TrainerWorker:
         from accerl_lerobot.policies.loading import copy_weights
 
         with self._lock:
-            self._kept = copy_weights(self._update.adapter), self._export(), self._update.state()
+            with self._peers.lending("lend_state"):
+                adapter = self._update.adapter
+                self._kept = copy_weights(adapter), adapter.export_trainable(), self._update.state()
             return self._update.version, self.metrics()
 
     def write(self, directory: Path) -> None:
@@ -190,5 +188,11 @@ class TrainerWorker:
         snapshot.save(directory / TRAINING_STATE / WEIGHTS, trained)
         snapshot.save(directory / TRAINING_STATE / "trainer", state)
 
+    def _view(self) -> dict[str, Any]:
+        """Trainable weights, to be copied before the next update."""
+        with self._peers.lending("lend_weights"):
+            return self._update.adapter.view_trainable()
+
     def _export(self) -> dict[str, Any]:
-        return self._update.adapter.export_trainable()
+        with self._peers.lending("lend_weights"):
+            return self._update.adapter.export_trainable()
