@@ -33,6 +33,7 @@ from accerl_lerobot.local import LocalEngine
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run import train
+from accerl_lerobot.timeline.read import shares
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, TrialConfig, WorldModelConfig
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig, OnlineLearnConfig
@@ -223,13 +224,13 @@ def test_dreams_of_a_copy_are_known_for_what_they_are(tiny_checkpoint: Path, wor
         assert all(np.array_equal(f, frames[0]) for f in frames)
 
 
-def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path):
+def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_path: Path):
     from accerl_lerobot.launch import RayEngine
 
     learn = OnlineLearnConfig(steps_per_episode=1.0, try_every=2, held_out=0.4, trial=LOOSE, batch=4)
     config = dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12)
     config = replace(config, rollout=replace(config.rollout, workers=2))
-    engine = RayEngine(config, ("match",))
+    engine = RayEngine(replace(config, output_dir=str(tmp_path)), ("match",))
     try:
         assert {"dream", "world learning"} < set(engine.pids())
         engine.train()
@@ -246,6 +247,9 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path):
     explained = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
     for name in last.imagination:
         assert f"`imagination_{name}`" in explained or name.startswith("gate_"), name
+    spent = shares(tmp_path)
+    assert {"recovery", "compute", "transport", "wait_in"} <= spent["dream"].keys()
+    assert {"recovery", "compute", "transport", "wait_in"} <= spent["world learning"].keys()
 
 
 def test_asynchronously_a_run_ends_when_its_episodes_are_used_up(tiny_checkpoint: Path):
