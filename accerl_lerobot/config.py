@@ -38,6 +38,7 @@ from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.transport.endpoint import FIELD, Transport
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 
 __all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "check_chunk", "decode", "encode", "parse"]
@@ -53,6 +54,11 @@ class LaunchConfig:
     """asynchronous: nobody waits for anybody. synchronous: a batch is collected, by all worlds in lock step,
     then learned from. overlap: the next one is collected meanwhile. These two are for measuring what the
     first gains."""
+    transport: Transport = "auto"
+    """How rollout workers and dreams reach inference and replay, and weights reach inference. shared_memory:
+    a message is written where the other process reads it. ray: it is copied, to any node. auto: shared memory
+    between processes of one node, if the system has it, and Ray otherwise.
+    """
     stall_s: float = 300.0
     """How long, in seconds, a worker may owe an answer or a world a step, and a run stand still; > 0.
 
@@ -73,6 +79,8 @@ class LaunchConfig:
                 "with launch.engine=local all is done in one process, in a schedule of its own; leave it out"
             )
             raise InputError("launch.schedule", self.schedule, remedy)
+        if self.transport not in get_args(Transport):
+            raise InputError(FIELD, self.transport, f"use {' or '.join(get_args(Transport))}")
         if not self.stall_s > 0:
             raise InputError("launch.stall_s", self.stall_s, "use a positive number of seconds")
         if self.max_recoveries < 0:

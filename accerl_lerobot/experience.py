@@ -40,6 +40,7 @@ REAL, IMAGINED = "real", "imagined"
 """Which worlds a segment can be from."""
 
 
+@kind
 @dataclass(frozen=True, kw_only=True)
 class Request:
     """One observation that waits for a decision.

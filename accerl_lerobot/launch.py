@@ -45,12 +45,13 @@ from ray.exceptions import RayError, RayTaskError
 from accerl_lerobot.checkpoint import TRAINING_STATE, saved_version
 from accerl_lerobot.config import RunConfig, journal_folder
 from accerl_lerobot.engine import Engine, Progress, Saved, WorkerError
-from accerl_lerobot.inference.worker import ServiceStoppedError
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seats import START_S, Seats
 from accerl_lerobot.stopping import Stopping
+from accerl_lerobot.transport.contract import ServiceStoppedError
+from accerl_lerobot.transport.endpoint import Endpoint, listens
 from accerl_lerobot.watched import Watched
 from accerl_lerobot.weights.publisher import ReaderLostError
 
@@ -84,7 +85,7 @@ class RayEngine(Engine):
         load: makes the policy's adapter, in the processes that have one; None: of LeRobot's checkpoint.
 
     Raises:
-        InputError: the state is of a run in one process.
+        InputError: the state is of a run in one process, or this system has no shared memory.
         WorkerError: a worker did not start; carries its own traceback.
     """
 
@@ -96,6 +97,7 @@ class RayEngine(Engine):
         state: Path | None = None,
         load: Load | None = None,
     ) -> None:
+        listens(config.launch.transport)
         self._config, self._state, self._load = config, state, load
         self._services: list[Watched] = []
         self._seats = Seats(config, tasks, history, state)
@@ -127,9 +129,12 @@ class RayEngine(Engine):
     def train(self) -> None:
         self._training, self._last_change = True, time.monotonic()
         self.follow(self._config.launch.schedule)
-        self._trainer.work = self._trainer.actor.run.remote(self._replay.actor, [self._inference.actor])
+        readers = [self._inference.actor]
+        self._trainer.work = self._trainer.actor.run.remote(
+            self._replay.actor, readers, self._config.launch.transport
+        )
         if self._dreamer is not None:
-            self._dreamer.work = self._dreamer.actor.run.remote(self._inference.actor, self._replay.actor)
+            self._dreamer.work = self._dreamer.actor.run.remote(*self._endpoints, self._replay.actor)
         if self._learner is not None and self._dreamer is not None:
             self._learner.work = self._learner.actor.run.remote(self._dreamer.actor, self._replay.actor)
 
@@ -247,9 +252,17 @@ class RayEngine(Engine):
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
         for worker, reference in ready:
             worker.result(reference, "ready", max(START_S, self._limit))
+        self._endpoints = self._endpoint(self._inference, "decide"), self._endpoint(self._replay, "insert")
         self._inference.work = self._inference.actor.serve.remote()
         self._replay.work = self._replay.actor.run.remote()
-        self._seats.set_to_work(self._inference.actor, self._replay.actor)
+        self._seats.set_to_work(*self._endpoints)
+
+    def _endpoint(self, service: Watched, method: str) -> Endpoint:
+        """Where workers reach a service."""
+        transport = self._config.launch.transport
+        address = service.call("listen", timeout=self._limit) if listens(transport) else None
+        way = getattr(service.actor, method)
+        return Endpoint(name=service.name, method=way, address=address, transport=transport)
 
     def _service(self, name: str, actor: Any) -> Watched:
         self._services.append(Watched(name, actor))

@@ -24,7 +24,6 @@ import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import ray
 from ray.exceptions import RayActorError, RayError
@@ -36,6 +35,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.ray_environment import TOKENLESS
 from accerl_lerobot.rollout.plans import budgets, whole_groups
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
+from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.watched import Watched
 
 logger = logging.getLogger(__name__)
@@ -85,7 +85,7 @@ class Seats:
     ) -> None:
         self._config, self._tasks, self._history = config, tasks, history
         self._past: dict[str, float] = {"restarts": 0.0}
-        self._peers: tuple[Any, Any] | None = None
+        self._peers: tuple[Endpoint, Endpoint] | None = None
         self.in_turn = False
         """Whether worlds wait for replay after each segment."""
         self._seats = [
@@ -100,8 +100,8 @@ class Seats:
         for seat in self._seats:
             seat.worker = self._new(seat)
 
-    def set_to_work(self, inference: Any, replay: Any) -> None:
-        """Has them step worlds, with these actors."""
+    def set_to_work(self, inference: Endpoint, replay: Endpoint) -> None:
+        """Has them step worlds, with these services."""
         self._peers = inference, replay
         for seat in self._seats:
             seat.worker.work = seat.worker.actor.run.remote(inference, replay)

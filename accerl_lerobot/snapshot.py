@@ -47,6 +47,11 @@ def kind[T](cls: type[T]) -> type[T]:
     return cls
 
 
+def kind_named(name: str) -> type[Any] | None:
+    """What was registered under this name; None: nothing."""
+    return _KINDS.get(name)
+
+
 def save(path: Path, tree: Any) -> None:
     """Writes ``path.json`` and ``path.safetensors``.
 
@@ -107,8 +112,8 @@ def _encode(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
         items = [[within("key", key), within(key, part)] for key, part in value.items()]
         return {MARK: "map", "items": items}
     name = type(value).__name__
-    if _KINDS.get(name) is type(value):
-        names = _field_names(type(value))
+    if kind_named(name) is type(value):
+        names = field_names(type(value))
         return {MARK: name, "fields": {field: within(field, getattr(value, field)) for field in names}}
     raise TypeError(f"{place}: a {name} cannot be saved")
 
@@ -122,10 +127,10 @@ def _decode(value: Any, arrays: dict[str, np.ndarray]) -> Any:
         return {key: _decode(part, arrays) for key, part in value.items()}
     if (name := value[MARK]) in _READERS:
         return _READERS[name](value, arrays)
-    if name not in _KINDS:
+    cls = kind_named(name)
+    if cls is None:
         raise ValueError(f"no kind of thing is called {name!r}")
-    fields = {key: _decode(part, arrays) for key, part in value["fields"].items()}
-    return _KINDS[name](**fields)
+    return cls(**{key: _decode(part, arrays) for key, part in value["fields"].items()})
 
 
 def _tensor(value: dict[str, Any], arrays: dict[str, np.ndarray]) -> Any:
@@ -151,7 +156,8 @@ _READERS: dict[str, Callable[[dict[str, Any], dict[str, np.ndarray]], Any]] = {
 }
 
 
-def _field_names(cls: type[Any]) -> tuple[str, ...]:
+def field_names(cls: type[Any]) -> tuple[str, ...]:
+    """Of a dataclass or named tuple, in order."""
     if dataclasses.is_dataclass(cls):
         return tuple(field.name for field in dataclasses.fields(cls))
     names: tuple[str, ...] = cls._fields

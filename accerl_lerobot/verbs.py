@@ -30,12 +30,16 @@ from typing import Any
 
 import yaml
 
+from accerl_lerobot.bench.async_vs_sync import BenchAsyncVsSyncConfig
 from accerl_lerobot.bench.dream import BenchDreamConfig
 from accerl_lerobot.bench.efficiency import BenchEfficiencyConfig
 from accerl_lerobot.bench.faults import BenchFaultsConfig
 from accerl_lerobot.bench.lag import BenchLagConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.ranking import BenchRankingConfig
+from accerl_lerobot.bench.scaling import BenchScalingConfig
+from accerl_lerobot.bench.throughput import BenchThroughputConfig
+from accerl_lerobot.bench.transport import BenchTransportConfig
 from accerl_lerobot.bench.weights import BenchWeightsConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
 from accerl_lerobot.checkpoint import CONFIG
@@ -265,13 +269,13 @@ def export(arguments: list[str]) -> int:
 
 
 def bench(arguments: list[str]) -> int:
-    """``accerl bench world``, ``policy``, ``lag``, ``dream``, ``efficiency``, ``ranking``, ``faults`` and
-    ``weights``."""
+    """``accerl bench NAME``; see `CONFIGS` for the names."""
     name = arguments[0] if arguments else ""
     if f"bench {name}" not in CONFIGS:
         names = [verb.split()[1] for verb in CONFIGS if verb.startswith("bench ")]
         raise InputError("bench", name, f"name what is measured: {', '.join(names)}")
     config = parse(CONFIGS[f"bench {name}"], arguments[1:])
+    name = name.replace("-", "_")
     module: Any = importlib.import_module(f"accerl_lerobot.bench.{name}")
     with redirect_stdout(sys.stderr):
         result = getattr(module, f"bench_{name}")(config)
@@ -294,12 +298,16 @@ CONFIGS: dict[str, type[Any]] = {
     "doctor": RunConfig,
     "bench world": BenchWorldConfig,
     "bench policy": BenchPolicyConfig,
+    "bench throughput": BenchThroughputConfig,
+    "bench scaling": BenchScalingConfig,
+    "bench async-vs-sync": BenchAsyncVsSyncConfig,
+    "bench transport": BenchTransportConfig,
+    "bench weights": BenchWeightsConfig,
     "bench lag": BenchLagConfig,
     "bench dream": BenchDreamConfig,
     "bench efficiency": BenchEfficiencyConfig,
     "bench faults": BenchFaultsConfig,
     "bench ranking": BenchRankingConfig,
-    "bench weights": BenchWeightsConfig,
 }
 """Verb → what its command line is parsed into."""
 

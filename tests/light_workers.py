@@ -30,6 +30,8 @@ import pytest
 from accerl_lerobot import snapshot
 from accerl_lerobot.checkpoint import TRAINING_STATE
 from accerl_lerobot.experience import Decision, Request
+from accerl_lerobot.transport.on_loop import serve_on_loop
+from accerl_lerobot.transport.shared_memory import Address
 
 
 @pytest.fixture(scope="session")
@@ -63,17 +65,22 @@ class LightInference:
     async def serve(self) -> None:
         await self._broken
 
+    async def listen(self) -> Address:
+        return serve_on_loop(self.decide).address
+
     async def fail(self) -> None:
         self._broken.set_exception(ArithmeticError("the forward pass fell over"))
 
     async def decide(self, requests: list[Request]) -> list[Decision]:
-        from accerl_lerobot.inference.worker import ServiceStoppedError
+        from accerl_lerobot.transport.contract import ServiceStoppedError
 
         if self._broken.done():
             raise ServiceStoppedError("the inference service has stopped")
         return [_decision(request, self._version) for request in requests]
 
-    async def receive_weights(self, version: int, tensors: dict[str, np.ndarray]) -> int:
+    async def receive_weights(
+        self, version: int, tensors: dict[str, np.ndarray], published_s: float = 0.0
+    ) -> int:
         self._version = version
         return version
 
@@ -115,7 +122,7 @@ class LightTrainer:
     def idle(self) -> None:
         self._idle = True
 
-    def run(self, replay: Any, readers: list[Any]) -> int:
+    def run(self, replay: Any, readers: list[Any], transport: str) -> int:
         import ray
 
         n = self._config.batch_decisions

@@ -291,6 +291,6 @@ def test_bench_without_a_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["bench"]) == 2
     assert (
         capsys.readouterr().err
-        == "accerl: bench='': name what is measured: world, policy, lag, dream, efficiency, faults, ranking, "
-        "weights\n"
+        == "accerl: bench='': name what is measured: world, policy, throughput, scaling, async-vs-sync, "
+        "transport, weights, lag, dream, efficiency, faults, ranking\n"
     )

@@ -162,6 +162,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--env.max_steps=0"], "env.max_steps=0: use 1 to 500 env steps"),
     (["--seed=100"], "seed=100: use 0 to 99"),
     (["--launch.engine=slurm"], "launch.engine='slurm': use ray or local"),
+    (["--launch.transport=tcp"], "launch.transport='tcp': use one of auto, ray, shared_memory"),
     (["--rollout.group_size=1"], "rollout.group_size=1: groups of one have no comparison; use 0"),
     (["--rollout.group_advantage=gae"], "rollout.group_advantage='gae': use one of grpo, rloo, grpo_no_std"),
     (
@@ -324,6 +325,6 @@ def test_types_in_words(hint: Any, words: str) -> None:
 
 
 def test_changes_are_not_sent_within_one_process():
-    with pytest.raises(InputError, match=r"^trainer.publish_changes=True: launch.engine=local is one process"):
+    with pytest.raises(InputError, match=r"^trainer.publish_changes=True: launch.engine=local"):
         parse(RunConfig, ["--launch.engine=local", "--trainer.publish_changes=true"])
     assert parse(RunConfig, ["--trainer.publish_changes=true"]).trainer.publish_changes

@@ -40,15 +40,8 @@ HEADER = (
     '# Licensed under the Apache License, Version 2.0 (the "License");\n'
 )
 LONGEST_FILE = 400
-SHELLS = {
-    "launch.py",
-    "seats.py",
-    "watched.py",
-    "doctor.py",
-    "ray_channel.py",
-    "weights_readers.py",
-    "worker.py",
-}
+RAYS = {"ray_channel.py", "ray_calls.py", "transport_ends.py", "weights_readers.py"}
+SHELLS = {"launch.py", "seats.py", "watched.py", "doctor.py", "worker.py"} | RAYS
 """Files that may import Ray; all others are testable without it."""
 
 LIGHT = [

@@ -20,18 +20,18 @@
 
     ends        with the process; an exception fails every caller that waits or comes later, and ends the run
 
-The event loop only queues and answers; forward passes run on a thread of their own, so requests are
-accepted meanwhile.
+One thread does all of it: it waits for callers and for the batcher's clock at once, runs the forward pass and
+replies; what is sent meanwhile lies in shared memory. Ray's calls come in on the event loop beside it, which
+only hands them over.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
+import threading
 import time
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,7 +43,12 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
+from accerl_lerobot.transport.contract import Asked, Server, stopped
+from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
 from accerl_lerobot.weights.reader import Received, SharedMemoryReader
+
+LOOK_S = 1.0
+"""How long the thread that serves waits at most before it looks whether it is still wanted."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,20 +68,6 @@ class InferenceConfig:
                 raise InputError(f"inference.{name}", getattr(self, name), "use at least 1")
         if not 0 <= self.max_wait_s < 10:
             raise InputError("inference.max_wait_s", self.max_wait_s, "use seconds in [0, 10)")
-
-
-class ServiceStoppedError(RuntimeError):
-    """The caller did nothing wrong: the service behind it had failed, and says why where it failed."""
-
-
-class _Waiting:
-    """Requests of one caller and where their answer goes."""
-
-    def __init__(self, requests: Sequence[Request], future: asyncio.Future[list[Decision]]) -> None:
-        self.requests, self.future = requests, future
-
-    def __len__(self) -> int:
-        return len(self.requests)
 
 
 class InferenceWorker:
@@ -102,25 +93,32 @@ class InferenceWorker:
 
         torch.set_num_threads(config.num_threads)
         self._adapter = loader(load)(policy)
-        self._batcher: Batcher[_Waiting] = Batcher(config.max_batch, config.max_wait_s)
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="forward")
-        self._wake = asyncio.Event()
+        self._batcher: Batcher[Asked] = Batcher(config.max_batch, config.max_wait_s)
+        self._server = Server(self._take)
         self._version = version
         if state is not None:
             self._adapter.load_trainable(snapshot.load(state / WEIGHTS))
         self._received = -1
-        self._published: Received | None = None
+        # Shared by two threads: appending and popping are atomic, and only the newest of each is kept.
+        self._published: deque[Received] = deque(maxlen=1)
+        self._together: deque[int] = deque(maxlen=1)
         self._reader: SharedMemoryReader | None = None
         self._broken: BaseException | None = None
         self._swap_s = self._publish_to_served_s = 0.0
         self._unserved_since: float | None = None
         self._failure: BaseException | None = None
-        self._busy_s = 0.0
+        self._over = False
+        self._busy_s = self._busy_told_s = 0.0
         self._since = time.monotonic()
 
     async def ready(self) -> int:
         """Answers once the policy is loaded; returns this process's id."""
         return os.getpid()
+
+    async def listen(self) -> Address:
+        """Offers shared memory to its callers and says where; before `serve`."""
+        self._server = server = SharedMemoryServer(self._take, copy=False)
+        return server.address
 
     async def decide(self, requests: list[Request]) -> list[Decision]:
         """Answers a caller's requests, in order, as part of some batch.
@@ -128,12 +126,11 @@ class InferenceWorker:
         Raises:
             ServiceStoppedError: `serve` has failed, before or after this call began.
         """
-        if self._failure is not None:
-            raise _stopped(self._failure)
-        waiting = _Waiting(requests, asyncio.get_running_loop().create_future())
-        self._batcher.add(waiting, time.monotonic())
-        self._wake.set()
-        return await waiting.future
+        answer = self._server.call(requests)
+        if self._failure is not None:  # looked at after the call: `serve` hands over once more when it fails
+            raise stopped(self._failure)
+        decisions: list[Decision] = await asyncio.wrap_future(answer)
+        return decisions
 
     async def receive_weights(self, version: int, tensors: dict[str, np.ndarray], published_s: float) -> int:
         """Takes a published set; it serves from the next batch on. What is not newer is ignored."""
@@ -142,13 +139,8 @@ class InferenceWorker:
 
     async def open_weights(self, address: str) -> bool:
         """Receives weights through shared memory from now on; False if that is not to be had from here."""
-        loop = asyncio.get_running_loop()
         try:
-            self._reader = SharedMemoryReader(
-                address,
-                deliver=lambda received: loop.call_soon_threadsafe(self._offer, received),
-                failed=lambda error: loop.call_soon_threadsafe(self._break, error),
-            )
+            self._reader = SharedMemoryReader(address, deliver=self._offer, failed=self._break)
         except OSError:
             return False
         return True
@@ -156,42 +148,48 @@ class InferenceWorker:
     def _offer(self, received: Received) -> None:
         if received.version > self._received:
             self._received = received.version
-            self._published = received
-            self._wake.set()
+            self._published.append(received)
+            self._server.wake()
         else:
             received.release()
 
     def _break(self, error: BaseException) -> None:
         self._broken = error
-        self._wake.set()
+        self._server.wake()
 
     async def lock_step(self, observations: int) -> None:
         """See `Batcher.lock_step`."""
-        self._batcher.lock_step(observations)
-        self._wake.set()
+        self._together.append(observations)
+        self._server.wake()
 
     async def serve(self) -> None:
         """Serves until the process ends; an exception here ends the run."""
+        loop = asyncio.get_running_loop()
+        ended: asyncio.Future[None] = loop.create_future()
+
+        def tell(error: BaseException | None) -> None:
+            if not ended.done():
+                ended.set_exception(error) if error else ended.set_result(None)
+
+        def work() -> None:
+            try:
+                self._serve()
+            except BaseException as error:
+                loop.call_soon_threadsafe(tell, error)
+
+        threading.Thread(target=work, name="serve", daemon=True).start()
         try:
-            while True:
-                await self._wait()
-                await self._swap()
-                if self._batcher.due(time.monotonic()):
-                    await self._serve_batch(self._batcher.take(time.monotonic()))
-        except BaseException as error:
-            self._failure = error
-            if self._reader is not None:
-                self._reader.close()
-            while batch := self._batcher.take(time.monotonic()):
-                _fail(batch, error)
-            raise
+            await ended
+        finally:
+            self._over = True
+            self._server.wake()
 
     async def metrics(self) -> dict[str, float]:
         """Batching statistics, the version served, the busy share since the last call, and of the last
         swap of weights how long it took and how long after their publication they served first."""
-        now = time.monotonic()
-        share, self._busy_s = self._busy_s / max(1e-9, now - self._since), 0.0
-        self._since = now
+        now, busy_s = time.monotonic(), self._busy_s
+        share = (busy_s - self._busy_told_s) / max(1e-9, now - self._since)
+        self._since, self._busy_told_s = now, busy_s
         return {
             **self._batcher.stats.metrics(),
             "version": float(self._version),
@@ -200,61 +198,61 @@ class InferenceWorker:
             "publish_to_served_s": self._publish_to_served_s,
         }
 
-    async def _wait(self) -> None:
-        """Returns when a batch is due or weights have arrived.
+    def _serve(self) -> None:
+        batch: list[Asked] = []
+        try:
+            while not self._over:
+                self._server.poll(self._patience())
+                if self._together:
+                    self._batcher.lock_step(self._together.popleft())
+                self._swap()
+                if self._batcher.due(time.monotonic()):
+                    batch = self._batcher.take(time.monotonic())
+                    self._serve_batch(batch)
+                    batch = []
+        except BaseException as error:
+            self._failure = error
+            if self._reader is not None:
+                self._reader.close()
+            self._server.poll(0.0)
+            while batch:
+                for asked in batch:
+                    asked.fail(error)
+                batch = self._batcher.take(time.monotonic())
+            self._server.close()
+            raise
 
-        The event only says that something may have changed. It is cleared before the state is looked at, and
-        nothing runs in between, so a request that arrives at any moment is either seen or sets it again.
-        """
-        while True:
-            self._wake.clear()
-            deadline, now = self._batcher.next_deadline(), time.monotonic()
-            arrived = self._published is not None or self._broken is not None
-            if arrived or (deadline is not None and now >= deadline):
-                return
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._wake.wait(), None if deadline is None else deadline - now)
+    def _take(self, asked: Asked) -> None:
+        try:
+            self._batcher.add(asked, asked.sent)
+        except (TypeError, ValueError) as error:  # no list of requests, or an empty one
+            asked.fail(error)
 
-    async def _swap(self) -> None:
+    def _patience(self) -> float:
+        """How long nothing is to be done unless something comes, in seconds."""
+        deadline = self._batcher.next_deadline()
+        return LOOK_S if deadline is None else max(0.0, deadline - time.monotonic())
+
+    def _swap(self) -> None:
         if self._broken is not None:
             raise self._broken
-        if self._published is None:
-            return
-        received, self._published = self._published, None
-        started = time.monotonic()
-        await asyncio.get_running_loop().run_in_executor(
-            self._pool, self._adapter.load_trainable, received.tensors, received.changed
-        )
-        received.release()
-        self._swap_s = time.monotonic() - started
-        self._version, self._unserved_since = received.version, received.published_s
+        if self._published:
+            received, started = self._published.popleft(), time.monotonic()
+            self._adapter.load_trainable(received.tensors, received.changed)
+            received.release()
+            self._swap_s = time.monotonic() - started
+            self._version, self._unserved_since = received.version, received.published_s
 
-    async def _serve_batch(self, batch: list[_Waiting]) -> None:
-        requests = [r for waiting in batch for r in waiting.requests]
+    def _serve_batch(self, batch: list[Asked]) -> None:
+        batch = [asked for asked in batch if not asked.gone]
+        requests = [request for asked in batch for request in asked.message]
         started = time.monotonic()
-        try:
-            decisions = await asyncio.get_running_loop().run_in_executor(
-                self._pool, self._adapter.decide, requests, self._version
-            )
-        except BaseException as error:
-            _fail(batch, error)
-            raise
+        decisions = self._adapter.decide(requests, self._version) if requests else []
         now = time.monotonic()
         self._busy_s += now - started
         if self._unserved_since is not None:
             self._publish_to_served_s, self._unserved_since = now - self._unserved_since, None
         start = 0
-        for waiting in batch:
-            if not waiting.future.done():  # the caller may have been cancelled meanwhile
-                waiting.future.set_result(decisions[start : start + len(waiting)])
-            start += len(waiting)
-
-
-def _stopped(error: BaseException) -> ServiceStoppedError:
-    return ServiceStoppedError(f"the inference service has stopped: {error!r}")
-
-
-def _fail(batch: list[_Waiting], error: BaseException) -> None:
-    for waiting in batch:
-        if not waiting.future.done():
-            waiting.future.set_exception(_stopped(error))
+        for asked in batch:
+            asked.answer(decisions[start : start + len(asked)])
+            start += len(asked)

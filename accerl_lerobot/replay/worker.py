@@ -38,6 +38,8 @@ from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.replay.mixed import MixedReplay
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.replay.turns import Schedule, Turns
+from accerl_lerobot.transport.on_loop import serve_on_loop
+from accerl_lerobot.transport.shared_memory import Address
 
 IN_TRANSIT = 1024
 """Newest real segments that are kept for those who dream, who ask for them several times a second."""
@@ -101,6 +103,10 @@ class ReplayWorker:
     async def ready(self) -> int:
         """Answers once this process is up; returns its id."""
         return os.getpid()
+
+    async def listen(self) -> Address:
+        """Offers shared memory to those who insert, and says where."""
+        return serve_on_loop(self.insert).address
 
     async def run(self) -> None:
         """Lasts until `close`; that it ends earlier is how the conductor learns of this process's death."""

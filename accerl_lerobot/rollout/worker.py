@@ -31,19 +31,20 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
-
-import ray
 
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.experience import Decision, Request, Segment
 from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig, RolloutRunner
+from accerl_lerobot.transport.contract import Caller
+from accerl_lerobot.transport.endpoint import Endpoint
 
 PARTS = 2
 """A worker's worlds are asked for in so many parts: one is stepped while the other's decisions are made."""
 AT_THE_DOOR = 2
-"""Insert calls that may be waiting before exploring worlds pause."""
+"""Messages to replay that may be waiting before exploring worlds pause."""
+QUEUE = 32
+"""Messages to replay that may be waiting before segments stay here: no transport carries any number."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,34 +141,34 @@ class RolloutWorker:
             spent=self._spent,
         )
 
-    def run(self, inference: Any, replay: Any) -> None:
+    def run(self, inference: Endpoint, replay: Endpoint) -> None:
         """Steps worlds until the process ends."""
+        deciding, door = inference.connect(), replay.connect()
         idle = list(range(len(self._runner)))
         due: dict[int, Request] = {}
-        under_way: dict[Any, list[int]] = {}
-        door: list[Any] = []
+        under_way: dict[int, list[int]] = {}
+        at_the_door: set[int] = set()
         size = max(1, len(self._runner) // PARTS)
         while True:
-            door = _still_waiting(door)
-            self._spent = self._plans.spent and not self._runner.exploring and not door
+            # Where no decision is awaited, there is nothing to wait for but the door, and orders.
+            at_the_door -= {ticket for ticket, _ in door.done(0.0 if under_way else 0.005)}
+            self._bring(door, at_the_door, size)
+            self._spent = self._plans.spent and not self._runner.exploring and not at_the_door
             self._give_up(due, idle)
             idle = [slot for slot in idle if not self._begin(slot, due)]
-            sendable = [slot for slot in due if len(door) < self._at_the_door or not due[slot].explore]
+            sendable = [slot for slot in due if len(at_the_door) < self._at_the_door or not due[slot].explore]
             for start in range(0, len(sendable), size):
                 slots = sendable[start : start + size]
-                under_way[inference.decide.remote([due.pop(slot) for slot in slots])] = slots
-            if not under_way:
-                time.sleep(0.005)
-                continue
-            done, _ = ray.wait(list(under_way), num_returns=1, timeout=0.5)
-            for reference in done:
-                slots = under_way.pop(reference)
-                for slot, decision in zip(slots, ray.get(reference), strict=True):
+                under_way[deciding.send([due.pop(slot) for slot in slots])] = slots
+            for ticket, decisions in deciding.done(0.5) if under_way else ():
+                for slot, decision in zip(under_way.pop(ticket), decisions, strict=True):
                     self._advance(slot, decision, due, idle)
-                # The segments of a whole group may come at once; replay's pace is for a few at a time.
-                for start in range(0, len(self._outbox), size):
-                    door.append(replay.insert.remote(self._outbox[start : start + size]))
-                self._outbox.clear()
+
+    def _bring(self, door: Caller, at_the_door: set[int], size: int) -> None:
+        """Brings segments to replay; those of a whole group may come at once, and its pace is for a few."""
+        while self._outbox and len(at_the_door) < QUEUE:
+            at_the_door.add(door.send(self._outbox[:size]))
+            del self._outbox[:size]
 
     def _begin(self, slot: int, due: dict[int, Request]) -> bool:
         with self._in_world():
@@ -203,13 +204,3 @@ class RolloutWorker:
     def _ended(self, result: EpisodeResult) -> None:
         self._plans.report(result)
         self._results.append(result)
-
-
-def _still_waiting(door: list[Any]) -> list[Any]:
-    """The insert calls that have not returned."""
-    if not door:
-        return door
-    done, waiting = ray.wait(door, num_returns=len(door), timeout=0)
-    for reference in done:
-        ray.get(reference)  # an insert that failed ends this worker
-    return list(waiting)

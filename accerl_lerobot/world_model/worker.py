@@ -37,6 +37,7 @@ import ray
 from accerl_lerobot import snapshot
 from accerl_lerobot.checkpoint import TRAINING_STATE, WORLD_MODEL
 from accerl_lerobot.experience import Segment
+from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.world_model.dreaming import make_imagination, make_learner
 from accerl_lerobot.world_model.online import Promotion
 
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
     from accerl_lerobot.config import RunConfig
 
 AT_THE_DOOR = 2
-"""Insert calls that may be waiting before dreams pause."""
+"""Messages to replay that may be waiting before dreams pause."""
 DREAMS, LEARNER = "dreams", "world_learner"
 """Names of their states."""
 PAUSE_S = 0.02
@@ -67,6 +68,8 @@ class DreamWorker:
         import torch
 
         torch.set_num_threads(config.trainer.num_threads)
+        # Inference that hangs is the conductor's to notice, which takes `stall_s`; this is for the worst.
+        self._patience_s = 2 * config.launch.stall_s
         self._share, self._batch = config.imagination.share, config.inference.max_batch
         self._outbox: list[Segment] = []
         self._dreams = make_imagination(config, "dream", self._outbox.append)
@@ -109,10 +112,11 @@ class DreamWorker:
             snapshot.save(directory / TRAINING_STATE / DREAMS, saved)
             self._dreams.save_promoted(directory / WORLD_MODEL)
 
-    def run(self, inference: Any, replay: Any) -> None:
+    def run(self, inference: Endpoint, inserting: Endpoint, replay: Any) -> None:
         """Dreams until replay is closed."""
         news, told = _News(replay, self._cursor), None
-        door: list[Any] = []
+        deciding, door = inference.connect(), inserting.connect()
+        at_the_door: set[int] = set()
         while not news.closed:
             with self._dreaming:
                 promising = self._swap()
@@ -123,20 +127,21 @@ class DreamWorker:
             if told != (self._dreams.on, promising):
                 told = (self._dreams.on, promising)
                 ray.get(replay.mix.remote(self._share if self._dreams.on else 0.0, any(told)))
-            done, door = ray.wait(door, num_returns=len(door), timeout=0) if door else ([], [])
-            if not all(ray.get(list(done))):
-                return
+            for ticket, stored in door.done(0.0):
+                at_the_door.discard(ticket)
+                if not stored:
+                    return
             with self._dreaming:
-                requests = [] if len(door) >= AT_THE_DOOR else self._dreams.requests()
+                requests = [] if len(at_the_door) >= AT_THE_DOOR else self._dreams.requests()
             if not requests:
                 time.sleep(PAUSE_S)
                 continue
             parts = [requests[i : i + self._batch] for i in range(0, len(requests), self._batch)]
-            answers = ray.get([inference.decide.remote(part) for part in parts])
+            answers = deciding.ask(parts, self._patience_s)
             with self._dreaming:
                 self._dreams.advance([decision for answer in answers for decision in answer])
                 if self._outbox:
-                    door.append(replay.insert.remote(list(self._outbox)))
+                    at_the_door.add(door.send(self._outbox))
                     self._outbox.clear()
 
     def _swap(self) -> bool:

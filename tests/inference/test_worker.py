@@ -25,9 +25,10 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.experience import TASK, Decision, Request
-from accerl_lerobot.inference.worker import InferenceConfig, InferenceWorker, ServiceStoppedError
+from accerl_lerobot.inference.worker import InferenceConfig, InferenceWorker
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.transport.contract import ServiceStoppedError
 from accerl_lerobot.weights import shared_memory
 from accerl_lerobot.weights.publisher import ReaderLostError
 from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher

@@ -30,15 +30,14 @@ from accerl_lerobot.experience import TASK, Request
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import normal
 from accerl_lerobot.policies.samplers import DiffusionSamplerConfig
-from accerl_lerobot.rollout import worker as module
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.rollout.worker import RolloutWorker
 from accerl_lerobot.trainer.config import TrainerConfig
-from tests.local_ray import Handle, Local
 from tests.policies.checkpoints import write_diffusion
 from tests.policies.contract import PolicyContract
 from tests.policies.tiny import adapter_at, looking_back, requests
 from tests.runs import tiny_run
+from tests.transport.played import played
 
 OBSERVED = 2
 STATE = "observation.state"
@@ -141,7 +140,7 @@ def test_a_world_without_a_history_is_refused_in_words(path: Path):
         adapter_at(path).decide([request], 0)
 
 
-def test_a_rollout_process_asks_with_the_history(monkeypatch: pytest.MonkeyPatch):
+def test_a_rollout_process_asks_with_the_history():
     worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), ("match",), 0, 0, 0, (8, 2), OBSERVED)
     asked: list[Request] = []
 
@@ -149,9 +148,8 @@ def test_a_rollout_process_asks_with_the_history(monkeypatch: pytest.MonkeyPatch
         asked.extend(due)
         raise InterruptedError
 
-    monkeypatch.setattr(module, "ray", Local)
     worker.report(True, [])
     with pytest.raises(InterruptedError):
-        worker.run(Handle(decide=decide), Handle(insert=lambda segments: True))
+        worker.run(played(decide), played(lambda segments: True))
     assert asked[0].observation[STATE].shape == (OBSERVED, 4)
     assert asked[0].observation["observation.images.front"].shape == (OBSERVED, 40, 40, 3)

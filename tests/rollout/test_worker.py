@@ -31,8 +31,8 @@ from accerl_lerobot.experience import Decision, Request, Segment
 from accerl_lerobot.rollout import worker as module
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
 from accerl_lerobot.rollout.worker import AT_THE_DOOR, RolloutWorker
-from tests.local_ray import Handle, Local
 from tests.rollout.worlds import evaluate
+from tests.transport.played import played
 
 WORLD = SimulatedConfig(max_steps=8, tolerance=0.05)
 
@@ -97,7 +97,7 @@ class Stage:
 
     def _run(self) -> None:
         try:
-            self.worker.run(Handle(decide=self._decide), Handle(insert=self._insert))
+            self.worker.run(played(self._decide), played(self._insert))
         except OverError:
             pass
         except BaseException as error:
@@ -110,8 +110,7 @@ def a_decision() -> Decision:
 
 
 @pytest.fixture
-def stage(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Stage]]:
-    monkeypatch.setattr(module, "ray", Local)
+def stage() -> Iterator[Callable[..., Stage]]:
     made: list[Stage] = []
 
     def make(insert: Callable[[list[Segment]], Any], **config: Any) -> Stage:
@@ -247,7 +246,7 @@ def test_an_insert_that_fails_ends_the_worker(stage):
     assert isinstance(one.failure, OSError)
 
 
-def test_a_restarted_worker_uses_other_keys_and_other_seeds(monkeypatch: pytest.MonkeyPatch):
+def test_a_restarted_worker_uses_other_keys_and_other_seeds():
     plans = []
     for incarnation in (0, 1):
         worker = RolloutWorker(WORLD, RolloutConfig(), ("match",), 0, 0, incarnation, (8, 2))

@@ -1,0 +1,71 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Where a service is reached, and by which transport."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.transport.contract import Caller
+from accerl_lerobot.transport.shared_memory import Address, SharedMemoryCaller, available, this_node
+
+Transport = Literal["auto", "ray", "shared_memory"]
+FIELD = "launch.transport"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Endpoint:
+    """What a worker needs in order to call a service.
+
+    Example:
+        >>> inference = Endpoint(name="inference", method=actor.decide, address=address)
+        >>> caller = inference.connect()  # in the process that calls
+    """
+
+    name: str
+    """Of the service, for messages."""
+    method: Any
+    """Of the actor's handle; the way through Ray."""
+    address: Address | None = None
+    """Of its shared memory; None: only Ray leads there."""
+    transport: Transport = "auto"
+
+    def connect(self) -> Caller:
+        """A connection of this process's own.
+
+        Raises:
+            InputError: shared memory was asked for, and the service is on another node.
+            ServiceStoppedError: the service is gone.
+        """
+        if self.address is not None and available() and self.address.node == this_node():
+            return SharedMemoryCaller(self.name, self.address)
+        if self.transport == "shared_memory":
+            remedy = f"{self.name} is on another node; use auto or ray"
+            raise InputError(FIELD, self.transport, remedy)
+        from accerl_lerobot.transport.ray_calls import RayCaller
+
+        return RayCaller(self.name, self.method)
+
+
+def listens(transport: Transport) -> bool:
+    """Whether services are to offer shared memory to their callers.
+
+    Raises:
+        InputError: it was asked for and this system does not have it.
+    """
+    if transport == "shared_memory" and not available():
+        raise InputError(FIELD, transport, "this system has no memfd, epoll and eventfd; use auto or ray")
+    return transport != "ray" and available()

@@ -1,0 +1,144 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Memory that two processes share, and the tokens that say what is in it.
+
+A slot is a memfd: it has no name, so nothing is left of it when whoever maps it is gone, however that ended.
+Its size is sealed, so that neither end can take pages away under the other's feet.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import mmap
+import os
+import socket
+import struct
+from typing import NamedTuple
+
+from accerl_lerobot.transport.codec import DamagedMessageError
+
+LARGEST = 2**31
+"""Bytes of a slot at most."""
+LEAST = 2**16
+"""Bytes of a slot at least; what a message leaves of it is room for the reply."""
+SLOTS = 64
+"""Of one caller at most, and so messages that it may have under way. Their tokens fit into the buffers of the
+two sockets, so no end ever waits for the other one to read."""
+_TOKEN = struct.Struct("<BIQQQd")
+_ROOM_FOR_A_FILE = socket.CMSG_LEN(struct.calcsize("i"))
+
+ASK, ANSWER, FAIL = range(3)
+"""What a token is for."""
+
+
+class Token(NamedTuple):
+    """What goes through the socket; a file goes with it where the slot is new or has been replaced."""
+
+    what: int
+    slot: int
+    ticket: int
+    start: int
+    """Of the message in the slot."""
+    size: int
+    """Of the message."""
+    sent: float
+    """On `time.monotonic`."""
+
+
+class Slot:
+    """Shared memory of a fixed size, which lasts as long as somebody refers to it or to a view of it.
+
+    Args:
+        file: of it; not needed any more, as the mapping keeps one of its own.
+
+    Raises:
+        DamagedMessageError: it is not one that `new_file` makes.
+    """
+
+    def __init__(self, file: int) -> None:
+        try:
+            self.size = os.fstat(file).st_size
+            if not LEAST <= self.size <= LARGEST or not _sealed(file):
+                raise DamagedMessageError(f"no slot, but a file of {self.size} bytes whose size may change")
+            self.memory = mmap.mmap(file, self.size)
+        except OSError as error:
+            raise DamagedMessageError(f"a slot that cannot be mapped: {error}") from error
+
+
+def new_file(room: int) -> int:
+    """Shared memory for at least so many bytes, as a file descriptor.
+
+    Raises:
+        TypeError: nothing that large is sent.
+    """
+    size = max(LEAST, 1 << (room - 1).bit_length())
+    if size > LARGEST:
+        raise TypeError(f"a message of {room} bytes cannot be sent; there is room for {LARGEST}")
+    file = os.memfd_create("accerl", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    try:
+        os.ftruncate(file, size)
+        fcntl.fcntl(file, fcntl.F_ADD_SEALS, _wanted_seals())
+    except BaseException:
+        os.close(file)
+        raise
+    return file
+
+
+def send(connection: socket.socket, token: Token, file: int | None = None) -> None:
+    """Sends a token; a file goes along and is closed here."""
+    if file is None:
+        connection.send(_TOKEN.pack(*token))
+        return
+    try:
+        socket.send_fds(connection, [_TOKEN.pack(*token)], [file])
+    finally:
+        os.close(file)
+
+
+def receive(connection: socket.socket) -> tuple[Token, Slot | None] | None:
+    """The next token, and the slot that came with it; None if the other end is gone.
+
+    Raises:
+        DamagedMessageError: that was none.
+    """
+    packet, ancillary, _, _ = connection.recvmsg(_TOKEN.size + 1, _ROOM_FOR_A_FILE)
+    file = None
+    for level, kind, data in ancillary:
+        if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
+            (file,) = struct.unpack("i", data)  # the kernel keeps what there is no room for
+    try:
+        if not packet:
+            return None
+        if len(packet) != _TOKEN.size:
+            raise DamagedMessageError(f"a token of {len(packet)} bytes")
+        return Token._make(_TOKEN.unpack(packet)), None if file is None else Slot(file)
+    finally:
+        if file is not None:
+            os.close(file)
+
+
+def same_user(connection: socket.socket) -> bool:
+    """Whether the process at the other end is of this user."""
+    size = struct.calcsize("3i")
+    _, user, _ = struct.unpack("3i", connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size))
+    return bool(user == os.getuid())
+
+
+def _wanted_seals() -> int:
+    return fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
+
+
+def _sealed(file: int) -> bool:
+    wanted = _wanted_seals()
+    return fcntl.fcntl(file, fcntl.F_GET_SEALS) & wanted == wanted

@@ -1,0 +1,66 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A service that a test plays, so that a worker's loop runs in the test's own process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from typing import Any
+
+from accerl_lerobot.transport.contract import Caller
+from accerl_lerobot.transport.endpoint import Endpoint
+
+
+class PlayedCaller(Caller):
+    """Replies are what a function returns, or what is put into a future that it returns."""
+
+    def __init__(self, name: str, answer: Callable[[Any], Any]) -> None:
+        super().__init__(name)
+        self._answer = answer
+        self._under_way: dict[int, Future[Any]] = {}
+        self._sent = 0
+
+    def send(self, message: Any) -> int:
+        answer = self._answer(message)
+        if not isinstance(answer, Future):
+            future: Future[Any] = Future()
+            future.set_result(answer)
+            answer = future
+        self._sent += 1
+        self._under_way[self._sent] = answer
+        return self._sent
+
+    def done(self, timeout: float) -> list[tuple[int, Any]]:
+        wait(self._under_way.values(), timeout=timeout, return_when=FIRST_COMPLETED)
+        done = [ticket for ticket, future in self._under_way.items() if future.done()]
+        return [(ticket, self._under_way.pop(ticket).result()) for ticket in done]
+
+    def forget(self, ticket: int) -> None:
+        self._under_way.pop(ticket, None)
+
+    def close(self) -> None:
+        self._under_way.clear()
+
+
+class PlayedEndpoint(Endpoint):
+    """Leads to a function of the test."""
+
+    def connect(self) -> Caller:
+        return PlayedCaller(self.name, self.method)
+
+
+def played(answer: Callable[[Any], Any]) -> Endpoint:
+    """An endpoint at which `answer` replies."""
+    return PlayedEndpoint(name="played", method=answer)

@@ -1,0 +1,374 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What only shared memory can get wrong: slots, their files, tokens, strangers."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.transport import shared_memory, slots
+from accerl_lerobot.transport.codec import encode
+from accerl_lerobot.transport.contract import Asked, Caller, ServiceStoppedError
+from accerl_lerobot.transport.shared_memory import SharedMemoryCaller, SharedMemoryServer, available
+from accerl_lerobot.transport.slots import ASK, LEAST, SLOTS, Token, new_file
+
+pytestmark = pytest.mark.skipif(not available(), reason="no memfd, epoll and eventfd here")
+LONG_S = 30.0
+
+
+class Stage:
+    """A service in the test's own process: what is asked lies in `asked` until the test answers."""
+
+    def __init__(self, copy: bool) -> None:
+        self.asked: list[Asked] = []
+        self.server = SharedMemoryServer(self.asked.append, copy=copy)
+        self.callers: list[SharedMemoryCaller] = []
+
+    def caller(self) -> SharedMemoryCaller:
+        self.callers.append(SharedMemoryCaller("service", self.server.address))
+        return self.callers[-1]
+
+    def await_asked(self, count: int) -> list[Asked]:
+        """Polls until so many messages have come; takes them."""
+        self.until(lambda: len(self.asked) >= count)
+        taken, self.asked[:] = list(self.asked), []
+        return taken
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + LONG_S
+        while not condition():
+            assert time.monotonic() < deadline, "it did not happen"
+            self.server.poll(0.05)
+
+    def raw(self) -> socket.socket:
+        """A connection that says what the test wants."""
+        end = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        end.settimeout(LONG_S)
+        end.connect(f"\0{self.server.address.name}")
+        return end
+
+
+@pytest.fixture
+def stage() -> Iterator[Callable[..., Stage]]:
+    made: list[Stage] = []
+
+    def make(*, copy: bool = False) -> Stage:
+        made.append(Stage(copy))
+        return made[-1]
+
+    yield make
+    for one in made:
+        for caller in one.callers:
+            caller.close()
+        one.server.close()
+
+
+def mapped() -> int:
+    """Slots that this process has mapped."""
+    return len(re.findall(r"memfd:accerl", Path("/proc/self/maps").read_text()))
+
+
+def test_messages_are_views_of_the_slot_until_the_answer_or_copies_if_so_asked(stage):
+    image = np.arange(1000, dtype=np.int32)
+    for copy in (False, True):
+        one = stage(copy=copy)
+        caller = one.caller()
+        caller.send(image)
+        (asked,) = one.await_asked(1)
+        np.testing.assert_array_equal(asked.message, image)
+        assert asked.message.flags.owndata is copy
+        kept = asked.message
+        asked.answer(None)
+        assert caller.done(LONG_S) == [(1, None)]
+        caller.send(-image)
+        (asked,) = one.await_asked(1)
+        assert (kept == (image if copy else -image)).all(), "the slot is the same, and so is its memory"
+
+
+def test_a_reply_may_consist_of_what_was_asked(stage):
+    one = stage()
+    caller = one.caller()
+    parts = [np.arange(5000) + i for i in range(4)]
+    caller.send(parts)
+    (asked,) = one.await_asked(1)
+    asked.answer({"turned": asked.message[::-1], "twice": asked.message + asked.message, "more": "text" * 50})
+    ((_, reply),) = caller.done(LONG_S)
+    for i in range(4):
+        np.testing.assert_array_equal(reply["turned"][i], parts[3 - i])
+        np.testing.assert_array_equal(reply["twice"][4 + i], parts[i])
+
+
+def test_messages_of_all_callers_are_handed_over_oldest_first(stage):
+    one = stage()
+    callers = [one.caller() for _ in range(3)]
+    order = [2, 0, 1, 1, 0, 2, 2, 0]
+    for i in order:
+        callers[i].send(i)
+    taken = one.await_asked(len(order))
+    assert [asked.message for asked in taken] == order
+    assert all(earlier.sent <= later.sent for earlier, later in zip(taken, taken[1:], strict=False))
+
+
+def test_slots_are_used_again_and_replaced_by_larger_ones_only(stage):
+    one, before = stage(), mapped()
+    caller = one.caller()
+    for size in (10, LEAST * 3, 20, LEAST * 3, LEAST * 20, 30):
+        for _ in range(3):
+            caller.send(np.zeros(size, np.uint8))
+            (asked,) = one.await_asked(1)
+            asked.answer(size)
+            del asked
+            assert caller.done(LONG_S)[0][1] == size
+    assert mapped() - before == 2, "one slot, mapped at either end"
+
+
+def test_a_reply_that_is_too_large_brings_its_own_slot(stage):
+    one, before = stage(), mapped()
+    caller = one.caller()
+    for _ in range(3):
+        caller.send("much")
+        (asked,) = one.await_asked(1)
+        asked.answer(np.full(LEAST * 5, 9, np.uint8))
+        del asked
+        ((_, reply),) = caller.done(LONG_S)
+        assert reply.shape == (LEAST * 5,) and (reply == 9).all()
+    assert mapped() - before == 2
+
+
+def test_no_more_are_under_way_than_have_slots(stage):
+    one = stage()
+    caller = one.caller()
+    tickets = [caller.send(i) for i in range(SLOTS)]
+    with pytest.raises(TimeoutError, match=f"service: none of {SLOTS} messages under way has been answered"):
+        caller.send("one more")
+    for asked in one.await_asked(SLOTS):
+        asked.answer(asked.message)  # nobody reads meanwhile, and no end waits for the other
+    assert caller.done(LONG_S) == [(ticket, i) for i, ticket in enumerate(tickets)]
+    assert caller.send("again") == SLOTS + 1
+
+
+def files() -> int:
+    """That this process has open, but for what the slots that it has mapped keep: one each."""
+    return len(os.listdir("/proc/self/fd")) - mapped()
+
+
+def test_slots_leave_no_files_open_but_their_own(stage):
+    one = stage()
+    callers = [one.caller() for _ in range(2)]
+    one.until(lambda: len(one.server._connections) == 2)
+    before, slots_before = files(), mapped()
+    for caller in callers:
+        for size in (1, LEAST * 2, LEAST * 40):
+            caller.send(np.zeros(size, np.uint8))
+    one.await_asked(6)
+    assert files() == before and mapped() == slots_before + 12
+
+
+ASKING = """
+import sys, time, numpy as np
+from accerl_lerobot.transport.shared_memory import Address, SharedMemoryCaller
+caller = SharedMemoryCaller("service", Address(*sys.argv[1:]))
+for _ in range(3):
+    caller.send(np.zeros(100_000, np.uint8))
+time.sleep(600)
+"""
+
+
+def test_what_a_killed_caller_had_asked_is_forgotten_and_its_memory_freed(stage):
+    one, before = stage(), mapped()
+    patient = one.caller()
+    process = subprocess.Popen([sys.executable, "-c", ASKING, *one.server.address])
+    try:
+        taken = one.await_asked(3)
+        patient.send("still here")
+        (other,) = one.await_asked(1)
+        assert mapped() - before == 3 + 2 and not any(asked.gone for asked in taken)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    one.until(lambda: all(asked.gone for asked in taken))
+    taken[0].answer("nobody is there")
+    taken[1].fail(ValueError("nobody is there"))
+    taken.clear()
+    assert mapped() - before == 2 and not other.gone
+    other.answer("yes")
+    assert patient.done(LONG_S)[0][1] == "yes"
+
+
+def test_a_service_that_closes_is_noticed_and_refuses_new_callers(stage):
+    one = stage()
+    waiting, idle = one.caller(), one.caller()
+    waiting.send(1)
+    one.await_asked(1)
+    one.server.close()
+    for caller in (waiting, idle):
+        with pytest.raises(ServiceStoppedError, match="service is gone"):
+            caller.done(LONG_S)
+        with pytest.raises(ServiceStoppedError, match="service is gone"):
+            caller.send(2)
+    with pytest.raises(ServiceStoppedError, match="service cannot be connected to"):
+        one.caller()
+    one.server = SharedMemoryServer(one.asked.append, copy=False)  # for the fixture to close
+
+
+def test_threads_of_the_same_process_call_and_wake(stage):
+    one = stage()
+    answers: list[Any] = []
+    started = time.monotonic()
+    caller = threading.Thread(target=lambda: answers.append(one.server.call([1, 2]).result(LONG_S)))
+    caller.start()
+    while not one.asked:
+        one.server.poll(LONG_S)
+    one.asked.pop().answer("both")
+    caller.join(LONG_S)
+    one.server.wake()
+    one.server.poll(LONG_S)
+    assert answers == ["both"] and time.monotonic() - started < LONG_S
+
+
+def test_other_users_are_refused_at_both_ends(stage, monkeypatch: pytest.MonkeyPatch):
+    one = stage()
+    end = one.raw()
+    assert slots.same_user(end)
+    monkeypatch.setattr(slots.os, "getuid", lambda: os.geteuid() + 1)
+    with pytest.raises(ServiceStoppedError, match="service: another user's process has taken its place"):
+        one.caller()
+    one.server.poll(LONG_S)
+    assert end.recv(1) == b"" and not one.server._connections
+
+
+def test_nothing_is_left_with_a_name(stage):
+    one = stage()
+    one.caller().send(1)
+    one.await_asked(1)
+    names = [line.split()[-1] for line in Path("/proc/net/unix").read_text().splitlines()[1:]]
+    assert f"@{one.server.address.name}" in names
+    assert len(one.server.address.name) >= 32 and not list(Path("/dev/shm").glob("*accerl*"))
+    other = SharedMemoryServer(one.asked.append, copy=False)
+    assert other.address.name != one.server.address.name
+    other.close()
+
+
+def asks(slot: int, start: int, size: int) -> Token:
+    return Token(ASK, slot, 1, start, size, time.monotonic())
+
+
+def unsealed() -> int:
+    file = os.memfd_create("accerl", os.MFD_ALLOW_SEALING)
+    os.ftruncate(file, LEAST)
+    return file
+
+
+def tiny() -> int:
+    file = os.memfd_create("accerl", os.MFD_ALLOW_SEALING)
+    os.ftruncate(file, 100)
+    slots.fcntl.fcntl(file, slots.fcntl.F_ADD_SEALS, slots._wanted_seals())
+    return file
+
+
+NONSENSE: dict[str, Callable[[socket.socket], None]] = {
+    "short": lambda end: end.send(b"x"),
+    "long": lambda end: end.send(b"x" * 1000),
+    "no slot": lambda end: slots.send(end, asks(0, 0, 100)),
+    "no such slot": lambda end: slots.send(end, asks(SLOTS, 0, 100), new_file(1)),
+    "no question": lambda end: slots.send(end, asks(0, 0, 100)._replace(what=77), new_file(1)),
+    "before the slot": lambda end: slots.send(end, asks(0, 2**63, 100), new_file(1)),
+    "beyond the slot": lambda end: slots.send(end, asks(0, 0, LEAST + 1), new_file(1)),
+    "far beyond": lambda end: slots.send(end, asks(0, 64, 2**63), new_file(1)),
+    "not sealed": lambda end: slots.send(end, asks(0, 0, 100), unsealed()),
+    "too small": lambda end: slots.send(end, asks(0, 0, 100), tiny()),
+    "no memory": lambda end: slots.send(end, asks(0, 0, 100), os.open("/dev/null", os.O_RDWR)),
+    "a folder": lambda end: slots.send(end, asks(0, 0, 100), os.open("/", os.O_RDONLY)),
+}
+
+
+@pytest.mark.parametrize("nonsense", NONSENSE.values(), ids=NONSENSE.keys())
+def test_who_talks_nonsense_is_dropped_and_nobody_else(stage, nonsense: Callable[[socket.socket], None]):
+    one = stage()
+    caller, end = one.caller(), one.raw()
+    one.until(lambda: len(one.server._connections) == 2)
+    before = files()
+    nonsense(end)
+    caller.send("sense")
+    (asked,) = one.await_asked(1)
+    one.until(lambda: len(one.server._connections) == 1)
+    assert end.recv(1000) == b""
+    asked.answer("good")
+    assert caller.done(LONG_S)[0][1] == "good"
+    assert files() == before - 1, "the end of the connection is closed, and so is what came with the token"
+
+
+@pytest.mark.parametrize("place", [(0, 0), (0, 3), (0, 1000), (64, LEAST - 64)])
+def test_a_message_that_cannot_be_read_is_answered_so(stage, place: tuple[int, int]):
+    one = stage()
+    end = one.raw()
+    slots.send(end, asks(0, *place), new_file(1))
+    one.until(lambda: bool(one.server._connections))
+    one.server.poll(0.0)
+    received = slots.receive(end)
+    assert received is not None and received[0].what == slots.FAIL and not one.asked
+
+
+def test_a_slot_is_asked_once_at_a_time(stage):
+    one = stage()
+    end, encoded = one.raw(), encode("first")
+    slot = slots.Slot(file := new_file(1))
+    encoded.write(slot.memory, 0)
+    slots.send(end, asks(0, 0, encoded.size), file)
+    (asked,) = one.await_asked(1)
+    slots.send(end, asks(0, 0, encoded.size))
+    one.until(lambda: asked.gone)
+    assert end.recv(1000) == b""
+
+
+def test_a_caller_does_not_believe_a_strange_reply(stage):
+    one = stage()
+    caller = one.caller()
+    ticket = caller.send("question")
+    one.await_asked(1)
+    (connection,) = one.server._connections.values()
+    slots.send(connection.socket, Token(slots.ANSWER, 0, ticket + 5, 0, 10, 0.0))
+    with pytest.raises(ServiceStoppedError, match="a reply to message 6, which was not asked"):
+        caller.done(LONG_S)
+    other = one.caller()
+    ticket = other.send("question")
+    one.await_asked(1)
+    connection = list(one.server._connections.values())[-1]
+    slots.send(connection.socket, Token(slots.ANSWER, 0, ticket, 0, 2**40, 0.0))
+    with pytest.raises(ServiceStoppedError, match="a message that cannot be read"):
+        other.done(LONG_S)
+
+
+def test_a_service_that_takes_nothing_is_not_waited_for_for_ever(stage, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(shared_memory, "CONNECT_S", 0.05)
+    one = stage()
+    caller: Caller = one.caller()
+    with pytest.raises(TimeoutError, match=r"service: 1 of 1 replies did not come within 0\.05 s"):
+        caller.ask(["nobody polls"], 0.05)
+    with pytest.raises(ServiceStoppedError, match="service cannot be connected to: .*unavailable"):
+        for _ in range(10 * SLOTS):
+            one.caller()
