@@ -151,8 +151,8 @@ def test_only_what_is_trained_travels_and_is_copied_once(path: Path):
         assert received.tensors.keys() == parameters.keys()
         assert received.nbytes < 64 * len(views) + sum(p.numel() * 4 for p in parameters.values())
         reader.load_trainable(received.tensors, received.changed)
-        received.release()
         arrived.set()
+        received.release()
 
     SharedMemoryReader(publisher.address, apply, lambda error: None)
     perturb(trainer, 0.3)
