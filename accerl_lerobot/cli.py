@@ -38,6 +38,7 @@ VERBS = {
     "push": ("verbs:push", "a policy, world model, dataset or run to the Hub, as one commit"),
     "pull": ("verbs:pull", "what was pushed into a new folder, pinned and checked"),
     "report": ("verbs:report", "one HTML page of a run, or of several beside each other, to look at"),
+    "timeline": ("verbs:timeline", "what every worker of a run did when: a picture, a trace and shares"),
     "export": ("verbs:export", "the episodes of a run as a LeRobotDataset, with a picture at every env step"),
     "doctor": ("doctor:main", "resolve a recipe and check this machine"),
     "bench": ("verbs:bench", "measure: accerl bench world, policy, lag, dream, ranking, …"),

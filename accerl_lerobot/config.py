@@ -37,6 +37,7 @@ from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.timeline import TIMELINE
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.transport.endpoint import FIELD, Transport
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
@@ -55,9 +56,9 @@ class LaunchConfig:
     then learned from. overlap: the next one is collected meanwhile. These two are for measuring what the
     first gains."""
     transport: Transport = "auto"
-    """How rollout workers and dreams reach inference and replay. shared_memory: a message is written where
-    the other process reads it. ray: it is copied, to any node. auto: shared memory between processes of one
-    node, if the system has it, and Ray otherwise.
+    """How rollout workers and dreams reach inference and replay, and weights reach inference. shared_memory:
+    a message is written where the other process reads it. ray: it is copied, to any node. auto: shared memory
+    between processes of one node, if the system has it, and Ray otherwise.
     """
     stall_s: float = 300.0
     """How long, in seconds, a worker may owe an answer or a world a step, and a run stand still; > 0.
@@ -68,6 +69,9 @@ class LaunchConfig:
     """How often in a row, no later checkpoint having been reached in between, all workers are started again
     from the last checkpoint because one of them was lost that is not a rollout worker; once more ends the run
     with its error."""
+    timeline: bool = True
+    """Whether every worker records what it does when, for ``accerl timeline``: up to 8 MB each time one is
+    started."""
 
     def __post_init__(self) -> None:
         if self.engine not in ("ray", "local"):
@@ -160,6 +164,15 @@ class RunConfig:
                 f"use more than trainer.hold_back, {self.trainer.hold_back}, or all is thrown away as too old"
             )
             raise InputError("replay.max_lag", self.replay.max_lag, remedy)
+        if self.trainer.publish_changes and self.launch.engine == "local":
+            remedy = "launch.engine=local is one process, where nothing is sent; leave the field out"
+            raise InputError("trainer.publish_changes", True, remedy)
+        if self.trainer.ranks > 1 and self.launch.engine == "local":
+            remedy = "launch.engine=local is one process; use launch.engine=ray, or 1"
+            raise InputError("trainer.ranks", self.trainer.ranks, remedy)
+        if self.trainer.cpu_offload and self.policy.device == "cpu":
+            remedy = "policy.device=cpu has everything there already; leave the field out"
+            raise InputError("trainer.cpu_offload", True, remedy)
         batch, imagination = self.trainer.batch_decisions, self.imagination
         if self.trainer.updates:
             # Of both, as a batch is all real before anything is imagined, and all imagined after the last
@@ -185,6 +198,12 @@ class RunConfig:
 def journal_folder(config: RunConfig) -> Path | None:
     """Where a run's journal is kept; None: nowhere."""
     return None if config.output_dir is None else Path(config.output_dir).absolute()
+
+
+def timeline_folder(config: RunConfig) -> Path | None:
+    """Where the timeline of a run's workers is kept; None: nowhere."""
+    folder = journal_folder(config)
+    return folder / TIMELINE if folder is not None and config.launch.timeline else None
 
 
 def check_chunk(policy: dict[str, Any]) -> None:

@@ -33,7 +33,6 @@ handles and never hold the conductor.
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -43,7 +42,7 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from accerl_lerobot.checkpoint import TRAINING_STATE, saved_version
-from accerl_lerobot.config import RunConfig, journal_folder
+from accerl_lerobot.config import RunConfig, journal_folder, timeline_folder
 from accerl_lerobot.engine import Engine, Progress, Saved, WorkerError
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
@@ -53,6 +52,7 @@ from accerl_lerobot.stopping import Stopping
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from accerl_lerobot.transport.endpoint import Endpoint, listens
 from accerl_lerobot.watched import Watched
+from accerl_lerobot.weights.publisher import ReaderLostError
 
 logger = logging.getLogger(__name__)
 
@@ -106,6 +106,8 @@ class RayEngine(Engine):
         self._imagination_metrics: dict[str, float] = {}
         self._dreamer: Watched | None = None
         self._learner: Watched | None = None
+        self._ranks: list[Watched] = []
+        """The trainer's, but the first."""
         self._real_ended = False
         self._schedule: Schedule = ASYNCHRONOUS
         self._training = self._done = self._closed = False
@@ -128,7 +130,10 @@ class RayEngine(Engine):
     def train(self) -> None:
         self._training, self._last_change = True, time.monotonic()
         self.follow(self._config.launch.schedule)
-        self._trainer.work = self._trainer.actor.run.remote(self._replay.actor, [self._inference.actor])
+        readers = [self._inference.actor]
+        self._trainer.work = self._trainer.actor.run.remote(
+            self._replay.actor, readers, self._config.launch.transport
+        )
         if self._dreamer is not None:
             self._dreamer.work = self._dreamer.actor.run.remote(*self._endpoints, self._replay.actor)
         if self._learner is not None and self._dreamer is not None:
@@ -215,35 +220,42 @@ class RayEngine(Engine):
     def _start(self) -> None:
         from accerl_lerobot.inference.worker import InferenceWorker
         from accerl_lerobot.replay.worker import ReplayWorker
+        from accerl_lerobot.trainer.peers import TrainerRank
         from accerl_lerobot.trainer.worker import TrainerWorker
 
-        c = self._config
+        c, timeline = self._config, timeline_folder(self._config)
         gpus = ray.available_resources().get("GPU", 0)
         imagination = c.imagination
-        users = 2 + (imagination.share > 0) + imagination.learns
-        share = 0.0 if c.policy.device == "cpu" or not gpus else 1 / math.ceil(users / gpus)
+        users = 1 + (imagination.share > 0) + imagination.learns
+        of_rank, share = c.trainer.gpu_shares(0 if c.policy.device == "cpu" else gpus, users)
         inference = ray.remote(InferenceWorker).options(num_cpus=0, num_gpus=share, max_concurrency=1000)
         self._inference = self._service(
-            "inference", inference.remote(c.policy, c.inference, self._version, self._state, self._load)
+            "inference",
+            inference.remote(c.policy, c.inference, self._version, self._state, self._load, timeline),
         )
         replay = ray.remote(ReplayWorker).options(num_cpus=0, num_gpus=0, max_concurrency=1000)
         imagined, counted = imagination.replay if imagination.share else None, c.rollout.episodes > 0
         self._replay = self._service(
-            "replay", replay.remote(c.replay, c.seed, imagined, counted, self._state, journal_folder(c))
+            "replay",
+            replay.remote(c.replay, c.seed, imagined, counted, self._state, journal_folder(c), timeline),
         )
         threads = {"num_cpus": 0, "num_gpus": share, "max_concurrency": 4}
-        trainer = ray.remote(TrainerWorker).options(**threads)
-        learns = trainer.remote(c.policy, c.algorithm, c.trainer, c.seed, self._state, self._load)
-        self._trainer = self._service("trainer", learns)
+        learner = (c.policy, c.algorithm, c.trainer, c.seed, self._state, self._load)
+        peer = ray.remote(TrainerRank).options(num_cpus=0, num_gpus=of_rank)
+        for rank in range(1, c.trainer.ranks):
+            self._ranks.append(self._service(f"trainer rank {rank}", peer.remote(rank, *learner)))
+        trainer = ray.remote(TrainerWorker).options(**threads | {"num_gpus": of_rank})
+        handles = [rank.actor for rank in self._ranks]
+        self._trainer = self._service("trainer", trainer.remote(*learner, timeline, handles))
         if imagination.share:
             from accerl_lerobot.world_model.worker import DreamWorker, WorldLearningWorker
 
             self._dreamer = self._service(
-                "dream", ray.remote(DreamWorker).options(**threads).remote(c, self._state)
+                "dream", ray.remote(DreamWorker).options(**threads).remote(c, self._state, timeline)
             )
             if imagination.learns:
-                learner = ray.remote(WorldLearningWorker).options(**threads)
-                self._learner = self._service("world learning", learner.remote(c, self._state))
+                dreamt = ray.remote(WorldLearningWorker).options(**threads)
+                self._learner = self._service("world learning", dreamt.remote(c, self._state, timeline))
         self._seats.start()
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
         for worker, reference in ready:
@@ -285,7 +297,8 @@ class RayEngine(Engine):
         try:
             result = ray.get(reference)
         except RayError as error:
-            if isinstance(error, RayTaskError) and isinstance(error.cause, RayError | ServiceStoppedError):
+            innocent = RayError | ServiceStoppedError | ReaderLostError
+            if isinstance(error, RayTaskError) and isinstance(error.cause, innocent):
                 self._blame()
             if self._seats.restart_worker(worker, error):
                 return
@@ -317,6 +330,8 @@ class RayEngine(Engine):
         self._updates += self._hear(self._trainer) or []
         self._replay_metrics = self._hear(self._replay) or self._replay_metrics
         self._inference_metrics = self._hear(self._inference) or self._inference_metrics
+        for rank in self._ranks:
+            self._hear(rank)
         for imaginer in (self._dreamer, self._learner):
             if imaginer is not None:
                 self._imagination_metrics |= self._hear(imaginer) or {}

@@ -32,7 +32,7 @@ import numpy as np
 
 from accerl_lerobot import snapshot
 from accerl_lerobot.checkpoint import PRETRAINED, TRAINING_STATE, WEIGHTS, WORLD_MODEL
-from accerl_lerobot.config import RunConfig, journal_folder
+from accerl_lerobot.config import RunConfig, journal_folder, timeline_folder
 from accerl_lerobot.engine import Engine, Progress, Saved, check_new, episode_key
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
@@ -42,6 +42,7 @@ from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutRunner
 from accerl_lerobot.seeds import global_generators, restore_global_generators
+from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.weights.held_back import HeldBack
 
 logger = logging.getLogger(__name__)
@@ -66,6 +67,7 @@ class LocalEngine(Engine):
     def __init__(
         self, config: RunConfig, tasks: tuple[str, ...], history: int = 1, state: Path | None = None
     ) -> None:
+        self._clock = open_clock(timeline_folder(config), LOCAL)
         import torch
 
         from accerl_lerobot.policies.loading import load_adapter
@@ -118,6 +120,7 @@ class LocalEngine(Engine):
         self._due: dict[int, Request] = {}
         if state is not None:
             self._restore(state)
+        self._clock.enter(WAIT_IN)
 
     def plan(self, plans: list[EpisodePlan]) -> None:
         check_new(plans, self._outstanding)
@@ -128,6 +131,7 @@ class LocalEngine(Engine):
         self._training = True
 
     def poll(self) -> Progress:
+        self._clock.enter(COMPUTE)
         self._store()
         self._act()
         self._store()
@@ -140,6 +144,7 @@ class LocalEngine(Engine):
             if segments:
                 updates.append(self._update.step(segments) | {"update": float(self._update.version)})
                 self._publish()
+        self._clock.enter(WAIT_IN)
         episodes = list(self._episodes)
         self._episodes.clear()
         self._outstanding -= {episode_key(e.plan) for e in episodes}
@@ -157,6 +162,7 @@ class LocalEngine(Engine):
     def save(self, directory: Path) -> Saved:
         from accerl_lerobot.policies.loading import save_pretrained
 
+        self._clock.enter(CHECKPOINT)
         save_pretrained(self._adapter, directory / PRETRAINED, self._config.policy)
         state = directory / TRAINING_STATE
         snapshot.save(state / WEIGHTS, self._adapter.export_trainable())
@@ -178,6 +184,7 @@ class LocalEngine(Engine):
             learner = None if self._world_learner is None else self._world_learner.state()
             snapshot.save(state / DREAMS, {"dreams": self._dreams.state(), "learner": learner})
             self._dreams.save_promoted(directory / WORLD_MODEL)
+        self._clock.enter(WAIT_IN)
         return Saved(self._update.version, [])
 
     def _restore(self, directory: Path) -> None:
@@ -209,6 +216,7 @@ class LocalEngine(Engine):
 
     def close(self) -> None:
         try:
+            self._clock.close()
             self._runner.close()
             if self._dreams is not None:
                 self._dreams.close()
@@ -275,6 +283,7 @@ class LocalEngine(Engine):
         if self._acting is self._adapter:
             self._acting_version = version
             return
+        self._clock.enter(WEIGHT_SYNC)
         last = version == updates or not self._exploring
         weights = self._adapter.export_trainable()
         for number, tensors in self._held.push(version, weights, last=last):

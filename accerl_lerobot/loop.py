@@ -21,7 +21,7 @@ import shutil
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,8 @@ from accerl_lerobot.metrics import MetricsLog, plain
 from accerl_lerobot.resume import how_to_go_on
 from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.stopping import StoppedError, Stopping
+from accerl_lerobot.timeline import CHECKPOINT, EVALUATION, TIMELINE, TRAINING, Clock, NoClock
+from accerl_lerobot.timeline.watch import Watch
 
 FILMED = ".before"
 """Name of the filmed episodes of the evaluation before, kept until the video is made."""
@@ -106,6 +108,8 @@ class Times:
     """Training, in processes before this one."""
     before_s: float | None = 0.0
     """All, in processes before this one; None: the checkpoint will tell."""
+    clock: Clock = field(default_factory=NoClock)
+    """The driver's row of the timeline."""
 
     @property
     def wall_s(self) -> float:
@@ -149,8 +153,7 @@ class Loop:
         self.explored = 0
         """Exploring episodes that have ended."""
         self.lags: list[float] = []
-        self.lag_max = 0.0
-        self.mismatch_max = 0.0
+        self.lag_max = self.mismatch_max = 0.0
         self.during: dict[str, list[EpisodeResult]] = {}
         self.base: dict[str, float] = {}
         self.groups = (0.0, 0.0)
@@ -161,6 +164,7 @@ class Loop:
         """Evaluations and checkpoints that were due by the number of updates."""
         self._training_since: float | None = None
         self._saved_at = time.monotonic()
+        self._watch = Watch(directory / TIMELINE)
 
     def run(self, state: Path | None) -> dict[str, Any]:
         """Does it, or does what is left of it; returns the summary.
@@ -217,10 +221,7 @@ class Loop:
         self.saved = min(self.saved, version // save if save else 0)
 
     def _summary(
-        self,
-        before: dict[str, Any] | None,
-        after: dict[str, Any],
-        last: Progress,
+        self, before: dict[str, Any] | None, after: dict[str, Any], last: Progress
     ) -> dict[str, Any]:
         before = before or {}
         summary = {
@@ -259,6 +260,8 @@ class Loop:
     def _train(self) -> Progress:
         config = self.config
         self.engine.train()
+        self.times.clock.enter(TRAINING)
+        self._watch.news()  # what was before is not of the first record
         self._training_since = self._saved_at = time.monotonic()
         with self.console.stage(f"RL ({config.algorithm.type})", total=config.trainer.updates) as stage:
             while True:
@@ -300,6 +303,7 @@ class Loop:
             self.log.write("train", int(metrics["update"]), metrics)
 
     def _record(self, progress: Progress) -> None:
+        self.times.clock.beat()
         self._record_updates(progress.updates)
         explored = [e for e in progress.episodes if e.plan.explore]
         self.explored += len(explored)
@@ -311,10 +315,9 @@ class Loop:
         # Once all real episodes have been played, dreams and the learning from them go on.
         if explored or any(metrics["update"] % DREAMT == 0 for metrics in progress.updates):
             values = progress.rollout | {"success_exploring": share}
-            values |= {f"replay_{k}": v for k, v in progress.replay.items()}
-            values |= {f"inference_{k}": v for k, v in progress.inference.items()}
-            values |= {f"imagination_{k}": v for k, v in progress.imagination.items()}
-            self.log.write("rollout", progress.version, values)
+            for part in ("replay", "inference", "imagination"):
+                values |= {f"{part}_{k}": v for k, v in getattr(progress, part).items()}
+            self.log.write("rollout", progress.version, values | self._watch.news())
         for episode in progress.episodes:
             results = self.during.get(episode.plan.group)
             if results is not None:
@@ -344,6 +347,7 @@ class Loop:
     def _evaluate(
         self, group: str, episodes: int, steps: float
     ) -> tuple[dict[str, Any], list[EpisodeResult]]:
+        self.times.clock.enter(EVALUATION)
         self.engine.plan(evaluation_plans(self.tasks, episodes, group, self.config.evaluation.videos))
         # An evaluation planned while training may end only now.
         results = run_plans(self.engine, episodes, group, self.console, self._meanwhile)
@@ -376,7 +380,8 @@ class Loop:
             snapshot.save(folder / TRAINING_STATE / RUN_STATE, self._state())
             return saved.version
 
-        path = save_checkpoint(self.directory / CHECKPOINTS, write)
+        with self.times.clock.during(CHECKPOINT):
+            path = save_checkpoint(self.directory / CHECKPOINTS, write)
         let_go(self.directory / CHECKPOINTS, self.config.save_keep)
         self._saved_at = time.monotonic()
         self.console.say(f"checkpoint {path / PRETRAINED}")

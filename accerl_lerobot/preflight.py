@@ -37,11 +37,15 @@ def check_start(config: RunConfig) -> int:
         The policy's ``n_obs_steps``; 1 where LeRobot's trainer will tell.
 
     Raises:
-        InputError: see above; also what `check_sft_policy` raises.
+        InputError: see above; more ranks than GPUs; also what `check_sft_policy` raises.
     """
     if config.policy.path is None and not config.sft.steps:
         remedy = "give a LeRobot checkpoint, or sft.steps > 0 to make one; recipes/quickstart.yaml does"
         raise InputError("policy.path", None, remedy)
+    if config.trainer.ranks > 1 and config.policy.device != "cpu":
+        import torch
+
+        config.trainer.gpu_shares(torch.cuda.device_count(), others=1)
     if config.policy.path is not None:
         from accerl_lerobot.policies.loading import load_lerobot_config
 

@@ -20,6 +20,7 @@ outputs/<run>/
   sft/                   LeRobot's own training output, sft.log beside it
   checkpoints/NNNNNN/    LeRobot's layout, and all that is needed to go on; `last` is the newest
   metrics.jsonl          and tensorboard/
+  timeline/              what every worker did when, see `accerl timeline`
   success_curve.png, summary.json, and before_after.mp4 unless evaluation.before=false
 """
 
@@ -48,7 +49,7 @@ from accerl_lerobot.checkpoint import (
     newest_whole,
     write_atomically,
 )
-from accerl_lerobot.config import RunConfig, encode
+from accerl_lerobot.config import RunConfig, encode, timeline_folder
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import Engine, WorkerError
 from accerl_lerobot.envs import make_world
@@ -57,6 +58,7 @@ from accerl_lerobot.loop import Loop, Times, heed_stop
 from accerl_lerobot.metrics import METRICS, MetricsLog
 from accerl_lerobot.replay.journal import EPISODES
 from accerl_lerobot.stopping import Stopping
+from accerl_lerobot.timeline import RECOVERY, open_clock
 
 logger = logging.getLogger(__name__)
 
@@ -181,12 +183,14 @@ def train(config: RunConfig, directory: Path, console: Console, wanted: str | No
     times = Times(started=started, warm_s=time.monotonic() - started, before_s=before_s)
     with contextlib.ExitStack() as stack:  # flushes the log, whatever fails
         stop = stack.enter_context(Stopping())
+        times.clock = stack.enter_context(contextlib.closing(open_clock(timeline_folder(config), "driver")))
         log = stack.enter_context(contextlib.closing(MetricsLog(directory, config.wandb, encode(config))))
         recovery = Recovery(config.launch.max_recoveries)
         while True:
             try:
                 return _attempt(config, directory, checkpoint, console, log, tasks, times, stop)
             except WorkerError as error:
+                times.clock.enter(RECOVERY)
                 heed_stop(stop, directory)
                 checkpoint = recovery.next(directory / CHECKPOINTS, console, error)
                 heed_stop(stop, directory)

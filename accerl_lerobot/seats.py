@@ -29,7 +29,7 @@ import ray
 from ray.exceptions import RayActorError, RayError
 
 from accerl_lerobot import snapshot
-from accerl_lerobot.config import RunConfig
+from accerl_lerobot.config import RunConfig, timeline_folder
 from accerl_lerobot.engine import WorkerError, check_new, episode_key
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.ray_environment import TOKENLESS
@@ -227,7 +227,8 @@ class Seats:
         film = (c.evaluation.video_size, c.evaluation.video_every)
         actor = ray.remote(RolloutWorker).options(num_cpus=0, num_gpus=0, max_concurrency=4, **TOKENLESS)
         place = (c.seed, seat.index, seat.incarnation)
-        made = actor.remote(c.env, c.rollout, self._tasks, *place, film, self._history, seat.budget)
+        rest = (film, self._history, seat.budget, timeline_folder(c))
+        made = actor.remote(c.env, c.rollout, self._tasks, *place, *rest)
         return Watched(f"rollout {seat.index}", made)
 
     def _restart(self, seat: Seat, error: Exception) -> None:

@@ -30,13 +30,18 @@ from typing import Any
 
 import yaml
 
+from accerl_lerobot.bench.async_vs_sync import BenchAsyncVsSyncConfig
 from accerl_lerobot.bench.dream import BenchDreamConfig
 from accerl_lerobot.bench.efficiency import BenchEfficiencyConfig
 from accerl_lerobot.bench.faults import BenchFaultsConfig
 from accerl_lerobot.bench.lag import BenchLagConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.ranking import BenchRankingConfig
+from accerl_lerobot.bench.scaling import BenchScalingConfig
+from accerl_lerobot.bench.throughput import BenchThroughputConfig
+from accerl_lerobot.bench.timeline import BenchTimelineConfig
 from accerl_lerobot.bench.transport import BenchTransportConfig
+from accerl_lerobot.bench.weights import BenchWeightsConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
 from accerl_lerobot.checkpoint import CONFIG
 from accerl_lerobot.config import RunConfig, encode, parse
@@ -47,6 +52,7 @@ from accerl_lerobot.hub.config import PullConfig, PushConfig
 from accerl_lerobot.parsing import read_arguments
 from accerl_lerobot.report.config import ReportConfig
 from accerl_lerobot.rollout.runner import EpisodeResult
+from accerl_lerobot.timeline.config import TimelineConfig
 from accerl_lerobot.verb_configs import DemosRun, EvalRun, SFTRun, WorldModelEvalRun, WorldModelRun
 
 
@@ -252,6 +258,17 @@ def report(arguments: list[str]) -> int:
     return 0
 
 
+def timeline(arguments: list[str]) -> int:
+    """``accerl timeline``."""
+    config: TimelineConfig = parse(TimelineConfig, arguments)
+    from accerl_lerobot.timeline.show import show_timelines, table
+
+    found = show_timelines(config)
+    Console().rich.print(table(found))
+    sys.stdout.write(json.dumps(found, indent=2) + "\n")
+    return 0
+
+
 def export(arguments: list[str]) -> int:
     """``accerl export``."""
     config: ExportConfig = parse(ExportConfig, arguments)
@@ -271,6 +288,7 @@ def bench(arguments: list[str]) -> int:
         names = [verb.split()[1] for verb in CONFIGS if verb.startswith("bench ")]
         raise InputError("bench", name, f"name what is measured: {', '.join(names)}")
     config = parse(CONFIGS[f"bench {name}"], arguments[1:])
+    name = name.replace("-", "_")
     module: Any = importlib.import_module(f"accerl_lerobot.bench.{name}")
     with redirect_stdout(sys.stderr):
         result = getattr(module, f"bench_{name}")(config)
@@ -289,16 +307,22 @@ CONFIGS: dict[str, type[Any]] = {
     "push": PushConfig,
     "pull": PullConfig,
     "report": ReportConfig,
+    "timeline": TimelineConfig,
     "export": ExportConfig,
     "doctor": RunConfig,
     "bench world": BenchWorldConfig,
     "bench policy": BenchPolicyConfig,
+    "bench throughput": BenchThroughputConfig,
+    "bench scaling": BenchScalingConfig,
+    "bench async-vs-sync": BenchAsyncVsSyncConfig,
+    "bench transport": BenchTransportConfig,
+    "bench weights": BenchWeightsConfig,
+    "bench timeline": BenchTimelineConfig,
     "bench lag": BenchLagConfig,
     "bench dream": BenchDreamConfig,
     "bench efficiency": BenchEfficiencyConfig,
     "bench faults": BenchFaultsConfig,
     "bench ranking": BenchRankingConfig,
-    "bench transport": BenchTransportConfig,
 }
 """Verb → what its command line is parsed into."""
 

@@ -78,7 +78,9 @@ class LightInference:
             raise ServiceStoppedError("the inference service has stopped")
         return [_decision(request, self._version) for request in requests]
 
-    async def receive_weights(self, version: int, tensors: dict[str, np.ndarray]) -> int:
+    async def receive_weights(
+        self, version: int, tensors: dict[str, np.ndarray], published_s: float = 0.0
+    ) -> int:
         self._version = version
         return version
 
@@ -97,7 +99,7 @@ class LightTrainer:
     """Takes batches and learns nothing from them but what they were; breaks or idles on request."""
 
     def __init__(
-        self, policy: Any, algorithm: Any, config: Any, seed: int, state: Path | None = None, load: Any = None
+        self, policy: Any, algorithm: Any, config: Any, seed: int, state: Path | None = None, *_: Any
     ) -> None:
         if policy.path == NO_WEIGHTS:
             raise FileNotFoundError("no weights there")
@@ -120,7 +122,7 @@ class LightTrainer:
     def idle(self) -> None:
         self._idle = True
 
-    def run(self, replay: Any, readers: list[Any]) -> int:
+    def run(self, replay: Any, readers: list[Any], transport: str) -> int:
         import ray
 
         n = self._config.batch_decisions

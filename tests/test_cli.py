@@ -290,6 +290,7 @@ def test_demos_refuses_an_existing_folder(tmp_path: Path, capsys: pytest.Capture
 def test_bench_without_a_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["bench"]) == 2
     assert (
-        capsys.readouterr().err == "accerl: bench='': name what is measured: "
-        "world, policy, lag, dream, efficiency, faults, ranking, transport\n"
+        capsys.readouterr().err
+        == "accerl: bench='': name what is measured: world, policy, throughput, scaling, async-vs-sync, "
+        "transport, weights, timeline, lag, dream, efficiency, faults, ranking\n"
     )

@@ -322,3 +322,9 @@ def test_every_field_has_a_name_on_the_command_line() -> None:
 )
 def test_types_in_words(hint: Any, words: str) -> None:
     assert parsing.wanted(hint) == words
+
+
+def test_changes_are_not_sent_within_one_process():
+    with pytest.raises(InputError, match=r"^trainer.publish_changes=True: launch.engine=local"):
+        parse(RunConfig, ["--launch.engine=local", "--trainer.publish_changes=true"])
+    assert parse(RunConfig, ["--trainer.publish_changes=true"]).trainer.publish_changes

@@ -34,6 +34,7 @@ from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.replay import ReplayConfig, lag_bound
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
+from accerl_lerobot.timeline.read import ABSENT, read_timeline
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.runs import collect, polls, tiny_run
 
@@ -85,6 +86,7 @@ def story(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> It
         ),
     )
     told = Story(config, tmp_path_factory.mktemp("saved"))
+    config = told.config = replace(config, output_dir=str(told.directory))
     engine = RayEngine(config, ("match",))
     try:
         pids = engine.pids()
@@ -206,6 +208,18 @@ def test_what_is_saved_during_training_loads_again(story: Story, tiny_checkpoint
         assert saved.keys() == weights.keys()
         assert all(torch.equal(saved[k], weights[k]) for k in weights), "learning rate 0 moved the policy"
     load_adapter(PolicyConfig(path=str(story.directory / "middle" / PRETRAINED), device="cpu"))
+
+
+def test_every_worker_has_left_its_timeline(story: Story):
+    timeline = read_timeline(story.directory)
+    rows = {row.worker: row for row in timeline.rows}
+    assert list(rows) == ["rollout 0", "rollout 1", "inference", "replay", "trainer"]
+    assert [name for name, row in rows.items() if ABSENT in row.states] == ["rollout 1"], "it was killed"
+    spent = timeline.shares()
+    assert all(sum(own.values()) == pytest.approx(1.0) for own in spent.values())
+    assert {"compute", "wait_in", "weights"} <= spent["inference"].keys()
+    assert {"compute", "wait_in", "transport", "weights", "checkpoint"} <= spent["trainer"].keys()
+    assert "checkpoint" in spent["replay"]
 
 
 def test_inference_reports_what_it_did(story: Story):

@@ -32,6 +32,7 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.local import LocalEngine
 from accerl_lerobot.metrics import MetricsLog, WandBConfig
+from accerl_lerobot.timeline.states import ROLES, STATES
 
 ROOT = Path(__file__).parents[1]
 
@@ -148,10 +149,19 @@ def test_every_logged_number_is_explained(tiny_checkpoint: Path) -> None:
     with_ray = {"wait_s", "update_s", "publish_s"}
     assert explained("train") == (progress.updates[0].keys() - {"update"}) | with_ray
     rollout = progress.rollout.keys() | {f"replay_{k}" for k in progress.replay}
-    rollout |= {f"inference_{k}" for k in (*BatcherStats().metrics(), "version", "busy_share")}
+    of_weights = ("version", "swap_s", "publish_to_served_s")
+    rollout |= {f"inference_{k}" for k in (*BatcherStats().metrics(), "busy_share", *of_weights)}
     ends = ("s", "_return", "_steps", "_decisions", "_success")
     rollout |= {"restarts", "success_exploring", "replay_insert_wait_s", "replay_sample_wait_s"}
     assert explained("rollout") == rollout | {f"replay_episode{end}" for end in ends}
+
+
+def test_every_role_and_state_of_the_timeline_is_explained() -> None:
+    text = (ROOT / "docs" / "metrics.md").read_text().split("## Timeline")[1].split("\n## ")[0]
+    named = set(re.findall(r"`([a-z_]+)`", text.split("|---|---|---|")[1]))
+    assert named == {role.replace(" ", "_") for role in ROLES} | set(STATES)
+    means = (ROOT / "docs" / "performance.md").read_text().split("## The timeline")[1]
+    assert {role for role in ROLES if f"| {role} |" in means} == set(ROLES)
 
 
 def test_the_summary_is_explained() -> None:

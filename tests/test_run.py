@@ -98,7 +98,7 @@ def test_the_evaluation_before_can_be_left_out(tiny_checkpoint: Path, tmp_path: 
 def test_the_run_directory_is_complete(finished: Finished):
     assert {path.name for path in finished.directory.iterdir()} == {
         "config.yaml", "metrics.jsonl", "tensorboard", "checkpoints", "success_curve.png", "summary.json",
-        "before_after.mp4", "episodes.jsonl",
+        "before_after.mp4", "episodes.jsonl", "timeline",
     }  # fmt: skip
     assert list((finished.directory / "tensorboard").iterdir())
 

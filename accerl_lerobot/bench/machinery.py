@@ -15,34 +15,27 @@
 
 Each world is a process of its own, as in a real run, and so are the service, the replay and the trainer; what
 takes time in them is slept. So 64 worlds are measured on two cores, as long as what is not slept leaves cores
-idle: `Block.processors` says so.
+idle: `blocks.Block.processors` says so.
 """
 
 from __future__ import annotations
 
 import functools
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
-from accerl_lerobot.bench.host import Processors
+from accerl_lerobot.bench.blocks import Measured
 from accerl_lerobot.config import LaunchConfig, RunConfig
-from accerl_lerobot.engine import Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.worker import InferenceConfig
-from accerl_lerobot.policies.simulated import SimulatedPolicyConfig, load_simulated
+from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay import ReplayConfig
-from accerl_lerobot.replay.turns import Schedule
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 
 EPISODE = 16
 """Decisions of an episode."""
 CHUNK = 4
-SETTLE = 2
-"""Updates after a change that are not counted."""
-MOST_BUSY = 0.6
-"""Share of all cores above which the processors, and not what is slept, may be what is measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,17 +120,23 @@ class MachineryConfig:
                 updates=updates,
                 batch_decisions=batch,
                 micro_batch=2 * batch,
-                lr=0.02,
+                lr=0.05,
                 value_lr=0.02,
+                warmup_updates=5,
                 value_warmup_updates=2,
                 probe_every=0,
             ),
             launch=LaunchConfig(stall_s=120.0),
         )
 
-    @property
-    def load(self) -> Any:
+    def open(self) -> Measured:
+        """An engine of it, which has begun to train."""
+        return Measured(self.run_config(), ("match",), load=self.load())
+
+    def load(self) -> Load:
         """Its policy, for `RayEngine`."""
+        from accerl_lerobot.policies.simulated import SimulatedPolicyConfig, load_simulated
+
         policy = SimulatedPolicyConfig(
             decide_ms=self.decide_ms,
             decide_each_ms=self.decide_each_ms,
@@ -145,102 +144,3 @@ class MachineryConfig:
             chunk=CHUNK,
         )
         return functools.partial(load_simulated, policy)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Block:
-    """What was measured in some seconds."""
-
-    schedule: str
-    seconds: float
-    updates: int
-    decisions_per_s: float
-    """Learned from, each once."""
-    lag_mean: float
-    lag_max: float
-    trainer_waits: float
-    """Share of its time in which the trainer had no batch: its bubble."""
-    publishing: float
-    """Share of its time in which it handed over weights."""
-    batch_size: float
-    """Observations decided for together."""
-    request_wait_ms: float
-    """From the arrival of a request to its forward pass, on average."""
-    inference_busy: float
-    """Share of its time that the service decided."""
-    processors: float
-    """How busy all cores were, whoever used them."""
-
-
-class Machinery:
-    """An engine that has begun to train; ``with`` it, or close it.
-
-    Args:
-        config: of what.
-    """
-
-    def __init__(self, config: MachineryConfig) -> None:
-        from accerl_lerobot.launch import RayEngine
-
-        self.config = config
-        self.engine = RayEngine(config.run_config(), ("match",), load=config.load)
-        self.engine.train()
-
-    def __enter__(self) -> Machinery:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.engine.close()
-
-    def block(self, schedule: Schedule, seconds: float) -> Block:
-        """Measures at least so many seconds of a schedule, in whole updates, after a change has settled."""
-        self.engine.follow(schedule)
-        self._updates(SETTLE, 0.0)
-        processors, before = Processors(), self.engine.poll().inference
-        updates, polls = self._updates(1, seconds)
-        after = polls[-1].inference
-        total = sum(_seconds(u) for u in updates)
-        batches = after["batches"] - before["batches"]
-        requests = _observations(after) - _observations(before)
-        return Block(
-            schedule=schedule,
-            seconds=total,
-            updates=len(updates),
-            decisions_per_s=sum(u["decisions"] for u in updates) / total,
-            lag_mean=sum(u["lag_mean"] for u in updates) / len(updates),
-            lag_max=max(u["lag_max"] for u in updates),
-            trainer_waits=sum(u["wait_s"] for u in updates) / total,
-            publishing=sum(u["publish_s"] for u in updates) / total,
-            batch_size=requests / batches if batches else 0.0,
-            request_wait_ms=1000 * (_waited(after) - _waited(before)) / requests if requests else 0.0,
-            inference_busy=sum(p.inference["busy_share"] for p in polls) / len(polls),
-            processors=processors.share(),
-        )
-
-    def _updates(self, count: int, seconds: float) -> tuple[list[dict[str, float]], list[Progress]]:
-        """Polls until there are so many updates, which took so long."""
-        updates: list[dict[str, float]] = []
-        polls: list[Progress] = []
-        while len(updates) < count or sum(_seconds(u) for u in updates) < seconds:
-            progress = self.engine.poll()
-            updates += progress.updates
-            polls.append(progress)
-        return updates, polls
-
-
-def as_rows(blocks: list[Block]) -> list[dict[str, Any]]:
-    """For JSON."""
-    return [asdict(block) for block in blocks]
-
-
-def _seconds(update: dict[str, float]) -> float:
-    return update["wait_s"] + update["update_s"] + update["publish_s"]
-
-
-def _observations(inference: dict[str, float]) -> float:
-    """Of all requests so far; each has one."""
-    return inference["batches"] * inference["batch_size_mean"]
-
-
-def _waited(inference: dict[str, float]) -> float:
-    return inference["wait_mean_s"] * _observations(inference)

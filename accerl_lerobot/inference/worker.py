@@ -43,8 +43,10 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import Batcher
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
+from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.contract import Asked, Server, stopped
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
+from accerl_lerobot.weights.reader import Received, SharedMemoryReader
 
 LOOK_S = 1.0
 """How long the thread that serves waits at most before it looks whether it is still wanted."""
@@ -78,6 +80,7 @@ class InferenceWorker:
         version: of the weights it begins with.
         state: the ``training_state`` that holds these; None: they are the checkpoint's.
         load: makes the adapter; None: of LeRobot's checkpoint.
+        timeline: folder of the timeline; None: none is kept.
     """
 
     def __init__(
@@ -87,7 +90,9 @@ class InferenceWorker:
         version: int = 0,
         state: Path | None = None,
         load: Load | None = None,
+        timeline: Path | None = None,
     ) -> None:
+        self._clock = open_clock(timeline, "inference")
         import torch
 
         torch.set_num_threads(config.num_threads)
@@ -99,12 +104,17 @@ class InferenceWorker:
             self._adapter.load_trainable(snapshot.load(state / WEIGHTS))
         self._received = -1
         # Shared by two threads: appending and popping are atomic, and only the newest of each is kept.
-        self._published: deque[tuple[int, dict[str, np.ndarray]]] = deque(maxlen=1)
+        self._published: deque[Received] = deque(maxlen=1)
         self._together: deque[int] = deque(maxlen=1)
+        self._reader: SharedMemoryReader | None = None
+        self._broken: BaseException | None = None
+        self._swap_s = self._publish_to_served_s = 0.0
+        self._unserved_since: float | None = None
         self._failure: BaseException | None = None
         self._over = False
         self._busy_s = self._busy_told_s = 0.0
         self._since = time.monotonic()
+        self._clock.enter(WAIT_IN)
 
     async def ready(self) -> int:
         """Answers once the policy is loaded; returns this process's id."""
@@ -127,13 +137,30 @@ class InferenceWorker:
         decisions: list[Decision] = await asyncio.wrap_future(answer)
         return decisions
 
-    async def receive_weights(self, version: int, tensors: dict[str, np.ndarray]) -> int:
+    async def receive_weights(self, version: int, tensors: dict[str, np.ndarray], published_s: float) -> int:
         """Takes a published set; it serves from the next batch on. What is not newer is ignored."""
-        if version > self._received:
-            self._received = version
-            self._published.append((version, tensors))
-            self._server.wake()
+        self._offer(Received(version=version, tensors=tensors, published_s=published_s))
         return version
+
+    async def open_weights(self, address: str) -> bool:
+        """Receives weights through shared memory from now on; False if that is not to be had from here."""
+        try:
+            self._reader = SharedMemoryReader(address, deliver=self._offer, failed=self._break)
+        except OSError:
+            return False
+        return True
+
+    def _offer(self, received: Received) -> None:
+        if received.version > self._received:
+            self._received = received.version
+            self._published.append(received)
+            self._server.wake()
+        else:
+            received.release()
+
+    def _break(self, error: BaseException) -> None:
+        self._broken = error
+        self._server.wake()
 
     async def lock_step(self, observations: int) -> None:
         """See `Batcher.lock_step`."""
@@ -163,16 +190,25 @@ class InferenceWorker:
             self._server.wake()
 
     async def metrics(self) -> dict[str, float]:
-        """Batching statistics, the version served and the busy share since the last call."""
+        """Batching statistics, the version served, the busy share since the last call, and of the last
+        swap of weights how long it took and how long after their publication they served first."""
+        self._clock.beat()
         now, busy_s = time.monotonic(), self._busy_s
         share = (busy_s - self._busy_told_s) / max(1e-9, now - self._since)
         self._since, self._busy_told_s = now, busy_s
-        return {**self._batcher.stats.metrics(), "version": float(self._version), "busy_share": share}
+        return {
+            **self._batcher.stats.metrics(),
+            "version": float(self._version),
+            "busy_share": share,
+            "swap_s": self._swap_s,
+            "publish_to_served_s": self._publish_to_served_s,
+        }
 
     def _serve(self) -> None:
         batch: list[Asked] = []
         try:
             while not self._over:
+                self._clock.enter(WAIT_IN)
                 self._server.poll(self._patience())
                 if self._together:
                     self._batcher.lock_step(self._together.popleft())
@@ -183,6 +219,8 @@ class InferenceWorker:
                     batch = []
         except BaseException as error:
             self._failure = error
+            if self._reader is not None:
+                self._reader.close()
             self._server.poll(0.0)
             while batch:
                 for asked in batch:
@@ -203,17 +241,27 @@ class InferenceWorker:
         return LOOK_S if deadline is None else max(0.0, deadline - time.monotonic())
 
     def _swap(self) -> None:
+        if self._broken is not None:
+            raise self._broken
         if self._published:
-            version, tensors = self._published.popleft()
-            self._adapter.load_trainable(tensors)
-            self._version = version
+            self._clock.enter(WEIGHT_SYNC)
+            received, started = self._published.popleft(), time.monotonic()
+            self._adapter.load_trainable(received.tensors, received.changed)
+            received.release()
+            self._swap_s = time.monotonic() - started
+            self._version, self._unserved_since = received.version, received.published_s
 
     def _serve_batch(self, batch: list[Asked]) -> None:
         batch = [asked for asked in batch if not asked.gone]
         requests = [request for asked in batch for request in asked.message]
         started = time.monotonic()
+        self._clock.enter(COMPUTE)
         decisions = self._adapter.decide(requests, self._version) if requests else []
-        self._busy_s += time.monotonic() - started
+        now = time.monotonic()
+        self._busy_s += now - started
+        self._clock.enter(TRANSPORT)
+        if self._unserved_since is not None:
+            self._publish_to_served_s, self._unserved_since = now - self._unserved_since, None
         start = 0
         for asked in batch:
             asked.answer(decisions[start : start + len(asked)])

@@ -24,10 +24,10 @@ import torch
 from torch import Tensor, nn
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import Decision, Request
+from accerl_lerobot.experience import TASK, Decision, Request
 from accerl_lerobot.policies.base import Evaluation, PolicyAdapter, stack_observations
 from accerl_lerobot.policies.family import Encoded, Family, Model
-from accerl_lerobot.policies.processing import Processing
+from accerl_lerobot.policies.processing import Processing, example_observations
 from accerl_lerobot.policies.value_head import Value, ValueHead
 
 SELF_CHECK_TOLERANCE = 1e-5
@@ -122,6 +122,17 @@ class LeRobotAdapter(PolicyAdapter):
             for name, parameter in module.named_parameters()
             if parameter.requires_grad
         }
+
+    def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
+        """See the base class."""
+        observations, tasks = example_observations(self.policy.config, self.processing.rename_map)
+        requests = [
+            Request(observation={k: v[i] for k, v in observations.items()} | {TASK: task}, noise_seed=i)
+            for i, task in enumerate(tasks)
+        ]
+        latents = [decision.latent for decision in self.decide(requests, 0)]
+        stacked = {k: torch.from_numpy(np.stack([latent[k] for latent in latents])) for k in latents[0]}
+        return observations, tasks, stacked
 
     @torch.no_grad()
     def self_check(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> float:

@@ -31,6 +31,7 @@ from torch import Tensor, nn
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Decision, Request
 from accerl_lerobot.policies.value_head import Value
+from accerl_lerobot.tensors import in_parts, part_of, whole
 
 if TYPE_CHECKING:
     from accerl_lerobot.envs.base import WorldSpec
@@ -96,11 +97,22 @@ class PolicyAdapter(nn.Module, ABC):
         """V only, (B,), without gradient."""
 
     @abstractmethod
+    def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
+        """A few decisions as `evaluate` takes them, for those who want to see what it runs."""
+
+    @abstractmethod
     def trainable(self) -> dict[str, nn.Parameter]:
         """What the trainer updates and publishes, by name; the critic's begin with ``value_head.``"""
 
-    def load_trainable(self, tensors: dict[str, np.ndarray]) -> None:
+    def load_trainable(
+        self, tensors: dict[str, np.ndarray], changed: dict[str, np.ndarray] | None = None
+    ) -> None:
         """Copies published weights in place: all of them, or none when they do not fit.
+
+        Args:
+            tensors: by name, all that `trainable` has.
+            changed: name → indices of the elements, flattened, that are to be copied, where the others are
+                known to be equal; None: all.
 
         Raises:
             ValueError: names or shapes differ from `trainable`.
@@ -115,13 +127,34 @@ class PolicyAdapter(nn.Module, ABC):
                     f"published {name} has shape {tensors[name].shape}, not {tuple(parameter.shape)}"
                 )
         with torch.no_grad():
-            for name, parameter in parameters.items():
-                # A copy first: arrays out of Ray's store are read-only, which torch cannot express.
-                parameter.copy_(torch.tensor(tensors[name]))
+            if changed is None:
+                for name, parameter in parameters.items():
+                    _copy(parameter, tensors[name])
+            else:
+                for name, index in changed.items():
+                    values = torch.from_numpy(tensors[name].reshape(-1)[index])
+                    parameter = parameters[name]
+                    parameter.view(-1)[torch.from_numpy(index)] = values.to(parameter)
+
+    def view_trainable(self) -> dict[str, np.ndarray]:
+        """`trainable` as NumPy arrays, to be copied before the next update.
+
+        On a CPU they are the parameters' own memory, else copies of them.
+        """
+        named = {name: whole(parameter.detach()) for name, parameter in self.trainable().items()}
+        return {name: tensor.to("cpu", torch.float32).numpy() for name, tensor in named.items()}
 
     def export_trainable(self) -> dict[str, np.ndarray]:
         """A copy of `trainable` as NumPy arrays, safe to hand to another thread."""
-        return {k: p.detach().to("cpu", torch.float32).numpy().copy() for k, p in self.trainable().items()}
+        return {name: view.copy() for name, view in self.view_trainable().items()}
+
+
+def _copy(parameter: nn.Parameter, tensor: np.ndarray) -> None:
+    """Arrays that were received are read-only, which torch cannot express: NumPy copies where it can."""
+    if parameter.device.type == "cpu" and parameter.dtype == torch.float32 and not in_parts(parameter):
+        np.copyto(parameter.detach().numpy(), tensor)
+    else:
+        parameter.copy_(part_of(torch.tensor(tensor), parameter))
 
 
 def stack_observations(requests: Sequence[Request]) -> tuple[dict[str, np.ndarray], list[str]]:

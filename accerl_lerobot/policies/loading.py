@@ -23,13 +23,11 @@ from __future__ import annotations
 import importlib
 import json
 import logging
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import draccus
-import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
@@ -37,19 +35,19 @@ from torch import Tensor, nn
 from accerl_lerobot.checkpoint import BACKBONE, relocate
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.adapter import LeRobotAdapter
-from accerl_lerobot.policies.base import OBS_STATE
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Model
 from accerl_lerobot.policies.files import CONFIG, FAMILY, OURS, VALUE_HEAD, WEIGHTS, fetched_checkpoint
 from accerl_lerobot.policies.guard import Budget, guarded, input_error
 from accerl_lerobot.policies.plugins import register_policies
 from accerl_lerobot.policies.portable import keep_names, save_backbone, tokenizer_overrides, use_backbone
-from accerl_lerobot.policies.processing import IMAGES, Processing
+from accerl_lerobot.policies.processing import Processing, example_observations
 from accerl_lerobot.policies.samplers import SamplerConfig
 from accerl_lerobot.policies.tuning import merged_state_dict, tune
 from accerl_lerobot.policies.value_head import ValueHead
 from accerl_lerobot.policies.verify import verify_weights
 from accerl_lerobot.safety import Origin, brief
+from accerl_lerobot.tensors import place, whole
 
 logger = logging.getLogger(__name__)
 
@@ -277,29 +275,6 @@ def save_pretrained(
     (directory / OURS).write_text(json.dumps(ours, indent=2) + "\n")
 
 
-def example_observations(
-    policy_config: Any, rename_map: dict[str, str]
-) -> tuple[dict[str, np.ndarray], Sequence[str]]:
-    """Two random observations as a world would give them to this policy, and instructions of unequal length.
-
-    Args:
-        policy_config: LeRobot's; names and sizes the inputs.
-        rename_map: world feature name → policy feature name.
-    """
-    rng = np.random.default_rng(0)
-    world_name = {policy: world for world, policy in rename_map.items()}
-    observations: dict[str, np.ndarray] = {}
-    for key, feature in policy_config.input_features.items():
-        shape = tuple(feature.shape)
-        batch = (2,) if policy_config.n_obs_steps == 1 else (2, policy_config.n_obs_steps)
-        if key.startswith(IMAGES) and ".empty_camera_" not in key:
-            size = (*batch, *shape[1:], shape[0])
-            observations[world_name.get(key, key)] = rng.integers(0, 256, size, dtype=np.uint8)
-        elif key == OBS_STATE:
-            observations[world_name.get(key, key)] = rng.standard_normal((*batch, *shape), dtype=np.float32)
-    return observations, ("Go", "Put the red cube on the plate")
-
-
 def _checkpoint_folder(config: PolicyConfig) -> Path:
     """Where the checkpoint's files are, once checked; those of a Hub repository are fetched."""
     if config.path is None:
@@ -337,9 +312,10 @@ def _load_ours(adapter: LeRobotAdapter, folder: Path) -> None:
 
 def _copied(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Copies on the CPU; what shared its memory shares it again, so that it is written once."""
-    places = {name: (t.data_ptr(), t.shape, t.stride()) for name, t in tensors.items()}
-    copies = {places[n]: t.detach().to("cpu", copy=True).contiguous() for n, t in tensors.items()}
-    return {name: copies[place] for name, place in places.items()}
+    places = {name: place(t) for name, t in tensors.items()}
+    kept = {places[name]: t for name, t in tensors.items()}
+    copies = {at: whole(t.detach()).to("cpu", copy=True).contiguous() for at, t in kept.items()}
+    return {name: copies[at] for name, at in places.items()}
 
 
 def _load_module(module: nn.Module, path: Path, what: str, otherwise: str) -> None:

@@ -22,6 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from accerl_lerobot.policies.base import OBS_STATE
+
 IMAGES = "observation.image"
 """How images' names begin: ``observation.images.<camera>``, or LeRobot's name for a lone camera."""
 
@@ -63,3 +65,26 @@ class Processing:
     def unnormalise(self, chunk: Tensor) -> Tensor:
         """(B, K, A) from normalised to environment units."""
         return self.postprocessor(chunk)
+
+
+def example_observations(
+    policy_config: Any, rename_map: dict[str, str]
+) -> tuple[dict[str, np.ndarray], Sequence[str]]:
+    """Two random observations as a world would give them to this policy, and instructions of unequal length.
+
+    Args:
+        policy_config: LeRobot's; names and sizes the inputs.
+        rename_map: world feature name → policy feature name.
+    """
+    rng = np.random.default_rng(0)
+    world_name = {policy: world for world, policy in rename_map.items()}
+    observations: dict[str, np.ndarray] = {}
+    for key, feature in policy_config.input_features.items():
+        shape = tuple(feature.shape)
+        batch = (2,) if policy_config.n_obs_steps == 1 else (2, policy_config.n_obs_steps)
+        if key.startswith(IMAGES) and ".empty_camera_" not in key:
+            size = (*batch, *shape[1:], shape[0])
+            observations[world_name.get(key, key)] = rng.integers(0, 256, size, dtype=np.uint8)
+        elif key == OBS_STATE:
+            observations[world_name.get(key, key)] = rng.standard_normal((*batch, *shape), dtype=np.float32)
+    return observations, ("Go", "Put the red cube on the plate")

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import TuningConfig
 from accerl_lerobot.policies.family import Family, Model
+from accerl_lerobot.tensors import whole
 
 
 def tune(policy: Any, model: Model, family: Family, config: TuningConfig) -> None:
@@ -64,7 +65,7 @@ def merged_state_dict(policy: nn.Module) -> dict[str, Tensor] | None:
     for name, layer in layers.items():
         weight = state[f"{name}.base_layer.weight"]
         state[f"{name}.base_layer.weight"] = weight + layer.get_delta_weight("default").to(weight)
-    return {k.replace(".base_layer.", "."): v.detach().cpu().contiguous() for k, v in state.items()}
+    return {k.replace(".base_layer.", "."): whole(v.detach()).cpu().contiguous() for k, v in state.items()}
 
 
 def _inject(policy: Any, config: TuningConfig) -> None:

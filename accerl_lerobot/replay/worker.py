@@ -38,6 +38,7 @@ from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.replay.mixed import MixedReplay
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.replay.turns import Schedule, Turns
+from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
 from accerl_lerobot.transport.on_loop import serve_on_loop
 from accerl_lerobot.transport.shared_memory import Address
 
@@ -68,6 +69,7 @@ class ReplayWorker:
         patient: see `MixedReplay`.
         state: the ``training_state`` to go on from; None: begin.
         directory: of the run, for the journal; None: none is kept.
+        timeline: folder of the timeline; None: none is kept.
     """
 
     def __init__(
@@ -78,7 +80,9 @@ class ReplayWorker:
         patient: bool = False,
         state: Path | None = None,
         directory: Path | None = None,
+        timeline: Path | None = None,
     ) -> None:
+        self._clock = open_clock(timeline, "replay")
         journal = None if directory is None else Journal(directory / EPISODES)
         self._replay = MixedReplay(config, imagined or ReplayConfig(), 0.0, patient, journal)
         # Nothing is imagined until the dreamer says so.
@@ -99,6 +103,7 @@ class ReplayWorker:
             # Those who dream were saved before, and may not have been told of the last ones.
             self._real.extend(self._replay.real.segments)
             self._real_count = saved["real_count"]
+        self._clock.enter(WAIT_IN)
 
     async def ready(self) -> int:
         """Answers once this process is up; returns its id."""
@@ -127,12 +132,14 @@ class ReplayWorker:
                 self._insert_wait_s += time.monotonic() - started
             if self._closed:
                 return False
+            self._clock.enter(COMPUTE)
             for segment in segments:
                 if self._replay.insert(segment) and source == REAL:
                     self._real.append(segment)
                     self._real_count += 1
                     if segment.episode:
                         self._episodes.append(segment.episode)
+            self._clock.enter(WAIT_IN)
             self._changed.notify_all()
             await self._changed.wait_for(lambda: self._closed or self._turns.may_collect(self._ready))
         return True
@@ -152,7 +159,9 @@ class ReplayWorker:
                 )
                 if self._closed or self._replay.exhausted(num_decisions):
                     return []
+                self._clock.enter(COMPUTE)
                 segments = self._replay.sample(num_decisions, trainer_version, self._rng)
+                self._clock.enter(WAIT_IN)
                 self._changed.notify_all()
                 if segments:
                     self._turns.drawn()
@@ -197,11 +206,13 @@ class ReplayWorker:
 
     async def save(self, directory: Path, version: int) -> None:
         """Writes its part of ``training_state``, as it was when the trainer had made `version` updates."""
+        self._clock.enter(CHECKPOINT)
         state = {
             "replay": self._replay.state(version),
             "rng": copy.deepcopy(self._rng),
             "real_count": self._real_count,
         }
+        self._clock.enter(WAIT_IN)
         await asyncio.to_thread(snapshot.save, directory / "replay", state)
 
     @property
@@ -216,6 +227,7 @@ class ReplayWorker:
 
     async def metrics(self) -> dict[str, float]:
         """Counters and seconds waited at either door; episodes since the last call as means."""
+        self._clock.beat()
         episodes, self._episodes = self._episodes, []
         means = {
             f"episode_{k}": float(np.mean([e[k] for e in episodes]))

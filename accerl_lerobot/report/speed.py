@@ -23,6 +23,7 @@ from accerl_lerobot.report.blocks import Bar, Bars, Block, Part, Words, figures
 from accerl_lerobot.report.charts import Chart, line, rates
 from accerl_lerobot.report.read import Record, column, has, newest
 from accerl_lerobot.report.words import duration, number, percent
+from accerl_lerobot.timeline.states import ROLES, STATES
 
 SOME, MOST = 0.1, 0.8
 """Share of its time up to which the trainer hardly waits; and above which inference hardly does."""
@@ -33,6 +34,7 @@ TRAINER = (
     ("wait_s", "waiting for a batch", 7),
 )
 """Number, what the trainer does in it, colour."""
+STATE_COLOURS = dict(zip(STATES, (0, 7, 1, 3, 2, 6, 5, 4, 4), strict=True))
 
 
 def speed_charts(train: Sequence[Record], rollout: Sequence[Record]) -> list[Chart]:
@@ -55,16 +57,44 @@ def time_blocks(train: Sequence[Record], rollout: Sequence[Record], batch: int |
     if not spent or not sum(spent.values()):
         return []
     inference = _inference_busy(rollout)
+    return [
+        Words(text=_verdict(spent, newest(rollout, "replay_insert_wait_s"), inference)),
+        Bars(bars=_role_bars(rollout) or _partial_bars(spent, inference)),
+        *figures(_busy_chart(train, rollout), _batch_chart(rollout, batch), _request_chart(rollout)),
+    ]
+
+
+def _role_bars(rollout: Sequence[Record]) -> list[Bar]:
+    """How the time of every role divides; nothing for a run without a timeline.
+
+    Each record's shares are of the time since the one before.
+    """
+    length = np.diff(column(rollout, "wall_s"), prepend=np.nan)
+    bars = []
+    for role in ROLES:
+        name = f"timeline_{role.replace(' ', '_')}"
+        there = np.isfinite(column(rollout, f"{name}_bubble")) & (length > 0)
+        if role == "driver" or not there.any():
+            continue
+        parts = []
+        for state in STATES:
+            own = np.nan_to_num(column(rollout, f"{name}_{state}_share"))[there]
+            share = float((own * length[there]).sum() / length[there].sum())
+            if share > 0:
+                note, colour = percent(share), STATE_COLOURS[state]
+                parts.append(Part(name=state.replace("_", " "), share=share, colour=colour, note=note))
+        bars.append(Bar(name=role, parts=parts))
+    return bars
+
+
+def _partial_bars(spent: dict[str, float], inference: float | None) -> list[Bar]:
+    """What the trainer and inference log of themselves, which all runs do."""
     bars = [Bar(name="trainer", parts=_trainer_parts(spent))]
     if inference is not None:
         idle = Part(name="waiting for requests", share=1 - inference, colour=7, note=percent(1 - inference))
         busy = Part(name="deciding", share=inference, colour=0, note=percent(inference))
         bars.append(Bar(name="inference", parts=(busy, idle)))
-    return [
-        Words(text=_verdict(spent, newest(rollout, "replay_insert_wait_s"), inference)),
-        Bars(bars=bars),
-        *figures(_busy_chart(train, rollout), _batch_chart(rollout, batch), _request_chart(rollout)),
-    ]
+    return bars
 
 
 def _trainer_parts(spent: dict[str, float]) -> list[Part]:

@@ -31,11 +31,13 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.experience import Decision, Request, Segment
 from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig, RolloutRunner
+from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, open_clock
 from accerl_lerobot.transport.contract import Caller
 from accerl_lerobot.transport.endpoint import Endpoint
 
@@ -74,6 +76,7 @@ class RolloutWorker:
         film: see `RolloutRunner`.
         history: env steps that an observation holds.
         budget: exploring episodes at most; None: no end.
+        timeline: folder of the timeline; None: none is kept.
     """
 
     def __init__(
@@ -87,7 +90,9 @@ class RolloutWorker:
         film: tuple[int, int],
         history: int = 1,
         budget: int | None = None,
+        timeline: Path | None = None,
     ) -> None:
+        self._clock = open_clock(timeline, f"rollout {index}")
         self._plans = EpisodePlans(
             config,
             tasks,
@@ -108,7 +113,7 @@ class RolloutWorker:
         name = f"rollout{index}.{incarnation}"
         self._runner = RolloutRunner(
             worlds,
-            lambda: self._plans.next(exploring=self._training.is_set()),
+            self._next,
             config,
             name,
             self._outbox.append,
@@ -116,6 +121,7 @@ class RolloutWorker:
             film,
             self._plans.groups,
         )
+        self._clock.enter(WAIT_IN)
 
     def ready(self) -> int:
         """Answers once the worlds exist; returns this process's id."""
@@ -129,6 +135,7 @@ class RolloutWorker:
             plans: evaluation episodes to queue; they are taken before any training episode.
             in_turn: exploring worlds pause until replay lets them go on after each segment, from now on.
         """
+        self._clock.beat()
         self._plans.queue(plans)
         self._at_the_door = 1 if in_turn else AT_THE_DOOR
         (self._training.set if training else self._training.clear)()
@@ -151,6 +158,8 @@ class RolloutWorker:
         size = max(1, len(self._runner) // PARTS)
         while True:
             # Where no decision is awaited, there is nothing to wait for but the door, and orders.
+            if not under_way:
+                self._clock.enter(WAIT_OUT if due else WAIT_IN)
             at_the_door -= {ticket for ticket, _ in door.done(0.0 if under_way else 0.005)}
             self._bring(door, at_the_door, size)
             self._spent = self._plans.spent and not self._runner.exploring and not at_the_door
@@ -158,8 +167,10 @@ class RolloutWorker:
             idle = [slot for slot in idle if not self._begin(slot, due)]
             sendable = [slot for slot in due if len(at_the_door) < self._at_the_door or not due[slot].explore]
             for start in range(0, len(sendable), size):
+                self._clock.enter(TRANSPORT)
                 slots = sendable[start : start + size]
                 under_way[deciding.send([due.pop(slot) for slot in slots])] = slots
+            self._clock.enter(WAIT_IN)
             for ticket, decisions in deciding.done(0.5) if under_way else ():
                 for slot, decision in zip(under_way.pop(ticket), decisions, strict=True):
                     self._advance(slot, decision, due, idle)
@@ -167,8 +178,15 @@ class RolloutWorker:
     def _bring(self, door: Caller, at_the_door: set[int], size: int) -> None:
         """Brings segments to replay; those of a whole group may come at once, and its pace is for a few."""
         while self._outbox and len(at_the_door) < QUEUE:
+            self._clock.enter(TRANSPORT)
             at_the_door.add(door.send(self._outbox[:size]))
             del self._outbox[:size]
+
+    def _next(self) -> EpisodePlan | None:
+        plan = self._plans.next(exploring=self._training.is_set())
+        if plan is not None:
+            self._clock.enter(COMPUTE)
+        return plan
 
     def _begin(self, slot: int, due: dict[int, Request]) -> bool:
         with self._in_world():
@@ -178,6 +196,7 @@ class RolloutWorker:
         return request is not None
 
     def _advance(self, slot: int, decision: Decision, due: dict[int, Request], idle: list[int]) -> None:
+        self._clock.enter(COMPUTE)
         with self._in_world():
             request = self._runner.advance(slot, decision)
         if request is None:

@@ -17,14 +17,13 @@
 ``proximal``   those of a few updates ago, for decoupled PPO
 ``probe``      those of one published version, see `probe`
 
-A copy holds the policy's trainable weights, not the critic's, on the same device. Nobody pays for a copy that
-nobody takes.
+A copy holds the policy's trainable weights, not the critic's, on the same device and in the same parts.
+Nobody pays for a copy that nobody takes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -32,6 +31,8 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.policies.base import PolicyAdapter
+from accerl_lerobot.tensors import part_of, whole
+from accerl_lerobot.trainer.sharding import swapped_in
 
 CRITIC = "value_head."
 """How names of the critic's weights begin."""
@@ -76,14 +77,14 @@ class Anchors:
         """All that `restore` needs; see `snapshot`."""
         return {"named": {name: version for name, (version, _) in self._copies.items()}} | {
             "weights": {
-                version: [t.detach().clone() for t in kept] for version, kept in self._copies.values()
+                version: [whole(t.detach()).clone() for t in kept] for version, kept in self._copies.values()
             }
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Goes on from what `state` gave."""
         weights = {
-            version: [t.to(live.device) for t, live in zip(kept, self._live, strict=True)]
+            version: [part_of(t, live) for t, live in zip(kept, self._live, strict=True)]
             for version, kept in state["weights"].items()
         }
         self._copies = {name: (version, weights[version]) for name, version in state["named"].items()}
@@ -100,18 +101,5 @@ class Anchors:
             tasks: B instruction texts.
             latent: each (B, ...).
         """
-        with self._swapped_in(name):
+        with swapped_in(self.adapter, self._live, self._copies[name][1]):
             return self.adapter.evaluate(observations, tasks, latent).log_prob
-
-    @contextmanager
-    def _swapped_in(self, name: str) -> Iterator[None]:
-        """Parameters point to the copy inside, and to their own memory again afterwards, whatever happens."""
-        _, tensors = self._copies[name]
-        own = [p.data for p in self._live]
-        try:
-            for parameter, tensor in zip(self._live, tensors, strict=True):
-                parameter.data = tensor
-            yield
-        finally:
-            for parameter, tensor in zip(self._live, own, strict=True):
-                parameter.data = tensor

@@ -18,8 +18,10 @@ Shapes: S segments, N decisions in all, L log-prob factors of one.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -89,6 +91,32 @@ def pick(
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """Some rows of observations and of the tasks beside them."""
     return {k: v[rows] for k, v in observations.items()}, [tasks[i] for i in rows]
+
+
+class Turn(NamedTuple):
+    """One run of the network in an update."""
+
+    rows: np.ndarray
+    own: bool
+    """False: the rank has no rows left and lends its network for one that is somebody else's."""
+
+
+def turns(rows: np.ndarray, size: int, rank: int, ranks: int) -> list[Turn]:
+    """A rank's share of rows, consecutive ones, in parts of at most `size`.
+
+    Every rank gets as many parts, because all ranks have to run a network of which each keeps a part: who has
+    no rows left repeats the first of all, and what comes of it is not counted.
+
+    Args:
+        rows: of all ranks, at least one.
+        size: the largest part.
+        rank: whose share.
+        ranks: how many there are.
+    """
+    shares = np.array_split(rows, ranks)
+    mine = [Turn(part, own=True) for part in split(shares[rank], size) if len(part)]
+    most = math.ceil(len(shares[0]) / size)
+    return mine + [Turn(rows[:1], own=False)] * (most - len(mine))
 
 
 def split(rows: np.ndarray, size: int) -> list[np.ndarray]:

@@ -28,15 +28,16 @@ another one is taken. That is after `replay.max_lag` updates at the latest.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from accerl_lerobot.trainer.anchors import Anchors
-from accerl_lerobot.trainer.batch import Batch, split
+from accerl_lerobot.trainer.batch import Batch
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.ranks import Ranks
 
 PROBE = "probe"
 CLIP = 0.2
@@ -49,10 +50,11 @@ class Probe:
     Args:
         anchors: where the copy is kept.
         config: how often, and which versions are published.
+        ranks: who measure together; None: this process alone.
     """
 
-    def __init__(self, anchors: Anchors, config: TrainerConfig) -> None:
-        self._anchors, self._config = anchors, config
+    def __init__(self, anchors: Anchors, config: TrainerConfig, ranks: Ranks | None = None) -> None:
+        self._anchors, self._config, self._ranks = anchors, config, ranks or Ranks()
         self._version: int | None = None
         self._next = 0
         self.renew(0)
@@ -93,8 +95,7 @@ class Probe:
         return metrics
 
     def _measure(self, batch: Batch, rows: np.ndarray) -> dict[str, float]:
-        parts = split(rows, self._config.micro_batch)
-        apart = torch.cat([self._apart(batch, part) for part in parts])
+        apart = self._ranks.each(partial(self._apart, batch), rows, self._config.micro_batch)
         return {
             "logprob/mismatch_mean": float(apart.abs().mean()),
             "logprob/mismatch_max": float(apart.abs().max()),

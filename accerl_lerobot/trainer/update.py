@@ -42,10 +42,13 @@ from accerl_lerobot.algorithms.ratio import present
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.optimizers import optimizer_state, restore_optimizer
 from accerl_lerobot.policies.base import PolicyAdapter
+from accerl_lerobot.tensors import whole
 from accerl_lerobot.trainer.anchors import CRITIC, Anchors
-from accerl_lerobot.trainer.batch import Batch, Part, collate, pick, split
+from accerl_lerobot.trainer.batch import Batch, Part, collate, pick, turns
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.probe import Probe
+from accerl_lerobot.trainer.ranks import Ranks
+from accerl_lerobot.trainer.sharding import arrange, synchronise
 
 
 class NonFiniteError(RuntimeError):
@@ -53,7 +56,13 @@ class NonFiniteError(RuntimeError):
 
 
 class Update:
-    """The optimiser around one adapter.
+    """The optimiser around one adapter; of several ranks, each has one, and all make the same steps.
+
+    Args:
+        adapter: the policy; its parameters are others afterwards where ranks keep parts of them.
+        algorithm: the objective.
+        config: the optimiser.
+        ranks: those that make each update; None: this process alone.
 
     Example:
         >>> update = Update(adapter, GIPOConfig(), TrainerConfig(lr=1e-4))
@@ -61,9 +70,18 @@ class Update:
         >>> weights = adapter.export_trainable()        # to publish as version `update.version`
     """
 
-    def __init__(self, adapter: PolicyAdapter, algorithm: AlgorithmConfig, config: TrainerConfig) -> None:
+    def __init__(
+        self,
+        adapter: PolicyAdapter,
+        algorithm: AlgorithmConfig,
+        config: TrainerConfig,
+        ranks: Ranks | None = None,
+    ) -> None:
         check_level(algorithm.level, adapter.actions)
         self.adapter, self.algorithm, self.config = adapter, algorithm, config
+        self.ranks = ranks or Ranks()
+        self.ranks.begin_alike(list(adapter.trainable().values()))
+        arrange(adapter, config)
         self._grouped = algorithm.advantage == "group"
         self._critic = not self._grouped or algorithm.value_coef > 0
         self.version = 0
@@ -73,7 +91,7 @@ class Update:
         self.anchors = Anchors(adapter)
         if algorithm.reference_coef:
             self.anchors.take("reference", self.version)
-        self._probe = Probe(self.anchors, config)
+        self._probe = Probe(self.anchors, config, self.ranks)
         named = adapter.trainable()
         critic = [p for k, p in named.items() if k.startswith(CRITIC)]
         self._policy_parameters = [p for k, p in named.items() if not k.startswith(CRITIC)]
@@ -105,7 +123,7 @@ class Update:
             # Before the norm is taken: noise in the policy's gradient must not scale the critic's.
             for parameter in self._policy_parameters:
                 parameter.grad = None
-        norm = torch.nn.utils.clip_grad_norm_(self._parameters, self.config.grad_clip)
+        norm = whole(torch.nn.utils.clip_grad_norm_(self._parameters, self.config.grad_clip))
         if bool(torch.isfinite(norm)) and np.isfinite(metrics["loss"]):
             self.optimizer.step()
             self._skipped_in_a_row = 0
@@ -159,7 +177,7 @@ class Update:
 
     def _backward(self, batch: Batch) -> dict[str, float]:
         """Accumulates gradients over micro-batches; returns metrics weighted by their decisions."""
-        parts = split(np.arange(len(batch)), self.config.micro_batch)
+        parts = turns(np.arange(len(batch)), self.config.micro_batch, self.ranks.rank, self.ranks.size)
         bootstrap = self._values(batch.last_observations, batch.segment_tasks)
         targets: tuple[Tensor, Tensor] | None = None
         if len(parts) > 1:  # a single micro-batch supplies the values that GAE needs by its own forward pass
@@ -167,15 +185,17 @@ class Update:
         factors = self.adapter.factors(batch.latent)
         ratios = None if factors is None else self._ratios_per_decision(factors)
         total: dict[str, float] = {}
-        for rows in parts:
-            part = batch.part(rows)
+        for number, turn in enumerate(parts, 1):
+            rows, part = turn.rows, batch.part(turn.rows)
             reference = self._under("reference", part)
             proximal = None if self._is_proximal else self._under("proximal", part)
             evaluation = self.adapter.evaluate(*part)
             if self._is_proximal:
                 proximal = evaluation.log_prob.detach()
             if targets is None:
-                targets = self._targets(batch, evaluation.value.mean.detach().cpu(), bootstrap)
+                mine = evaluation.value.mean.detach().cpu().float()
+                values = self.ranks.gather(mine if turn.own else mine[:0], len(batch))
+                targets = self._targets(batch, values, bootstrap)
             device = evaluation.log_prob.device
             returns = targets[1][rows].to(device)
             inputs = LossInputs(
@@ -193,11 +213,26 @@ class Update:
                 log_prob_proximal=proximal,
             )
             output = compute_loss(inputs, self.algorithm)
-            share = len(rows) / len(batch)
-            (output.loss * share).backward()
-            _merge(total, {k: float(v) for k, v in output.metrics.items()}, share)
+            share = len(rows) / len(batch) if turn.own else 0.0
+            synchronise(self.adapter, number == len(parts))
+            (output.loss * share * self.ranks.size).backward()  # a gradient is the mean over ranks
+            said = {k: float(v) if turn.own else 0.0 for k, v in output.metrics.items()}
+            _merge(total, said, share)
+        if self.config.sharding == "ddp":
+            self.ranks.average(self._parameters)
         assert targets is not None
-        return total | {"return_mean": float(targets[1].mean()), "reward_mean": float(batch.reward.mean())}
+        return self._of_all(total) | {
+            "return_mean": float(targets[1].mean()),
+            "reward_mean": float(batch.reward.mean()),
+        }
+
+    def _of_all(self, metrics: dict[str, float]) -> dict[str, float]:
+        """Numbers over all ranks, from those over this one's share."""
+        mine = torch.tensor([list(metrics.values())], dtype=torch.float64)
+        total: dict[str, float] = {}
+        for numbers in self.ranks.gather(mine, self.ranks.size).tolist():
+            _merge(total, dict(zip(metrics, numbers, strict=True)), 1.0)
+        return total
 
     def _under(self, name: str, part: Part) -> Tensor | None:
         """log-probs (rows, L) under a copy; None if there is none."""
@@ -237,8 +272,11 @@ class Update:
         """V of each row, (rows,), without gradient, at most `micro_batch` rows at a time."""
         if not self._critic:  # V is neither used nor learnt
             return torch.zeros(len(tasks))
-        parts = split(np.arange(len(tasks)), self.config.micro_batch)
-        return torch.cat([self.adapter.values(*pick(observations, tasks, r)).cpu().float() for r in parts])
+
+        def values(rows: np.ndarray) -> Tensor:
+            return self.adapter.values(*pick(observations, tasks, rows)).float()
+
+        return self.ranks.each(values, np.arange(len(tasks)), self.config.micro_batch)
 
 
 def _merge(total: dict[str, float], metrics: dict[str, float], share: float) -> None:

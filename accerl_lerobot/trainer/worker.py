@@ -14,7 +14,7 @@
 """The trainer process: the run's clock.
 
 consumes    batches of segments from replay, the next one drawn while the current one is learned from
-produces    weights, published every `publish_every` updates without waiting for anyone
+produces    weights, published every `publish_every` updates without waiting for more than a copy of them
 waits for   a batch
 ends        after `updates` updates, or when replay is closed
 """
@@ -25,6 +25,7 @@ import os
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,11 +34,14 @@ import ray
 from accerl_lerobot import snapshot
 from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.checkpoint import PRETRAINED, TRAINING_STATE, WEIGHTS
-from accerl_lerobot.policies.config import Load, PolicyConfig, loader
+from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
+from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.peers import Learner, Peers
 from accerl_lerobot.weights.held_back import HeldBack
-from accerl_lerobot.weights.ray_channel import RayPublisher
+from accerl_lerobot.weights.publisher import Publisher
+from accerl_lerobot.weights.ray_channel import make_publisher
 
 
 class TrainerWorker:
@@ -50,6 +54,8 @@ class TrainerWorker:
         seed: of torch's global generator.
         state: the ``training_state`` to go on from; None: begin.
         load: makes the adapter; None: of LeRobot's checkpoint.
+        timeline: folder of the timeline; None: none is kept.
+        peers: handles of the other ranks.
     """
 
     def __init__(
@@ -60,51 +66,71 @@ class TrainerWorker:
         seed: int,
         state: Path | None = None,
         load: Load | None = None,
+        timeline: Path | None = None,
+        peers: Sequence[Any] = (),
     ) -> None:
-        import torch
-
-        from accerl_lerobot.trainer.update import Update
-
-        torch.set_num_threads(config.num_threads)
-        torch.manual_seed(seed)
+        self._clock = open_clock(timeline, "trainer")
         self._policy, self._config = policy, config
-        adapter = loader(load)(policy)
-        self._update = Update(adapter, algorithm, config)
-        if state is not None:
-            adapter.load_trainable(snapshot.load(state / WEIGHTS))
-            self._update.restore(snapshot.load(state / "trainer"))
+        self._peers = Peers(peers, config)
+        self._update = self._peers.begin(Learner(policy, algorithm, config, seed, state, load))
         self._lock = threading.Lock()
         self._kept: Any = None
         self._in_turn = False
         self._history: deque[dict[str, float]] = deque()  # filled on one thread, emptied on another
+        self._clock.enter(WAIT_IN)
 
     def ready(self) -> int:
         """Answers once the policy is loaded; returns this process's id."""
         return os.getpid()
 
-    def run(self, replay: Any, readers: list[Any]) -> int:
-        """Trains; returns the number of updates made."""
-        publisher, held = RayPublisher(readers), HeldBack(self._config.hold_back)
+    def run(self, replay: Any, readers: list[Any], transport: str = "auto") -> int:
+        """Trains; returns the number of updates made.
+
+        Args:
+            replay: actor handle.
+            readers: actor handles; where the weights go.
+            transport: see `make_publisher`.
+        """
+        self._clock.enter(WEIGHT_SYNC)
+        publisher = make_publisher(readers, transport, changes=self._config.publish_changes)
+        try:
+            # A checkpoint need not hold a critic: all start from this one.
+            publisher.publish(self._update.version, self._view())
+            self._train(replay, publisher)
+            self._clock.enter(WEIGHT_SYNC)
+            publisher.flush()
+        finally:
+            publisher.close()
+            self._clock.enter(WAIT_IN)
+        return self._update.version
+
+    def _train(self, replay: Any, publisher: Publisher) -> None:
+        """Makes the updates."""
+        held = HeldBack(self._config.hold_back)
         n, config = self._config.batch_decisions, self._config
-        # A checkpoint need not hold a critic: all start from this one.
-        publisher.publish(self._update.version, self._export())
         upcoming = replay.sample.remote(n, self._update.version)
         asked = time.monotonic()
         while self._update.version < config.updates:
-            segments = ray.get(upcoming)
+            self._clock.enter(WAIT_IN)
+            ray.wait([upcoming])
+            self._clock.enter(TRANSPORT)
+            batch, segments = upcoming, ray.get(upcoming)
             if not segments:
                 break
             waited = time.monotonic() - asked
             if self._update.version + 1 < config.updates:
                 upcoming = replay.sample.remote(n, self._update.version + 1)
+            self._clock.enter(CHECKPOINT)
             with self._lock:
+                self._clock.enter(COMPUTE)
                 started = time.monotonic()
-                metrics = self._update.step(segments)
+                with self._peers.joining("step", batch):
+                    metrics = self._update.step(segments)
                 updated = time.monotonic()
+                self._clock.enter(WEIGHT_SYNC)
                 version = self._update.version
                 if config.publishes(version):
-                    for due in held.push(version, self._export(), last=version == config.updates):
-                        publisher.publish(*due)
+                    self._publish(publisher, held, last=version == config.updates)
                 metrics |= {
                     "update": float(self._update.version),
                     "wait_s": waited,
@@ -114,18 +140,25 @@ class TrainerWorker:
                 self._history.append(metrics)
             asked = time.monotonic()
             if self._in_turn:
+                self._clock.enter(WEIGHT_SYNC)
                 publisher.flush()
             replay.learnt.remote()
         version = self._update.version
         if version < config.updates and (config.hold_back or not config.publishes(version)):
             # It has ended early, and what is evaluated is to be what is saved.
-            for due in held.push(version, self._export(), last=True):
-                publisher.publish(*due)
-        publisher.flush()
-        return self._update.version
+            self._publish(publisher, held, last=True)
+
+    def _publish(self, publisher: Publisher, held: HeldBack, last: bool) -> None:
+        """Hands the weights of now over, or those that are old enough."""
+        if not held.updates:
+            publisher.publish(self._update.version, self._view())
+            return
+        for due in held.push(self._update.version, self._export(), last=last):
+            publisher.publish(*due)
 
     def metrics(self) -> list[dict[str, float]]:
         """One record per update since the last call."""
+        self._clock.beat()
         return [self._history.popleft() for _ in range(len(self._history))]
 
     def follow(self, schedule: Schedule) -> None:
@@ -141,7 +174,9 @@ class TrainerWorker:
         from accerl_lerobot.policies.loading import copy_weights
 
         with self._lock:
-            self._kept = copy_weights(self._update.adapter), self._export(), self._update.state()
+            with self._peers.lending("lend_state"):
+                adapter = self._update.adapter
+                self._kept = copy_weights(adapter), adapter.export_trainable(), self._update.state()
             return self._update.version, self.metrics()
 
     def write(self, directory: Path) -> None:
@@ -153,5 +188,11 @@ class TrainerWorker:
         snapshot.save(directory / TRAINING_STATE / WEIGHTS, trained)
         snapshot.save(directory / TRAINING_STATE / "trainer", state)
 
+    def _view(self) -> dict[str, Any]:
+        """Trainable weights, to be copied before the next update."""
+        with self._peers.lending("lend_weights"):
+            return self._update.adapter.view_trainable()
+
     def _export(self) -> dict[str, Any]:
-        return self._update.adapter.export_trainable()
+        with self._peers.lending("lend_weights"):
+            return self._update.adapter.export_trainable()

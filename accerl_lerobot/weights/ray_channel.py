@@ -14,7 +14,8 @@
 """Weights from the trainer to inference workers through Ray's object store.
 
 One copy is put into the store, each reader gets a reference, and at most one set per reader is under way: a
-reader that is slow skips versions instead of queueing them. The publisher never waits for a reader.
+reader that is slow skips versions instead of queueing them. The trainer waits for its own copy and neither
+for the store nor for a reader.
 """
 
 from __future__ import annotations
@@ -24,61 +25,121 @@ from typing import Any
 
 import ray
 
-from accerl_lerobot.weights.channel import Tensors, check_grows
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.weights.publisher import Publisher
+from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher, is_available
+from accerl_lerobot.weights.slab import Slab
+
+TRANSPORTS = ("auto", "ray", "shared_memory")
+CONNECT_S = 60.0
+"""How long readers may take to say whether they can map the trainer's memory."""
+_POLL_S = 0.02
+"""How long the thread waits for a reader before it looks for something newer."""
 
 
-class RayPublisher:
+def make_publisher(readers: Sequence[Any], transport: str = "auto", *, changes: bool = False) -> Publisher:
+    """The trainer's end of the transport that is asked for, with its readers connected.
+
+    Args:
+        readers: actor handles with ``receive_weights(version, tensors, published_s)`` and
+            ``open_weights(address)``, as `InferenceWorker` has them.
+        transport: shared_memory, ray, or auto: the former if all readers can reach it, that is if they run
+            on this machine.
+        changes: send only what has changed, where that is less; shared memory only.
+
+    Raises:
+        InputError: shared memory is asked for and not to be had.
+        ray.exceptions.RayError: a reader has died.
+    """
+    if transport not in TRANSPORTS:
+        raise InputError("launch.transport", transport, f"use one of {', '.join(TRANSPORTS)}")
+    if transport != "ray" and is_available():
+        publisher = SharedMemoryPublisher(len(readers), changes=changes)
+        try:
+            answers = [reader.open_weights.remote(publisher.address) for reader in readers]
+            if all(_answered(answer) for answer in answers):
+                return publisher
+        except BaseException:
+            publisher.close()
+            raise
+        publisher.close()
+    if transport == "shared_memory":
+        raise InputError(
+            "launch.transport", transport, "it needs Linux and all workers on one machine; use ray"
+        )
+    if changes:
+        raise InputError("trainer.publish_changes", changes, "it needs shared memory: see launch.transport")
+    return RayPublisher(readers)
+
+
+def _answered(answer: Any) -> bool:
+    try:
+        return bool(ray.get(answer, timeout=CONNECT_S))
+    except ray.exceptions.GetTimeoutError as error:
+        raise TimeoutError(f"a reader has not answered `open_weights` within {CONNECT_S:g} s") from error
+
+
+class RayPublisher(Publisher):
     """The trainer's end; the readers' end is `InferenceWorker.receive_weights`.
 
     Args:
-        readers: actor handles with a ``receive_weights(version, tensors)`` method.
+        readers: actor handles with a ``receive_weights(version, tensors, published_s)`` method.
     """
 
     def __init__(self, readers: Sequence[Any]) -> None:
+        super().__init__(2, Slab)  # one is put into the store while the next is written
         self._readers = list(readers)
         self._under_way: list[Any] = [None] * len(self._readers)
         self._sent: list[int | None] = [None] * len(self._readers)
-        self._version: int | None = None
-        self._newest: Any = None
+        self._stored: tuple[int, Any, float] | None = None
+        self._thread.start()
 
-    def publish(self, version: int, tensors: Tensors) -> None:
-        """Makes a set the newest one; returns once it is copied into the object store.
+    def _serve(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closing or self._pending is not None or self._busy())
+                if self._closing:
+                    return
+            shipment = self._take()
+            if shipment is not None:
+                tensors = shipment.slab.views(shipment.layout)
+                self._stored = (shipment.version, ray.put(tensors), shipment.published_s)
+                self._spare()
+                with self._changed:
+                    self._current = None  # the store has a copy
+            waiting = [reference for reference in self._under_way if reference is not None]
+            if waiting and shipment is None:
+                ray.wait(waiting, timeout=_POLL_S)
+            for index in range(len(self._readers)):
+                self._advance(index)
 
-        Raises:
-            ValueError: `version` does not grow.
-            ray.exceptions.RayError: a reader has died.
-        """
-        check_grows(version, self._version)
-        self._version, self._newest = version, ray.put(tensors)
-        for index in range(len(self._readers)):
-            if self._arrived(index, timeout=0):
-                self._send(index)
-
-    def flush(self) -> None:
-        """Waits until every reader has the newest set; called once, after the last update.
-
-        Raises:
-            ray.exceptions.RayError: a reader has died.
-        """
-        for index in range(len(self._readers)):
-            self._arrived(index, timeout=None)
-            self._send(index)
-        for index in range(len(self._readers)):
-            self._arrived(index, timeout=None)
-
-    def _send(self, index: int) -> None:
-        if self._sent[index] != self._version:
-            reader = self._readers[index]
-            self._under_way[index] = reader.receive_weights.remote(self._version, self._newest)
-            self._sent[index] = self._version
-
-    def _arrived(self, index: int, timeout: float | None) -> bool:
-        """Whether what was sent to a reader has been received; waits up to `timeout` seconds for it."""
+    def _advance(self, index: int) -> None:
+        """Hears from a reader, and sends it the newest set if it is free and has another one."""
         reference = self._under_way[index]
-        if reference is None:
-            return True
-        done, _ = ray.wait([reference], timeout=timeout)
-        if done:
+        if reference is not None:
+            done, _ = ray.wait([reference], timeout=0)
+            if not done:
+                return
             ray.get(done[0])  # a dead reader raises here
-            self._under_way[index] = None
-        return bool(done)
+        assert self._stored is not None
+        version, stored, published_s = self._stored
+        sent = None
+        if self._sent[index] != version:
+            sent = self._readers[index].receive_weights.remote(version, stored, published_s)
+        with self._changed:
+            self._under_way[index], self._sent[index] = sent, version
+            self._changed.notify_all()
+
+    def _busy(self) -> bool:
+        return any(reference is not None for reference in self._under_way)
+
+    def _wake(self) -> None:
+        self._changed.notify_all()
+
+    def _owed(self) -> str:
+        late = [
+            str(i)
+            for i, (version, reference) in enumerate(zip(self._sent, self._under_way, strict=True))
+            if self._version is not None and (version != self._version or reference is not None)
+        ]
+        return f"not received by readers {', '.join(late)}" if late else ""

@@ -37,6 +37,7 @@ import ray
 from accerl_lerobot import snapshot
 from accerl_lerobot.checkpoint import TRAINING_STATE, WORLD_MODEL
 from accerl_lerobot.experience import Segment
+from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.world_model.dreaming import make_imagination, make_learner
 from accerl_lerobot.world_model.online import Promotion
@@ -62,9 +63,11 @@ class DreamWorker:
     Args:
         config: the run; its ``policy.path`` must be set.
         state: the ``training_state`` to go on from; None: begin.
+        timeline: folder of the timeline; None: none is kept.
     """
 
-    def __init__(self, config: RunConfig, state: Path | None = None) -> None:
+    def __init__(self, config: RunConfig, state: Path | None = None, timeline: Path | None = None) -> None:
+        self._clock = open_clock(timeline, "dream")
         import torch
 
         torch.set_num_threads(config.trainer.num_threads)
@@ -83,6 +86,7 @@ class DreamWorker:
             saved = snapshot.load(state / DREAMS)
             self._dreams.restore(saved["dreams"])
             self._cursor = saved["cursor"]
+        self._clock.enter(WAIT_IN)
 
     def ready(self) -> int:
         """Answers once the world model is loaded; returns this process's id."""
@@ -100,6 +104,7 @@ class DreamWorker:
 
     def metrics(self) -> dict[str, float]:
         """See `Imagination.metrics`."""
+        self._clock.beat()
         return self._dreams.metrics()
 
     def save(self, directory: Path) -> None:
@@ -118,7 +123,9 @@ class DreamWorker:
         deciding, door = inference.connect(), inserting.connect()
         at_the_door: set[int] = set()
         while not news.closed:
+            self._clock.enter(CHECKPOINT)
             with self._dreaming:
+                self._clock.enter(COMPUTE)
                 promising = self._swap()
                 for segment in news.fresh():
                     self._dreams.remember(segment)
@@ -127,19 +134,26 @@ class DreamWorker:
             if told != (self._dreams.on, promising):
                 told = (self._dreams.on, promising)
                 ray.get(replay.mix.remote(self._share if self._dreams.on else 0.0, any(told)))
+            self._clock.enter(TRANSPORT)
             for ticket, stored in door.done(0.0):
                 at_the_door.discard(ticket)
                 if not stored:
                     return
+            self._clock.enter(COMPUTE)
             with self._dreaming:
                 requests = [] if len(at_the_door) >= AT_THE_DOOR else self._dreams.requests()
             if not requests:
+                self._clock.enter(WAIT_OUT if len(at_the_door) >= AT_THE_DOOR else WAIT_IN)
                 time.sleep(PAUSE_S)
                 continue
             parts = [requests[i : i + self._batch] for i in range(0, len(requests), self._batch)]
+            self._clock.enter(WAIT_IN)
             answers = deciding.ask(parts, self._patience_s)
+            self._clock.enter(CHECKPOINT)
             with self._dreaming:
+                self._clock.enter(COMPUTE)
                 self._dreams.advance([decision for answer in answers for decision in answer])
+                self._clock.enter(TRANSPORT)
                 if self._outbox:
                     at_the_door.add(door.send(self._outbox))
                     self._outbox.clear()
@@ -150,7 +164,9 @@ class DreamWorker:
             promoted, self._promoted = self._promoted, None
             promising = self._promising
         if promoted is not None:
+            self._clock.enter(WEIGHT_SYNC)
             self._dreams.swap(promoted)
+            self._clock.enter(COMPUTE)
         return promising
 
 
@@ -160,9 +176,11 @@ class WorldLearningWorker:
     Args:
         config: the run; its ``policy.path`` must be set.
         state: the ``training_state`` to go on from; None: begin.
+        timeline: folder of the timeline; None: none is kept.
     """
 
-    def __init__(self, config: RunConfig, state: Path | None = None) -> None:
+    def __init__(self, config: RunConfig, state: Path | None = None, timeline: Path | None = None) -> None:
+        self._clock = open_clock(timeline, "world learning")
         import torch
 
         torch.set_num_threads(config.trainer.num_threads)
@@ -175,6 +193,7 @@ class WorldLearningWorker:
             saved = snapshot.load(state / LEARNER)
             self._learner.restore(saved["learner"])
             self._cursor = saved["cursor"]
+        self._clock.enter(WAIT_IN)
 
     def ready(self) -> int:
         """Answers once the world model and its dataset are loaded; returns this process's id."""
@@ -182,6 +201,7 @@ class WorldLearningWorker:
 
     def metrics(self) -> dict[str, float]:
         """See `OnlineLearner.metrics`."""
+        self._clock.beat()
         return self._learner.metrics()
 
     def save(self, directory: Path) -> None:
@@ -197,6 +217,7 @@ class WorldLearningWorker:
         held: bool | None = None
         """What replay has been told; None: nothing by this process."""
         while not news.closed:
+            self._clock.enter(TRANSPORT)
             with self._learning:
                 for segment in news.fresh():
                     learner.add(segment)
@@ -210,13 +231,18 @@ class WorldLearningWorker:
                 promising = learner.promising(last)
                 ray.get(dreamer.expect.remote(promising))
             if learner.owed >= 1:
+                self._clock.enter(CHECKPOINT)
                 with self._learning:
+                    self._clock.enter(COMPUTE)
                     learner.step()
             elif learner.due(last):
+                self._clock.enter(COMPUTE)
                 if promotion := learner.promote(last):
+                    self._clock.enter(WEIGHT_SYNC)
                     ray.get(dreamer.promote.remote(promotion))
                     learner.handed_over()
             else:
+                self._clock.enter(WAIT_IN)
                 time.sleep(PAUSE_S)
 
 

@@ -29,6 +29,9 @@ from accerl_lerobot.inference.worker import InferenceConfig, InferenceWorker
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.transport.contract import ServiceStoppedError
+from accerl_lerobot.weights import shared_memory
+from accerl_lerobot.weights.publisher import ReaderLostError
+from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
 
 NAMES = ("a", "b", "c")
 
@@ -71,7 +74,7 @@ class CountingAdapter:
         self._leave()
         return answers
 
-    def load_trainable(self, tensors: dict[str, np.ndarray]) -> None:
+    def load_trainable(self, tensors: dict[str, np.ndarray], changed: Any = None) -> None:
         self._enter()
         if self.broken is not None:
             raise self.broken
@@ -194,7 +197,7 @@ def test_no_batch_sees_two_versions(play):
             for version in range(1, last + 1):
                 while len(adapter.batches) < version:
                     await asyncio.sleep(0.0002)
-                await worker.receive_weights(version, weights(version))
+                await worker.receive_weights(version, weights(version), time.monotonic())
 
         async def ask(first: int) -> list[Decision]:
             answers = []
@@ -216,7 +219,7 @@ def test_no_batch_sees_two_versions(play):
 def test_weights_that_arrive_while_nobody_asks_are_loaded(play):
     async def scene(worker, adapter):
         await asyncio.sleep(0.01)
-        await worker.receive_weights(3, weights(3))
+        await worker.receive_weights(3, weights(3), time.monotonic())
         while adapter.loaded != [3]:
             await asyncio.sleep(0.001)
         (decision,) = await worker.decide(requests(0))
@@ -229,7 +232,7 @@ def test_weights_that_arrive_while_nobody_asks_are_loaded(play):
 def test_the_first_weights_are_version_zero_and_are_loaded(play):
     async def scene(worker, adapter):
         adapter.weights = dict.fromkeys(NAMES, -1.0)  # another critic than the trainer's
-        await worker.receive_weights(0, weights(0))
+        await worker.receive_weights(0, weights(0), time.monotonic())
         (decision,) = await worker.decide(requests(0))
         assert decision.version == 0 and set(decision.chunk.ravel()) == {0.0}
 
@@ -239,7 +242,7 @@ def test_the_first_weights_are_version_zero_and_are_loaded(play):
 def test_a_batch_served_after_weights_were_received_uses_them(play):
     async def scene(worker, adapter):
         for version in range(1, 30):
-            await worker.receive_weights(version, weights(version))
+            await worker.receive_weights(version, weights(version), time.monotonic())
             (decision,) = await worker.decide(requests(0))
             assert decision.version == version
 
@@ -248,10 +251,10 @@ def test_a_batch_served_after_weights_were_received_uses_them(play):
 
 def test_older_weights_are_ignored_even_while_newer_ones_are_loaded(play):
     async def scene(worker, adapter):
-        await worker.receive_weights(4, weights(4))
+        await worker.receive_weights(4, weights(4), time.monotonic())
         while not adapter.entered.is_set():
             await asyncio.sleep(0.0005)
-        await worker.receive_weights(3, weights(3))  # version 4 is being written just now
+        await worker.receive_weights(3, weights(3), time.monotonic())  # version 4 is being written just now
         versions = [(await worker.decide(requests(i)))[0].version for i in range(3)]
         assert versions == [4, 4, 4] and adapter.loaded == [4]
 
@@ -266,7 +269,7 @@ def test_a_failure_reaches_everyone_who_waits_and_everyone_after(play, weights_t
         # A batch holds one request, so that of those who wait only one is in the batch that fails.
         adapter.broken = ValueError("no such weights")
         if weights_too:
-            await worker.receive_weights(1, weights(1))
+            await worker.receive_weights(1, weights(1), time.monotonic())
         calls = [worker.decide(requests(i)) for i in range(5)]
         answers = await asyncio.gather(*calls, return_exceptions=True)
         assert all(isinstance(a, ServiceStoppedError) for a in answers), answers
@@ -308,3 +311,62 @@ def test_a_caller_who_gave_up_does_not_disturb_the_others(play):
         assert (await worker.decide(requests(2)))[0].value == 2.0
 
     play(scene, adapter, max_batch=2, max_wait_s=1.0)
+
+
+def test_weights_through_shared_memory_are_swapped_in_and_let_go_of(play):
+    publisher = SharedMemoryPublisher(1)
+
+    async def scene(worker, adapter):
+        assert await worker.open_weights(publisher.address)
+        for version in range(30):
+            publisher.publish(version, weights(version))
+            await asyncio.to_thread(publisher.flush, 20)  # applied, though nobody has asked for a decision
+            (decision,) = await worker.decide(requests(0))
+            assert decision.version == version and set(decision.chunk.ravel()) == {version}
+        metrics = await worker.metrics()
+        assert metrics["publish_to_served_s"] >= metrics["swap_s"] > 0
+
+    play(scene, max_batch=1, max_wait_s=0.0)
+    publisher.close()
+
+
+def test_nobody_at_the_address_is_an_answer_and_no_error(play):
+    async def scene(worker, adapter):
+        assert not await worker.open_weights("accerl-weights-nobody")
+
+    play(scene)
+
+
+def test_a_torn_set_ends_the_service_and_is_never_served(play, monkeypatch: pytest.MonkeyPatch):
+    publisher = SharedMemoryPublisher(1)
+    monkeypatch.setattr(shared_memory, "digest", lambda *_: bytes(16))
+
+    async def scene(worker, adapter):
+        assert await worker.open_weights(publisher.address)
+        publisher.publish(1, weights(1))
+        with pytest.raises(ServiceStoppedError, match="version 1 are not what their digest says"):
+            while True:
+                (decision,) = await worker.decide(requests(0))
+                assert decision.version == 0
+        assert adapter.loaded == []
+        with pytest.raises(ReaderLostError):
+            await asyncio.to_thread(publisher.flush, 20)
+
+    play(scene, max_batch=1, max_wait_s=0.0)
+    publisher.close()
+
+
+def test_a_service_that_fails_is_heard_of_by_the_trainer(play):
+    publisher = SharedMemoryPublisher(1)
+
+    async def scene(worker, adapter):
+        assert await worker.open_weights(publisher.address)
+        adapter.broken = ValueError("no such weights")
+        publisher.publish(1, weights(1))
+        with pytest.raises(ReaderLostError):
+            await asyncio.to_thread(publisher.flush, 20)
+        with pytest.raises(ServiceStoppedError, match="no such weights"):
+            await worker.decide(requests(0))
+
+    play(scene, max_batch=1)
+    publisher.close()

@@ -15,7 +15,9 @@
 
 from __future__ import annotations
 
+import pickle
 import re
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +29,8 @@ from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import stack_observations
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.loading import load_adapter, save_pretrained
+from accerl_lerobot.weights.reader import Received, SharedMemoryReader
+from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
 from tests.conftest import write_smolvla
 from tests.policies.tiny import adapter_at, log_ratio, perturb, requests, stored
 
@@ -131,3 +135,44 @@ def test_targets_that_match_nothing(path: Path, targets: str, said: str):
 def test_bad_options_name_their_field(name: str, value: object):
     with pytest.raises(InputError, match=rf"^policy\.tuning\.{name}={value!r}: use"):
         TuningConfig(**{name: value})
+
+
+def test_only_what_is_trained_travels_and_is_copied_once(path: Path):
+    trainer, reader, asked = tuned(path, mode="lora", rank=2), tuned(path, mode="lora", rank=2), requests(4)
+    views, parameters = trainer.view_trainable(), trainer.trainable()
+    trained = {f"policy.{k}" for k, p in trainer.policy.named_parameters() if p.requires_grad}
+    assert {k for k in views if k.startswith("policy.")} == trained and len(trained) < 0.5 * sum(
+        1 for _ in trainer.policy.parameters()
+    )
+    assert all(views[k].ctypes.data == p.data_ptr() for k, p in parameters.items()), "their own memory"
+    publisher, arrived = SharedMemoryPublisher(1), threading.Event()
+
+    def apply(received: Received) -> None:
+        assert received.tensors.keys() == parameters.keys()
+        assert received.nbytes < 64 * len(views) + sum(p.numel() * 4 for p in parameters.values())
+        reader.load_trainable(received.tensors, received.changed)
+        received.release()
+        arrived.set()
+
+    SharedMemoryReader(publisher.address, apply, lambda error: None)
+    perturb(trainer, 0.3)
+    publisher.publish(1, trainer.view_trainable())
+    publisher.flush(60)
+    publisher.close()
+    assert arrived.is_set()
+    assert pickle.dumps(reader.decide(asked, 0)) == pickle.dumps(trainer.decide(asked, 0))
+
+
+def test_only_what_has_changed_is_copied(path: Path):
+    adapter = tuned(path, mode="lora", rank=2)
+    before = adapter.export_trainable()
+    published = {k: v + 1 for k, v in before.items()}
+    name = max(before, key=lambda k: before[k].size)
+    index = np.arange(0, before[name].size, 3)
+    adapter.load_trainable(published, {name: index})
+    after = adapter.export_trainable()
+    for key, tensor in before.items():
+        expected = tensor.copy()
+        if key == name:
+            expected.reshape(-1)[index] += 1
+        np.testing.assert_array_equal(after[key], expected)

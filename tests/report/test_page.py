@@ -189,6 +189,20 @@ def test_numbers_of_a_known_run(tmp_path: Path) -> None:
     assert "Segments stood at the replay's door for 20 s" in seen.text
 
 
+def test_the_time_of_every_role_divides_as_the_timeline_says(tmp_path: Path) -> None:
+    shares = {
+        "timeline_rollout_compute_share": 0.5, "timeline_rollout_wait_in_share": 0.4,
+        "timeline_rollout_transport_share": 0.1, "timeline_rollout_bubble": 0.4,
+        "timeline_trainer_compute_share": 0.25, "timeline_trainer_wait_in_share": 0.75,
+        "timeline_trainer_bubble": 0.75,
+        "timeline_driver_training_share": 1.0, "timeline_driver_bubble": 0.0,
+    }  # fmt: skip
+    text = page_of(write_run(tmp_path / "run", rollout=shares)).text
+    assert "rollout compute: 50 % wait in: 40 % transport: 10 %" in text
+    assert "trainer compute: 25 % wait in: 75 %" in text
+    assert "driver" not in text and "deciding" not in text
+
+
 @pytest.mark.parametrize(
     ("waited", "busy", "said"),
     [

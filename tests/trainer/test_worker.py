@@ -36,14 +36,29 @@ from tests.local_ray import Handle, Local
 from tests.trainer.linear import LinearAdapter, make_segments
 
 
+def copied(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What a store would have made of them."""
+    return {name: tensor.copy() for name, tensor in tensors.items()}
+
+
+class Prompt(ray_channel.RayPublisher):
+    """Skips nothing."""
+
+    def publish(self, version: int, tensors: Any) -> None:
+        super().publish(version, tensors)
+        self.flush()
+
+
 class Stage:
     """A trainer, a replay that counts what it is asked for, and a reader that keeps what it is sent."""
 
     def __init__(self, batches: int = 1000, **config: Any) -> None:
         self.asked: list[tuple[int, int]] = []
         self.received: list[tuple[int, dict[str, np.ndarray]]] = []
-        self.replay = Handle(sample=self._sample)
-        self.reader = Handle(receive_weights=lambda *published: self.received.append(published))
+        self.replay = Handle(sample=self._sample, learnt=lambda: None)
+        self.reader = Handle(
+            receive_weights=lambda version, tensors, _: self.received.append((version, copied(tensors))),
+        )
         self._batches = batches
         defaults = {"updates": 6, "batch_decisions": 7, "warmup_updates": 0, "value_warmup_updates": 0}
         self.worker = TrainerWorker(
@@ -61,6 +76,7 @@ class Stage:
 @pytest.fixture(autouse=True)
 def _without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "ray", Local)
+    monkeypatch.setattr(module, "make_publisher", lambda readers, *_, **__: Prompt(readers))
     monkeypatch.setattr(ray_channel, "ray", Local)
     monkeypatch.setattr(loading, "load_adapter", lambda policy: LinearAdapter())
 

@@ -16,7 +16,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -68,7 +69,7 @@ class Reader:
         self.shelf, self.name = shelf, f"reader{Reader.count}"
         self.receive_weights = self
 
-    def remote(self, version: int, tensors: Any) -> Any:
+    def remote(self, version: int, tensors: Any, published_s: float) -> Any:
         return self.shelf.receive.remote(self.name, version, tensors)
 
     def newest(self) -> tuple[int, Tensors] | None:
@@ -84,6 +85,14 @@ def shelves(light_ray: None) -> Iterator[list[Any]]:
     yield made
     for shelf in made:
         ray.kill(shelf)
+
+
+def until(holds: Callable[[], bool]) -> None:
+    """Waits for it, a minute at most."""
+    deadline = time.monotonic() + 60
+    while not holds():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
 
 
 class Delivered(WeightChannel):
@@ -111,8 +120,11 @@ def test_a_slow_reader_skips_versions_and_does_not_hold_up_the_publisher(shelves
     slow, quick = Reader(shelves[0]), Reader(shelves[1])
     publisher = RayPublisher([slow, quick])
     ray.get(shelves[0].shut.remote())
-    for version in range(10):  # would not return if it waited for the reader whose gate is shut
+    publisher.publish(0, filled(0.0))
+    until(lambda: quick.versions() == [0])
+    for version in range(1, 10):  # would not return if it waited for the reader whose gate is shut
         publisher.publish(version, filled(float(version)))
+    until(lambda: quick.versions()[-1] == 9)
     assert slow.versions() == []
     ray.get(shelves[0].open.remote())
     publisher.flush()
@@ -124,13 +136,16 @@ def test_a_slow_reader_skips_versions_and_does_not_hold_up_the_publisher(shelves
         assert found is not None and values_of(found[1]) == {9.0}
 
 
-def test_a_reader_that_caught_up_is_sent_the_newest_by_the_next_publication(shelves: list[Any]):
-    reader = Reader(shelves[0])
-    publisher = RayPublisher([reader])
+def test_a_reader_that_caught_up_is_sent_the_newest_without_being_asked(shelves: list[Any]):
+    reader, quick = Reader(shelves[0]), Reader(shelves[1])
+    publisher = RayPublisher([reader, quick])
     ray.get(shelves[0].shut.remote())
-    for version in (1, 2, 3):
+    publisher.publish(1, filled(1.0))
+    until(lambda: quick.versions() == [1])
+    for version in (2, 3):
         publisher.publish(version, filled(float(version)))
     ray.get(shelves[0].open.remote())
+    until(lambda: reader.versions() == [1, 3])
     publisher.flush()
     assert reader.versions() == [1, 3]
     publisher.publish(7, filled(7.0))
@@ -162,6 +177,20 @@ def test_what_a_reader_holds_stays_whole_when_many_more_are_published(shelves: l
     assert held == sorted(set(held)) and held[-1] == 30
     found = reader.newest()
     assert found is not None and found[0] == 30 and values_of(found[1]) == {30.0}
+
+
+def test_flush_names_the_reader_it_waited_for(shelves: list[Any]):
+    slow, quick = Reader(shelves[0]), Reader(shelves[1])
+    publisher = RayPublisher([quick, slow])
+    ray.get(shelves[0].shut.remote())
+    publisher.publish(4, filled(4.0))
+    with pytest.raises(TimeoutError, match=r"version 4, after 0.5 s: not received by readers 1$"):
+        publisher.flush(timeout_s=0.5)
+    ray.get(shelves[0].open.remote())
+    publisher.flush()
+    publisher.close()
+    with pytest.raises(RuntimeError, match="closed"):
+        publisher.publish(5, filled(5.0))
 
 
 def test_a_dead_reader_is_an_error_at_the_next_publication(light_ray: None):

@@ -1,0 +1,257 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What asynchrony gains: the same workers, asynchronous, overlapped and synchronous, by turns in one run.
+
+    S    decisions learned from per second, asynchronous over synchronous
+    S*   the most that any schedule could gain over the synchronous one: the tightest of what the worlds, the
+         service and the trainer can do at best, over what the synchronous schedule did
+    S/S* how much of that there is
+
+A speed-up without the law of the worlds' latency says nothing: where all worlds take equally long there is
+little to gain. So there is one row per law. And it is worth nothing if less is learned from each sample;
+hence runs of equally many updates under each schedule, on a problem that the policy made of time can learn.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from rich.console import Group
+
+from accerl_lerobot.bench.blocks import MOST_BUSY, Block, as_rows
+from accerl_lerobot.bench.host import floors, host, spread
+from accerl_lerobot.bench.machinery import MachineryConfig
+from accerl_lerobot.bench.study import as_markdown, as_table
+from accerl_lerobot.console import Console
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.config import evaluation_plans
+from accerl_lerobot.evaluation.stats import Rate
+from accerl_lerobot.replay.turns import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
+
+ARMS: tuple[Schedule, ...] = (ASYNCHRONOUS, OVERLAP, SYNCHRONOUS)
+LEARNING = MachineryConfig(worlds=4, latency_ms=4.0, image_size=16, decide_ms=1.0, update_ms=8.0)
+"""Small, as nothing is timed in it."""
+TRIALS = 100
+"""Episodes of the evaluation that ends a run that learns."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchAsyncVsSyncConfig(MachineryConfig):
+    """What is compared, how often."""
+
+    cvs: tuple[float, ...] = (0.0, 0.1, 0.3, 0.5, 1.0)
+    """Laws of latency: standard deviation over mean; takes the place of `latency_cv`."""
+    seconds: float = 8.0
+    """Of a block, at least, above 0."""
+    rounds: int = 3
+    """Times each arm is measured twice, forth and back, 1 or more."""
+    learning_updates: int = 18
+    """Of each run that learns; 0: none does."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Of those runs."""
+    output_dir: str = "outputs/async_vs_sync"
+    """Folder for async_vs_sync.json, .md and .png."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.cvs or any(cv < 0 for cv in self.cvs):
+            raise InputError("cvs", self.cvs, "name at least one, none below 0")
+        if not self.seconds > 0:
+            raise InputError("seconds", self.seconds, "use a positive time")
+        if self.rounds < 1:
+            raise InputError("rounds", self.rounds, "use at least 1")
+
+
+def bench_async_vs_sync(config: BenchAsyncVsSyncConfig) -> dict[str, Any]:
+    """Measures all laws, then what is learned.
+
+    Returns:
+        ``laws``: for each, the blocks, decisions per second by arm, S, S*, S/S* and whether the processors
+        were busy; ``learning``: success by arm and seed; ``config``, ``host`` and ``floors``.
+    """
+    console, root = Console(), Path(config.output_dir)
+    root.mkdir(parents=True, exist_ok=True)
+    result: dict[str, Any] = {"config": asdict(config), "host": host(), "floors": floors(), "laws": []}
+    with console.stage("laws", total=len(config.cvs)) as stage:
+        for cv in config.cvs:
+            law = _law(config, cv)
+            result["laws"].append(law)
+            stage.update(len(result["laws"]), f"CV {cv:g}: S {law['speed_up']['median']:.2f}")
+    result["learning"] = _learning(config, console) if config.learning_updates else {}
+    result["host_after"] = host()
+    (root / "async_vs_sync.json").write_text(json.dumps(result, indent=2) + "\n")
+    (root / "async_vs_sync.md").write_text(markdown(result))
+    _draw(root / "async_vs_sync.png", result)
+    console.say(f"wrote async_vs_sync.json, .md and .png into {root}")
+    return result
+
+
+def compare(config: MachineryConfig, blocks: list[Block]) -> dict[str, Any]:
+    """Of one law's blocks: `bench_async_vs_sync`'s ``laws``.
+
+    Args:
+        config: with that law.
+        blocks: forth and back through `ARMS`.
+    """
+    rates = {arm: [b.decisions_per_s for b in blocks if b.schedule == arm] for arm in ARMS}
+    waits = {arm: [b.trainer_waits for b in blocks if b.schedule == arm] for arm in ARMS}
+    pairs = {
+        arm: [a / b for a, b in zip(rates[ASYNCHRONOUS], rates[arm], strict=True)]
+        for arm in (OVERLAP, SYNCHRONOUS)
+    }
+    reached = [rate / config.bound for rate in rates[ASYNCHRONOUS]]
+    return {
+        "latency_cv": config.latency_cv,
+        "bound": config.bound,
+        "rates": {arm: spread(values) for arm, values in rates.items()},
+        "trainer_waits": {arm: statistics.median(values) for arm, values in waits.items()},
+        "speed_up": spread(pairs[SYNCHRONOUS]),
+        "speed_up_over_overlap": spread(pairs[OVERLAP]),
+        "largest_speed_up": config.bound / statistics.median(rates[SYNCHRONOUS]),
+        "share_of_largest": spread(reached),
+        "processor_bound": max(b.processors for b in blocks) > MOST_BUSY,
+        "blocks": as_rows(blocks),
+    }
+
+
+def table(result: dict[str, Any]) -> Group:
+    """`result` for people."""
+    title = f"{result['config']['worlds']} worlds, decisions learned from per second"
+    shown = [as_table(title, _COLUMNS, _rows(result))]
+    if result["learning"]:
+        shown.append(as_table(_learnt(result), _LEARNING, _learning_rows(result)))
+    return Group(*shown)
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """`table` for the docs."""
+    text = as_markdown(_COLUMNS, _rows(result))
+    if result["learning"]:
+        text += f"\n{_learnt(result)}:\n\n{as_markdown(_LEARNING, _learning_rows(result))}"
+    return text
+
+
+def _law(config: BenchAsyncVsSyncConfig, cv: float) -> dict[str, Any]:
+    of = replace(config, latency_cv=cv)
+    with of.open() as engine:
+        order = config.rounds * (*ARMS, *reversed(ARMS))
+        return compare(of, [engine.block(arm, config.seconds) for arm in order])
+
+
+def _learning(config: BenchAsyncVsSyncConfig, console: Console) -> dict[str, Any]:
+    """Success after equally many updates of equally many decisions."""
+    found: dict[str, Any] = {arm: [] for arm in ARMS}
+    with console.stage("learning", total=len(ARMS) * len(config.seeds)) as stage:
+        for seed in config.seeds:
+            for arm in ARMS:
+                found[arm].append(_success(config.learning_updates, arm, seed))
+                stage.update(sum(map(len, found.values())), f"{arm} {found[arm][-1]:.0%}")
+    return {"success": found, "n": TRIALS, "updates": config.learning_updates, "seeds": list(config.seeds)}
+
+
+def _success(updates: int, arm: Schedule, seed: int) -> float:
+    from accerl_lerobot.launch import RayEngine
+
+    run = LEARNING.run_config(updates=updates, seed=seed)
+    run = replace(run, launch=replace(run.launch, schedule=arm))
+    engine = RayEngine(run, ("match",), load=LEARNING.load())
+    try:
+        engine.train()
+        while not engine.poll().done:
+            pass
+        engine.plan(evaluation_plans(("match",), TRIALS, "after"))
+        results: list[bool] = []
+        while len(results) < TRIALS:
+            results += [e.success for e in engine.poll().episodes if e.plan.group == "after"]
+        return sum(results) / TRIALS
+    finally:
+        engine.close()
+
+
+_COLUMNS = ("CV", *ARMS, "S", "S over overlap", "S*", "S/S*", "trainer waits", "")
+_LEARNING = ("schedule", "success (each seed)")
+
+
+def _rows(result: dict[str, Any]) -> list[list[str]]:
+    rows = []
+    for law in result["laws"]:
+        rows.append(
+            [
+                f"{law['latency_cv']:g}",
+                *(_ranged(law["rates"][arm], ".0f") for arm in ARMS),
+                _ranged(law["speed_up"], ".2f"),
+                _ranged(law["speed_up_over_overlap"], ".2f"),
+                f"{law['largest_speed_up']:.2f}",
+                _ranged(law["share_of_largest"], ".2f"),
+                " / ".join(f"{law['trainer_waits'][arm]:.0%}" for arm in ARMS),
+                "processors busy" if law["processor_bound"] else "",
+            ]
+        )
+    return rows
+
+
+def _learning_rows(result: dict[str, Any]) -> list[list[str]]:
+    rows = []
+    for arm, values in result["learning"]["success"].items():
+        n = result["learning"]["n"] * len(values)
+        rate = Rate(successes=round(sum(values) * result["learning"]["n"]), n=n)
+        rows.append([arm, f"{rate} ({' '.join(f'{100 * v:.0f}' for v in values)})"])
+    return rows
+
+
+def _learnt(result: dict[str, Any]) -> str:
+    return f"Success after {result['learning']['updates']} updates of equally many decisions"
+
+
+def _ranged(value: dict[str, Any], form: str) -> str:
+    return f"{value['median']:{form}} ({value['min']:{form}} to {value['max']:{form}})"
+
+
+def _draw(path: Path, result: dict[str, Any]) -> None:
+    """Speed-up by law, beside the largest one possible."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    laws = result["laws"]
+    x = range(len(laws))
+    figure, axes = plt.subplots(figsize=(7, 4), dpi=120)
+    axes.plot(x, [law["largest_speed_up"] for law in laws], "k_", ms=30, label="S*, the most possible")
+    for name, key, place in (
+        ("over synchronous", "speed_up", -0.1),
+        ("over overlap", "speed_up_over_overlap", 0.1),
+    ):
+        middle = [law[key]["median"] for law in laws]
+        error = [
+            [m - law[key]["min"] for m, law in zip(middle, laws, strict=True)],
+            [law[key]["max"] - m for m, law in zip(middle, laws, strict=True)],
+        ]
+        axes.errorbar([i + place for i in x], middle, yerr=error, fmt="o", capsize=3, label=name)
+    axes.set_xticks(list(x), [f"{law['latency_cv']:g}" for law in laws])
+    axes.set(
+        xlabel="latency of the worlds: standard deviation over mean",
+        ylabel="speed-up of the asynchronous schedule",
+        title=f"{result['config']['worlds']} worlds, decisions learned from per second",
+    )
+    axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.tight_layout()
+    figure.savefig(path)
+    plt.close(figure)

@@ -1,0 +1,141 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A training engine, measured a block at a time."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from accerl_lerobot.bench.host import Processors
+from accerl_lerobot.config import RunConfig
+from accerl_lerobot.engine import Progress
+from accerl_lerobot.policies.config import Load
+from accerl_lerobot.replay.turns import Schedule
+
+SETTLE = 2
+"""Updates after a change that are not counted."""
+MOST_BUSY = 0.6
+"""Share of all cores above which the processors, and not what is slept, may be what is measured."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Block:
+    """What was measured in some seconds."""
+
+    schedule: str
+    seconds: float
+    updates: int
+    decisions_per_s: float
+    """Learned from, repetitions included."""
+    env_steps_per_s: float
+    lag_mean: float
+    lag_max: float
+    trainer_waits: float
+    """Share of its time in which the trainer had no batch: its bubble."""
+    publishing: float
+    """Share of its time in which it handed over weights."""
+    batch_size: float
+    """Observations decided for together."""
+    request_wait_ms: float
+    """From the arrival of a request to its forward pass, on average."""
+    inference_busy: float
+    """Share of its time that the service decided."""
+    processors: float
+    """How busy all cores were, whoever used them."""
+
+
+class Measured:
+    """An engine that has begun to train; ``with`` it, or close it.
+
+    Args:
+        config: the run.
+        tasks: the training tasks.
+        history: env steps that an observation holds.
+        load: see `RayEngine`.
+    """
+
+    def __init__(
+        self, config: RunConfig, tasks: tuple[str, ...], history: int = 1, load: Load | None = None
+    ) -> None:
+        from accerl_lerobot import ray_environment
+
+        ray_environment.prepare()
+        from accerl_lerobot.launch import RayEngine
+
+        self.engine = RayEngine(config, tasks, history, load=load)
+        self.engine.train()
+
+    def __enter__(self) -> Measured:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.engine.close()
+
+    def block(self, schedule: Schedule, seconds: float) -> Block:
+        """Measures at least so many seconds of a schedule, in whole updates, after a change has settled."""
+        self.engine.follow(schedule)
+        self._updates(SETTLE, 0.0)
+        processors, first, started = Processors(), self.engine.poll(), time.perf_counter()
+        updates, polls = self._updates(1, seconds)
+        wall = time.perf_counter() - started
+        before, after = first.inference, polls[-1].inference
+        steps = polls[-1].rollout["env_steps"] - first.rollout["env_steps"]
+        total = sum(_seconds(u) for u in updates)
+        batches = after["batches"] - before["batches"]
+        requests = _observations(after) - _observations(before)
+        return Block(
+            schedule=schedule,
+            seconds=total,
+            updates=len(updates),
+            decisions_per_s=sum(u["decisions"] for u in updates) / total,
+            env_steps_per_s=steps / wall,
+            lag_mean=sum(u["lag_mean"] for u in updates) / len(updates),
+            lag_max=max(u["lag_max"] for u in updates),
+            trainer_waits=sum(u["wait_s"] for u in updates) / total,
+            publishing=sum(u["publish_s"] for u in updates) / total,
+            batch_size=requests / batches if batches else 0.0,
+            request_wait_ms=1000 * (_waited(after) - _waited(before)) / requests if requests else 0.0,
+            inference_busy=sum(p.inference["busy_share"] for p in polls) / len(polls),
+            processors=processors.share(),
+        )
+
+    def _updates(self, count: int, seconds: float) -> tuple[list[dict[str, float]], list[Progress]]:
+        """Polls until there are so many updates, which took so long."""
+        updates: list[dict[str, float]] = []
+        polls: list[Progress] = []
+        while len(updates) < count or sum(_seconds(u) for u in updates) < seconds:
+            progress = self.engine.poll()
+            updates += progress.updates
+            polls.append(progress)
+        return updates, polls
+
+
+def as_rows(blocks: list[Block]) -> list[dict[str, Any]]:
+    """For JSON."""
+    return [asdict(block) for block in blocks]
+
+
+def _seconds(update: dict[str, float]) -> float:
+    return update["wait_s"] + update["update_s"] + update["publish_s"]
+
+
+def _observations(inference: dict[str, float]) -> float:
+    """Of all requests so far; each has one."""
+    return inference["batches"] * inference["batch_size_mean"]
+
+
+def _waited(inference: dict[str, float]) -> float:
+    return inference["wait_mean_s"] * _observations(inference)

@@ -1,0 +1,166 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""How collecting grows with the number of worlds: R(N) decisions a second of N worlds, through all workers.
+
+    E(N) = R(N) / (N · R(1))
+
+Each world is a process, each observation 301 KB, and all of them go to the service, into the replay and to
+the trainer. What is slept costs no processor, so that many worlds can be measured on few cores; where these
+were busy for more than `MOST_BUSY` of the time, they may be what was measured, and the row says so.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from accerl_lerobot.bench.blocks import MOST_BUSY, Block, as_rows
+from accerl_lerobot.bench.host import floors, host, spread
+from accerl_lerobot.bench.machinery import MachineryConfig
+from accerl_lerobot.bench.study import as_markdown, as_table
+from accerl_lerobot.console import Console
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.replay.turns import ASYNCHRONOUS
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchScalingConfig(MachineryConfig):
+    """How many worlds, for how long."""
+
+    counts: tuple[int, ...] = (1, 2, 4, 8, 16, 32, 64)
+    """Worlds; takes the place of `worlds`. The first is what the others are compared with."""
+    image_size: int = 317
+    latency_ms: float = 200.0
+    latency_cv: float = 0.0
+    update_ms: float = 10.0
+    """Short, so that the trainer is not what is measured."""
+    seconds: float = 6.0
+    """Of a block, at least, above 0."""
+    blocks: int = 5
+    """At each count, at least 1."""
+    output_dir: str = "outputs/scaling"
+    """Folder for scaling.json, .md and .png."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.counts or any(n < 1 for n in self.counts) or len(set(self.counts)) < len(self.counts):
+            raise InputError("counts", self.counts, "name numbers of worlds from 1 up, none of them twice")
+        if not self.seconds > 0:
+            raise InputError("seconds", self.seconds, "use a positive time")
+        if self.blocks < 1:
+            raise InputError("blocks", self.blocks, "use at least 1")
+
+
+def bench_scaling(config: BenchScalingConfig) -> dict[str, Any]:
+    """Measures all counts, forth and back, half of the blocks each.
+
+    Returns:
+        ``counts``: for each, decisions per second, E(N), the bound, their share of it, and whether the
+        processors were busy; ``config``, ``host`` and ``floors``.
+    """
+    console, root = Console(), Path(config.output_dir)
+    root.mkdir(parents=True, exist_ok=True)
+    result: dict[str, Any] = {"config": asdict(config), "host": host(), "floors": floors()}
+    blocks: dict[int, list[Block]] = {n: [] for n in config.counts}
+    forth, back = config.blocks - config.blocks // 2, config.blocks // 2
+    legs = [(n, forth) for n in config.counts] + [(n, back) for n in reversed(config.counts) if back]
+    with console.stage("counts", total=len(legs)) as stage:
+        for done, (n, repeats) in enumerate(legs, start=1):
+            with replace(config, worlds=n).open() as engine:
+                blocks[n] += [engine.block(ASYNCHRONOUS, config.seconds) for _ in range(repeats)]
+            stage.update(done, f"{n} worlds: {blocks[n][-1].decisions_per_s:.0f} decisions/s")
+    result |= {"counts": compare(config, blocks), "host_after": host()}
+    (root / "scaling.json").write_text(json.dumps(result, indent=2) + "\n")
+    (root / "scaling.md").write_text(as_markdown(_COLUMNS, _rows(result)))
+    _draw(root / "scaling.png", result)
+    console.say(f"wrote scaling.json, .md and .png into {root}")
+    return result
+
+
+def compare(config: BenchScalingConfig, blocks: dict[int, list[Block]]) -> list[dict[str, Any]]:
+    """Of the blocks of each count: `bench_scaling`'s ``counts``."""
+    rates = {n: spread([b.decisions_per_s for b in of]) for n, of in blocks.items()}
+    first = config.counts[0]
+    one = rates[first]["median"] / first
+    return [
+        {
+            "worlds": n,
+            "decisions_per_s": rates[n],
+            "efficiency": spread([rate / (n * one) for rate in rates[n]["blocks"]]),
+            "bound": (bound := replace(config, worlds=n).bound),
+            "share_of_bound": rates[n]["median"] / bound,
+            "processors": max(b.processors for b in of),
+            "processor_bound": max(b.processors for b in of) > MOST_BUSY,
+            "batch_size": sum(b.batch_size for b in of) / len(of),
+            "blocks": as_rows(of),
+        }
+        for n, of in blocks.items()
+    ]
+
+
+def table(result: dict[str, Any]) -> Table:
+    """`result` for people."""
+    return as_table("decisions per second by number of worlds", _COLUMNS, _rows(result))
+
+
+_COLUMNS = ("worlds", "decisions/s", "E(N)", "of the bound", "batch", "processors", "")
+
+
+def _rows(result: dict[str, Any]) -> list[list[str]]:
+    return [
+        [
+            str(row["worlds"]),
+            f"{rate['median']:.1f} ({rate['min']:.1f} to {rate['max']:.1f})",
+            f"{row['efficiency']['median']:.2f}",
+            f"{row['share_of_bound']:.2f}",
+            f"{row['batch_size']:.1f}",
+            f"{row['processors']:.0%}",
+            "processors busy" if row["processor_bound"] else "",
+        ]
+        for row in result["counts"]
+        for rate in [row["decisions_per_s"]]
+    ]
+
+
+def _draw(path: Path, result: dict[str, Any]) -> None:
+    """Decisions per second over worlds, beside the bound."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    rows = sorted(result["counts"], key=lambda row: row["worlds"])
+    x = [row["worlds"] for row in rows]
+    figure, axes = plt.subplots(figsize=(7, 4), dpi=120)
+    axes.plot(x, [row["bound"] for row in rows], "k--", lw=1, label="bound")
+    axes.plot(x, [row["decisions_per_s"]["median"] for row in rows], "o-", label="measured")
+    for row in rows:
+        place = (row["worlds"], row["decisions_per_s"]["median"])
+        text = f"{row['efficiency']['median']:.2f}"
+        axes.annotate(text, place, textcoords="offset points", xytext=(6, -10), fontsize=8)
+    axes.set_xscale("log", base=2)
+    axes.set_yscale("log", base=2)
+    axes.set_xticks(x, [str(n) for n in x])
+    axes.set(
+        xlabel="worlds, a process each", ylabel="decisions per second", title="with E(N) beside each point"
+    )
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.tight_layout()
+    figure.savefig(path)
+    plt.close(figure)

@@ -1,0 +1,156 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""How fast a recipe collects and learns on this machine, under each schedule, and where everything goes.
+
+Real worlds, a real policy, the real engine. What is generated is accounted for: each decision is in the
+replay, was thrown away for a reason that is counted, or is under way.
+"""
+
+from __future__ import annotations
+
+import statistics
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from rich.table import Table
+
+from accerl_lerobot.bench.async_vs_sync import ARMS
+from accerl_lerobot.bench.blocks import Block, Measured, as_rows
+from accerl_lerobot.bench.host import host, spread
+from accerl_lerobot.bench.study import as_table
+from accerl_lerobot.config import RunConfig, parse
+from accerl_lerobot.console import Console
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.replay.pacing import decisions_under_way
+from accerl_lerobot.replay.turns import Schedule
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchThroughputConfig:
+    """What is measured, for how long."""
+
+    recipe: str = "recipes/quickstart.yaml"
+    """The run."""
+    policy_path: str | None = None
+    """The LeRobot checkpoint that acts and learns."""
+    schedules: tuple[Schedule, ...] = ARMS
+    """Which ones, by turns in one run."""
+    seconds: float = 20.0
+    """Of a block, at least, above 0."""
+    rounds: int = 3
+    """Times each schedule is measured twice, forth and back, 1 or more."""
+
+    def __post_init__(self) -> None:
+        if self.policy_path is None:
+            remedy = "name a LeRobot checkpoint, such as RUN/checkpoints/last/pretrained_model"
+            raise InputError("policy_path", None, remedy)
+        if not self.schedules or any(name not in ARMS for name in self.schedules):
+            raise InputError("schedules", self.schedules, f"name some of {', '.join(ARMS)}")
+        if not self.seconds > 0:
+            raise InputError("seconds", self.seconds, "use a positive time")
+        if self.rounds < 1:
+            raise InputError("rounds", self.rounds, "use at least 1")
+
+
+def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
+    """Measures all schedules.
+
+    Returns:
+        ``schedules``: for each, env steps, decisions and updates per second and the rest of `Block`;
+        ``books``: what became of all decisions; ``config`` and ``host``.
+
+    Raises:
+        InputError: the recipe or the checkpoint cannot be used.
+        RuntimeError: the books do not add up.
+    """
+    from accerl_lerobot.run import check_policy, check_world
+
+    console = Console()
+    run: RunConfig = parse(
+        RunConfig,
+        [
+            f"--config_path={config.recipe}",
+            f"--policy.path={config.policy_path}",
+            "--sft.steps=0",
+            "--trainer.updates=1000000",
+            "--trainer.schedule=constant",
+        ],
+    )
+    tasks = check_world(run)
+    result: dict[str, Any] = {"config": asdict(config), "host": host()}
+    order = config.rounds * (*config.schedules, *reversed(config.schedules))
+    blocks: list[Block] = []
+    with Measured(run, tasks, check_policy(run)) as engine:
+        with console.stage("blocks", total=len(order)) as stage:
+            for schedule in order:
+                blocks.append(engine.block(schedule, config.seconds))
+                stage.update(len(blocks), f"{schedule}: {blocks[-1].env_steps_per_s:.0f} env steps/s")
+        progress = engine.engine.poll()
+    result["books"] = books(run, progress.rollout, progress.replay)
+    result["schedules"] = {
+        name: _summed([b for b in blocks if b.schedule == name]) for name in config.schedules
+    }
+    return result | {"host_after": host()}
+
+
+def books(run: RunConfig, rollout: dict[str, float], replay: dict[str, float]) -> dict[str, float]:
+    """What became of the decisions that were made.
+
+    Raises:
+        RuntimeError: fewer are under way than none, or more than there can be.
+    """
+    dropped = rollout["dropped_nonfinite"] + rollout["groups_dropped_decisions"]
+    found = {
+        "generated": rollout["decisions"],
+        "committed": replay["inserted_decisions"],
+        "dropped": dropped + replay["dropped_nonfinite"],
+    }
+    found["under_way"] = found["generated"] - found["committed"] - found["dropped"]
+    r = run.rollout
+    # Two reports are not of the same moment: what a segment's time brings may be in one and not in the other.
+    most = 3 * decisions_under_way(workers=r.workers, worlds=r.worlds, segment_length=r.segment_length)
+    if not r.group_size and not -most <= found["under_way"] <= most:
+        raise RuntimeError(f"decisions are missing, or there twice: {found}; at most {most} can be under way")
+    return found
+
+
+def table(result: dict[str, Any]) -> Table:
+    """`result` for people."""
+    books, rows = result["books"], []
+    for name, found in result["schedules"].items():
+        cells = [name]
+        for key in ("env_steps_per_s", "decisions_per_s"):
+            cells.append(f"{found[key]['median']:.0f} ({found[key]['min']:.0f} to {found[key]['max']:.0f})")
+        shares = (f"{found[key]:.0%}" for key in ("trainer_waits", "inference_busy", "processors"))
+        rows.append([*cells, f"{found['updates_per_s']:.2f}", f"{found['lag_mean']:.1f}", *shares])
+    title = (
+        f"{books['generated']:.0f} decisions generated = {books['committed']:.0f} committed + "
+        f"{books['under_way']:.0f} under way + {books['dropped']:.0f} dropped"
+    )
+    columns = ("schedule", "env steps/s", "decisions/s learned from", "updates/s", "lag", "trainer waits",
+               "inference busy", "processors")  # fmt: skip
+    return as_table(title, columns, rows)
+
+
+def _summed(blocks: list[Block]) -> dict[str, Any]:
+    median = {
+        key: statistics.median(getattr(b, key) for b in blocks)
+        for key in ("lag_mean", "trainer_waits", "inference_busy", "processors", "batch_size")
+    }
+    return median | {
+        "env_steps_per_s": spread([b.env_steps_per_s for b in blocks]),
+        "decisions_per_s": spread([b.decisions_per_s for b in blocks]),
+        "updates_per_s": statistics.median(b.updates / b.seconds for b in blocks),
+        "blocks": as_rows(blocks),
+    }

@@ -1,0 +1,284 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""``accerl bench weights``: from an optimiser step to the weights that act, against copying memory.
+
+    accerl bench weights --output_dir=outputs/weights
+
+    stall     how long `publish` keeps the trainer; at best, one copy
+    applied   from the call of `publish` until the slowest reader has the weights in its parameters; at best,
+              two copies, one in and one out of what both share
+    pause     how long a reader does nothing else; at best, one copy
+
+The copy is measured beside each publication. Arms go forth and back (A B C D D C B A), all with the same
+reader processes; of each block the last publication counts, when all memory has been touched.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from accerl_lerobot import snapshot
+from accerl_lerobot.bench.host import host, spread
+from accerl_lerobot.bench.study import as_markdown, as_table, named
+from accerl_lerobot.checkpoint import TRAINING_STATE, WEIGHTS
+from accerl_lerobot.console import Console
+from accerl_lerobot.errors import InputError
+
+ARMS: dict[str, tuple[str, bool, float]] = {
+    "shared memory": ("shared_memory", False, 1.0),
+    "Ray": ("ray", False, 1.0),
+    "changes, 1 %": ("shared_memory", True, 0.01),
+    "changes, 100 %": ("shared_memory", True, 1.0),
+}
+"""Arm → transport, whether only changes are sent, and the share of values that an update changes."""
+MB = 1 << 20
+WARM = 4
+"""Publications of a block that do not count: until all slabs have been written to and mapped."""
+Tensors = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchWeightsConfig:
+    """What is published, to how many."""
+
+    sizes_mb: tuple[int, ...] = (1, 16, 256, 1024)
+    """Sizes of a set of float32 weights, in MiB. With two readers the largest needs about 15 times
+    its size in memory."""
+    readers: tuple[int, ...] = (1, 2)
+    """How many processes read; each at least 1."""
+    tensors: int = 64
+    """Into how many equal tensors a set falls."""
+    repeats: int = 5
+    """Publications of each arm that count, each in a block of its own."""
+    seed: int = 0
+    """Of the values, and of which ones change."""
+    output_dir: str | None = None
+    """Folder for weights.json, weights.md and weights.png; must not exist. None: nothing is written."""
+    checkpoints: str | None = None
+    """Folder of a run's checkpoints. How many values of the trained weights differ between those that follow
+    each other, in float32 and rounded to bfloat16, is told too."""
+
+    def __post_init__(self) -> None:
+        for name in ("sizes_mb", "readers"):
+            named(self, name)
+            if min(getattr(self, name)) < 1:
+                raise InputError(name, getattr(self, name), "use 1 or more")
+        for name in ("tensors", "repeats"):
+            if getattr(self, name) < 1:
+                raise InputError(name, getattr(self, name), "use at least 1")
+
+
+def bench_weights(config: BenchWeightsConfig) -> dict[str, Any]:
+    """Measures every arm at every size with every number of readers.
+
+    Returns:
+        ``cells``: ``size_mb``, ``readers``, ``arm``; ``stall_ms``, ``applied_ms``, ``pause_ms`` and
+        ``memcpy_ms``; ``mb`` that each reader read; and ``stall``, ``applied`` and ``pause`` as shares of
+        what memcpy allows, 1 the best: each median, min, max and all. ``changed``, of the checkpoints;
+        ``config``; ``host`` before and after.
+
+    Raises:
+        InputError: the folder exists, or there are no checkpoints.
+    """
+    root = None if config.output_dir is None else Path(config.output_dir).expanduser()
+    if root is not None and root.exists():
+        raise InputError("output_dir", str(root), "the folder exists; choose another or remove it")
+    changed = [] if config.checkpoints is None else changed_shares(Path(config.checkpoints).expanduser())
+    before, console, cells = host(), Console(), []
+    for size in config.sizes_mb:
+        for readers in config.readers:
+            with console.stage(f"{size} MB, {readers} readers"):
+                cells += _measure(config, size, readers)
+    result = {"config": asdict(config), "cells": cells, "changed": changed, "host": [before, host()]}
+    if root is not None:
+        root.mkdir(parents=True)
+        (root / "weights.json").write_text(json.dumps(result, indent=2) + "\n")
+        (root / "weights.md").write_text(as_markdown(_COLUMNS, _rows(result)))
+        draw(root / "weights.png", result)
+    return result
+
+
+def table(result: dict[str, Any]) -> Table:
+    """`result` for people."""
+    title = "milliseconds, and share of what memcpy allows"
+    if result["changed"]:
+        fp32, bf16 = (spread([pair[kind] for pair in result["changed"]]) for kind in ("fp32", "bf16"))
+        title += (
+            f"; between {len(result['changed']) + 1} checkpoints {fp32['median']:.1%} of the float32 values "
+            f"changed ({fp32['min']:.1%} to {fp32['max']:.1%}), of bfloat16 {bf16['median']:.1%} "
+            f"({bf16['min']:.1%} to {bf16['max']:.1%})"
+        )
+    return as_table(title, _COLUMNS, _rows(result))
+
+
+def changed_shares(folder: Path) -> list[dict[str, Any]]:
+    """Which share of the trained weights differs between checkpoints that follow each other.
+
+    Args:
+        folder: of checkpoints whose names are the numbers of their updates.
+
+    Raises:
+        InputError: it holds fewer than two.
+    """
+    import torch
+
+    paths = {int(path.name): path for path in folder.glob("*") if path.name.isdigit()}
+    steps = sorted(paths)
+    if len(steps) < 2:
+        raise InputError("checkpoints", str(folder), "name a folder of two checkpoints or more")
+    found: list[dict[str, Any]] = []
+    last: dict[str, Any] = {}
+    for step in steps:
+        weights = snapshot.load(paths[step] / TRAINING_STATE / WEIGHTS)
+        flat = torch.cat([torch.from_numpy(np.array(weights[name])).reshape(-1) for name in sorted(weights)])
+        kinds = {"fp32": flat.view(torch.int32), "bf16": flat.to(torch.bfloat16).view(torch.int16)}
+        if last:
+            shares = {kind: float((bits != last[kind]).float().mean()) for kind, bits in kinds.items()}
+            found.append({"from": steps[len(found)], "to": step, "values": len(flat), **shares})
+        last = kinds
+    return found
+
+
+def draw(path: Path, result: dict[str, Any]) -> None:
+    """What memcpy allows and how much of it is reached, over the size; a line per arm."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    config = result["config"]
+    kinds = {"stall": "trainer's stall", "applied": "publish to applied", "pause": "reader's pause"}
+    figure, panels = plt.subplots(
+        len(config["readers"]), 3, figsize=(12, 3.2 * len(config["readers"])), squeeze=False, sharey=True
+    )
+    for row, readers in zip(panels, config["readers"], strict=True):
+        for axes, (kind, label) in zip(row, kinds.items(), strict=True):
+            for arm in ARMS:
+                cells = [c for c in result["cells"] if (c["arm"], c["readers"]) == (arm, readers)]
+                middle = [c[kind]["median"] for c in cells]
+                ends = [
+                    [m - c[kind]["min"] for m, c in zip(middle, cells, strict=True)],
+                    [c[kind]["max"] - m for m, c in zip(middle, cells, strict=True)],
+                ]
+                axes.errorbar([c["size_mb"] for c in cells], middle, ends, marker="o", capsize=3, label=arm)
+            axes.axhline(1, color="0.6", linestyle=":")
+            axes.set(xscale="log", yscale="log", xlabel="MiB", title=f"{label}, {readers} readers")
+    panels[0][0].legend(fontsize="small")
+    panels[0][0].set_ylabel("share of what memcpy allows")
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _measure(config: BenchWeightsConfig, size_mb: int, readers: int) -> list[dict[str, Any]]:
+    """One row per arm."""
+    from accerl_lerobot.bench.weights_readers import reading
+
+    rng = np.random.default_rng(config.seed)
+    elements = max(1, size_mb * MB // 4 // config.tensors)
+    tensors = {f"t{i}": rng.random(elements, np.float32) for i in range(config.tensors)}
+    copy = {name: np.zeros_like(tensor) for name, tensor in tensors.items()}
+    blocks: dict[str, list[dict[str, float]]] = {arm: [] for arm in ARMS}
+    with reading(readers, config.tensors, elements) as handles:
+        for repeat in range(config.repeats):
+            for arm in list(ARMS)[:: -1 if repeat % 2 else 1]:
+                blocks[arm].append(_block(arm, handles, tensors, copy, rng))
+    return [_cell(size_mb, readers, arm, notes) for arm, notes in blocks.items()]
+
+
+def _block(
+    arm: str, handles: list[Any], tensors: Tensors, copy: Tensors, rng: np.random.Generator
+) -> dict[str, float]:
+    """Publishes a few times, each after an update, and notes the last."""
+    from accerl_lerobot.bench.weights_readers import ask
+    from accerl_lerobot.weights.ray_channel import make_publisher
+
+    transport, changes, share = ARMS[arm]
+    publisher = make_publisher(handles, transport, changes=changes)
+    try:
+        for version in range(WARM + 1):
+            _update(tensors, 0.0, rng)
+            started = perf_counter()
+            for name, tensor in tensors.items():
+                np.copyto(copy[name], tensor)
+            memcpy = perf_counter() - started
+            _update(tensors, share, rng)
+            started = perf_counter()
+            publisher.publish(version, tensors)
+            stall = perf_counter() - started
+            publisher.flush()
+    finally:
+        publisher.close()
+    notes = [ask(handle, "note", WARM) for handle in handles]
+    expected = np.stack([tensor[:: max(1, len(tensor) // 100)] for tensor in tensors.values()])
+    for handle in handles:
+        if not np.array_equal(ask(handle, "some"), expected):
+            raise RuntimeError(f"{arm}: a reader has other weights than were published")
+    worst = {key: max(note[key] for note in notes) for key in ("applied_s", "pause_s", "bytes")}
+    return {"stall_s": stall, "memcpy_s": memcpy, **worst}
+
+
+def _update(tensors: Tensors, share: float, rng: np.random.Generator) -> None:
+    """Writes all values, as an optimiser does, so that caches are as after one; a share of them changes."""
+    for tensor in tensors.values():
+        tensor += share == 1
+        if 0 < share < 1:
+            tensor[rng.integers(0, len(tensor), max(1, int(share * len(tensor))))] += 1
+
+
+def _cell(size_mb: int, readers: int, arm: str, notes: list[dict[str, float]]) -> dict[str, Any]:
+    copies = {"stall": 1, "applied": 2, "pause": 1}
+    times = {f"{key}_ms": spread([1000 * n[f"{key}_s"] for n in notes]) for key in (*copies, "memcpy")}
+    shares = {
+        key: spread([count * n["memcpy_s"] / n[f"{key}_s"] for n in notes]) for key, count in copies.items()
+    }
+    mb = spread([n["bytes"] / MB for n in notes])
+    return {"size_mb": size_mb, "readers": readers, "arm": arm, "mb": mb, **times, **shares}
+
+
+_COLUMNS = [
+    "MiB",
+    "readers",
+    "arm",
+    "read, MiB",
+    "memcpy",
+    "stall",
+    "of it",
+    "applied",
+    "of it",
+    "pause",
+    "of it",
+]
+
+
+def _rows(result: dict[str, Any]) -> list[list[str]]:
+    rows = []
+    for cell in result["cells"]:
+        row = [str(cell["size_mb"]), str(cell["readers"]), cell["arm"], f"{cell['mb']['median']:.3g}"]
+        row.append(_ranged(cell["memcpy_ms"], ".3g"))
+        for kind in ("stall", "applied", "pause"):
+            row += [_ranged(cell[f"{kind}_ms"], ".3g"), f"{cell[kind]['median']:.0%}"]
+        rows.append(row)
+    return rows
+
+
+def _ranged(values: dict[str, Any], shape: str) -> str:
+    return f"{values['median']:{shape}} ({values['min']:{shape}} to {values['max']:{shape}})"

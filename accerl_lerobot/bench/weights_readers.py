@@ -1,0 +1,119 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Processes that receive weights as the inference service does, and note when they had them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import ray
+
+from accerl_lerobot.launch import start_ray
+from accerl_lerobot.weights.channel import Tensors
+from accerl_lerobot.weights.reader import Received, SharedMemoryReader
+
+READY_S = 120.0
+"""How long they may take to start, and to answer."""
+
+
+class ReadingWorker:
+    """Becomes a threaded Ray actor; to a publisher it is an inference worker that has nothing to decide."""
+
+    def __init__(self, tensors: int, elements: int) -> None:
+        self._parameters = {f"t{i}": np.zeros(elements, np.float32) for i in range(tensors)}
+        self._reader: SharedMemoryReader | None = None
+        self._error: BaseException | None = None
+        self._notes: dict[int, dict[str, float]] = {}
+
+    def ready(self) -> bool:
+        """Answers once it has its memory."""
+        return True
+
+    def open_weights(self, address: str) -> bool:
+        """See `InferenceWorker`."""
+        if self._reader is not None:
+            self._reader.close()
+        self._reader = SharedMemoryReader(address, self._apply, self._fail)
+        return True
+
+    def receive_weights(self, version: int, tensors: Tensors, published_s: float) -> int:
+        """See `InferenceWorker`; but this one returns when they are applied."""
+        nbytes = sum(tensor.nbytes for tensor in tensors.values())
+        self._apply(Received(version=version, tensors=tensors, published_s=published_s, nbytes=nbytes))
+        return version
+
+    def note(self, version: int) -> dict[str, float]:
+        """When a set was applied, how long that took, and its bytes.
+
+        Raises:
+            RuntimeError: receiving has failed.
+        """
+        if self._error is not None:
+            raise RuntimeError(f"receiving weights failed: {self._error!r}") from self._error
+        return self._notes[version]
+
+    def some(self) -> np.ndarray:
+        """A few of its values, to be compared."""
+        return np.stack([tensor[:: max(1, len(tensor) // 100)] for tensor in self._parameters.values()])
+
+    def _apply(self, received: Received) -> None:
+        started = time.monotonic()
+        if received.changed is None:
+            for name, tensor in received.tensors.items():
+                np.copyto(self._parameters[name], tensor)
+        else:
+            for name, index in received.changed.items():
+                self._parameters[name][index] = received.tensors[name][index]
+        now = time.monotonic()
+        self._notes[received.version] = {
+            "applied_s": now - received.published_s,
+            "pause_s": now - started,
+            "bytes": float(received.nbytes),
+        }
+        received.release()
+
+    def _fail(self, error: BaseException) -> None:
+        self._error = error
+
+
+@contextmanager
+def reading(count: int, tensors: int, elements: int) -> Iterator[list[Any]]:
+    """So many of them, ready; they end with the block. Ray is started if it is not there."""
+    if not ray.is_initialized():
+        start_ray()
+    worker = ray.remote(ReadingWorker).options(num_cpus=0, max_concurrency=4)
+    handles = [worker.remote(tensors, elements) for _ in range(count)]
+    try:
+        for handle in handles:
+            ask(handle, "ready")
+        yield handles
+    finally:
+        for handle in handles:
+            ray.kill(handle)
+
+
+def ask(handle: Any, method: str, *arguments: Any) -> Any:
+    """The answer of one of them.
+
+    Raises:
+        TimeoutError: names the question that was not answered.
+    """
+    try:
+        return ray.get(getattr(handle, method).remote(*arguments), timeout=READY_S)
+    except ray.exceptions.GetTimeoutError as error:
+        raise TimeoutError(f"a reader has not answered `{method}` within {READY_S:g} s") from error

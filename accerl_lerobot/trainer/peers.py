@@ -1,0 +1,232 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The trainer's other ranks: processes that make each update along with the first, which the engine talks to.
+
+    replay ──batch──► rank 0 ──its reference──► ranks 1, 2 …
+                        ◄── torch.distributed: values, gradients, parts of weights ──►
+
+Whatever the first rank does that takes all of them it does within `Peers.joining`: the others are told, do
+the same, and are waited for. A rank that dies or hangs ends what the others are waiting for, at the latest
+after ``trainer.rank_timeout_s``, and is named in the error.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import ray
+from ray.exceptions import GetTimeoutError, RayActorError, RayError
+
+from accerl_lerobot import snapshot
+from accerl_lerobot.algorithms import AlgorithmConfig
+from accerl_lerobot.checkpoint import WEIGHTS
+from accerl_lerobot.experience import Segment
+from accerl_lerobot.policies.config import Load, PolicyConfig, loader
+from accerl_lerobot.trainer.config import TrainerConfig
+
+if TYPE_CHECKING:
+    from accerl_lerobot.trainer.ranks import Meeting, Ranks
+    from accerl_lerobot.trainer.update import Update
+
+LOAD_S = 600.0
+"""How long a rank may take to load its policy."""
+BLAME_S = 10.0
+"""How long to wait for the failure that the first rank's own is the consequence of."""
+
+
+class RankError(RuntimeError):
+    """A rank is lost, or was not there in time."""
+
+
+class Learner:
+    """What every rank has: a policy, and the updates of it.
+
+    Args:
+        policy: the checkpoint to start from.
+        algorithm: the objective.
+        config: the optimiser.
+        seed: of torch's global generator.
+        state: the ``training_state`` to go on from; None: begin.
+        load: makes the adapter; None: of LeRobot's checkpoint.
+    """
+
+    def __init__(
+        self,
+        policy: PolicyConfig,
+        algorithm: AlgorithmConfig,
+        config: TrainerConfig,
+        seed: int,
+        state: Path | None,
+        load: Load | None = None,
+    ) -> None:
+        import torch
+
+        torch.set_num_threads(config.num_threads)
+        torch.manual_seed(seed)
+        self._algorithm, self._config, self._state = algorithm, config, state
+        self.adapter: Any = loader(load)(policy)
+
+    def begin(self, ranks: Ranks) -> Update:
+        """The updates, from the state on; what ranks share out is shared out then."""
+        from accerl_lerobot.trainer.update import Update
+
+        update = Update(self.adapter, self._algorithm, self._config, ranks)
+        if self._state is not None:
+            self.adapter.load_trainable(snapshot.load(self._state / WEIGHTS))
+            update.restore(snapshot.load(self._state / "trainer"))
+        return update
+
+
+class TrainerRank:
+    """Any rank but the first; becomes a Ray actor of one thread, so that calls are done in their order.
+
+    Args:
+        rank: which one.
+        arguments: of its `Learner`.
+    """
+
+    def __init__(self, rank: int, *arguments: Any) -> None:
+        self._rank, self._learner = rank, Learner(*arguments)
+        self._config: TrainerConfig = arguments[2]
+
+    def ready(self) -> int:
+        """Answers once the policy is loaded; returns this process's id."""
+        return os.getpid()
+
+    def node(self) -> str:
+        """Which machine it is on."""
+        return str(ray.get_runtime_context().get_node_id())
+
+    def metrics(self) -> dict[str, float]:
+        """Nothing: the first rank reports for all. Answering shows that it is not stuck."""
+        return {}
+
+    def join(self, meeting: Meeting) -> None:
+        """Meets the others."""
+        from accerl_lerobot.trainer import ranks
+
+        config = self._config
+        if meeting.address == ranks.LOOPBACK:
+            ranks.only_loopback()
+        store = ranks.visit(meeting, config.ranks, config.rank_timeout_s)
+        group = ranks.Group(
+            store, self._rank, config.ranks, self._learner.adapter.device, config.rank_timeout_s
+        )
+        self._update = self._learner.begin(group)
+
+    def step(self, segments: Sequence[Segment]) -> None:
+        """Its part of an update."""
+        self._update.step(segments)
+
+    def lend_weights(self) -> None:
+        """Its part of the trainable weights, for the first rank to export."""
+        self._learner.adapter.export_trainable()
+
+    def lend_state(self) -> None:
+        """Its part of all that is saved, in the order in which the first rank asks for it."""
+        from accerl_lerobot.policies.loading import copy_weights
+
+        copy_weights(self._learner.adapter)
+        self.lend_weights()
+        self._update.state()
+
+
+class Peers:
+    """The others, as the first rank sees them.
+
+    Args:
+        actors: handles of `TrainerRank`, of rank 1, 2 …; none where there is one rank.
+        config: how long to wait for them.
+
+    Example:
+        >>> with peers.joining("step", batch):   # they are told …
+        ...     update.step(ray.get(batch))      # … and have done it too when this is over
+    """
+
+    def __init__(self, actors: Sequence[Any], config: TrainerConfig) -> None:
+        self._actors, self._config = list(actors), config
+
+    def begin(self, learner: Learner) -> Update:
+        """Meets them, once they have loaded their policies."""
+        from accerl_lerobot.trainer import ranks
+
+        if not self._actors:
+            return learner.begin(ranks.Ranks())
+        self._collect("ready", [actor.ready.remote() for actor in self._actors], LOAD_S)
+        nodes = self._collect("node", [actor.node.remote() for actor in self._actors], LOAD_S)
+        address = ranks.LOOPBACK
+        if set(nodes) == {str(ray.get_runtime_context().get_node_id())}:
+            ranks.only_loopback()
+        else:
+            address = ray.util.get_node_ip_address()
+        size, timeout_s = self._config.ranks, self._config.rank_timeout_s
+        store, meeting = ranks.host(address, size, timeout_s)
+        with self.joining("join", meeting):
+            return learner.begin(ranks.Group(store, 0, size, learner.adapter.device, timeout_s))
+
+    @contextmanager
+    def joining(self, method: str, *arguments: Any) -> Iterator[None]:
+        """They do `method` while the first rank does its part inside.
+
+        Raises:
+            RankError: one of them failed, with its traceback, or was not there in time.
+        """
+        calls = [getattr(actor, method).remote(*arguments) for actor in self._actors]
+        try:
+            yield
+        except Exception as error:
+            if calls and (lost := self._failure(method, calls)) is not None:
+                raise lost from error
+            raise
+        self._collect(method, calls, self._config.rank_timeout_s)
+
+    def lending(self, method: str) -> AbstractContextManager[None]:
+        """As `joining`, for what takes all ranks only where each keeps a part of the weights."""
+        return self.joining(method) if self._config.zero else nullcontext()
+
+    def _collect(self, method: str, calls: list[Any], timeout_s: float) -> list[Any]:
+        try:
+            return list(ray.get(calls, timeout=timeout_s)) if calls else []
+        except GetTimeoutError as error:
+            missing = self._names(ray.wait(calls, num_returns=len(calls), timeout=0)[1], calls)
+            raise RankError(f"trainer {missing} did not do {method} within {timeout_s:.0f} s") from error
+        except RayError as error:
+            raise self._failure(method, calls) or error from error
+
+    def _failure(self, method: str, calls: list[Any]) -> RankError | None:
+        """What is wrong with the others, if anything: first the dead, then the silent, then the rest."""
+        done, silent = ray.wait(calls, num_returns=len(calls), timeout=BLAME_S)
+        failures = {call: error for call in done if (error := _error(call)) is not None}
+        # A process that is gone made the others fail; what they say of it is only that it is gone.
+        gone = [call for call, error in failures.items() if isinstance(error, RayActorError)]
+        if not gone and silent:
+            return RankError(f"trainer {self._names(silent, calls)} did not do {method}: no answer")
+        for call in gone or failures:
+            return RankError(f"trainer {self._names([call], calls)} failed in {method}:\n{failures[call]}")
+        return None
+
+    def _names(self, some: Sequence[Any], calls: list[Any]) -> str:
+        return ", ".join(f"rank {rank}" for rank, call in enumerate(calls, 1) if call in some)
+
+
+def _error(call: Any) -> RayError | None:
+    try:
+        ray.get(call, timeout=0)
+    except RayError as error:
+        return error
+    return None

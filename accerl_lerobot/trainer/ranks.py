@@ -1,0 +1,146 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The processes that make an update together, as one of them sees the others.
+
+Each rank has the whole batch and runs the network on its rows of it. What is said of rows is gathered, so
+that every rank knows it of all rows: targets, moments and numbers are computed from the same values, by the
+same code, everywhere, and nobody has to be told whether an update was finite. Only gradients are averaged.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable, Sequence
+from datetime import timedelta
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+
+from accerl_lerobot.trainer.batch import turns
+
+LOOPBACK = "127.0.0.1"
+
+
+class Ranks:
+    """A trainer that is one process; `Group` is one of several.
+
+    Example:
+        >>> ranks.each(lambda rows: scored(rows), np.arange(len(batch)), size=64)  # of all rows, everywhere
+    """
+
+    rank, size = 0, 1
+
+    def gather(self, mine: Tensor, total: int) -> Tensor:
+        """Rows of all ranks, in order, from each one's own.
+
+        Args:
+            mine: (rows, ...), on the CPU; `np.array_split` of all rows says how many.
+            total: rows of all ranks.
+        """
+        return mine
+
+    def average(self, parameters: Sequence[nn.Parameter]) -> None:
+        """Puts the mean over ranks into each gradient."""
+
+    def begin_alike(self, parameters: Sequence[nn.Parameter]) -> None:
+        """Puts the first rank's values into those of all."""
+
+    def each(self, score: Callable[[np.ndarray], Tensor], rows: np.ndarray, size: int) -> Tensor:
+        """What `score` says of rows, (rows, ...) on the CPU; a rank is asked of its own, `size` at once."""
+        said = [(turn.own, score(turn.rows).cpu()) for turn in turns(rows, size, self.rank, self.size)]
+        return self.gather(torch.cat([rows if own else rows[:0] for own, rows in said]), len(rows))
+
+
+class Meeting(NamedTuple):
+    """Where ranks find each other."""
+
+    address: str
+    port: int
+
+
+class Group(Ranks):
+    """One of several ranks, once all of them have come.
+
+    Args:
+        store: where they have met.
+        rank: which one this is.
+        size: how many there are.
+        device: where their networks are.
+        timeout_s: how long each waits for the others.
+    """
+
+    def __init__(
+        self, store: dist.Store, rank: int, size: int, device: torch.device, timeout_s: float
+    ) -> None:
+        self.rank, self.size = rank, size
+        timeout = timedelta(seconds=timeout_s)
+        # What is gathered lies on the CPU, and so does what is offloaded.
+        backend = "gloo" if device.type == "cpu" else f"cpu:gloo,{device.type}:nccl"
+        dist.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=timeout)
+
+    def gather(self, mine: Tensor, total: int) -> Tensor:
+        counts = [len(part) for part in np.array_split(np.arange(total), self.size)]
+        padded = mine.new_zeros((counts[0], *mine.shape[1:]))
+        padded[: len(mine)] = mine
+        parts = [torch.empty_like(padded) for _ in counts]
+        dist.all_gather(parts, padded)
+        return torch.cat([part[:count] for part, count in zip(parts, counts, strict=True)])
+
+    def average(self, parameters: Sequence[nn.Parameter]) -> None:
+        gradients = [p.grad for p in parameters if p.grad is not None]
+        if not gradients:
+            return
+        flat = nn.utils.parameters_to_vector(gradients)
+        dist.all_reduce(flat)
+        nn.utils.vector_to_parameters(flat.div_(self.size), gradients)
+
+    def begin_alike(self, parameters: Sequence[nn.Parameter]) -> None:
+        for parameter in parameters:
+            dist.broadcast(parameter.data, src=0)
+
+
+def host(address: str, size: int, timeout_s: float) -> tuple[dist.Store, Meeting]:
+    """Opens a meeting place on one of this machine's addresses, and on no other.
+
+    Args:
+        address: the loopback, where all ranks are on one machine.
+        size: how many ranks will come.
+        timeout_s: how long they wait for what another one has to say there.
+    """
+    listener = socket.socket()
+    listener.bind((address, 0))
+    listener.listen()
+    meeting = Meeting(address, listener.getsockname()[1])
+    # A store that opens its own socket listens on every interface.
+    return _store(meeting, size, timeout_s, master_listen_fd=listener.detach(), is_master=True), meeting
+
+
+def visit(meeting: Meeting, size: int, timeout_s: float) -> dist.Store:
+    """Goes to a meeting place that another rank has opened."""
+    return _store(meeting, size, timeout_s)
+
+
+def _store(meeting: Meeting, size: int, timeout_s: float, **options: bool | int) -> dist.Store:
+    timeout = timedelta(seconds=timeout_s)
+    return dist.TCPStore(*meeting, world_size=size, timeout=timeout, wait_for_workers=False, **options)
+
+
+def only_loopback() -> None:
+    """Has gloo listen on the loopback interface and on no other; it reads a variable of this process."""
+    names = [name for _, name in socket.if_nameindex() if name.startswith("lo")]
+    os.environ["GLOO_SOCKET_IFNAME"] = names[0]

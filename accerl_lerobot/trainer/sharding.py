@@ -1,0 +1,233 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A policy of whose weights each rank keeps a part, by PyTorch's FSDP2 (`fully_shard`).
+
+The adapter is the module that is shared out: `evaluate` and `values` gather its weights and let go of them.
+What is gathered and let go of at once is a *block*: one of the network's repeated modules, whose weights are
+used inside its own forward pass and nowhere else. LeRobot's policies do not make that plain: SmolVLA, π0 and
+theirs run the inside of a layer without calling the layer, attention reads weights of linear layers that it
+never calls, caches carry gradients past a layer's output, and embeddings are tied. So one evaluation is
+watched, and a layer that is no block falls into the largest of its parts that are. What is left over belongs
+to the adapter as a whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
+from torch.utils.checkpoint import checkpoint
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.base import Evaluation, PolicyAdapter
+from accerl_lerobot.policies.value_head import Value
+from accerl_lerobot.tensors import in_parts
+from accerl_lerobot.trainer.config import TrainerConfig
+
+
+def arrange(adapter: PolicyAdapter, config: TrainerConfig) -> None:
+    """Prepares an adapter for `trainer.sharding` and `trainer.activation_checkpointing`, in place.
+
+    Args:
+        adapter: on every rank with the same weights; called before anybody takes hold of its parameters.
+        config: which of the two.
+
+    Raises:
+        InputError: the policy has no block that can forget, or there is nothing to offload from.
+    """
+    if not (config.zero or config.activation_checkpointing):
+        return
+    seen = Watch(adapter)
+    if config.activation_checkpointing:
+        forgetful = [block for block in seen.blocks if list(block.children())]
+        if not forgetful:
+            remedy = "no block of this policy can be computed again by itself; leave the field out"
+            raise InputError("trainer.activation_checkpointing", True, remedy)
+        for block in forgetful:
+            # FSDP's hooks stand around this, at the module's call: weights are there when it is repeated.
+            block.forward = partial(checkpoint, block.forward, use_reentrant=False)
+    if config.zero:
+        _share_out(adapter, seen.blocks, config)
+
+
+def _share_out(adapter: PolicyAdapter, blocks: Sequence[nn.Module], config: TrainerConfig) -> None:
+    import torch.distributed as dist
+    from torch.distributed.device_mesh import init_device_mesh
+    from torch.distributed.fsdp import (
+        CPUOffloadPolicy,
+        OffloadPolicy,
+        fully_shard,
+        register_fsdp_forward_method,
+    )
+
+    if config.cpu_offload and adapter.device.type == "cpu":
+        raise InputError("trainer.cpu_offload", True, "the policy is on the CPU already; leave the field out")
+    for kind in (Evaluation, Value):
+        if kind not in torch.utils._pytree.SUPPORTED_NODES:
+            torch.export.register_dataclass(kind)  # so that FSDP finds the tensors of which gradients begin
+    options: dict[str, Any] = {
+        "mesh": init_device_mesh(adapter.device.type, (dist.get_world_size(),)),
+        "reshard_after_forward": config.sharding == "zero3",
+        "offload_policy": CPUOffloadPolicy() if config.cpu_offload else OffloadPolicy(),
+    }
+    for block in blocks:
+        fully_shard(block, **options)
+    fully_shard(adapter, **options)
+    for name in ("evaluate", "values"):
+        register_fsdp_forward_method(adapter, name)
+
+
+def synchronise(adapter: PolicyAdapter, now: bool) -> None:
+    """Whether the next backward pass ends with gradients averaged over ranks, or adds to those kept back."""
+    if hasattr(adapter, "set_requires_gradient_sync"):
+        adapter.set_requires_gradient_sync(now)
+
+
+@contextmanager
+def swapped_in(
+    adapter: PolicyAdapter, live: Sequence[nn.Parameter], tensors: Sequence[Tensor]
+) -> Iterator[None]:
+    """Parameters have other values inside, and their own again afterwards, whatever happens.
+
+    Args:
+        adapter: whose they are.
+        live: its parameters.
+        tensors: like them.
+    """
+    sharded = any(map(in_parts, live))
+    own = [p.detach().clone() if sharded else p.data for p in live]
+    try:
+        _put(adapter, live, tensors, sharded)
+        yield
+    finally:
+        _put(adapter, live, own, sharded)
+
+
+@torch.no_grad()
+def _put(
+    adapter: PolicyAdapter, live: Sequence[nn.Parameter], tensors: Sequence[Tensor], sharded: bool
+) -> None:
+    for parameter, tensor in zip(live, tensors, strict=True):
+        if sharded:  # FSDP gathers from memory of its own, whatever a parameter points to
+            parameter.copy_(tensor)
+        else:
+            parameter.data = tensor
+    if sharded:
+        for module in adapter.modules():  # what has been gathered is of other values
+            if hasattr(module, "reshard"):
+                module.reshard()
+
+
+class Watch(TorchFunctionMode):
+    """Which modules one evaluation calls, and where it uses which parameter.
+
+    Args:
+        adapter: what is watched.
+
+    Attributes:
+        blocks: see the top of this file; none within another.
+    """
+
+    def __init__(self, adapter: PolicyAdapter) -> None:
+        super().__init__()
+        self._called: set[nn.Module] = set()
+        self._leaky: set[nn.Module] = set()
+        """Modules that were handed something in which a call can leave tensors, such as a key-value cache."""
+        self._stack: list[nn.Module] = []
+        self._around: dict[Tensor, set[nn.Module]] = {}
+        """The modules whose calls enclose every use of a parameter."""
+        arguments = adapter.example()
+        hooks = [h for m in adapter.modules() for h in (
+            m.register_forward_pre_hook(self._enter, with_kwargs=True), m.register_forward_hook(self._leave)
+        )]  # fmt: skip
+        try:
+            with torch.no_grad(), self:
+                adapter.evaluate(*arguments)
+        finally:
+            for hook in hooks:
+                hook.remove()
+        self._owners = _owners(adapter)
+        self.blocks = list(dict.fromkeys(self._blocks(adapter, repeated=False)))
+
+    def __torch_function__(
+        self,
+        function: Any,
+        types: Any,
+        arguments: tuple[Any, ...] = (),
+        options: dict[str, Any] | None = None,
+    ) -> Any:
+        result = function(*arguments, **(options or {}))
+        if any(True for _ in _tensors(result)):  # else it has only been asked what it is like
+            for tensor in _tensors((arguments, options)):
+                if isinstance(tensor, nn.Parameter):
+                    around = self._around.setdefault(tensor, set(self._stack))
+                    around.intersection_update(self._stack)
+        return result
+
+    def _enter(self, module: nn.Module, arguments: tuple[Any, ...], options: dict[str, Any]) -> None:
+        self._called.add(module)
+        self._stack.append(module)
+        if not _plain((arguments, tuple(options.values()))):
+            self._leaky.add(module)
+
+    def _leave(self, module: nn.Module, arguments: Any, output: Any) -> None:
+        self._stack.pop()
+
+    def _blocks(self, module: nn.Module, repeated: bool) -> Iterator[nn.Module]:
+        if repeated and self._is_block(module):
+            yield module
+            return
+        for child in module.children():
+            yield from self._blocks(child, repeated or isinstance(module, (nn.ModuleList, nn.Sequential)))
+
+    def _is_block(self, module: nn.Module) -> bool:
+        """Called, of more than vectors, and no weight of it is used or held anywhere else."""
+        parameters = list(module.parameters())
+        # Gradients that come by way of a cache pass by a module's output, where FSDP waits for them; and what
+        # is computed again would be put there again.
+        if module not in self._called or module in self._leaky or all(p.dim() < 2 for p in parameters):
+            return False
+        inside = set(module.modules())
+        return all(module in self._around.get(p, (module,)) and self._owners[p] <= inside for p in parameters)
+
+
+def _owners(root: nn.Module) -> dict[Tensor, set[nn.Module]]:
+    """The modules that hold each parameter as their own; several where it is tied."""
+    owners: dict[Tensor, set[nn.Module]] = {}
+    for module in root.modules():
+        for parameter in module.parameters(recurse=False):
+            owners.setdefault(parameter, set()).add(module)
+    return owners
+
+
+def _tensors(value: Any) -> Iterator[Tensor]:
+    if isinstance(value, Tensor):
+        yield value
+    elif isinstance(value, dict):
+        yield from _tensors(tuple(value.values()))
+    elif isinstance(value, (tuple, list)):
+        for part in value:
+            yield from _tensors(part)
+
+
+def _plain(value: Any) -> bool:
+    """Whether it is made of tensors and numbers, none of which a call can leave another tensor in."""
+    if isinstance(value, tuple):
+        return all(map(_plain, value))
+    return value is None or isinstance(value, (Tensor, str, int, float, torch.dtype, torch.device))

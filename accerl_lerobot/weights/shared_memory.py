@@ -1,0 +1,280 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Weights from the trainer to readers on the same machine through memory that both map.
+
+    trainer ──copies──► slab ◄──reads── reader ──copies──► its parameters, then lets the slab go
+       └── version and, once, the slab's file descriptor over a Unix socket ──┘
+       └── the digest, which both have reckoned meanwhile ────────────────────┘
+
+The socket's name is an abstract one and slabs have none at all, so nothing is left behind whoever is killed.
+Both sides talk to processes of the same user only. A slab that a reader holds is never written to: with R
+readers there are R for them, one that is being sent, one to write to, and one to compare with if only changes
+are sent.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import selectors
+import socket
+import struct
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from accerl_lerobot.weights import changes as changed_words
+from accerl_lerobot.weights.changes import LIMIT, Changes
+from accerl_lerobot.weights.publisher import Publisher, ReaderLostError, Shipment
+from accerl_lerobot.weights.slab import Layout, Slab, aligned, digest
+
+NOT_ONLY_CHANGES = -1
+TALK_S = 10.0
+"""How long a message of some hundred bytes may take."""
+_PEER = struct.Struct("3i")
+
+
+class Message(NamedTuple):
+    """A set that lies in a slab; the slab's file descriptor comes with the first one about it."""
+
+    slot: int
+    """Of the slab; one that comes for a slot takes the place of the one before."""
+    version: int
+    published_s: float
+    size: int
+    text: int
+    """Bytes of the layout, which follows the data."""
+    keep: bool
+    """Changes may follow, against this set."""
+    changed: int
+    """How many words the changes have, or `NOT_ONLY_CHANGES`."""
+    base: int
+    """The version that they are against."""
+
+    def pack(self) -> bytes:
+        """For the socket."""
+        return FORMAT.pack(*self)
+
+    @classmethod
+    def unpack(cls, data: bytes) -> Message:
+        """The inverse of `pack`."""
+        return cls(*FORMAT.unpack(data))
+
+
+FORMAT = struct.Struct("<QqdQQ?qq")
+CONFIRMED = struct.Struct("<q16s")
+"""What follows every message: version, and digest of the whole set."""
+APPLIED = struct.Struct("<q")
+"""What a reader answers: the version that it has applied, so that it does not hold the slab any more."""
+
+
+def is_available() -> bool:
+    """Whether this system has memory that is shared without a name."""
+    return sys.platform == "linux" and hasattr(os, "memfd_create")
+
+
+def make_socket() -> socket.socket:
+    """Messages stay whole and in order, and take file descriptors along."""
+    return socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+
+
+def is_own(connection: socket.socket) -> bool:
+    """Whether a process of this user is at the other end."""
+    _, uid, _ = _PEER.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
+    return bool(uid == os.getuid())
+
+
+@dataclass(eq=False)
+class _Reader:
+    """One of them as the publisher sees it."""
+
+    connection: socket.socket
+    known: dict[int, Slab] = field(default_factory=dict)
+    """Slot → slab that it has mapped."""
+    holds: Shipment | None = None
+    applied: int | None = None
+
+
+class SharedMemoryPublisher(Publisher):
+    """The trainer's end; `SharedMemoryReader` is the other one.
+
+    Args:
+        readers: how many there will be.
+        changes: send only the words that changed, where these are few and the reader has the set before.
+    """
+
+    def __init__(self, readers: int, *, changes: bool = False) -> None:
+        super().__init__(readers + 2 + changes, Slab.shared)
+        self._expected, self._changes = readers, changes
+        self._readers: list[_Reader] = []
+        self._base: Shipment | None = None
+        self._difference: Changes | None = None
+        name = f"accerl-weights-{secrets.token_hex(16)}"
+        self._listener = make_socket()
+        self._listener.bind(f"\0{name}")
+        self._listener.listen(readers)
+        self._event = os.eventfd(0, os.EFD_CLOEXEC)
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self._event, selectors.EVENT_READ)
+        self._selector.register(self._listener, selectors.EVENT_READ)
+        self.address = name
+        """What readers connect to, on this machine."""
+        self._thread.start()
+
+    def close(self) -> None:
+        super().close()
+        self._selector.close()
+        for connection in (self._listener, *(reader.connection for reader in self._readers)):
+            connection.close()
+        if self._event >= 0:
+            os.close(self._event)
+            self._event = -1
+
+    def _serve(self) -> None:
+        while True:
+            for key, _ in self._selector.select():
+                if key.fileobj is self._listener:
+                    self._accept()
+                elif key.fileobj == self._event:
+                    os.eventfd_read(self._event)
+                    if self._closing:
+                        return
+                    self._begin()
+                else:
+                    self._hear(key.data)
+            self._send_newest()
+
+    def _accept(self) -> None:
+        connection, _ = self._listener.accept()
+        if not is_own(connection):
+            connection.close()
+            return
+        connection.settimeout(TALK_S)
+        reader = _Reader(connection)
+        self._selector.register(connection, selectors.EVENT_READ, reader)
+        with self._changed:
+            self._readers.append(reader)
+
+    def _begin(self) -> None:
+        """Makes the newest set ready to be sent."""
+        with self._changed:
+            before, shipment = self._current, self._take()
+            if shipment is None:
+                return
+            if self._changes:
+                self._base = before
+        if self._changes:
+            self._difference = self._compare(shipment)
+        self._send_newest()  # readers reckon the digest while it is reckoned here
+        data = shipment.slab.memory[: shipment.layout.size]
+        shipment.digest = digest(shipment.version, shipment.layout, data)
+        for reader in self._readers:
+            if reader.holds is shipment:
+                self._confirm(reader, shipment)
+        self._spare()
+
+    def _compare(self, shipment: Shipment) -> Changes | None:
+        """Puts what differs from the set before behind the layout; None if that is not worth it."""
+        base, layout = self._base, shipment.layout
+        if base is None or base.layout.text != layout.text:
+            return None
+        memory, size = shipment.slab.memory, layout.size
+        found = changed_words.find(base.slab.memory[:size], memory[:size], layout.word)
+        if found is not None:
+            where, words = found
+            memory[layout.end : layout.end + where.nbytes].view(where.dtype)[:] = where
+            start = aligned(layout.end + where.nbytes)
+            memory[start : start + words.nbytes].view(words.dtype)[:] = words
+        return found
+
+    def _send_newest(self) -> None:
+        """To every reader that holds nothing and has not had it."""
+        shipment = self._current
+        if shipment is None:
+            return
+        for reader in self._readers:
+            if reader.holds is None and reader.applied != shipment.version:
+                self._announce(reader, shipment)
+                if shipment.digest:
+                    self._confirm(reader, shipment)
+
+    def _announce(self, reader: _Reader, shipment: Shipment) -> None:
+        slab, layout = shipment.slab, shipment.layout
+        base = -1 if self._base is None else self._base.version
+        found = self._difference if reader.applied == base else None
+        with self._changed:
+            slot = self._slabs.index(slab)
+            reader.holds = shipment
+        message = Message(
+            slot=slot,
+            version=shipment.version,
+            published_s=shipment.published_s,
+            size=layout.size,
+            text=len(layout.text),
+            keep=self._changes,
+            changed=NOT_ONLY_CHANGES if found is None else len(found.where),
+            base=base,
+        )
+        fds = [] if slab.fd is None or reader.known.get(slot) is slab else [slab.fd]
+        with _lost():
+            socket.send_fds(reader.connection, [message.pack()], fds)
+        reader.known[slot] = slab
+
+    def _confirm(self, reader: _Reader, shipment: Shipment) -> None:
+        with _lost():
+            reader.connection.send(CONFIRMED.pack(shipment.version, shipment.digest))
+
+    def _hear(self, reader: _Reader) -> None:
+        with _lost():
+            data = reader.connection.recv(APPLIED.size)
+            if not data:
+                raise ConnectionResetError("it has ended")
+        with self._changed:
+            (reader.applied,) = APPLIED.unpack(data)
+            reader.holds = None
+            self._changed.notify_all()
+
+    def _wake(self) -> None:
+        if self._event >= 0:
+            os.eventfd_write(self._event, 1)
+
+    def _held(self) -> list[Slab]:
+        shipments = [self._base, *(reader.holds for reader in self._readers)]
+        return [shipment.slab for shipment in shipments if shipment is not None]
+
+    def _size(self, layout: Layout) -> int:
+        if not self._changes:
+            return layout.end
+        words = int(LIMIT * layout.size / layout.word) + 1
+        return aligned(layout.end + 4 * words) + words * layout.word
+
+    def _owed(self) -> str:
+        if self._version is None:
+            return ""
+        missing = self._expected - len(self._readers)
+        late = [str(i) for i, reader in enumerate(self._readers) if reader.applied != self._version]
+        parts = [f"{missing} readers have not connected"] if missing else []
+        parts += [f"not applied by readers {', '.join(late)}"] if late else []
+        return "; ".join(parts)
+
+
+@contextlib.contextmanager
+def _lost() -> Iterator[None]:
+    """Says what it means that the socket does not work any more."""
+    try:
+        yield
+    except OSError as error:
+        raise ReaderLostError(f"a reader of the weights has gone: {error}") from error

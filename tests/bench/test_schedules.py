@@ -1,0 +1,165 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Schedules, scaling and throughput: what is made of the numbers, and one small run of it all."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from accerl_lerobot.bench import async_vs_sync
+from accerl_lerobot.bench.async_vs_sync import ARMS, BenchAsyncVsSyncConfig, bench_async_vs_sync
+from accerl_lerobot.bench.async_vs_sync import compare as compare_schedules
+from accerl_lerobot.bench.async_vs_sync import table as schedules_table
+from accerl_lerobot.bench.blocks import Block
+from accerl_lerobot.bench.host import Processors, floors, host, spread
+from accerl_lerobot.bench.machinery import MachineryConfig
+from accerl_lerobot.bench.scaling import BenchScalingConfig, bench_scaling
+from accerl_lerobot.bench.scaling import compare as compare_counts
+from accerl_lerobot.bench.throughput import BenchThroughputConfig, books
+from accerl_lerobot.config import RunConfig
+from accerl_lerobot.console import Console
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.rollout.runner import RolloutConfig
+from tests.light_workers import light_ray
+
+__all__ = ["light_ray"]
+
+
+def block(schedule: str, rate: float, processors: float = 0.2, waits: float = 0.5) -> Block:
+    return Block(
+        schedule=schedule,
+        seconds=1.0,
+        updates=4,
+        decisions_per_s=rate,
+        env_steps_per_s=4 * rate,
+        lag_mean=1.0,
+        lag_max=2.0,
+        trainer_waits=waits,
+        publishing=0.0,
+        batch_size=2.0,
+        request_wait_ms=1.0,
+        inference_busy=0.5,
+        processors=processors,
+    )
+
+
+def test_bounds_by_hand():
+    """Ten worlds of 90 ms: 90 · 17/16 + 4 + 0.375 = 100 ms a decision."""
+    machine = MachineryConfig(
+        worlds=10, latency_ms=90.0, decide_ms=4.0, decide_each_ms=0.375, max_batch=8, update_ms=500.0
+    )
+    assert machine.world_bound == pytest.approx(100.0)
+    assert machine.service_bound == pytest.approx(8 / 0.007)
+    assert machine.trainer_bound == pytest.approx(40 / 0.5)
+    assert machine.bound == pytest.approx(80.0)
+    free = MachineryConfig(decide_ms=0.0, decide_each_ms=0.0, update_ms=0.0)
+    assert free.service_bound == free.trainer_bound == math.inf
+    assert free.bound == free.world_bound
+
+
+def test_speed_ups_are_of_neighbouring_blocks():
+    machine = MachineryConfig(
+        worlds=10, latency_ms=90.0, decide_ms=4.0, decide_each_ms=0.375, update_ms=500.0
+    )
+    rates = {"asynchronous": [60.0, 72.0], "overlap": [40.0, 36.0], "synchronous": [20.0, 36.0]}
+    blocks = [block(arm, rates[arm][0]) for arm in ARMS]
+    blocks += [block(arm, rates[arm][1], processors=0.7) for arm in reversed(ARMS)]
+    found = compare_schedules(machine, blocks)
+    assert found["speed_up"]["blocks"] == [3.0, 2.0] and found["speed_up"]["median"] == 2.5
+    assert found["speed_up_over_overlap"]["blocks"] == [1.5, 2.0]
+    assert found["largest_speed_up"] == pytest.approx(80.0 / 28.0)
+    assert found["share_of_largest"]["blocks"] == pytest.approx([0.75, 0.9])
+    assert found["processor_bound"] and len(found["blocks"]) == 6
+
+
+def test_efficiency_is_relative_to_the_first_count():
+    config = BenchScalingConfig(counts=(2, 4), update_ms=0.0)
+    found = compare_counts(config, {2: [block("", 10.0), block("", 10.0)], 4: [block("", 15.0, 0.9)]})
+    assert [row["efficiency"]["median"] for row in found] == [1.0, 0.75]
+    assert [row["processor_bound"] for row in found] == [False, True]
+    assert found[1]["bound"] == pytest.approx(2 * found[0]["bound"])
+
+
+def test_books_that_do_not_add_up_are_an_error():
+    run = RunConfig(rollout=RolloutConfig(workers=2, worlds=2, segment_length=4))
+    rollout = {"decisions": 100.0, "dropped_nonfinite": 3.0, "groups_dropped_decisions": 0.0}
+    found = books(run, rollout, {"inserted_decisions": 90.0, "dropped_nonfinite": 1.0})
+    assert found == {"generated": 100.0, "committed": 90.0, "dropped": 4.0, "under_way": 6.0}
+    for inserted in (20.0, 170.0):
+        with pytest.raises(RuntimeError, match="missing, or there twice"):
+            books(run, rollout, {"inserted_decisions": inserted, "dropped_nonfinite": 0.0})
+
+
+def test_a_small_run_of_everything(light_ray: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    small = {"worlds": 2, "latency_ms": 5.0, "update_ms": 20.0, "image_size": 16, "decide_ms": 1.0}
+    config = BenchAsyncVsSyncConfig(
+        **small, cvs=(0.5,), seconds=0.2, rounds=1, learning_updates=2, seeds=(0,), output_dir=str(tmp_path)
+    )
+    monkeypatch.setattr(async_vs_sync, "TRIALS", 4)
+    result = bench_async_vs_sync(config)
+    (law,) = result["laws"]
+    assert [b["schedule"] for b in law["blocks"]] == [*ARMS, *reversed(ARMS)]
+    assert all(b["decisions_per_s"] > 0 and b["updates"] >= 1 for b in law["blocks"])
+    # In lock step the service sees both worlds at once.
+    assert {b["batch_size"] for b in law["blocks"] if b["schedule"] == "synchronous"} == {2.0}
+    assert set(result["learning"]["success"]) == set(ARMS)
+    assert json.loads((tmp_path / "async_vs_sync.json").read_text()) == json.loads(json.dumps(result))
+    text = (tmp_path / "async_vs_sync.md").read_text()
+    assert "S/S*" in text and "Success after 2 updates" in text
+    assert (tmp_path / "async_vs_sync.png").stat().st_size > 1000
+    with Console().rich.capture():
+        Console().rich.print(schedules_table(result))
+
+
+def test_a_small_run_of_scaling(light_ray: None, tmp_path: Path):
+    config = BenchScalingConfig(
+        counts=(1, 2), latency_ms=5.0, image_size=16, seconds=0.2, blocks=1, output_dir=str(tmp_path)
+    )
+    rows = bench_scaling(config)["counts"]
+    assert [row["worlds"] for row in rows] == [1, 2] and rows[0]["efficiency"]["median"] == 1.0
+    assert (tmp_path / "scaling.png").stat().st_size > 1000 and "E(N)" in (
+        tmp_path / "scaling.md"
+    ).read_text()
+
+
+def test_the_machine_is_described():
+    assert host()["cores"] >= 1 and "ray" in host()["versions"]
+    assert set(floors()) == {"memcpy_gb_per_s", "sleep_overshoot_us", "pipe_us"}
+    processors = Processors()
+    sum(i * i for i in range(300_000))
+    assert 0.0 <= processors.share() <= 1.0
+    assert spread([3.0, 1.0, 2.0]) == {"median": 2.0, "min": 1.0, "max": 3.0, "blocks": [3.0, 1.0, 2.0]}
+
+
+@pytest.mark.parametrize(
+    ("make", "field"),
+    [
+        (lambda: MachineryConfig(worlds=0), "worlds"),
+        (lambda: MachineryConfig(latency_ms=0.0), "latency_ms"),
+        (lambda: MachineryConfig(segment_length=5), "segment_length"),
+        (lambda: BenchAsyncVsSyncConfig(cvs=()), "cvs"),
+        (lambda: BenchAsyncVsSyncConfig(rounds=0), "rounds"),
+        (lambda: BenchScalingConfig(counts=(0,)), "counts"),
+        (lambda: BenchScalingConfig(counts=(2, 2)), "counts"),
+        (lambda: BenchThroughputConfig(), "policy_path"),
+        (lambda: BenchThroughputConfig(policy_path="x", schedules=("sometimes",)), "schedules"),
+    ],
+)
+def test_what_cannot_be_measured_is_refused(make, field: str):
+    with pytest.raises(InputError, match=field):
+        make()

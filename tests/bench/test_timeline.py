@@ -1,0 +1,57 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The bench of the timeline runs, and its numbers fit each other."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from accerl_lerobot.bench.timeline import BenchTimelineConfig, bench_timeline, table
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.timeline import COMPUTE, TRAINING, WAIT_IN
+from tests.timeline.folders import write_worker
+
+
+def test_the_cost_of_an_entry_and_of_a_run(tmp_path: Path) -> None:
+    write_worker(tmp_path / "run", "driver", [(TRAINING, 10)])
+    write_worker(tmp_path / "run", "trainer", 1000 * [(COMPUTE, 0.005), (WAIT_IN, 0.005)])
+    config = BenchTimelineConfig(entries=200, repeats=2, folder=str(tmp_path), run=str(tmp_path / "run"))
+    result = bench_timeline(config)
+    assert (
+        json.loads(json.dumps(result)) == json.loads(json.dumps(result)) and result["config"]["repeats"] == 2
+    )
+    for arm in result["arms"].values():
+        assert len(arm["blocks"]) == 4 and 0 < arm["min"] <= arm["median"] <= arm["max"]
+    trainer = result["workers"]["trainer"]
+    assert trainer["entries_per_s"] == pytest.approx(200, rel=0.01)
+    assert trainer["share"] == pytest.approx(trainer["entries_per_s"] * result["arms"]["on"]["median"] / 1e9)
+    assert {path.name for path in tmp_path.iterdir()} == {"run"}, "it cleans up after itself"
+    console = Console(width=120, record=True, file=io.StringIO())
+    console.print(table(result))
+    assert "trainer" in console.export_text()
+
+
+@pytest.mark.parametrize(
+    ("values", "field"),
+    [({"entries": 1}, "entries"), ({"repeats": 0}, "repeats"), ({"folder": "no"}, "folder")],
+)
+def test_bad_values_name_their_field(values: dict[str, Any], field: str) -> None:
+    with pytest.raises(InputError, match=f"^{field}="):
+        BenchTimelineConfig(**values)

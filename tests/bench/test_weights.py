@@ -1,0 +1,78 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""``accerl bench weights``, small."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from accerl_lerobot import snapshot
+from accerl_lerobot.bench.weights import ARMS, BenchWeightsConfig, bench_weights, changed_shares, table
+from accerl_lerobot.checkpoint import TRAINING_STATE, WEIGHTS
+from accerl_lerobot.errors import InputError
+from tests.light_workers import light_ray
+
+__all__ = ["light_ray"]
+
+
+def test_all_arms_at_all_sizes(light_ray: None, tmp_path: Path):
+    root = tmp_path / "weights"
+    config = BenchWeightsConfig(sizes_mb=(1, 2), readers=(1, 2), tensors=3, repeats=2, output_dir=str(root))
+    result = bench_weights(config)
+    assert json.loads(json.dumps(result)) == json.loads((root / "weights.json").read_text())
+    assert len(result["cells"]) == 2 * 2 * len(ARMS)
+    for cell in result["cells"]:
+        for kind in ("stall", "applied", "pause"):
+            assert len(cell[kind]["blocks"]) == 2 and cell[f"{kind}_ms"]["min"] > 0
+        assert cell["applied_ms"]["median"] > cell["pause_ms"]["median"]
+        # An index and a value for each of one in a hundred, or less where one was drawn twice; else all.
+        few = cell["arm"] == "changes, 1 %"
+        assert cell["mb"]["median"] == pytest.approx(cell["size_mb"] * (0.02 if few else 1), rel=0.02)
+    console = Console(width=200, record=True, file=io.StringIO())
+    console.print(table(result))
+    shown = console.export_text()
+    assert all(arm in shown and arm in (root / "weights.md").read_text() for arm in ARMS)
+    assert (root / "weights.png").read_bytes()[:4] == b"\x89PNG"
+    with pytest.raises(InputError, match="^output_dir=.*the folder exists"):
+        bench_weights(config)
+
+
+def test_what_changes_between_checkpoints(tmp_path: Path):
+    weights: dict[str, Any] = {"a": np.ones((5, 10), np.float32), "b": np.ones(50, np.float32)}
+    for step in (2, 4, 10):
+        snapshot.save(tmp_path / f"{step:06d}" / TRAINING_STATE / WEIGHTS, weights)
+        weights = {name: tensor.copy() for name, tensor in weights.items()}
+        weights["a"] += 1e-4  # less than bfloat16 can tell from 1
+        weights["b"][:10] += step
+    found = changed_shares(tmp_path)
+    assert [(pair["from"], pair["to"], pair["values"]) for pair in found] == [(2, 4, 100), (4, 10, 100)]
+    assert [(pair["fp32"], pair["bf16"]) for pair in found] == [(pytest.approx(0.6), pytest.approx(0.1))] * 2
+    with pytest.raises(InputError, match="^checkpoints=.*two checkpoints or more"):
+        changed_shares(tmp_path / "000002")
+
+
+@pytest.mark.parametrize(
+    ("values", "field"),
+    [({"sizes_mb": ()}, "sizes_mb"), ({"readers": (0,)}, "readers"), ({"repeats": 0}, "repeats")],
+)
+def test_bad_values_name_their_field(values: dict, field: str):
+    with pytest.raises(InputError, match=f"^{field}="):
+        BenchWeightsConfig(**values)

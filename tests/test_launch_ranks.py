@@ -1,0 +1,136 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The asynchronous engine with a trainer of two ranks, everything real: LeRobot's SmolVLA, Ray, gloo, FSDP2.
+
+One run learns with two ranks, is saved, and loses a rank that hangs; another one goes on with a single rank.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from accerl_lerobot import snapshot
+from accerl_lerobot.checkpoint import PRETRAINED, STEP, TRAINING_STATE, WEIGHTS
+from accerl_lerobot.config import RunConfig
+from accerl_lerobot.engine import WorkerError
+from accerl_lerobot.evaluation.config import evaluation_plans
+from accerl_lerobot.launch import RayEngine
+from accerl_lerobot.trainer.config import TrainerConfig
+from tests.runs import collect, drive, polls, tiny_run
+from tests.test_ray_environment import LOOPBACK, listening
+
+UPDATES = 12
+TWO = TrainerConfig(
+    updates=1000, batch_decisions=16, warmup_updates=0, value_warmup_updates=1, probe_every=3,
+    ranks=2, sharding="zero3", rank_timeout_s=15.0,
+)  # fmt: skip
+
+
+@dataclass
+class Story:
+    """What the run with two ranks did."""
+
+    config: RunConfig
+    saved: Path
+    version: int
+    updates: list[dict[str, float]]
+    served: int
+    """Version of the weights that inference had."""
+    error: str
+    addresses: set[str]
+    """At which its processes accepted connections."""
+
+
+@pytest.fixture(scope="module")
+def story(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Story]:
+    config = tiny_run(tiny_checkpoint, trainer=TWO)
+    directory = tmp_path_factory.mktemp("saved")
+    engine = RayEngine(config, ("match",))
+    try:
+        pids = engine.pids()
+        engine.train()
+        updates: list[dict[str, float]] = []
+        for progress in polls(engine):
+            updates += progress.updates
+            if progress.version >= UPDATES:
+                break
+        saved, addresses = engine.save(directory), set(listening())
+        served = int(progress.inference["version"])
+        os.kill(pids["trainer rank 1"], signal.SIGSTOP)
+        with pytest.raises(WorkerError) as lost:
+            drive(engine)
+        updates += saved.updates
+        yield Story(config, directory, saved.version, updates, served, str(lost.value), addresses)
+    finally:
+        engine.close()
+
+
+def test_two_ranks_train_and_publish(story: Story):
+    assert [u["update"] for u in story.updates[: story.version]] == [i + 1.0 for i in range(story.version)]
+    assert 0 < story.served <= story.version
+    assert all(np.isfinite(u["loss"]) and u["grad_norm"] > 0 and u["skipped"] == 0 for u in story.updates)
+
+
+def test_acting_and_learning_in_parts_agree(story: Story):
+    """Decisions were made by whole weights that had been in parts when they were published."""
+    probes = [u["logprob/mismatch_max"] for u in story.updates if "logprob/mismatch_max" in u]
+    assert len(probes) >= 2 and max(probes) <= 1e-4
+
+
+def test_the_checkpoint_is_whole_and_has_moved(story: Story, tiny_checkpoint: Path):
+    before = load_file(tiny_checkpoint / "model.safetensors")
+    after = load_file(story.saved / PRETRAINED / "model.safetensors")
+    assert {k: t.shape for k, t in after.items()} == {k: t.shape for k, t in before.items()}
+    assert any(not torch.equal(after[k], before[k]) for k in before)
+    trained = snapshot.load(story.saved / TRAINING_STATE / WEIGHTS)
+    named = {k.removeprefix("policy."): v for k, v in trained.items() if k.startswith("policy.")}
+    assert all(np.array_equal(after[k].numpy(), named[k]) for k in after if k in named) and len(named) > 20
+
+
+def test_ranks_listen_on_the_loopback_interface_only(story: Story):
+    assert story.addresses and story.addresses <= LOOPBACK
+
+
+def test_a_rank_that_hangs_is_named(story: Story):
+    assert story.error.startswith("trainer worker failed for good:")
+    assert "trainer rank 1 did not do step: no answer" in story.error
+
+
+def test_one_rank_goes_on_from_what_two_have_saved(story: Story):
+    updates = story.version + 4
+    trainer = replace(TWO, updates=updates, ranks=1, sharding="none")
+    config = replace(story.config, trainer=trainer)
+    state = story.saved / TRAINING_STATE
+    (state / STEP).write_text(json.dumps({"step": story.version}))
+    engine = RayEngine(config, ("match",), state=state)
+    try:
+        assert "trainer rank 1" not in engine.pids()
+        engine.plan(evaluation_plans(("match",), 2, "before"))
+        assert {e.versions for e in collect(engine, "before", 2)} == {(story.version, story.version)}
+        engine.train()
+        made = [u for progress in drive(engine) for u in progress.updates]
+        assert [u["update"] for u in made] == [story.version + i + 1.0 for i in range(4)]
+        assert all(np.isfinite(u["loss"]) and u["ratio_max_dev"] < 5 for u in made)
+    finally:
+        engine.close()

@@ -1,0 +1,199 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""States exclude each other, leave no time out, and are on disk as they were; the disk never fills."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import random
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.timeline import COMPUTE, RECOVERY, TIMELINE, WAIT_IN, WAIT_OUT, Clock, NoClock, open_clock
+from accerl_lerobot.timeline.parts import PART_BYTES, read_sections
+from accerl_lerobot.timeline.read import read_timeline
+from accerl_lerobot.timeline.states import STATES
+from tests.timeline.folders import UP, a_clock, write_worker
+
+
+def lived(clock: Clock, hands, rng: random.Random, turns: int) -> list[tuple[int, int]]:
+    """Enters states at random moments; what it was in, and how long, equal neighbours taken together."""
+    spans = [(RECOVERY, 0)]
+    for _ in range(turns):
+        length = rng.choice((0, 1, 999, 10**6, 3 * 10**9))
+        hands.now += length
+        spans[-1] = (spans[-1][0], spans[-1][1] + length)
+        if rng.random() < 0.1:
+            clock.beat()
+        else:
+            state = rng.randrange(len(STATES))
+            clock.enter(state)
+            if state != spans[-1][0]:
+                spans.append((state, 0))
+    return spans
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_states_exclude_each_other_and_leave_no_time_out(tmp_path: Path, seed: int) -> None:
+    clock, hands = a_clock(tmp_path)
+    spans = lived(clock, hands, random.Random(seed), turns=3000)
+    clock.close()
+    totals = clock.totals_ns()
+    assert sum(totals.values()) == hands.now - UP
+    assert totals == {
+        name: sum(length for state, length in spans if state == number) for number, name in enumerate(STATES)
+    }
+    (row,) = read_timeline(tmp_path).rows
+    assert row.times[0] == 0 and row.times[-1] == hands.now - UP
+    # States in which no time was spent may be there or not.
+    kept = [(s, n) for s, n in zip(row.states.tolist(), np.diff(row.times).tolist(), strict=True) if n]
+    assert merged(kept) == merged([(s, n) for s, n in spans if n])
+
+
+def merged(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    return [(s, sum(n for _, n in own)) for s, own in itertools.groupby(spans, key=lambda span: span[0])]
+
+
+def test_to_enter_the_same_state_again_is_no_entry(tmp_path: Path) -> None:
+    clock, hands = a_clock(tmp_path)
+    clock.enter(COMPUTE)
+    hands.now += 5
+    clock.enter(COMPUTE)
+    clock.close()
+    (path,) = (tmp_path / TIMELINE).iterdir()
+    assert len(path.read_bytes().split(b"\n", 1)[1]) == 2 * 8  # and the beat at the end
+    clock.close()
+
+
+def test_a_while_in_another_state_ends_in_the_one_before_whatever_happens(tmp_path: Path) -> None:
+    clock, hands = a_clock(tmp_path)
+    clock.enter(COMPUTE)
+    with pytest.raises(KeyError), clock.during(WAIT_OUT):
+        hands.now += 7
+        raise KeyError
+    hands.now += 2
+    clock.beat()
+    assert (clock.totals_ns()["wait_out"], clock.totals_ns()["compute"]) == (7, 2)
+
+
+def test_entries_and_beats_of_two_threads_leave_no_time_out(tmp_path: Path) -> None:
+    clock = open_clock(tmp_path / TIMELINE, "trainer")
+    over = threading.Event()
+
+    def beat() -> None:
+        while not over.is_set():
+            clock.beat()
+
+    thread = threading.Thread(target=beat)
+    thread.start()
+    for turn in range(5000):
+        clock.enter((WAIT_IN, COMPUTE)[turn % 2])
+    over.set()
+    thread.join()
+    clock.close()
+    (section,) = read_sections(tmp_path / TIMELINE)
+    assert sum(clock.totals_ns().values()) == section.times[-1] > 0
+    assert np.sum(np.diff(section.states.astype(int)) != 0) == 5000
+
+
+def test_what_is_old_makes_room_and_is_counted(tmp_path: Path) -> None:
+    clock, hands = a_clock(tmp_path, part_bytes=8 * 1000)
+    spans = lived(clock, hands, random.Random(0), turns=60_000)
+    clock.close()
+    files = list((tmp_path / TIMELINE).iterdir())
+    # Two parts, each beyond its size by one batch of entries and a first line at most.
+    assert len(files) == 2 and sum(f.stat().st_size for f in files) < 2 * (8 * (1000 + 512) + 1000)
+    timeline = read_timeline(tmp_path)
+    (row,) = timeline.rows
+    (section,) = read_sections(tmp_path / TIMELINE)
+    assert len(section.states) >= 1000 and row.kept_from > 0
+    kept = [(s, n) for s, n in zip(row.states.tolist(), np.diff(row.times).tolist(), strict=True) if n]
+    assert merged(kept)[1:] == merged([(s, n) for s, n in spans if n])[-len(merged(kept)) + 1 :]
+    whole = sum(n for _, n in spans)
+    for number, name in enumerate(STATES):
+        exact = sum(n for s, n in spans if s == number) / whole
+        assert timeline.shares()["trainer"][name] == pytest.approx(exact, rel=1e-12)
+    assert PART_BYTES / 8 >= 400_000
+
+
+def test_a_process_that_was_killed_leaves_all_but_what_was_on_its_way(tmp_path: Path) -> None:
+    write_worker(tmp_path, "trainer", [(COMPUTE, 1.0), (WAIT_IN, 2.0), (COMPUTE, 3.0)])
+    (path,) = (tmp_path / TIMELINE).iterdir()
+    data = path.read_bytes()
+    head = data.index(b"\n") + 1
+    for size in range(len(data), -1, -1):
+        path.write_bytes(data[:size])
+        sections = read_sections(tmp_path / TIMELINE)
+        if size < head:
+            assert sections == []
+        else:
+            (section,) = sections
+            assert len(section.states) == (size - head) // 8
+            assert section.times.tolist() == [0, 0, 10**9, 3 * 10**9, 6 * 10**9][: len(section.times)]
+
+
+@pytest.mark.parametrize(
+    ("broken", "why"),
+    [
+        (b'{"timeline": 1}\n', "totals_ns"),
+        (b"no json\n", "Expecting value"),
+        (b"[1, 2]\n", "indices"),
+        ("format", "format 9"),
+        ("back", "time goes back"),
+        ("state", "no such state"),
+    ],
+)
+def test_a_damaged_file_is_named(tmp_path: Path, broken: bytes | str, why: str) -> None:
+    write_worker(tmp_path, "trainer", [(COMPUTE, 1.0), (WAIT_IN, 1.0)])
+    (path,) = (tmp_path / TIMELINE).iterdir()
+    head, entries = path.read_bytes().split(b"\n", 1)
+    if isinstance(broken, bytes):
+        path.write_bytes(broken)
+    elif broken == "format":
+        path.write_bytes(json.dumps({**json.loads(head), "timeline": 9}).encode() + b"\n")
+    else:
+        extra = (0).to_bytes(8, "little") if broken == "back" else (2**60 + 15).to_bytes(8, "little")
+        path.write_bytes(head + b"\n" + entries + extra)
+    with pytest.raises(InputError, match=rf"{path.name}.*damaged \(.*{why}") as caught:
+        read_timeline(tmp_path)
+    assert caught.value.field == "runs"
+
+
+def test_a_file_that_is_none_of_ours_is_named(tmp_path: Path) -> None:
+    (tmp_path / TIMELINE).mkdir()
+    (tmp_path / TIMELINE / "notes.bin").write_bytes(b"")
+    with pytest.raises(InputError, match=r"notes\.bin.*no part of a timeline"):
+        read_timeline(tmp_path)
+
+
+def test_without_a_folder_nothing_is_recorded() -> None:
+    clock = open_clock(None, "trainer")
+    assert isinstance(clock, NoClock)
+    with clock.during(COMPUTE):
+        clock.beat()
+    clock.close()
+    assert clock.totals_ns() == {}
+
+
+def test_processes_of_one_worker_write_beside_each_other(tmp_path: Path) -> None:
+    for _ in range(3):
+        open_clock(tmp_path, "rollout 1").close()
+    open_clock(tmp_path, "rollout 11").close()
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"rollout-1.0.0.bin", "rollout-1.1.0.bin", "rollout-1.2.0.bin", "rollout-11.0.0.bin"}

@@ -1,0 +1,132 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Both engines leave a timeline in which every moment of every worker is in one state."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import ray
+
+from accerl_lerobot import launch
+from accerl_lerobot.config import LaunchConfig
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.evaluation.config import evaluation_plans
+from accerl_lerobot.inference import worker as inference_worker
+from accerl_lerobot.launch import RayEngine
+from accerl_lerobot.local import LocalEngine
+from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.timeline import TIMELINE
+from accerl_lerobot.timeline.read import ABSENT, Timeline, read_timeline, shares
+from accerl_lerobot.trainer import worker as trainer_worker
+from tests.light_workers import LightInference, LightTrainer, light_ray
+from tests.runs import collect, drive, tiny_run
+
+__all__ = ["light_ray"]
+
+
+@pytest.fixture
+def light(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(launch, "POLL_S", 0.1)
+    monkeypatch.setattr(inference_worker, "InferenceWorker", LightInference)
+    monkeypatch.setattr(trainer_worker, "TrainerWorker", LightTrainer)
+
+
+def adds_up(timeline: Timeline) -> None:
+    for row in timeline.rows:
+        there = row.states != ABSENT
+        whole = row.times[-1] - row.times[0] - np.diff(row.times)[~there].sum()
+        assert row.until(row.times[-1:])[0].sum() == pytest.approx(whole, rel=1e-9) and whole > 0
+    for own in timeline.shares().values():
+        assert sum(own.values()) == pytest.approx(1.0)
+
+
+def test_the_asynchronous_engine(light: None, tmp_path: Path) -> None:
+    """Its rollout and replay workers are real; one is started again."""
+    config = tiny_run(
+        Path("nowhere"),
+        env=SimulatedConfig(max_steps=16, step_ms=1.0),
+        rollout=RolloutConfig(workers=2, worlds=2, segment_length=3),
+        output_dir=str(tmp_path),
+    )
+    begun = time.monotonic_ns()
+    engine = RayEngine(config, ("match",))
+    try:
+        ready = time.monotonic_ns()
+        engine.plan(evaluation_plans(("match",), 4, "before"))
+        collect(engine, "before", 4)
+        engine.train()
+        drive(engine)
+        ray.kill(next(iter(engine._seats.workers())).actor)
+        engine.plan(evaluation_plans(("match",), 8, "after"))
+        collect(engine, "after", 8)
+        asked = time.monotonic_ns()
+        engine._replay.call("metrics", timeout=60)
+    finally:
+        engine.close()
+    ended = time.monotonic_ns()
+    timeline = read_timeline(tmp_path)
+    adds_up(timeline)
+    rows = {row.worker: row for row in timeline.rows}
+    assert list(rows) == ["rollout 0", "rollout 1", "replay"]
+    assert (rows["rollout 0"].states == ABSENT).sum() == 1 and ABSENT not in rows["rollout 1"].states
+    found = shares(tmp_path)
+    assert {"recovery", "compute", "transport", "wait_in"} <= found["rollout"].keys()
+    assert found["replay"].keys() == {"recovery", "compute", "wait_in"}
+    # The whole life of replay is in it, from before it was ready to when it was asked last.
+    (path,) = (tmp_path / TIMELINE).glob("replay.*")
+    from accerl_lerobot.timeline.parts import read_head
+
+    head, _ = read_head(path)
+    assert head is not None
+    first = head.begins.clock_ns
+    assert begun < first < ready
+    assert asked < first + int(rows["replay"].times[-1] - rows["replay"].times[0]) < ended
+
+
+def test_a_run_that_wants_none(light: None, tmp_path: Path) -> None:
+    config = tiny_run(
+        Path("nowhere"), output_dir=str(tmp_path), launch=LaunchConfig(stall_s=120, timeline=False)
+    )
+    engine = RayEngine(config, ("match",))
+    try:
+        engine.train()
+        drive(engine)
+    finally:
+        engine.close()
+    assert (tmp_path / "episodes.jsonl").stat().st_size and not (tmp_path / TIMELINE).exists()
+
+
+@pytest.fixture
+def in_one_process(tiny_checkpoint: Path, tmp_path: Path) -> Iterator[LocalEngine]:
+    config = tiny_run(tiny_checkpoint, output_dir=str(tmp_path))
+    engine = LocalEngine(replace(config, launch=replace(config.launch, engine="local")), ("match",))
+    yield engine
+    engine.close()
+
+
+def test_the_engine_in_one_process_is_one_row(in_one_process: LocalEngine, tmp_path: Path) -> None:
+    in_one_process.train()
+    drive(in_one_process)
+    in_one_process.save(tmp_path / "saved")
+    in_one_process.close()
+    timeline = read_timeline(tmp_path)
+    adds_up(timeline)
+    assert [row.worker for row in timeline.rows] == ["local"]
+    assert timeline.shares()["local"].keys() == {"recovery", "compute", "wait_in", "checkpoint"}

@@ -1,0 +1,174 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""How the time of roles divides, in all and in a part; workers that were started again; machines apart."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.timeline import (
+    CHECKPOINT,
+    COMPUTE,
+    EVALUATION,
+    RECOVERY,
+    TIMELINE,
+    TRAINING,
+    WAIT_IN,
+    WAIT_OUT,
+)  # fmt: skip
+from accerl_lerobot.timeline.parts import Moment
+from accerl_lerobot.timeline.read import ABSENT, read_timeline, shares
+from accerl_lerobot.timeline.states import bubble
+from accerl_lerobot.timeline.watch import Watch
+from tests.timeline.folders import SECOND, UP, a_clock, write_worker
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """Ten seconds; the driver trains from the second to the eighth, with a checkpoint in between."""
+    driver = [(RECOVERY, 1), (EVALUATION, 1), (TRAINING, 3), (CHECKPOINT, 1), (TRAINING, 2), (EVALUATION, 2)]
+    write_worker(tmp_path, "driver", driver)
+    write_worker(tmp_path, "rollout 0", [(COMPUTE, 6), (WAIT_IN, 4)])
+    write_worker(tmp_path, "rollout 1", [(COMPUTE, 2), (WAIT_OUT, 8)])
+    write_worker(tmp_path, "trainer", [(WAIT_IN, 4), (COMPUTE, 4), (WAIT_IN, 1)], at_s=1)
+    return tmp_path
+
+
+def test_shares_are_of_the_time_of_all_workers_of_a_role(run: Path) -> None:
+    found = shares(run)
+    assert found["rollout"] == pytest.approx({"compute": 0.4, "wait_in": 0.2, "wait_out": 0.4})
+    assert found["trainer"] == pytest.approx({"compute": 4 / 9, "wait_in": 5 / 9})
+    assert list(found) == ["driver", "rollout", "trainer"]
+    assert bubble(found["rollout"]) == pytest.approx(0.6) and bubble(found["driver"]) == 0
+
+
+def test_shares_of_a_part(run: Path) -> None:
+    assert shares(run, 4.0, 2.0)["trainer"] == pytest.approx({"wait_in": 0.5, "compute": 0.5})
+    assert shares(run, 9.0)["rollout"] == pytest.approx({"wait_in": 0.5, "wait_out": 0.5})
+    # From second 2 to 8, the checkpoint included.
+    assert shares(run, training=True)["trainer"] == pytest.approx({"wait_in": 0.5, "compute": 0.5})
+    assert shares(run, 7.0, training=True)["trainer"] == pytest.approx({"compute": 1.0})
+    assert shares(run, 0.0, 0.5).keys() == {"driver", "rollout"}, "the trainer had not begun"
+
+
+@pytest.mark.parametrize(
+    ("start", "length", "field"),
+    [(10.5, None, "start_s"), (-1.0, None, "start_s"), (float("nan"), 1.0, "start_s"), (0.0, 0.0, "seconds")],
+)
+def test_a_part_that_is_not_within_the_run(run: Path, start: float, length: float | None, field: str) -> None:
+    with pytest.raises(InputError, match=f"^{field}="):
+        shares(run, start, length)
+
+
+def test_a_part_that_is_not_within_the_training(run: Path) -> None:
+    with pytest.raises(InputError, match=r"^start_s=8\.5: .*training.* 2\.0 to 8\.0"):
+        shares(run, 8.5, training=True)
+
+
+def test_a_run_that_was_gone_on_with_has_trained_twice(run: Path) -> None:
+    write_worker(run, "driver", [(RECOVERY, 5), (CHECKPOINT, 1), (RECOVERY, 1), (TRAINING, 3)], at_s=100)
+    write_worker(run, "trainer", [(RECOVERY, 6), (COMPUTE, 4)], at_s=100)
+    timeline = read_timeline(run)
+    assert timeline.training() == [(2.0, 8.0), (107.0, 110.0)]
+    assert shares(run, training=True)["trainer"] == pytest.approx({"wait_in": 3 / 9, "compute": 6 / 9})
+    assert shares(run, 50.0, training=True)["trainer"] == pytest.approx({"compute": 1.0})
+
+
+def test_a_worker_that_was_started_again_is_one_row_with_a_gap(tmp_path: Path) -> None:
+    write_worker(tmp_path, "rollout 3", [(COMPUTE, 2)])
+    write_worker(tmp_path, "rollout 3", [(RECOVERY, 1), (COMPUTE, 1)], at_s=4)
+    (row,) = read_timeline(tmp_path).rows
+    assert row.states.tolist() == [RECOVERY, COMPUTE, ABSENT, RECOVERY, COMPUTE]
+    assert (row.times / SECOND).tolist() == [0, 0, 2, 4, 5, 6]
+    assert shares(tmp_path)["rollout"] == pytest.approx({"compute": 0.75, "recovery": 0.25})
+
+
+def test_the_last_words_of_a_process_are_cut_where_its_successor_begins(tmp_path: Path) -> None:
+    write_worker(tmp_path, "rollout 0", [(COMPUTE, 2), (WAIT_IN, 3)])
+    write_worker(tmp_path, "rollout 0", [(COMPUTE, 1)], at_s=4)
+    (row,) = read_timeline(tmp_path).rows
+    assert (np.diff(row.times) >= 0).all() and len(row.states) == len(row.times) - 1
+    assert row.times[-1] == 5 * SECOND
+
+
+def test_machines_are_set_by_the_calendar_and_processes_of_one_by_its_clock(tmp_path: Path) -> None:
+    """A clock that has run for another time, and a calendar that is put right meanwhile."""
+    moments = {
+        "trainer": Moment("here", UP, 2 * UP),
+        "replay": Moment("here", UP + 5 * SECOND, 2 * UP + 9 * SECOND),
+        "rollout 0": Moment("there", 77, 2 * UP + 3 * SECOND),
+    }
+    for worker, moment in moments.items():
+        clock, hands = a_clock(tmp_path, worker, begins=moment)
+        hands.now += SECOND
+        clock.close()
+    begins = {row.worker: int(row.times[0]) for row in read_timeline(tmp_path).rows}
+    assert begins == {"trainer": 0, "replay": 5 * SECOND, "rollout 0": 3 * SECOND}
+
+
+def test_workers_are_in_order(tmp_path: Path) -> None:
+    for worker in ("trainer", "rollout 10", "world learning", "rollout 9", "driver", "someone new"):
+        write_worker(tmp_path, worker, [(COMPUTE, 1)])
+    names = [row.worker for row in read_timeline(tmp_path).rows]
+    assert names == ["driver", "rollout 9", "rollout 10", "trainer", "world learning", "someone new"]
+
+
+def test_what_is_no_run_and_a_run_without_a_timeline(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "bare").mkdir()
+    (tmp_path / "bare" / "config.yaml").write_text("")
+    said = {"nowhere": "no such folder", "file": "a file", "empty": "no run in it", "bare": "launch.timeline"}
+    for name, text in said.items():
+        with pytest.raises(InputError, match=f"^runs='[^']*{name}': .*{text}"):
+            shares(tmp_path / name)
+
+
+def test_news_are_of_the_time_since_the_last(tmp_path: Path) -> None:
+    write_worker(tmp_path, "trainer", [(WAIT_IN, 100)], at_s=-200)  # before anyone watched
+    clock, hands = a_clock(tmp_path, "trainer", part_bytes=80)
+    watch = Watch(tmp_path / TIMELINE)
+    assert watch.news() == {}
+    for state, length in ((COMPUTE, 3), (WAIT_IN, 1)):
+        clock.enter(state)
+        hands.now += length * SECOND
+    clock.beat()
+    assert watch.news() == {
+        "timeline_trainer_compute_share": 0.75,
+        "timeline_trainer_wait_in_share": 0.25,
+        "timeline_trainer_bubble": 0.25,
+    }
+    assert watch.news() == {}
+    spent = 0.0
+    for _ in range(50):  # through many parts
+        clock.enter(COMPUTE)
+        hands.now += SECOND
+        clock.enter(WAIT_OUT)
+        hands.now += 3 * SECOND
+        clock.beat()
+        spent += watch.news()["timeline_trainer_bubble"]
+    assert spent == pytest.approx(50 * 0.75)
+    write_worker(tmp_path, "world learning", [(COMPUTE, 1)])
+    assert watch.news() == {
+        "timeline_world_learning_compute_share": 1.0,
+        "timeline_world_learning_bubble": 0.0,
+    }
+
+
+def test_nobody_to_watch(tmp_path: Path) -> None:
+    assert Watch(tmp_path / "nowhere").news() == {}

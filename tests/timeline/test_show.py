@@ -1,0 +1,159 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What people look at: the picture, the trace and the shares."""
+
+from __future__ import annotations
+
+import io
+import json
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from accerl_lerobot.cli import main
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.timeline import COMPUTE, RECOVERY, TRAINING, WAIT_IN
+from accerl_lerobot.timeline.chrome import COLOURS, trace
+from accerl_lerobot.timeline.config import TimelineConfig
+from accerl_lerobot.timeline.picture import COLUMNS, columns
+from accerl_lerobot.timeline.read import read_timeline
+from accerl_lerobot.timeline.show import choose_windows, show_timelines, table
+from accerl_lerobot.timeline.states import STATES
+from tests.timeline.folders import write_worker
+
+
+def write_run(folder: Path, turn: float = 0.5, turns: int = 200) -> Path:
+    """The trainer computes half of each turn; the rollout worker is lost once, and the other waits then."""
+    write_worker(folder, "driver", [(RECOVERY, 5), (TRAINING, turn * turns), (RECOVERY, 1)])
+    write_worker(folder, "trainer", [(WAIT_IN, 5), *turns * [(COMPUTE, turn / 2), (WAIT_IN, turn / 2)]])
+    write_worker(folder, "rollout 0", [(COMPUTE, 3)])
+    write_worker(folder, "rollout 0", [(RECOVERY, 1), (COMPUTE, 5 + turn * turns)], at_s=4)
+    write_worker(folder, "rollout 1", [(WAIT_IN, 2), (COMPUTE, 3 + turn * turns)])
+    return folder
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    return write_run(tmp_path / "run")
+
+
+def test_the_trace_is_one_that_viewers_read(run: Path) -> None:
+    timeline = read_timeline(run)
+    made = json.loads(json.dumps(trace(timeline, (0.0, timeline.seconds))))
+    assert made["displayTimeUnit"] == "ms"
+    events: list[dict[str, Any]] = made["traceEvents"]
+    names = {(e["name"], e["pid"], e["tid"]): e["args"] for e in events if e["ph"] == "M"}
+    threads = {key[1:]: args["name"] for key, args in names.items() if key[0] == "thread_name"}
+    processes = {key[1]: args["name"] for key, args in names.items() if key[0] == "process_name"}
+    assert set(threads.values()) == {"driver", "rollout 0", "rollout 1", "trainer"}
+    assert sorted(processes.values()) == ["driver", "rollout", "trainer"]
+    spans: dict[tuple[int, int], list[dict[str, Any]]] = {}
+    for event in events:
+        if event["ph"] == "X":
+            assert event["name"] in STATES and event["cname"] in COLOURS and event["dur"] > 0
+            assert threads[event["pid"], event["tid"]].startswith(processes[event["pid"]])
+            spans.setdefault((event["pid"], event["tid"]), []).append(event)
+    assert spans.keys() == threads.keys()
+    for own in spans.values():
+        assert all(a["ts"] + a["dur"] <= b["ts"] + 1e-3 for a, b in pairwise(own)), "intervals overlap"
+    (trainer,) = [own for key, own in spans.items() if threads[key] == "trainer"]
+    assert sum(e["dur"] for e in trainer if e["name"] == "compute") == pytest.approx(50e6)
+    assert len(trainer) == 401
+
+
+def test_a_trace_of_a_part_is_cut_at_its_ends(run: Path) -> None:
+    spans = [e for e in trace(read_timeline(run), (5.1, 5.4))["traceEvents"] if e["ph"] == "X"]
+    assert min(e["ts"] for e in spans) == 5.1e6 and max(e["ts"] + e["dur"] for e in spans) == 5.4e6
+
+
+def test_a_column_of_the_picture_shares_itself_among_the_states(run: Path) -> None:
+    (row,) = [row for row in read_timeline(run).rows if row.worker == "trainer"]
+    shares = columns(row, 5.0, 5.0 + COLUMNS * 0.5)  # a turn in each, far beyond the end
+    np.testing.assert_allclose(shares[:200, [COMPUTE, WAIT_IN]], 0.5, atol=1e-6)
+    assert (shares[200:] == 0).all(), "there is no worker any more"
+    narrow = columns(row, 5.0, 5.5)
+    assert (narrow[: COLUMNS // 2 - 1, COMPUTE] > 0.999).all() and (
+        narrow[COLUMNS // 2 + 1 :, COMPUTE] < 1e-3
+    ).all()
+
+
+def test_a_window_is_in_the_middle_of_the_training_and_shows_some_updates(run: Path, tmp_path: Path) -> None:
+    slow = write_run(tmp_path / "slow", turn=2.0, turns=20)
+    ((start, end),) = choose_windows([read_timeline(run)], None, None)
+    assert end - start == pytest.approx(16 * 0.5) and (start + end) / 2 == pytest.approx(5 + 50)
+    both = choose_windows([read_timeline(run), read_timeline(slow)], None, None)
+    assert [end - start for start, end in both] == pytest.approx([32.0, 32.0]), "one scale, the slower one's"
+    assert choose_windows([read_timeline(run)], 7.0, 3.0) == [(7.0, 10.0)]
+    assert choose_windows([read_timeline(run)], 100.0, 30.0) == [(100.0, read_timeline(run).seconds)]
+
+
+def test_pictures_stand_above_each_other_and_are_replaced(run: Path, tmp_path: Path, monkeypatch) -> None:
+    result = show_timelines(TimelineConfig(runs=(str(run),)))
+    with Image.open(run / "timeline.png") as image:
+        one = image.size
+        seen = {tuple(pixel[:3]) for _, pixel in image.convert("RGB").getcolors(2**20)}
+    assert (0x3A, 0x7D, 0x44) in seen, "nobody works"
+    assert result["picture"] == str(run / "timeline.png") and (run / "timeline.json").is_file()
+    assert result["runs"][0]["bubble"]["trainer"] == pytest.approx(0.5)
+    other = write_run(tmp_path / "other")
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):
+        show_timelines(TimelineConfig(runs=(str(run), str(other)), seconds=4.0))
+    with Image.open(tmp_path / "timeline.png") as image:
+        assert image.width == one[0] and image.height > 1.5 * one[1]
+    console = Console(width=79, record=True, file=io.StringIO())
+    console.print(table(show_timelines(TimelineConfig(runs=(str(run), str(other))))))
+    text = console.export_text()
+    assert "other" in text and "bubble" in text and "50.0" in text
+
+
+def test_no_picture_over_anything_else(run: Path, tmp_path: Path) -> None:
+    foreign = tmp_path / "mine.png"
+    Image.new("RGB", (4, 4)).save(foreign)
+    text = tmp_path / "text.png"
+    text.write_text("no picture")
+    for path, said in (
+        (foreign, "another file"), (text, "another file"), (tmp_path / "a.svg", "PNG"),
+        (tmp_path / "no" / "a.png", "no folder"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=f"^output=.*{said}"):
+            show_timelines(TimelineConfig(runs=(str(run),), output=str(path)))
+    assert text.read_text() == "no picture"
+
+
+@pytest.mark.parametrize(
+    ("values", "field"),
+    [
+        ({"runs": ()}, "runs"),
+        ({"start_s": -1.0}, "start_s"),
+        ({"seconds": 0.0}, "seconds"),
+        ({"trace_seconds": float("inf")}, "trace_seconds"),
+    ],
+)
+def test_bad_values_name_their_field(values: dict[str, Any], field: str) -> None:
+    with pytest.raises(InputError, match=f"^{field}="):
+        TimelineConfig(**{"runs": ("run",), **values})
+
+
+def test_the_verb_writes_json_to_the_standard_output(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["timeline", str(run), "--start_s=10", "--seconds=2"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["runs"][0]["window_s"] == [10.0, 12.0] and "rollout" in err
+    assert main(["timeline", str(run), "--start_s=1000"]) == 2
+    assert "start_s=1000.0: use 0 or more, below 110.0" in capsys.readouterr().err

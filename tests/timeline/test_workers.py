@@ -1,0 +1,168 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What each worker says it does, while it does something that a test knows. Engines: ``test_engines.py``."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.experience import TASK, Decision, Request, Segment
+from accerl_lerobot.inference.worker import InferenceConfig, InferenceWorker
+from accerl_lerobot.policies import loading
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.replay.worker import ReplayWorker
+from accerl_lerobot.rollout import worker as rollout
+from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.timeline.read import read_timeline
+from accerl_lerobot.timeline.states import STATES, TIMELINE
+from accerl_lerobot.trainer import worker as trainer
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.weights import ray_channel
+from tests.local_ray import Handle, Local
+from tests.replay.segments import make_segment
+from tests.trainer.linear import LinearAdapter, make_segments
+
+
+class StoppedError(Exception):
+    """Ends a loop that has no end."""
+
+
+def states(run: Path) -> list[str]:
+    """What the only worker was in, one after the other."""
+    (row,) = read_timeline(run).rows
+    return [STATES[state] for state in row.states]
+
+
+def test_the_trainer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trainer, "ray", Local)
+    monkeypatch.setattr(ray_channel, "ray", Local)
+    monkeypatch.setattr(loading, "load_adapter", lambda policy: LinearAdapter())
+    config = TrainerConfig(updates=2, batch_decisions=7, warmup_updates=0, value_warmup_updates=0)
+    worker = trainer.TrainerWorker(
+        PolicyConfig(path="nowhere"), GIPOConfig(), config, 0, timeline=tmp_path / TIMELINE
+    )
+    replay = Handle(sample=lambda decisions, version: make_segments((4, 3), seed=version))
+    assert worker.run(replay, [Handle(receive_weights=lambda *published: None)]) == 2
+    worker.metrics()
+    turn = ["wait_in", "transport", "checkpoint", "compute", "weights"]
+    assert states(tmp_path) == ["recovery", "wait_in", "weights", *turn, *turn, "wait_in"]
+
+
+def test_inference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Adapter:
+        def decide(self, requests: list[Request], version: int) -> list[Decision]:
+            return [decision() for _ in requests]
+
+        def load_trainable(self, tensors: dict[str, np.ndarray]) -> None:
+            pass
+
+    monkeypatch.setattr(loading, "load_adapter", lambda policy: Adapter())
+
+    async def scene() -> None:
+        worker = InferenceWorker(
+            PolicyConfig(path="nowhere"), InferenceConfig(max_batch=1), timeline=tmp_path / TIMELINE
+        )
+        serving = asyncio.create_task(worker.serve())
+        request = Request(observation={TASK: "push"}, noise_seed=0)
+        await worker.decide([request])
+        await worker.receive_weights(1, {})
+        while (await worker.metrics())["version"] < 1:
+            await asyncio.sleep(0)
+        await worker.decide([request])
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
+        await worker.metrics()
+
+    asyncio.run(asyncio.wait_for(scene(), 30))
+    batch = ["wait_in", "compute", "transport"]
+    assert states(tmp_path) == ["recovery", *batch, "wait_in", "weights", *batch, "wait_in"]
+
+
+def test_replay(tmp_path: Path) -> None:
+    async def scene() -> None:
+        config = ReplayConfig(capacity=64, min_decisions=8, ahead=8)
+        worker = ReplayWorker(config, seed=0, timeline=tmp_path / TIMELINE)
+        await worker.insert([make_segment("a", 8)])
+        late = asyncio.ensure_future(worker.insert([make_segment("b", 8)]))  # the door is shut
+        await worker.sample(8, 0)
+        await late
+        await worker.save(tmp_path, 0)
+        await worker.metrics()
+
+    asyncio.run(asyncio.wait_for(scene(), 30))
+    once = ["wait_in", "compute"]
+    assert states(tmp_path) == ["recovery", *once, *once, *once, "wait_in", "checkpoint", "wait_in"]
+
+
+def decision() -> Decision:
+    zeros = np.zeros((4, 2), np.float32)
+    return Decision(chunk=zeros, latent={"x": zeros}, log_prob=np.zeros(4, np.float32), value=0.0, version=0)
+
+
+@pytest.fixture
+def collect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
+    """Has a rollout worker explore until `over` is set; what it was in."""
+    monkeypatch.setattr(rollout, "ray", Local)
+
+    def run(insert: Callable[[list[Segment]], Any], decide: Callable[[list[Request]], Any]) -> list[str]:
+        worker = rollout.RolloutWorker(
+            SimulatedConfig(max_steps=8, tolerance=0.05), RolloutConfig(worlds=2, segment_length=1),
+            ("match",), 0, 0, 0, (8, 2), timeline=tmp_path / TIMELINE,
+        )  # fmt: skip
+        worker.report(True, [])
+        with pytest.raises(StoppedError):
+            worker.run(Handle(decide=decide), Handle(insert=insert))
+        worker.report(True, [])
+        return states(tmp_path)
+
+    return run
+
+
+def test_collecting_is_to_step_worlds_and_wait_for_decisions(collect) -> None:
+    calls: list[int] = []
+
+    def decide(requests: list[Request]) -> list[Decision]:
+        calls.append(len(requests))
+        if len(calls) > 20:
+            raise StoppedError
+        return [decision() for _ in requests]
+
+    seen = collect(lambda segments: True, decide)
+    assert set(seen) == {"recovery", "compute", "transport", "wait_in"}
+    # Every decision is waited for, taken, executed, and followed by a request.
+    start = seen.index("wait_in", 2)
+    assert seen[start : start + 5] == ["wait_in", "transport", "compute", "transport", "wait_in"]
+
+
+def test_a_full_door_is_waited_at(collect, monkeypatch: pytest.MonkeyPatch) -> None:
+    sleeps: list[float] = []
+
+    def sleep(seconds: float) -> None:
+        sleeps.append(seconds)
+        if len(sleeps) > 3:
+            raise StoppedError
+
+    monkeypatch.setattr(rollout.time, "sleep", sleep)
+    seen = collect(lambda segments: Future(), lambda requests: [decision() for _ in requests])
+    assert seen[-1] == "wait_out"

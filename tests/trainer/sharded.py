@@ -1,0 +1,206 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What the ranks of a test do, in processes of their own; free of pytest, which they have no use for.
+
+Results travel as snapshots: every rank writes its own, and the test reads them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from accerl_lerobot import snapshot
+from accerl_lerobot.algorithms import AlgorithmConfig, DecoupledConfig, GIPOConfig, PPOConfig
+from accerl_lerobot.experience import Segment
+from accerl_lerobot.policies.base import Evaluation, PolicyAdapter
+from accerl_lerobot.policies.value_head import Value
+from accerl_lerobot.trainer import ranks
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.update import Update
+from tests.trainer.linear import STATE, STD, LinearAdapter, make_segments
+
+TIMEOUT_S = 60.0
+
+
+class Layer(nn.Module):
+    """Two linear layers around a norm."""
+
+    def __init__(self, width: int, inner: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(width)
+        self.up, self.down = nn.Linear(width, inner), nn.Linear(inner, width)
+
+    def forward(self, x: Tensor, cache: Cache | None = None) -> Tensor:
+        if cache is not None:
+            cache.append(x)
+        return x + self.down(torch.tanh(self.up(self.norm(x))))
+
+
+class Cache(list[Tensor]):
+    """Remembers what was put into it."""
+
+
+class LayeredAdapter(LinearAdapter):
+    """A policy with every way in which LeRobot's use their layers."""
+
+    def __init__(self, seed: int = 0) -> None:
+        super().__init__(seed)
+        generator = torch.Generator().manual_seed(seed + 1)
+        self.layers = nn.ModuleList(Layer(3, 5 + i) for i in range(4))
+        self.tied = nn.ModuleList(nn.Linear(3, 3, bias=False) for _ in range(2))
+        self.tied[1].weight = self.tied[0].weight
+        self.read = nn.ModuleList([nn.Linear(3, 3)])
+        self.frozen = nn.ModuleList([nn.Linear(3, 3).requires_grad_(False)])
+        self.idle = nn.ModuleList([nn.Linear(3, 3)])
+        with torch.no_grad():
+            for parameter in self.parameters():
+                if parameter is not self.weight:
+                    parameter.copy_(0.4 * torch.randn(parameter.shape, generator=generator))
+
+    def evaluate(
+        self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
+    ) -> Evaluation:
+        features = self.encode(torch.from_numpy(observations[STATE]))
+        z = (latent["x"] - features @ self.weight.T) / STD
+        value = Value(mean=self.value_head(features.detach())[:, 0])
+        return Evaluation(log_prob=-0.5 * z * z, entropy=torch.zeros(len(z)), value=value)
+
+    @torch.no_grad()
+    def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
+        return self.value_head(self.encode(torch.from_numpy(observations[STATE])))[:, 0]
+
+    def encode(self, x: Tensor) -> Tensor:
+        called, again, inside, caching = self.layers
+        x = self.frozen[0](called(x))
+        for _ in range(3):  # as denoising steps do
+            x = again(x)
+        x = x + inside.down(torch.tanh(inside.up(inside.norm(x))))  # the layer itself is not called
+        x = caching(x, Cache())
+        x = self.tied[1](self.tied[0](x))
+        return functional.linear(self.read[0](x), self.read[0].weight)
+
+    def trainable(self) -> dict[str, nn.Parameter]:
+        named = {k: p for k, p in self.named_parameters() if p.requires_grad}
+        return {k if k.startswith("value_head.") else f"policy.{k}": p for k, p in named.items()}
+
+
+class Case(NamedTuple):
+    """Some updates that one process and several are to make alike."""
+
+    adapter: Callable[[], PolicyAdapter]
+    algorithm: AlgorithmConfig
+    config: dict[str, Any]
+    """Of the trainer, apart from its ranks."""
+    batches: list[list[Segment]]
+
+
+def run(case: Case, config: TrainerConfig, group: ranks.Ranks, state: Any = None) -> dict[str, Any]:
+    """Makes the case's updates, those that `state` has not made; all that can be said of them."""
+    adapter = case.adapter()
+    if group.rank:  # as if it had been loaded otherwise there
+        with torch.no_grad():
+            for parameter in adapter.trainable().values():
+                parameter.add_(1.0)
+    update = Update(adapter, case.algorithm, config, group)
+    if state is not None:
+        adapter.load_trainable(state["weights"])
+        update.restore(state["update"])
+    half, metrics = state, []
+    for number, batch in enumerate(case.batches):
+        if number < update.version:
+            continue
+        metrics.append(update.step(batch))
+        if update.version == len(case.batches) // 2:
+            half = {"weights": adapter.export_trainable(), "update": update.state()}
+    return {"metrics": metrics, "weights": adapter.export_trainable(), "half": half}
+
+
+def config_of(case: Case, sharding: str, size: int) -> TrainerConfig:
+    return TrainerConfig(**case.config, ranks=size, sharding=sharding if size > 1 else "none")
+
+
+def cases() -> dict[str, Case]:
+    """Between them: every mean over a batch, every copy of weights, every way of being uneven."""
+    plain = {"updates": 100, "lr": 1e-2, "value_lr": 1e-2, "warmup_updates": 0, "value_warmup_updates": 1}
+    uneven = [make_segments((3, 5, 1, 4), version=i, seed=i) for i in range(6)]
+    for i, batch in enumerate(uneven):  # decisions of the versions that are probed
+        for segment in batch:
+            segment.version[:] = max(0, i - 2)
+    broken = [make_segments((3, 5, 1, 4), seed=i) for i in range(6)]
+    broken[1][2].reward[0] = broken[4][0].reward[1] = np.nan
+    counted = [make_segments((2, 4, 3), seed=i) for i in range(6)]
+    for batch in counted:
+        for segment in batch:
+            segment.latent["count"] = 1 + np.arange(len(segment)) % 2
+    compared = [make_segments((3, 2, 4), seed=i) for i in range(6)]
+    for batch in compared:
+        for number, segment in enumerate(batch):
+            segment.advantage = np.full(len(segment), 1.0 - number, np.float32)
+    few = [make_segments((1,) * (1 + i % 3), seed=i) for i in range(6)]
+    reference = GIPOConfig(reference_coef=0.1, kl_coef=0.1)
+    shrunk = {"grad_clip": 0.05, "weight_decay": 0.1}
+    return {
+        "whole": Case(LinearAdapter, reference, plain | shrunk | {"probe_every": 1}, uneven),
+        "parts": Case(
+            LinearAdapter,
+            DecoupledConfig(reference_coef=0.1),
+            plain | {"micro_batch": 2, "advantage_memory": 0.5, "probe_every": 1},
+            uneven,
+        ),
+        "few": Case(LinearAdapter, PPOConfig(), plain | {"probe_every": 0}, few),
+        "broken": Case(LinearAdapter, GIPOConfig(), plain | {"micro_batch": 3}, broken),
+        "counted": Case(LinearAdapter, GIPOConfig(level="token"), plain | {"micro_batch": 2}, counted),
+        "compared": Case(LinearAdapter, GIPOConfig(advantage="group"), plain, compared),
+        "layers": Case(LayeredAdapter, reference, plain | {"micro_batch": 2, "probe_every": 1}, uneven),
+        "forgetful": Case(LayeredAdapter, GIPOConfig(), plain | {"activation_checkpointing": True}, uneven),
+    }
+
+
+def work(rank: int, size: int, place: Any, names: Sequence[str], states: Path, results: Path) -> None:
+    """One rank: every named case, in every way of sharing, from the beginning and from one rank's state."""
+    torch.set_num_threads(1)
+    group = joined(rank, size, place)
+    for name in names:
+        case = cases()[name]
+        for sharding in ("ddp", "zero2", "zero3"):
+            config = config_of(case, sharding, size)
+            result = run(case, config, group)
+            result["resumed"] = run(case, config, group, snapshot.load(states / name))
+            snapshot.save(results / f"{name}-{sharding}-{rank}", result)
+    torch.distributed.destroy_process_group()
+
+
+def joined(rank: int, size: int, place: Any) -> ranks.Group:
+    """A rank of a group.
+
+    Args:
+        rank: which one.
+        size: how many there are.
+        place: a queue that tells where they meet.
+    """
+    ranks.only_loopback()
+    if rank == 0:
+        store, meeting = ranks.host(ranks.LOOPBACK, size, TIMEOUT_S)
+        for _ in range(size - 1):
+            place.put(tuple(meeting))
+    else:
+        store = ranks.visit(ranks.Meeting(*place.get()), size, TIMEOUT_S)
+    return ranks.Group(store, rank, size, torch.device("cpu"), TIMEOUT_S)

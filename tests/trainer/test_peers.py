@@ -1,0 +1,120 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""How the first rank deals with the others: real Ray actors that do what they are told, fail, die or hang."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import ray
+
+from accerl_lerobot.trainer import peers as module
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.peers import Peers, RankError
+from tests.light_workers import light_ray
+
+__all__ = ["light_ray"]
+
+THREE = TrainerConfig(ranks=3, sharding="ddp", rank_timeout_s=2.0)
+
+
+class LightRank:
+    """Answers `step` in the way it is asked to."""
+
+    def __init__(self) -> None:
+        self.steps = 0
+
+    def step(self, how: str) -> int:
+        if how == "dies":
+            os._exit(1)
+        if how == "hangs":
+            time.sleep(60)
+        if how == "fails":
+            raise ArithmeticError("the gradient fell over")
+        self.steps += 1
+        return self.steps
+
+    def made(self) -> int:
+        return self.steps
+
+
+class Split:
+    """Rank 2 does something else than rank 1."""
+
+    def __init__(self, actor: Any, how: str) -> None:
+        self.step = self
+        self._actor, self._how = actor, how
+
+    def remote(self, _: str) -> Any:
+        return self._actor.step.remote(self._how)
+
+
+@pytest.fixture
+def peers(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, str], Peers]]:
+    monkeypatch.setattr(module, "BLAME_S", 1.0)
+    actors: list[Any] = []
+
+    def make(first: str, second: str) -> Peers:
+        actors.extend(ray.remote(LightRank).options(num_cpus=0).remote() for _ in range(2))
+        ray.get([actor.made.remote() for actor in actors])
+        return Peers([Split(actors[-2], first), Split(actors[-1], second)], THREE)
+
+    yield make
+    for actor in actors:
+        ray.kill(actor)
+
+
+def test_they_have_done_it_when_the_first_goes_on(peers: Callable[[str, str], Peers]):
+    both = peers("fine", "fine")
+    for _ in range(3):
+        with both.joining("step", ""):
+            pass
+    assert [ray.get(actor._actor.made.remote()) for actor in both._actors] == [3, 3]
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [
+        ("fails", r"^trainer rank 2 failed in step:\n(.|\n)*the gradient fell over"),
+        ("dies", r"^trainer rank 2 failed in step:\n(.|\n)*died"),
+        ("hangs", r"^trainer rank 2 did not do step within 2 s$"),
+    ],
+)
+def test_who_is_lost_is_named(peers: Callable[[str, str], Peers], how: str, says: str):
+    with pytest.raises(RankError, match=says), peers("fine", how).joining("step", ""):
+        pass
+
+
+@pytest.mark.parametrize(("how", "says"), [("dies", "rank 2 failed in step"), ("hangs", "rank 2 did not do")])
+def test_one_that_is_gone_is_named_and_not_those_that_fail_for_it(
+    peers: Callable[[str, str], Peers], how: str, says: str
+):
+    """A collective that breaks breaks for all: what rank 1 and the first one say of it is of no use."""
+    with pytest.raises(RankError, match=says) as lost, peers("fails", how).joining("step", ""):
+        raise RuntimeError("connection closed by peer")
+    assert "connection closed by peer" in str(lost.value.__cause__)
+
+
+def test_what_the_first_does_wrong_is_its_own(peers: Callable[[str, str], Peers]):
+    with pytest.raises(KeyError, match="mine"), peers("fine", "fine").joining("step", ""):
+        raise KeyError("mine")
+
+
+def test_a_lone_rank_waits_for_nobody():
+    with Peers([], TrainerConfig()).joining("step", ""):
+        pass

@@ -1,0 +1,299 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Several ranks make the updates that one makes, and go on from each other's checkpoints.
+
+Ranks are processes that talk through gloo on the loopback, one group of 2 and one of 4 for the whole module;
+PyTorch's collectives are real, so is FSDP2.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from accerl_lerobot import snapshot
+from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.config import LaunchConfig, RunConfig
+from accerl_lerobot.demos.sft import SFTConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.preflight import check_start
+from accerl_lerobot.trainer.batch import turns
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.ranks import Ranks
+from accerl_lerobot.trainer.sharding import Watch, arrange
+from accerl_lerobot.trainer.update import Update
+from tests.trainer import sharded
+from tests.trainer.linear import LinearAdapter
+
+TOLERANCE = 1e-5
+SHARDINGS = ("ddp", "zero2", "zero3")
+NAMES = tuple(sharded.cases())
+OF_A_PART = ("ess", "explained_variance", "log_ratio_p05", "log_ratio_p50", "log_ratio_p95")
+"""No means over decisions: what is reported is the mean over parts of the batch, as with micro-batches."""
+OF_RATIOS = ("approx_kl", "clip_fraction", "low_weight")
+"""Means over ratios; the same where decisions have different numbers of them."""
+GROUPS = {2: NAMES, 4: ("parts", "few", "layers")}
+RUNS = [(size, how, name) for size, names in GROUPS.items() for how in SHARDINGS for name in names]
+
+
+@pytest.fixture(scope="module")
+def alone() -> dict[str, dict[str, Any]]:
+    """What one rank makes of every case."""
+    found = {}
+    for name, case in sharded.cases().items():
+        found[name] = sharded.run(case, sharded.config_of(case, "none", 1), Ranks())
+    return found
+
+
+@pytest.fixture(scope="module")
+def folder(alone: dict[str, dict[str, Any]], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What groups of 2 and of 4 make of them, from the beginning and from one rank's checkpoint."""
+    directory = tmp_path_factory.mktemp("ranks")
+    for name, result in alone.items():
+        snapshot.save(directory / "alone" / name, result["half"])
+    for size, names in GROUPS.items():
+        results = directory / str(size)
+        results.mkdir()
+        place = torch.multiprocessing.get_context("spawn").SimpleQueue()
+        arguments = (size, place, names, directory / "alone", results)
+        torch.multiprocessing.spawn(sharded.work, arguments, nprocs=size)
+    return directory
+
+
+@pytest.fixture(params=RUNS, ids=lambda run: f"{run[2]}-{run[1]}-{run[0]}")
+def made(request: pytest.FixtureRequest, folder: Path) -> tuple[str, list[dict[str, Any]]]:
+    """A case, and what every rank has made of it."""
+    size, how, name = request.param
+    return name, [snapshot.load(folder / str(size) / f"{name}-{how}-{rank}") for rank in range(size)]
+
+
+def assert_same(found: dict[str, Any], expected: dict[str, Any], name: str) -> None:
+    for key, tensor in expected["weights"].items():
+        np.testing.assert_allclose(
+            found["weights"][key], tensor, rtol=TOLERANCE, atol=TOLERANCE, err_msg=name
+        )
+    assert_same_metrics(found["metrics"], expected["metrics"], name)
+
+
+def assert_same_metrics(found: list[dict[str, float]], expected: list[dict[str, float]], name: str) -> None:
+    assert len(found) == len(expected)
+    for update, (mine, theirs) in enumerate(zip(found, expected, strict=True)):
+        assert mine.keys() == theirs.keys()
+        uneven = OF_RATIOS if name == "counted" else ()
+        for key in mine.keys() - {*OF_A_PART, *uneven}:
+            close = pytest.approx(theirs[key], rel=TOLERANCE, abs=TOLERANCE, nan_ok=True)
+            assert mine[key] == close, f"{name}, update {update}: {key}"
+
+
+# ---- with other processes
+
+
+def test_ranks_make_the_updates_of_one(made: Any, alone: dict[str, dict[str, Any]]):
+    name, results = made
+    before = sharded.cases()[name].adapter().export_trainable()
+    expected = alone[name]
+    moved = [np.abs(expected["weights"][key] - tensor).max() for key, tensor in before.items()]
+    assert max(moved) > 1e-2, "the case teaches nothing"
+    for result in results:
+        assert_same(result, expected, name)
+
+
+def test_ranks_know_the_same_to_the_last_bit(made: Any):
+    """So that none of them skips an update that another makes."""
+    first, *others = made[1]
+    for other in others:
+        assert [list(m) for m in first["metrics"]] == [list(m) for m in other["metrics"]]
+        for mine, theirs in zip(first["metrics"], other["metrics"], strict=True):
+            np.testing.assert_array_equal(list(mine.values()), list(theirs.values()))
+        for key, tensor in first["weights"].items():
+            np.testing.assert_array_equal(tensor, other["weights"][key])
+
+
+def test_ranks_go_on_from_the_checkpoint_of_one(made: Any, alone: dict[str, dict[str, Any]]):
+    name, results = made
+    expected = alone[name]
+    for result in results:
+        resumed = result["resumed"]
+        half = len(expected["metrics"]) - len(resumed["metrics"])
+        assert half > 0
+        assert_same(resumed, expected | {"metrics": expected["metrics"][half:]}, name)
+
+
+def test_one_goes_on_from_the_checkpoint_of_ranks(made: Any, alone: dict[str, dict[str, Any]]):
+    name, results = made
+    case, expected = sharded.cases()[name], alone[name]
+    saved = results[0]["half"]
+    assert saved["update"].keys() == expected["half"]["update"].keys()
+    resumed = sharded.run(case, sharded.config_of(case, "none", 1), Ranks(), saved)
+    half = len(expected["metrics"]) - len(resumed["metrics"])
+    assert_same(resumed, expected | {"metrics": expected["metrics"][half:]}, name)
+
+
+def test_the_cases_meet_what_they_are_for(alone: dict[str, dict[str, Any]]):
+    assert alone["broken"]["metrics"][-1]["skipped"] == 2
+    assert any("logprob/mismatch_mean" in metrics for metrics in alone["whole"]["metrics"])
+    assert all(metrics["kl_reference"] > 0 for metrics in alone["layers"]["metrics"][2:])
+    assert min(metrics["decisions"] for metrics in alone["few"]["metrics"]) == 1, "four ranks, one decision"
+    assert all(metrics["grad_norm"] > 0.05 for metrics in alone["whole"]["metrics"]), "clipped"
+
+
+# ---- shares
+
+
+@pytest.mark.parametrize("ranks", [1, 2, 3, 4, 7])
+@pytest.mark.parametrize(("count", "size"), [(1, 1), (1, 5), (2, 1), (5, 2), (13, 3), (13, 100), (64, 4)])
+def test_every_row_is_somebodys_and_all_run_equally_often(count: int, size: int, ranks: int):
+    rows = 100 + np.arange(count)
+    shares = [turns(rows, size, rank, ranks) for rank in range(ranks)]
+    assert len({len(share) for share in shares}) == 1, "as many turns each"
+    assert np.concatenate([t.rows for share in shares for t in share if t.own]).tolist() == rows.tolist()
+    assert all(1 <= len(t.rows) <= size for share in shares for t in share)
+    sizes = [sum(len(t.rows) for t in share if t.own) for share in shares]
+    assert max(sizes) - min(sizes) <= 1
+    assert len(shares[0]) == math.ceil(math.ceil(count / ranks) / size), "no turn more than it takes"
+
+
+def test_a_trainer_alone_gets_what_it_gives():
+    rows = np.arange(5)
+    said = Ranks().each(lambda some: torch.from_numpy(some * 2.0), rows, size=2)
+    assert said.tolist() == [0.0, 2.0, 4.0, 6.0, 8.0]
+
+
+# ---- blocks
+
+
+def test_blocks_are_layers_whose_weights_are_used_inside_their_own_call_only():
+    adapter = sharded.LayeredAdapter()
+    names = {module: name for name, module in adapter.named_modules()}
+    found = [names[block] for block in Watch(adapter).blocks]
+    assert found == [
+        "layers.0",
+        "layers.1",
+        "layers.2.up",  # the layer is not called
+        "layers.2.down",
+        "layers.3.up",  # the layer is handed a cache
+        "layers.3.down",
+        "frozen.0",
+        # neither the tied ones, nor the one whose weight is read from outside, nor the one that is not called
+    ]
+
+
+def test_watching_leaves_nothing_behind():
+    adapter, other = sharded.LayeredAdapter(), sharded.LayeredAdapter()
+    Watch(adapter)
+    assert all(not m._forward_hooks and not m._forward_pre_hooks for m in adapter.modules())
+    assert all(torch.equal(p, q) for p, q in zip(adapter.parameters(), other.parameters(), strict=True))
+
+
+def test_blocks_that_forget_compute_again_and_learn_the_same():
+    counts, gradients = [], []
+    for forget in (False, True):
+        adapter = sharded.LayeredAdapter()
+        config = TrainerConfig(warmup_updates=0, value_warmup_updates=0, activation_checkpointing=forget)
+        update = Update(adapter, GIPOConfig(), config)
+        calls: list[None] = []
+        adapter.layers[0].up.register_forward_hook(lambda *_, calls=calls: calls.append(None))
+        update.step(sharded.cases()["forgetful"].batches[0])
+        counts.append(len(calls))
+        gradients.append([p.grad for p in adapter.trainable().values() if p.grad is not None])
+    assert counts[1] == counts[0] + 1, "once more, for the gradient"
+    for mine, theirs in zip(*gradients, strict=True):
+        torch.testing.assert_close(mine, theirs)
+
+
+def test_a_policy_without_blocks_cannot_forget():
+    with pytest.raises(InputError, match=r"trainer\.activation_checkpointing=True: no block of this policy"):
+        arrange(LinearAdapter(), TrainerConfig(activation_checkpointing=True))
+
+
+def test_there_is_nothing_to_offload_from_on_a_cpu():
+    config = TrainerConfig(ranks=2, sharding="zero2", cpu_offload=True)
+    with pytest.raises(InputError, match=r"trainer\.cpu_offload=True: the policy is on the CPU already"):
+        arrange(LinearAdapter(), config)
+
+
+# ---- what is refused when a run is parsed
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"ranks": 0}, r"trainer\.ranks=0: use at least 1"),
+        ({"sharding": "zero1"}, r"trainer\.sharding='zero1': use none, ddp, zero2 or zero3"),
+        ({"ranks": 2}, r"trainer\.sharding='none': say how the 2 ranks share"),
+        ({"sharding": "zero3"}, r"trainer\.sharding='zero3': there is one rank"),
+        ({"ranks": 2, "sharding": "ddp", "cpu_offload": True}, r"trainer\.cpu_offload=True: .*=ddp keeps"),
+        ({"cpu_offload": True}, r"trainer\.cpu_offload=True: trainer\.sharding=none keeps"),
+        ({"ranks": 9, "sharding": "ddp", "batch_decisions": 8}, r"trainer\.ranks=9: use at most .*, 8"),
+        ({"rank_timeout_s": 0.0}, r"trainer\.rank_timeout_s=0\.0: use a positive number"),
+    ],
+)
+def test_what_cannot_be_shared_is_refused(fields: dict[str, Any], says: str):
+    with pytest.raises(InputError, match=says):
+        TrainerConfig(**fields)
+
+
+def test_ranks_want_workers_and_offloading_wants_a_gpu():
+    trainer = TrainerConfig(ranks=2, sharding="zero2", cpu_offload=True)
+    with pytest.raises(InputError, match=r"trainer\.ranks=2: launch\.engine=local is one process"):
+        RunConfig(trainer=trainer, launch=LaunchConfig(engine="local"))
+    with pytest.raises(
+        InputError, match=r"trainer\.cpu_offload=True: policy\.device=cpu has everything there"
+    ):
+        RunConfig(trainer=trainer, policy=PolicyConfig(device="cpu"))
+
+
+# ---- GPUs
+
+
+@pytest.mark.parametrize(
+    ("ranks", "gpus", "others", "shares"),
+    [
+        (1, 0, 1, (0.0, 0.0)),
+        (4, 0, 1, (0.0, 0.0)),
+        (1, 1, 1, (0.5, 0.5)),
+        (1, 2, 1, (1.0, 1.0)),
+        (2, 2, 1, (0.6, 0.4)),
+        (2, 2, 3, (0.6, 0.2)),
+        (2, 4, 3, (1.0, 0.5)),
+        (7, 8, 1, (1.0, 1.0)),
+    ],
+)
+def test_no_two_ranks_share_a_gpu(ranks: int, gpus: int, others: int, shares: tuple[float, float]):
+    config = TrainerConfig(ranks=ranks, sharding="none" if ranks == 1 else "zero2")
+    found = config.gpu_shares(gpus, others)
+    assert found == pytest.approx(shares)
+    assert ranks * found[0] + others * found[1] <= gpus + 1e-9
+    assert ranks == 1 or not gpus or found[0] > 0.5
+
+
+def test_more_ranks_than_gpus_are_refused_with_the_arithmetic():
+    config = TrainerConfig(ranks=4, sharding="zero2")
+    with pytest.raises(
+        InputError, match=r"trainer\.ranks=4: .* 4 ranks on 3 GPUs leave 1 without; use at most 3"
+    ):
+        config.gpu_shares(3, 1)
+
+
+def test_a_run_with_more_ranks_than_gpus_does_not_begin(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    trainer = TrainerConfig(ranks=2, sharding="ddp")
+    with pytest.raises(InputError, match=r"trainer\.ranks=2: .* 2 ranks on 1 GPUs leave 1 without"):
+        check_start(RunConfig(trainer=trainer, policy=PolicyConfig(path="nowhere"), sft=SFTConfig(steps=0)))

@@ -1,0 +1,142 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Every LeRobot policy type that has a likelihood, in parts: two ranks with zero3 learn what one learns.
+
+Small, offline, on LeRobot's own classes, see `tests.policies.matrix`. One group of two processes for all, as
+each imports LeRobot.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+from accerl_lerobot import snapshot
+from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.experience import Segment
+from accerl_lerobot.policies.adapter import LeRobotAdapter
+from accerl_lerobot.policies.config import TuningConfig
+from accerl_lerobot.policies.loading import copy_weights
+from accerl_lerobot.tensors import whole
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.ranks import Ranks
+from accerl_lerobot.trainer.update import Update
+from tests.policies.matrix import KINDS
+from tests.policies.tiny import adapter_at, as_segment, perturb
+from tests.trainer.sharded import joined
+
+DECISIONS = 5
+TOLERANCE = 1e-5
+LEARNING = TrainerConfig(
+    updates=10, lr=1e-3, warmup_updates=0, value_warmup_updates=0, micro_batch=2, probe_every=0
+)
+SHARDED = {"ranks": 2, "sharding": "zero3"}
+
+
+class Case(NamedTuple):
+    """A policy, and what of it is shared out."""
+
+    kind: str
+    config: dict[str, Any] = SHARDED
+    level: Any = "chunk"
+    options: dict[str, Any] = {}
+
+
+CASES = {kind: Case(kind) for kind in KINDS} | {
+    "smolvla, zero2": Case("smolvla", {"ranks": 2, "sharding": "zero2"}),
+    "smolvla, lora": Case("smolvla", options={"tuning": TuningConfig(mode="lora", rank=2, alpha=2)}),
+    "smolvla_bins, forgetful": Case("smolvla_bins", SHARDED | {"activation_checkpointing": True}),
+    "pi0, forgetful": Case("pi0", SHARDED | {"activation_checkpointing": True}),
+}
+
+
+def learn(case: Case, folder: Path, config: TrainerConfig, group: Ranks) -> dict[str, Any]:
+    """Makes two updates on what `segments` has left there; all that is published and saved afterwards."""
+    batch = snapshot.load(folder / case.kind / "segments")
+    with KINDS[case.kind].context():
+        torch.manual_seed(0)
+        adapter = adapter_at(folder / case.kind / "pretrained_model", **case.options)
+        perturb(adapter, 0.02)
+        update = Update(adapter, GIPOConfig(level=case.level, reference_coef=0.1), config, group)
+        metrics = [update.step(batch)]
+        gradients = {
+            name: torch.zeros(p.shape) if p.grad is None else whole(p.grad).clone()
+            for name, p in adapter.trainable().items()
+        }
+        metrics.append(update.step(batch))
+        saved = copy_weights(adapter).policy if case.kind == "smolvla" else {}
+        return {
+            "metrics": metrics,
+            "gradients": gradients,
+            "weights": adapter.export_trainable(),
+            "saved": {f"policy.{name}": tensor.numpy() for name, tensor in saved.items()},
+        }
+
+
+def segments(adapter: LeRobotAdapter, kind: str) -> list[Segment]:
+    asked = KINDS[kind].ask(DECISIONS + 1, image=KINDS[kind].image)
+    made = as_segment(asked, adapter, DECISIONS)
+    made.reward = np.linspace(-1, 1, DECISIONS, dtype=np.float32)
+    return [made]
+
+
+def work(rank: int, size: int, place: Any, folder: Path) -> None:
+    torch.set_num_threads(1)
+    logging.disable()
+    group = joined(rank, size, place)
+    for name, case in CASES.items():
+        config = TrainerConfig(**LEARNING.__dict__ | case.config)
+        snapshot.save(folder / f"{name}-{rank}", learn(case, folder, config, group))
+    torch.distributed.destroy_process_group()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("families")
+    for name, kind in KINDS.items():
+        with kind.context():
+            (directory / name).mkdir()
+            adapter = adapter_at(kind.write(directory / name / "pretrained_model"))
+            snapshot.save(directory / name / "segments", segments(adapter, name))
+    place = torch.multiprocessing.get_context("spawn").SimpleQueue()
+    torch.multiprocessing.spawn(work, (2, place, directory), nprocs=2)
+    return directory
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_two_ranks_learn_what_one_learns(folder: Path, name: str):
+    case = CASES[name]
+    expected = learn(case, folder, LEARNING, Ranks())
+    gradients = expected["gradients"]
+    largest = max(float(gradient.abs().max()) for gradient in gradients.values())
+    for rank in range(2):
+        found = snapshot.load(folder / f"{name}-{rank}")
+        for key in ("loss", "value_loss", "grad_norm", "kl_reference", "approx_kl"):
+            for mine, theirs in zip(found["metrics"], expected["metrics"], strict=True):
+                assert mine[key] == pytest.approx(theirs[key], rel=10 * TOLERANCE, abs=TOLERANCE), key
+        for key, gradient in gradients.items():
+            np.testing.assert_allclose(found["gradients"][key], gradient, atol=5 * TOLERANCE * largest)
+        for part in ("weights", "saved"):
+            assert found[part].keys() == expected[part].keys()
+            for key, tensor in expected[part].items():
+                # AdamW makes a whole step of a gradient that is rounding, of a key's bias for instance.
+                clear = np.abs(gradients[key].numpy()) > 1e-3 * largest if key in gradients else slice(None)
+                np.testing.assert_allclose(
+                    found[part][key][clear], tensor[clear], atol=TOLERANCE, err_msg=key
+                )

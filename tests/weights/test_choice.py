@@ -1,0 +1,113 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Which transport the trainer takes."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from typing import Any
+
+import pytest
+import ray as real_ray
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.weights import ray_channel
+from accerl_lerobot.weights.ray_channel import RayPublisher, make_publisher
+from accerl_lerobot.weights.reader import Received, SharedMemoryReader
+from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
+from tests.local_ray import Handle, Local
+from tests.weights.contract import filled, values_of
+
+
+class Ray(Local):
+    exceptions = real_ray.exceptions
+
+    @staticmethod
+    def get(reference: Future[Any], timeout: float | None = None) -> Any:
+        try:
+            return Local.get(reference, timeout)
+        except TimeoutError as error:
+            raise real_ray.exceptions.GetTimeoutError from error
+
+
+@pytest.fixture(autouse=True)
+def _without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ray_channel, "ray", Ray)
+
+
+class Inference:
+    """A handle of a worker on this machine, or on another one."""
+
+    def __init__(self, here: bool = True) -> None:
+        self.received: list[tuple[int, set[float]]] = []
+        self.here = here
+        self.handle = Handle(open_weights=self.open, receive_weights=self.receive)
+
+    def open(self, address: str) -> bool:
+        if self.here:
+            SharedMemoryReader(address, self.apply, lambda error: None)
+        return self.here
+
+    def apply(self, received: Received) -> None:
+        self.received.append((received.version, values_of(received.tensors)))
+        received.release()
+
+    def receive(self, version: int, tensors: Any, published_s: float) -> int:
+        self.received.append((version, values_of(tensors)))
+        return version
+
+
+@pytest.mark.parametrize(
+    ("here", "transport", "expected"),
+    [
+        ((True, True), "auto", SharedMemoryPublisher),
+        ((True, True), "shared_memory", SharedMemoryPublisher),
+        ((True, True), "ray", RayPublisher),
+        ((True, False), "auto", RayPublisher),
+    ],
+)
+def test_the_choice(here: tuple[bool, ...], transport: str, expected: type):
+    workers = [Inference(each) for each in here]
+    publisher = make_publisher([worker.handle for worker in workers], transport)
+    assert type(publisher) is expected
+    publisher.publish(3, filled(3.0))
+    publisher.flush(60)
+    publisher.close()
+    assert [worker.received for worker in workers] == [[(3, {3.0})]] * 2
+
+
+def test_without_memfd_there_is_ray(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(ray_channel, "is_available", lambda: False)
+    publisher = make_publisher([Inference().handle])
+    assert isinstance(publisher, RayPublisher)
+    publisher.close()
+
+
+def test_what_is_not_to_be_had_is_refused(monkeypatch: pytest.MonkeyPatch):
+    far = [Inference(here=False).handle]
+    with pytest.raises(
+        InputError, match=r"^launch.transport='shared_memory': it needs Linux and all workers"
+    ):
+        make_publisher(far, "shared_memory")
+    with pytest.raises(InputError, match=r"^launch.transport='nccl': use one of auto, ray, shared_memory"):
+        make_publisher(far, "nccl")
+    with pytest.raises(InputError, match=r"^trainer.publish_changes=True: it needs shared memory"):
+        make_publisher(far, changes=True)
+
+
+def test_a_reader_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(ray_channel, "CONNECT_S", 0.1)
+    silent: Future[bool] = Future()
+    with pytest.raises(TimeoutError, match="has not answered `open_weights` within 0.1 s"):
+        make_publisher([Handle(open_weights=lambda address: silent)])

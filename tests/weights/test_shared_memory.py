@@ -1,0 +1,404 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Weights through memory that trainer and readers map."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import multiprocessing
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.weights import shared_memory
+from accerl_lerobot.weights.channel import Tensors, WeightChannel
+from accerl_lerobot.weights.publisher import ReaderLostError
+from accerl_lerobot.weights.reader import Received, SharedMemoryReader
+from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
+from accerl_lerobot.weights.slab import Layout, Slab, TornSetError, digest
+from tests.weights.contract import CHECKS, Check, filled, values_of
+
+OPEN: list[Any] = []
+"""Publishers of the test that runs."""
+
+
+@pytest.fixture(autouse=True)
+def _closed() -> Iterator[None]:
+    yield
+    while OPEN:
+        OPEN.pop().close()
+
+
+def published(readers: int, changes: bool = False) -> SharedMemoryPublisher:
+    OPEN.append(SharedMemoryPublisher(readers, changes=changes))
+    return OPEN[-1]
+
+
+class Parameters:
+    """Copies what it receives into arrays of its own, or only what has changed, and lets it go."""
+
+    def __init__(self, publisher: SharedMemoryPublisher) -> None:
+        self.tensors: Tensors = {}
+        self.versions: list[int] = []
+        self.partial: list[int] = []
+        self.failure: BaseException | None = None
+        self.gate = threading.Event()
+        self.gate.set()
+        self.lock = threading.Lock()
+        self.reader = SharedMemoryReader(publisher.address, self.apply, self.fail)
+
+    def fail(self, error: BaseException) -> None:
+        self.failure = error
+
+    def apply(self, received: Received) -> None:
+        assert self.gate.wait(60)
+        with self.lock:
+            if received.changed is None:
+                self.tensors = {name: tensor.copy() for name, tensor in received.tensors.items()}
+            else:
+                self.tensors = {name: tensor.copy() for name, tensor in self.tensors.items()}
+                for name, index in received.changed.items():
+                    self.tensors[name].reshape(-1)[index] = received.tensors[name].reshape(-1)[index]
+                self.partial.append(received.version)
+            for tensor in self.tensors.values():
+                tensor.flags.writeable = False
+            self.versions.append(received.version)
+        received.release()
+
+
+class Delivered(WeightChannel):
+    """The publisher with two readers, as one channel: what is published has been applied by both."""
+
+    def __init__(self, changes: bool = False) -> None:
+        self.publisher = published(2, changes)
+        self.readers = [Parameters(self.publisher) for _ in range(2)]
+
+    def publish(self, version: int, tensors: Tensors) -> None:
+        self.publisher.publish(version, tensors)
+        self.publisher.flush(60)
+
+    def newest(self, than: int) -> tuple[int, Tensors] | None:
+        answers = []
+        for reader in self.readers:
+            with reader.lock:
+                answers.append((reader.versions[-1], dict(reader.tensors)) if reader.versions else None)
+        first, second = answers
+        if first is not None and second is not None and first[0] == second[0]:
+            for name, tensor in first[1].items():
+                np.testing.assert_array_equal(tensor, second[1][name])
+        return first if first is not None and first[0] > than else None
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("changes", [False, True], ids=["whole", "changes"])
+def test_contract(check: Check, changes: bool):
+    check(lambda: Delivered(changes))
+
+
+def until(holds: Callable[[], object]) -> None:
+    deadline = time.monotonic() + 60
+    while not holds():
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+
+
+@pytest.mark.parametrize("changes", [False, True], ids=["whole", "changes"])
+def test_a_writer_at_full_speed_never_gives_a_mixture(changes: bool):
+    """Nobody waits for anybody; each set is of one value, so a mixture shows even without a digest."""
+    publisher = published(2, changes)
+    seen: list[tuple[int, set[float]]] = []
+
+    def check(received: Received) -> None:
+        seen.append((received.version, values_of(received.tensors)))
+        received.release()
+
+    failures: list[BaseException] = []
+    readers = [SharedMemoryReader(publisher.address, check, failures.append) for _ in range(2)]
+    buffers = filled(0.0, size=100_000)
+    for version in range(300):
+        for tensor in buffers.values():
+            tensor[:] = version
+        publisher.publish(version, buffers)
+    publisher.flush(60)
+    assert not failures and all(values == {float(version)} for version, values in seen)
+    assert sum(version == 299 for version, _ in seen) == 2 and len(readers) == 2
+
+
+def test_a_torn_set_is_refused(monkeypatch: pytest.MonkeyPatch):
+    """Somebody writes into a set after its digest has been reckoned: no reader uses any of it."""
+    publisher = published(1)
+    reader = Parameters(publisher)
+    publisher.publish(1, filled(1.0, size=1000))
+    publisher.flush(60)
+
+    def then_torn(version: int, layout: Layout, data: np.ndarray) -> bytes:
+        found = digest(version, layout, data)
+        data[layout.places["b"].offset] ^= 1
+        return found
+
+    # What the reader reckons may be of before or after the tear; so it is made to look afterwards.
+    monkeypatch.setattr(shared_memory, "digest", then_torn)
+    original = SharedMemoryReader._slab
+
+    def later(self: SharedMemoryReader, *arguments: Any) -> Slab:
+        until(lambda: publisher._current is not None and publisher._current.digest)
+        return original(self, *arguments)
+
+    monkeypatch.setattr(SharedMemoryReader, "_slab", later)
+    publisher.publish(2, filled(2.0, size=1000))
+    with pytest.raises(ReaderLostError):
+        publisher.flush(60)
+    assert isinstance(reader.failure, TornSetError) and "version 2" in str(reader.failure)
+    assert reader.versions == [1] and values_of(reader.tensors) == {1.0}
+
+
+@pytest.mark.parametrize("what", ["version", "name", "value"])
+def test_the_digest_is_of_everything(what: str):
+    tensors = filled(1.0)
+    layout = Layout.of(tensors)
+    slab = Slab(layout.end)
+    slab.fill(layout, tensors)
+    before = digest(3, layout, slab.memory)
+    if what == "version":
+        assert digest(4, layout, slab.memory) != before
+    elif what == "name":
+        assert digest(3, Layout.of({**filled(1.0), "c.weight": tensors["a"].T}), slab.memory) != before
+    else:
+        slab.memory[layout.places["c.weight"].offset + 5] ^= 1
+        assert digest(3, layout, slab.memory) != before
+
+
+def test_a_slow_reader_keeps_what_it_holds_and_holds_up_nobody():
+    publisher = published(2)
+    slow, quick = Parameters(publisher), Parameters(publisher)
+    slow.gate.clear()
+    publisher.publish(0, filled(0.0, size=5000))
+    until(lambda: quick.versions == [0])
+    for version in range(1, 30):  # would not return if it waited for the reader whose gate is shut
+        publisher.publish(version, filled(float(version), size=5000))
+    until(lambda: quick.versions[-1] == 29)
+    assert slow.versions == []
+    with pytest.raises(
+        TimeoutError, match=r"weights of version 29, after 0.2 s: not applied by readers [01]$"
+    ):
+        publisher.flush(0.2)
+    slow.gate.set()
+    publisher.flush(60)
+    assert slow.versions == [0, 29] and values_of(slow.tensors) == {29.0}
+    assert len(publisher._slabs) <= 4
+
+
+def test_flush_names_readers_that_never_came():
+    publisher = published(2)
+    Parameters(publisher)
+    publisher.flush(0.1)  # nothing is owed before the first publication
+    publisher.publish(0, filled(0.0))
+    with pytest.raises(TimeoutError, match="1 readers have not connected"):
+        publisher.flush(0.3)
+
+
+def test_only_changes_are_read_where_they_are_few():
+    publisher = published(1, changes=True)
+    reader = Parameters(publisher)
+    rng = np.random.default_rng(0)
+    tensors = {name: rng.standard_normal((100, 50), dtype=np.float32) for name in "abc"}
+    for version in range(6):
+        for tensor in tensors.values():
+            tensor.reshape(-1)[rng.integers(0, tensor.size, 40)] = version
+        if version == 3:
+            tensors["a"] += 1
+            tensors["b"] += 1  # two thirds
+        publisher.publish(version, tensors)
+        publisher.flush(60)
+        for name, tensor in tensors.items():
+            np.testing.assert_array_equal(reader.tensors[name], tensor)
+    assert reader.versions == [0, 1, 2, 3, 4, 5] and reader.partial == [1, 2, 4, 5]
+
+
+def test_a_reader_with_another_base_gets_all():
+    publisher = published(2, changes=True)
+    slow, quick = Parameters(publisher), Parameters(publisher)
+    tensors = filled(0.0, size=1000)
+
+    def publish(version: int) -> None:
+        tensors["a"][0, version] = version
+        publisher.publish(version, tensors)
+        until(lambda: quick.versions[-1:] == [version])
+
+    publish(0)
+    publisher.flush(60)
+    slow.gate.clear()
+    for version in (1, 2, 3):
+        publish(version)
+    slow.gate.set()
+    publisher.flush(60)
+    # Version 1 was under way; 3 is against 2, which it never had.
+    assert slow.versions == [0, 1, 3] and slow.partial == [1]
+    assert quick.partial == [1, 2, 3]
+    for name, tensor in tensors.items():
+        np.testing.assert_array_equal(slow.tensors[name], tensor)
+
+
+def test_changes_that_do_not_make_the_whole_set_are_refused(monkeypatch: pytest.MonkeyPatch):
+    publisher = published(1, changes=True)
+    reader = Parameters(publisher)
+    tensors = filled(0.0, size=1000)
+    publisher.publish(0, tensors)
+    publisher.flush(60)
+    reader.reader._own[3] ^= 1  # as if it had been anything else than what was published
+    tensors["b"][0, 7] = 1.0
+    publisher.publish(1, tensors)
+    with pytest.raises(ReaderLostError):
+        publisher.flush(60)
+    assert isinstance(reader.failure, TornSetError) and reader.versions == [0]
+
+
+def test_a_failure_of_the_thread_is_raised_to_the_trainer(monkeypatch: pytest.MonkeyPatch):
+    publisher = published(1)
+    Parameters(publisher)
+
+    def broken(*_: Any) -> bytes:
+        raise ArithmeticError("no digest")
+
+    monkeypatch.setattr(shared_memory, "digest", broken)
+    publisher.publish(0, filled(0.0))
+    with pytest.raises(ArithmeticError, match="no digest"):
+        publisher.flush(60)
+    with pytest.raises(ArithmeticError, match="no digest"):
+        publisher.publish(1, filled(1.0))
+
+
+def test_sets_that_grow_find_room():
+    channel = Delivered()
+    for version, size in enumerate((4, 40_000, 10, 400_000, 3)):
+        channel.publish(version, filled(float(version), size=size))
+        found = channel.newest(-1)
+        assert found is not None and found[1]["a"].shape == (2, size)
+        assert values_of(found[1]) == {float(version)}
+    mapped = channel.readers[0].reader._slabs
+    assert len(mapped) <= len(channel.publisher._slabs) <= 4
+
+
+def test_a_stranger_is_turned_away(monkeypatch: pytest.MonkeyPatch):
+    publisher = published(1)
+    monkeypatch.setattr(shared_memory, "is_own", lambda connection: False)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as stranger:
+        stranger.settimeout(30)
+        stranger.connect(f"\0{publisher.address}")
+        publisher.publish(0, filled(0.0))
+        assert stranger.recv(100) == b""
+    monkeypatch.undo()
+    reader = Parameters(publisher)
+    publisher.flush(60)
+    assert reader.versions == [0]
+
+
+def test_nobody_listens_at_an_address_that_is_not_there():
+    with pytest.raises(ConnectionRefusedError):
+        SharedMemoryReader("accerl-weights-nobody", lambda received: None, lambda error: None)
+
+
+def _read_for_ever(address: str, started: Any) -> None:
+    reader = SharedMemoryReader(address, lambda received: started.set(), lambda error: None)
+    reader._thread.join(120)
+
+
+def test_a_reader_that_is_killed_is_an_error_and_leaves_nothing():
+    context = multiprocessing.get_context("spawn")
+    publisher, started = published(1), context.Event()
+    process = context.Process(target=_read_for_ever, args=(publisher.address, started), daemon=True)
+    process.start()
+    try:
+        publisher.publish(0, filled(0.0, size=10_000))
+        assert started.wait(60)  # it holds the set now, and never lets it go
+        assert process.pid is not None
+        os.kill(process.pid, signal.SIGKILL)
+        with pytest.raises(ReaderLostError, match="a reader of the weights has gone"):
+            publisher.flush(60)
+    finally:
+        process.kill()
+        process.join(60)
+
+
+_TRAINER = """
+import sys, time
+import numpy as np
+from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
+publisher = SharedMemoryPublisher(1)
+sys.stdout.write(publisher.address + "\\n"); sys.stdout.flush()
+for version in range(10**9):
+    publisher.publish(version, {"a": np.full(100_000, version, np.float32)})
+"""
+
+
+def test_a_trainer_that_is_killed_ends_the_reader_quietly_and_leaves_nothing():
+    """What was held stays readable; no name is left in a file system, and no memory once it is let go of."""
+    before = set(os.listdir("/dev/shm"))
+    process = subprocess.Popen([sys.executable, "-c", _TRAINER], stdout=subprocess.PIPE, text=True)
+    held: list[Received] = []
+    failures: list[BaseException] = []
+    try:
+        assert process.stdout is not None
+        address = process.stdout.readline().strip()
+        reader = SharedMemoryReader(address, held.append, failures.append)
+        until(lambda: held)
+        process.kill()
+        process.wait(60)
+        reader._thread.join(60)
+        assert not reader._thread.is_alive() and failures == [] and len(held) == 1
+        assert set(np.unique(held[0].tensors["a"])) == {np.float32(held[0].version)}
+        held[0].release()
+    finally:
+        process.kill()
+        process.wait(60)
+        with contextlib.suppress(ValueError):
+            process.communicate()
+    assert set(os.listdir("/dev/shm")) <= before
+    with open("/proc/net/unix") as names:
+        assert address not in names.read()
+
+
+def test_a_slab_that_is_shared_can_neither_grow_nor_shrink():
+    slab = Slab.shared(10_000)
+    assert slab.fd is not None
+    for size in (100, 100_000):
+        with pytest.raises(PermissionError):
+            os.ftruncate(slab.fd, size)
+    slab.close()
+
+
+def test_closing_lets_go_of_all_descriptors():
+    gc.collect()
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(10):
+        publisher = SharedMemoryPublisher(1)
+        reader = Parameters(publisher)
+        publisher.publish(0, filled(0.0))
+        publisher.flush(60)
+        publisher.close()
+        publisher.close()
+        reader.reader._thread.join(60)
+        reader.reader.close()
+    # Not exactly as many: what other tests have left may be closed meanwhile.
+    assert len(os.listdir("/proc/self/fd")) < before + 10
