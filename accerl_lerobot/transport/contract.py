@@ -36,6 +36,9 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any
 
+AT_ONCE = 32
+"""Messages that `Caller.ask` has under way at most; a transport carries at least so many."""
+
 
 class ServiceStoppedError(RuntimeError):
     """The caller did nothing wrong: the service behind it had failed, and says why where it failed."""
@@ -98,18 +101,22 @@ class Caller(ABC):
             ServiceStoppedError: see `done`.
             TimeoutError: they did not all come in so many seconds.
         """
-        tickets = [self.send(message) for message in messages]
+        under_way: dict[int, int] = {}
+        """Ticket → which of the messages."""
         replies: dict[int, Any] = {}
-        deadline = time.monotonic() + timeout
-        while len(replies) < len(tickets):
+        deadline, sent = time.monotonic() + timeout, 0
+        while len(replies) < len(messages):
+            while sent < len(messages) and len(under_way) < AT_ONCE:
+                under_way[self.send(messages[sent])] = sent
+                sent += 1
             left = deadline - time.monotonic()
             if left <= 0:
-                for ticket in tickets:
+                for ticket in under_way:
                     self.forget(ticket)
-                missing = f"{len(tickets) - len(replies)} of {len(tickets)} replies"
+                missing = f"{len(messages) - len(replies)} of {len(messages)} replies"
                 raise TimeoutError(f"{self.name}: {missing} did not come within {timeout:g} s")
-            replies |= self.done(left)
-        return [replies[ticket] for ticket in tickets]
+            replies |= {under_way.pop(ticket): reply for ticket, reply in self.done(left)}
+        return [replies[number] for number in range(len(messages))]
 
 
 class Asked(ABC):

@@ -135,6 +135,10 @@ def replies_go_to_the_messages_they_answer(make: Factory) -> None:
     assert caller.done(0.0) == []
 
 
+def any_number_may_be_asked(make: Factory) -> None:
+    assert make().ask([("echo", i) for i in range(300)], LONG_S) == list(range(300))
+
+
 def callers_do_not_get_each_others_replies(make: Factory) -> None:
     callers = [make() for _ in range(3)]
     tickets = [[caller.send(("echo", [i, j])) for j in range(5)] for i, caller in enumerate(callers)]
@@ -214,6 +218,7 @@ def a_service_that_is_killed_is_noticed_at_once(make: Factory) -> None:
 CHECKS: tuple[Check, ...] = (
     what_is_sent_arrives_whole,
     replies_go_to_the_messages_they_answer,
+    any_number_may_be_asked,
     callers_do_not_get_each_others_replies,
     what_was_sent_stays_when_the_caller_changes_it,
     messages_and_replies_grow_and_shrink,
