@@ -45,6 +45,8 @@ PARTS = 2
 """A worker's worlds are asked for in so many parts: one is stepped while the other's decisions are made."""
 AT_THE_DOOR = 2
 """Messages to replay that may be waiting before exploring worlds pause."""
+PAUSE_S = 0.005
+"""Between two looks at whether there is something to do."""
 QUEUE = 32
 """Messages to replay that may be waiting before segments stay here: no transport carries any number."""
 
@@ -156,11 +158,9 @@ class RolloutWorker:
         under_way: dict[int, list[int]] = {}
         at_the_door: set[int] = set()
         size = max(1, len(self._runner) // PARTS)
+        patience = 0.0
         while True:
-            # Where no decision is awaited, there is nothing to wait for but the door, and orders.
-            if not under_way:
-                self._clock.enter(WAIT_OUT if due else WAIT_IN)
-            at_the_door -= {ticket for ticket, _ in door.done(0.0 if under_way else 0.005)}
+            at_the_door -= {ticket for ticket, _ in door.done(patience)}
             self._bring(door, at_the_door, size)
             self._spent = self._plans.spent and not self._runner.exploring and not at_the_door
             self._give_up(due, idle)
@@ -170,7 +170,9 @@ class RolloutWorker:
                 self._clock.enter(TRANSPORT)
                 slots = sendable[start : start + size]
                 under_way[deciding.send([due.pop(slot) for slot in slots])] = slots
-            self._clock.enter(WAIT_IN)
+            # Where no decision is awaited, there is nothing to wait for but the door, and orders.
+            patience = 0.0 if under_way else PAUSE_S
+            self._clock.enter(WAIT_IN if under_way or not due else WAIT_OUT)
             for ticket, decisions in deciding.done(0.5) if under_way else ():
                 for slot, decision in zip(under_way.pop(ticket), decisions, strict=True):
                     self._advance(slot, decision, due, idle)

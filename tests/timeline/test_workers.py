@@ -26,7 +26,7 @@ import pytest
 
 from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.experience import TASK, Decision, Request, Segment
+from accerl_lerobot.experience import TASK, Decision, Request
 from accerl_lerobot.inference.worker import InferenceConfig, InferenceWorker
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
@@ -38,10 +38,13 @@ from accerl_lerobot.timeline.read import read_timeline
 from accerl_lerobot.timeline.states import STATES, TIMELINE
 from accerl_lerobot.trainer import worker as trainer
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.transport.contract import Caller
+from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.weights import ray_channel
 from tests.local_ray import Handle, Local
 from tests.replay.segments import make_segment
 from tests.trainer.linear import LinearAdapter, make_segments
+from tests.transport.played import PlayedCaller, played
 
 
 class StoppedError(Exception):
@@ -62,8 +65,10 @@ def test_the_trainer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     worker = trainer.TrainerWorker(
         PolicyConfig(path="nowhere"), GIPOConfig(), config, 0, timeline=tmp_path / TIMELINE
     )
-    replay = Handle(sample=lambda decisions, version: make_segments((4, 3), seed=version))
-    assert worker.run(replay, [Handle(receive_weights=lambda *published: None)]) == 2
+    replay = Handle(
+        sample=lambda decisions, version: make_segments((4, 3), seed=version), learnt=lambda: None
+    )
+    assert worker.run(replay, [Handle(receive_weights=lambda *published: None)], "ray") == 2
     worker.metrics()
     turn = ["wait_in", "transport", "checkpoint", "compute", "weights"]
     assert states(tmp_path) == ["recovery", "wait_in", "weights", *turn, *turn, "wait_in"]
@@ -74,7 +79,7 @@ def test_inference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         def decide(self, requests: list[Request], version: int) -> list[Decision]:
             return [decision() for _ in requests]
 
-        def load_trainable(self, tensors: dict[str, np.ndarray]) -> None:
+        def load_trainable(self, tensors: dict[str, np.ndarray], changed: Any = None) -> None:
             pass
 
     monkeypatch.setattr(loading, "load_adapter", lambda policy: Adapter())
@@ -86,7 +91,7 @@ def test_inference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         serving = asyncio.create_task(worker.serve())
         request = Request(observation={TASK: "push"}, noise_seed=0)
         await worker.decide([request])
-        await worker.receive_weights(1, {})
+        await worker.receive_weights(1, {}, 0.0)
         while (await worker.metrics())["version"] < 1:
             await asyncio.sleep(0)
         await worker.decide([request])
@@ -121,18 +126,17 @@ def decision() -> Decision:
 
 
 @pytest.fixture
-def collect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
+def collect(tmp_path: Path) -> Callable[..., list[str]]:
     """Has a rollout worker explore until `over` is set; what it was in."""
-    monkeypatch.setattr(rollout, "ray", Local)
 
-    def run(insert: Callable[[list[Segment]], Any], decide: Callable[[list[Request]], Any]) -> list[str]:
+    def run(door: Endpoint, decide: Callable[[list[Request]], Any]) -> list[str]:
         worker = rollout.RolloutWorker(
-            SimulatedConfig(max_steps=8, tolerance=0.05), RolloutConfig(worlds=2, segment_length=1),
+            SimulatedConfig(max_steps=8, tolerance=0.05), RolloutConfig(worlds=1, segment_length=1),
             ("match",), 0, 0, 0, (8, 2), timeline=tmp_path / TIMELINE,
         )  # fmt: skip
         worker.report(True, [])
         with pytest.raises(StoppedError):
-            worker.run(Handle(decide=decide), Handle(insert=insert))
+            worker.run(played(decide), door)
         worker.report(True, [])
         return states(tmp_path)
 
@@ -148,21 +152,29 @@ def test_collecting_is_to_step_worlds_and_wait_for_decisions(collect) -> None:
             raise StoppedError
         return [decision() for _ in requests]
 
-    seen = collect(lambda segments: True, decide)
+    seen = collect(played(lambda segments: True), decide)
     assert set(seen) == {"recovery", "compute", "transport", "wait_in"}
-    # Every decision is waited for, taken, executed, and followed by a request.
+    # Every decision is waited for, executed, and followed by a segment and a request.
     start = seen.index("wait_in", 2)
-    assert seen[start : start + 5] == ["wait_in", "transport", "compute", "transport", "wait_in"]
+    assert seen[start : start + 4] == ["wait_in", "compute", "transport", "wait_in"]
 
 
-def test_a_full_door_is_waited_at(collect, monkeypatch: pytest.MonkeyPatch) -> None:
-    sleeps: list[float] = []
+class ShutDoor(Endpoint):
+    """Lets nobody in, and ends the loop that has waited there three times."""
 
-    def sleep(seconds: float) -> None:
-        sleeps.append(seconds)
-        if len(sleeps) > 3:
-            raise StoppedError
+    def connect(self) -> Caller:
+        class Shut(PlayedCaller):
+            waits = 0
 
-    monkeypatch.setattr(rollout.time, "sleep", sleep)
-    seen = collect(lambda segments: Future(), lambda requests: [decision() for _ in requests])
+            def done(self, timeout: float) -> list[tuple[int, Any]]:
+                self.waits += bool(self._under_way) and timeout > 0
+                if self.waits > 3:
+                    raise StoppedError
+                return []
+
+        return Shut(self.name, lambda segments: Future())
+
+
+def test_a_full_door_is_waited_at(collect) -> None:
+    seen = collect(ShutDoor(name="door", method=None), lambda requests: [decision() for _ in requests])
     assert seen[-1] == "wait_out"
