@@ -222,10 +222,10 @@ class InferenceWorker:
             if self._reader is not None:
                 self._reader.close()
             self._server.poll(0.0)
-            while batch:
-                for asked in batch:
+            while waiting := batch or self._batcher.take(time.monotonic()):
+                for asked in waiting:
                     asked.fail(error)
-                batch = self._batcher.take(time.monotonic())
+                batch = []
             self._server.close()
             raise
 
