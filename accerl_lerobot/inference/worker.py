@@ -222,6 +222,7 @@ class InferenceWorker:
             if self._reader is not None:
                 self._reader.close()
             self._server.poll(0.0)
+            batch = batch or self._batcher.take(time.monotonic())  # it may have failed between two batches
             while batch:
                 for asked in batch:
                     asked.fail(error)
