@@ -44,6 +44,7 @@ from ray.exceptions import RayError, RayTaskError
 from accerl_lerobot.checkpoint import TRAINING_STATE, saved_version
 from accerl_lerobot.config import RunConfig, journal_folder, timeline_folder
 from accerl_lerobot.engine import Engine, Progress, Saved, WorkerError
+from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
@@ -207,6 +208,11 @@ class RayEngine(Engine):
     def pids(self) -> dict[str, int]:
         """Process ids by worker: ``inference``, ``replay``, ``trainer``, ``rollout 0`` …; for fault tests."""
         return {w.name: int(w.call("ready", timeout=self._limit)) for w in self._everyone()}
+
+    def batching(self) -> BatcherStats:
+        """What the inference service has batched so far."""
+        stats: BatcherStats = self._inference.call("batching", timeout=self._limit)
+        return stats
 
     @property
     def _limit(self) -> float:

@@ -31,12 +31,14 @@ from typing import Any
 import yaml
 
 from accerl_lerobot.bench.async_vs_sync import BenchAsyncVsSyncConfig
+from accerl_lerobot.bench.batching import BenchBatchingConfig
 from accerl_lerobot.bench.dream import BenchDreamConfig
 from accerl_lerobot.bench.efficiency import BenchEfficiencyConfig
 from accerl_lerobot.bench.faults import BenchFaultsConfig
 from accerl_lerobot.bench.lag import BenchLagConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.ranking import BenchRankingConfig
+from accerl_lerobot.bench.replay import BenchReplayConfig
 from accerl_lerobot.bench.scaling import BenchScalingConfig
 from accerl_lerobot.bench.throughput import BenchThroughputConfig
 from accerl_lerobot.bench.timeline import BenchTimelineConfig
@@ -317,6 +319,8 @@ CONFIGS: dict[str, type[Any]] = {
     "bench async-vs-sync": BenchAsyncVsSyncConfig,
     "bench transport": BenchTransportConfig,
     "bench weights": BenchWeightsConfig,
+    "bench batching": BenchBatchingConfig,
+    "bench replay": BenchReplayConfig,
     "bench timeline": BenchTimelineConfig,
     "bench lag": BenchLagConfig,
     "bench dream": BenchDreamConfig,

@@ -58,6 +58,8 @@ class MachineryConfig:
     """b of it."""
     max_batch: int = 64
     """Largest B."""
+    max_wait_ms: float = 2.0
+    """How long the oldest request waits for others, in milliseconds."""
     update_ms: float = 800.0
     """Time of an update, in milliseconds; it learns from one segment of each world."""
 
@@ -112,7 +114,7 @@ class MachineryConfig:
                 latency_cv=self.latency_cv,
             ),
             rollout=RolloutConfig(workers=self.worlds, worlds=1, segment_length=self.segment_length),
-            inference=InferenceConfig(max_batch=self.max_batch),
+            inference=InferenceConfig(max_batch=self.max_batch, max_wait_s=self.max_wait_ms / 1000),
             replay=ReplayConfig(
                 capacity=8 * batch, min_decisions=batch, ahead=2 * batch, samples_per_insert=1.0
             ),

@@ -26,11 +26,16 @@ for at most `max_wait_s` plus the time the batches before it take.
 
 from __future__ import annotations
 
-from collections import deque
+import math
+from collections import Counter, deque
 from collections.abc import Sized
 from dataclasses import dataclass, field
 
 from accerl_lerobot.errors import InputError
+
+GRAIN = 1.1
+"""Ratio of neighbouring waits that are told apart."""
+SHORTEST_S = 1e-6
 
 
 @dataclass(kw_only=True)
@@ -46,6 +51,15 @@ class BatcherStats:
     """Seconds from `Batcher.add` to `Batcher.take`, summed over requests."""
     wait_max_s: float = 0.0
     """The longest such wait, in seconds."""
+    waits: Counter[int] = field(default_factory=Counter)
+    """k → requests whose wait was about `GRAIN` to the k-th, in seconds."""
+
+    def note(self, wait_s: float) -> None:
+        """Counts a request that is taken."""
+        self.requests += 1
+        self.wait_sum_s += wait_s
+        self.wait_max_s = max(self.wait_max_s, wait_s)
+        self.waits[round(math.log(max(wait_s, SHORTEST_S), GRAIN))] += 1
 
     def metrics(self) -> dict[str, float]:
         """Means for the log; 0 before the first batch."""
@@ -55,6 +69,16 @@ class BatcherStats:
             "wait_mean_s": self.wait_sum_s / max(self.requests, 1),
             "wait_max_s": self.wait_max_s,
         }
+
+
+def quantile(waits: Counter[int], share: float) -> float:
+    """The wait that `share` of the requests do not exceed, in seconds, to `GRAIN`; NaN if there are none."""
+    left = share * waits.total()
+    for k in sorted(waits):
+        left -= waits[k]
+        if left <= 0:
+            return float(GRAIN**k)
+    return math.nan
 
 
 class Batcher[R: Sized]:
@@ -154,13 +178,11 @@ class Batcher[R: Sized]:
             request, since = self._waiting.popleft()
             batch.append(request)
             size += len(request)
-            self.stats.wait_sum_s += now - since
-            self.stats.wait_max_s = max(self.stats.wait_max_s, now - since)
+            self.stats.note(now - since)
         self._observations -= size
         self._left = max(0, self._left - size)
         if batch:
             self.stats.batches += 1
-            self.stats.requests += len(batch)
             self.stats.observations += size
             self.stats.batch_sizes[size] = self.stats.batch_sizes.get(size, 0) + 1
         return batch

@@ -28,6 +28,7 @@ only hands them over.
 from __future__ import annotations
 
 import asyncio
+import copy
 import os
 import threading
 import time
@@ -41,7 +42,7 @@ from accerl_lerobot import snapshot
 from accerl_lerobot.checkpoint import WEIGHTS
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.inference.batcher import Batcher
+from accerl_lerobot.inference.batcher import Batcher, BatcherStats
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.contract import Asked, Server, stopped
@@ -203,6 +204,10 @@ class InferenceWorker:
             "swap_s": self._swap_s,
             "publish_to_served_s": self._publish_to_served_s,
         }
+
+    async def batching(self) -> BatcherStats:
+        """What has been batched so far."""
+        return copy.deepcopy(self._batcher.stats)
 
     def _serve(self) -> None:
         batch: list[Asked] = []

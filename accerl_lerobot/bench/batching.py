@@ -1,0 +1,149 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What waiting for others does: batches, waits and decisions a second under several rules for batching.
+
+*one at a time* does not batch. *as they come* takes whatever waits when the service is free. The others have
+the oldest request wait so long for more to come. Each rule is an engine of its own, all of them forth and
+back in one run.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from accerl_lerobot.bench.blocks import MOST_BUSY
+from accerl_lerobot.bench.host import floors, host, spread
+from accerl_lerobot.bench.machinery import MachineryConfig
+from accerl_lerobot.bench.study import as_markdown, as_table
+from accerl_lerobot.console import Console
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.inference.batcher import quantile
+from accerl_lerobot.replay.turns import ASYNCHRONOUS
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchBatchingConfig(MachineryConfig):
+    """Which rules, for how long."""
+
+    worlds: int = 32
+    latency_ms: float = 50.0
+    update_ms: float = 10.0
+    """Short, so that the trainer is not what is measured."""
+    waits_ms: tuple[float, ...] = (0.0, 2.0, 10.0, 40.0)
+    """Waits of the oldest request, in milliseconds; 0: as they come. Take the place of `max_wait_ms`."""
+    seconds: float = 5.0
+    """Of a block, at least, above 0."""
+    blocks: int = 3
+    """Of each rule, each time it has its turn."""
+    output_dir: str = "outputs/batching"
+    """Folder for batching.json and .md."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.waits_ms or any(not 0 <= wait < 10_000 for wait in self.waits_ms):
+            raise InputError("waits_ms", self.waits_ms, "name at least one, each from 0 to 10,000")
+        if not self.seconds > 0:
+            raise InputError("seconds", self.seconds, "use a positive time")
+        if self.blocks < 1:
+            raise InputError("blocks", self.blocks, "use at least 1")
+
+
+def bench_batching(config: BenchBatchingConfig) -> dict[str, Any]:
+    """Measures all rules.
+
+    Returns:
+        ``rules``: for each, decisions per second, waits in milliseconds, the batches' sizes and how busy the
+        service was; ``config``, ``host`` and ``floors``.
+    """
+    console, root = Console(), Path(config.output_dir)
+    root.mkdir(parents=True, exist_ok=True)
+    result: dict[str, Any] = {"config": asdict(config), "host": host(), "floors": floors()}
+    rules = {"one at a time": replace(config, max_batch=1, max_wait_ms=0.0)}
+    rules |= {_name(wait): replace(config, max_wait_ms=wait) for wait in config.waits_ms}
+    found: dict[str, list[dict[str, Any]]] = {name: [] for name in rules}
+    order = [*rules, *reversed(rules)]
+    with console.stage("rules", total=len(order)) as stage:
+        for done, name in enumerate(order, start=1):
+            found[name].append(_measure(rules[name], config.seconds, config.blocks))
+            stage.update(done, f"{name}: {found[name][-1]['decisions_per_s'][-1]:.0f} decisions/s")
+    result["rules"] = {name: summed(turns) for name, turns in found.items()}
+    result["host_after"] = host()
+    (root / "batching.json").write_text(json.dumps(result, indent=2) + "\n")
+    (root / "batching.md").write_text(as_markdown(_COLUMNS, _rows(result)))
+    console.say(f"wrote batching.json and .md into {root}")
+    return result
+
+
+def summed(turns: list[dict[str, Any]]) -> dict[str, Any]:
+    """Of the turns of one rule: see `bench_batching`."""
+    waits = sum((Counter(turn["waits"]) for turn in turns), Counter())
+    sizes = sum((Counter(turn["sizes"]) for turn in turns), Counter())
+    return {
+        "decisions_per_s": spread([rate for turn in turns for rate in turn["decisions_per_s"]]),
+        "wait_p50_ms": 1000 * quantile(waits, 0.5),
+        "wait_p99_ms": 1000 * quantile(waits, 0.99),
+        "batch_size": sum(size * n for size, n in sizes.items()) / sizes.total(),
+        "batch_sizes": dict(sorted(sizes.items())),
+        "inference_busy": sum(turn["inference_busy"] for turn in turns) / len(turns),
+        "processor_bound": max(turn["processors"] for turn in turns) > MOST_BUSY,
+    }
+
+
+def table(result: dict[str, Any]) -> Table:
+    """`result` for people."""
+    return as_table(f"{result['config']['worlds']} worlds, by rule of batching", _COLUMNS, _rows(result))
+
+
+def _measure(rule: BenchBatchingConfig, seconds: float, count: int) -> dict[str, Any]:
+    with rule.open() as engine:
+        engine.block(ASYNCHRONOUS, 0.0)  # what begins is not counted
+        before = engine.engine.batching()
+        blocks = [engine.block(ASYNCHRONOUS, seconds) for _ in range(count)]
+        after = engine.engine.batching()
+    return {
+        "decisions_per_s": [block.decisions_per_s for block in blocks],
+        "waits": after.waits - before.waits,
+        "sizes": Counter(after.batch_sizes) - Counter(before.batch_sizes),
+        "inference_busy": sum(block.inference_busy for block in blocks) / count,
+        "processors": max(block.processors for block in blocks),
+    }
+
+
+def _name(wait_ms: float) -> str:
+    return f"at most {wait_ms:g} ms" if wait_ms else "as they come"
+
+
+_COLUMNS = ("rule", "decisions/s", "batch", "wait p50", "wait p99", "service busy", "")
+
+
+def _rows(result: dict[str, Any]) -> list[list[str]]:
+    return [
+        [
+            name,
+            f"{rate['median']:.0f} ({rate['min']:.0f} to {rate['max']:.0f})",
+            f"{found['batch_size']:.1f}",
+            f"{found['wait_p50_ms']:.1f} ms",
+            f"{found['wait_p99_ms']:.1f} ms",
+            f"{found['inference_busy']:.0%}",
+            "processors busy" if found["processor_bound"] else "",
+        ]
+        for name, found in result["rules"].items()
+        for rate in [found["decisions_per_s"]]
+    ]
