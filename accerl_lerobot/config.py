@@ -54,7 +54,7 @@ class LaunchConfig:
     schedule: Schedule = ASYNCHRONOUS
     """asynchronous: nobody waits for anybody. synchronous: a batch is collected, by all worlds in lock step,
     then learned from. overlap: the next one is collected meanwhile. These two are for measuring what the
-    first gains."""
+    first gains; with several inference services, the worlds of each are in step."""
     transport: Transport = "auto"
     """How rollout workers and dreams reach inference and replay, and weights reach inference. shared_memory:
     a message is written where the other process reads it. ray: it is copied, to any node. auto: shared memory
@@ -167,6 +167,12 @@ class RunConfig:
         if self.trainer.publish_changes and self.launch.engine == "local":
             remedy = "launch.engine=local is one process, where nothing is sent; leave the field out"
             raise InputError("trainer.publish_changes", True, remedy)
+        if self.inference.workers > 1 and self.launch.engine == "local":
+            remedy = "launch.engine=local is one process; use launch.engine=ray, or 1"
+            raise InputError("inference.workers", self.inference.workers, remedy)
+        if self.inference.workers > self.rollout.workers:
+            remedy = f"use at most rollout.workers, {self.rollout.workers}, or some have nobody to answer"
+            raise InputError("inference.workers", self.inference.workers, remedy)
         if self.trainer.ranks > 1 and self.launch.engine == "local":
             remedy = "launch.engine=local is one process; use launch.engine=ray, or 1"
             raise InputError("trainer.ranks", self.trainer.ranks, remedy)

@@ -45,13 +45,14 @@ from accerl_lerobot.checkpoint import TRAINING_STATE, saved_version
 from accerl_lerobot.config import RunConfig, journal_folder, timeline_folder
 from accerl_lerobot.engine import Engine, Progress, Saved, WorkerError
 from accerl_lerobot.inference.batcher import BatcherStats
+from accerl_lerobot.inference.pool import added, dealt, together
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seats import START_S, Seats
 from accerl_lerobot.stopping import Stopping
 from accerl_lerobot.transport.contract import ServiceStoppedError
-from accerl_lerobot.transport.endpoint import Endpoint, listens
+from accerl_lerobot.transport.endpoint import listens
 from accerl_lerobot.watched import Watched
 from accerl_lerobot.weights.publisher import ReaderLostError
 
@@ -103,7 +104,7 @@ class RayEngine(Engine):
         self._seats = Seats(config, tasks, history, state)
         self._updates: list[dict[str, float]] = []
         self._replay_metrics: dict[str, float] = {}
-        self._inference_metrics: dict[str, float] = {}
+        self._of_services: dict[str, dict[str, float]] = {}
         self._imagination_metrics: dict[str, float] = {}
         self._dreamer: Watched | None = None
         self._learner: Watched | None = None
@@ -131,12 +132,12 @@ class RayEngine(Engine):
     def train(self) -> None:
         self._training, self._last_change = True, time.monotonic()
         self.follow(self._config.launch.schedule)
-        readers = [self._inference.actor]
+        readers = [service.actor for service in self._inference]
         self._trainer.work = self._trainer.actor.run.remote(
             self._replay.actor, readers, self._config.launch.transport
         )
         if self._dreamer is not None:
-            self._dreamer.work = self._dreamer.actor.run.remote(*self._endpoints, self._replay.actor)
+            self._dreamer.work = self._dreamer.actor.run.remote(*self._dreams_ask, self._replay.actor)
         if self._learner is not None and self._dreamer is not None:
             self._learner.work = self._learner.actor.run.remote(self._dreamer.actor, self._replay.actor)
 
@@ -150,8 +151,10 @@ class RayEngine(Engine):
         # The trainer first: who takes turns waits for it to hand over its weights.
         for worker in (self._trainer, self._replay):
             worker.call("follow", schedule, timeout=self._limit)
-        together = rollout.workers * rollout.worlds if in_turn else 0
-        self._inference.call("lock_step", together, timeout=self._limit)
+        for service, workers in zip(
+            self._inference, dealt(rollout.workers, len(self._inference)), strict=True
+        ):
+            service.call("lock_step", workers * rollout.worlds if in_turn else 0, timeout=self._limit)
 
     def poll(self) -> Progress:
         self._ask()
@@ -168,7 +171,7 @@ class RayEngine(Engine):
             episodes=episodes,
             rollout=self._seats.counters(),
             replay=self._replay_metrics,
-            inference=self._inference_metrics,
+            inference=together([m for m in self._of_services.values() if m]),
             imagination=self._imagination_metrics,
         )
         self._check_moving(progress)
@@ -210,9 +213,8 @@ class RayEngine(Engine):
         return {w.name: int(w.call("ready", timeout=self._limit)) for w in self._everyone()}
 
     def batching(self) -> BatcherStats:
-        """What the inference service has batched so far."""
-        stats: BatcherStats = self._inference.call("batching", timeout=self._limit)
-        return stats
+        """What the inference services have batched so far."""
+        return added([service.call("batching", timeout=self._limit) for service in self._inference])
 
     @property
     def _limit(self) -> float:
@@ -232,13 +234,13 @@ class RayEngine(Engine):
         c, timeline = self._config, timeline_folder(self._config)
         gpus = ray.available_resources().get("GPU", 0)
         imagination = c.imagination
-        users = 1 + (imagination.share > 0) + imagination.learns
+        users = c.inference.workers + (imagination.share > 0) + imagination.learns
         of_rank, share = c.trainer.gpu_shares(0 if c.policy.device == "cpu" else gpus, users)
         inference = ray.remote(InferenceWorker).options(num_cpus=0, num_gpus=share, max_concurrency=1000)
-        self._inference = self._service(
-            "inference",
-            inference.remote(c.policy, c.inference, self._version, self._state, self._load, timeline),
-        )
+        serves = (c.policy, c.inference, self._version, self._state, self._load, timeline)
+        several = c.inference.workers > 1
+        names = [f"inference {i}" if several else "inference" for i in range(c.inference.workers)]
+        self._inference = [self._service(name, inference.remote(*serves, name)) for name in names]
         replay = ray.remote(ReplayWorker).options(num_cpus=0, num_gpus=0, max_concurrency=1000)
         imagined, counted = imagination.replay if imagination.share else None, c.rollout.episodes > 0
         self._replay = self._service(
@@ -266,17 +268,14 @@ class RayEngine(Engine):
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
         for worker, reference in ready:
             worker.result(reference, "ready", max(START_S, self._limit))
-        self._endpoints = self._endpoint(self._inference, "decide"), self._endpoint(self._replay, "insert")
-        self._inference.work = self._inference.actor.serve.remote()
+        way = c.launch.transport, self._limit
+        deciding = [service.endpoint("decide", *way) for service in self._inference]
+        inserting = self._replay.endpoint("insert", *way)
+        self._dreams_ask = deciding[-1], inserting  # those that get one rollout worker more come first
+        for service in self._inference:
+            service.work = service.actor.serve.remote()
         self._replay.work = self._replay.actor.run.remote()
-        self._seats.set_to_work(*self._endpoints)
-
-    def _endpoint(self, service: Watched, method: str) -> Endpoint:
-        """Where workers reach a service."""
-        transport = self._config.launch.transport
-        address = service.call("listen", timeout=self._limit) if listens(transport) else None
-        way = getattr(service.actor, method)
-        return Endpoint(name=service.name, method=way, address=address, transport=transport)
+        self._seats.set_to_work(deciding, inserting)
 
     def _service(self, name: str, actor: Any) -> Watched:
         self._services.append(Watched(name, actor))
@@ -335,7 +334,8 @@ class RayEngine(Engine):
         """Picks up the answers that have come; returns the episodes among them."""
         self._updates += self._hear(self._trainer) or []
         self._replay_metrics = self._hear(self._replay) or self._replay_metrics
-        self._inference_metrics = self._hear(self._inference) or self._inference_metrics
+        for service in self._inference:
+            self._of_services[service.name] = self._hear(service) or self._of_services.get(service.name, {})
         for rank in self._ranks:
             self._hear(rank)
         for imaginer in (self._dreamer, self._learner):

@@ -85,7 +85,7 @@ class Seats:
     ) -> None:
         self._config, self._tasks, self._history = config, tasks, history
         self._past: dict[str, float] = {"restarts": 0.0}
-        self._peers: tuple[Endpoint, Endpoint] | None = None
+        self._peers: tuple[list[Endpoint], Endpoint] | None = None
         self.in_turn = False
         """Whether worlds wait for replay after each segment."""
         self._seats = [
@@ -100,11 +100,11 @@ class Seats:
         for seat in self._seats:
             seat.worker = self._new(seat)
 
-    def set_to_work(self, inference: Endpoint, replay: Endpoint) -> None:
+    def set_to_work(self, inference: list[Endpoint], replay: Endpoint) -> None:
         """Has them step worlds, with these services."""
         self._peers = inference, replay
         for seat in self._seats:
-            seat.worker.work = seat.worker.actor.run.remote(inference, replay)
+            self._set_to_work(seat)
 
     def workers(self) -> Iterator[Watched]:
         """Those that have been started."""
@@ -250,5 +250,10 @@ class Seats:
             seat.budget = whole_groups(seat.budget, self._config.rollout)
         seat.worker = self._new(seat)
         seat.unsent = list(seat.outstanding.values())
+        self._set_to_work(seat)
+
+    def _set_to_work(self, seat: Seat) -> None:
         assert self._peers is not None
-        seat.worker.work = seat.worker.actor.run.remote(*self._peers)
+        inference, replay = self._peers
+        deciding = inference[seat.index % len(inference)]
+        seat.worker.work = seat.worker.actor.run.remote(deciding, replay)

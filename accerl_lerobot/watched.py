@@ -22,6 +22,7 @@ import ray
 from ray.exceptions import GetTimeoutError, RayError
 
 from accerl_lerobot.engine import WorkerError
+from accerl_lerobot.transport.endpoint import Endpoint, Transport, listens
 
 
 class Watched:
@@ -49,6 +50,12 @@ class Watched:
         self.answered = False
         self._question: Any = None
         self._asked = 0.0
+
+    def endpoint(self, method: str, transport: Transport, timeout: float) -> Endpoint:
+        """Where other workers reach it, by this method."""
+        address = self.call("listen", timeout=timeout) if listens(transport) else None
+        way = getattr(self.actor, method)
+        return Endpoint(name=self.name, method=way, address=address, transport=transport)
 
     def ask(self, method: str, *arguments: Any) -> bool:
         """Asks unless an answer is still owed; returns whether it did."""

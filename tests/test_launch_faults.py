@@ -120,7 +120,7 @@ def test_both_transports_play_the_same_episodes(engine):
     played = []
     for transport in ("ray", "shared_memory"):
         one = engine(rollout=TWO, launch=LaunchConfig(stall_s=120, transport=transport))
-        assert [end.address is None for end in one._endpoints] == [transport == "ray"] * 2
+        assert [end.address is None for end in one._dreams_ask] == [transport == "ray"] * 2
         one.plan(evaluation_plans(("match",), 10, "eval"))
         results = sorted(collect(one, "eval", 10), key=lambda result: result.plan.index)
         played.append([(r.plan, r.success, r.episode_return, r.steps, r.decisions) for r in results])
@@ -223,7 +223,7 @@ def test_an_inference_that_is_killed_ends_the_run_and_not_those_who_relied_on_it
 def test_an_exception_in_the_inference_service_is_reported_as_its_own(engine):
     one = engine(trainer=ENDLESS)
     until_training(one)
-    ray.get(one._inference.actor.fail.remote())
+    ray.get(one._inference[0].actor.fail.remote())
     text = until_failure(one)
     assert text.startswith("inference worker failed for good:")
     assert "the forward pass fell over" in text and "serve" in text

@@ -17,6 +17,8 @@ from __future__ import annotations
 
 import asyncio
 import functools
+from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +27,8 @@ import pytest
 from accerl_lerobot.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.config import evaluation_plans
+from accerl_lerobot.inference.pool import dealt, together
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.simulated import SimulatedPolicyConfig, load_simulated
 from accerl_lerobot.replay import ReplayConfig
@@ -35,7 +39,7 @@ from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 from tests.light_workers import light_ray
 from tests.replay.segments import make_segment
 from tests.replay.test_worker import BATCH, play, start, waits
-from tests.runs import drive
+from tests.runs import collect, drive
 
 __all__ = ["light_ray"]
 
@@ -152,6 +156,60 @@ def test_a_run_in_turn(light_ray: None, schedule: Any):
         assert np.isfinite([u["loss"] for u in updates]).all()
     finally:
         engine.close()
+
+
+def test_several_services_share_the_worlds_out(light_ray: None):
+    from accerl_lerobot.launch import RayEngine
+
+    run = run_of(SYNCHRONOUS)
+    run = replace(
+        run,
+        rollout=replace(run.rollout, workers=3),
+        inference=InferenceConfig(workers=2, max_batch=8),
+        replay=replace(run.replay, min_decisions=24, ahead=24),
+        trainer=replace(run.trainer, batch_decisions=24),
+    )
+    load = functools.partial(load_simulated, SimulatedPolicyConfig(decide_ms=1.0, update_ms=5.0))
+    engine = RayEngine(run, ("match",), load=load)
+    try:
+        pids = engine.pids()
+        assert len({pids["inference 0"], pids["inference 1"]}) == 2
+        engine.train()
+        history = drive(engine)
+        # Two workers of two worlds ask the first service, one asks the second, each in lock step.
+        sizes = Counter(engine.batching().batch_sizes)
+        assert sizes[4] + sizes[2] > 0.9 * sizes.total()  # all but what comes when training has ended
+        # They do not wait for each other: the quicker one may begin the next round before the batch is whole.
+        assert max(u["lag_max"] for p in history for u in p.updates) <= 1.0
+        assert history[-1].inference["batch_size_mean"] == pytest.approx(3.0, abs=0.3)
+        engine.plan(evaluation_plans(("match",), 6, "after"))
+        results = collect(engine, "after", 6)
+        assert {r.versions for r in results} == {(6, 6)}  # both have the last weights
+    finally:
+        engine.close()
+
+
+def test_what_services_say_together():
+    one = {"batches": 2.0, "batch_size_mean": 3.0, "wait_mean_s": 0.1, "wait_max_s": 0.5, "version": 7.0,
+           "busy_share": 0.2, "swap_s": 0.1, "publish_to_served_s": 0.3}  # fmt: skip
+    other = one | {"batches": 4.0, "batch_size_mean": 1.0, "wait_mean_s": 0.3, "wait_max_s": 0.4,
+                   "version": 6.0, "busy_share": 0.6}  # fmt: skip
+    found = together([one, other])
+    assert found["batches"] == 6.0 and found["batch_size_mean"] == pytest.approx(10 / 6)
+    assert found["wait_mean_s"] == pytest.approx((0.1 * 6 + 0.3 * 4) / 10)
+    assert (found["wait_max_s"], found["version"], found["busy_share"]) == (0.5, 6.0, pytest.approx(0.4))
+    assert together([one]) == one and together([]) == {}
+    assert dealt(5, 2) == [3, 2] and dealt(2, 2) == [1, 1]
+
+
+def test_services_without_callers_are_refused():
+    with pytest.raises(InputError, match=r"inference\.workers=2.*rollout\.workers, 1"):
+        RunConfig(inference=InferenceConfig(workers=2))
+    with pytest.raises(InputError, match=r"inference\.workers=0"):
+        InferenceConfig(workers=0)
+    local = LaunchConfig(engine="local")
+    with pytest.raises(InputError, match=r"inference\.workers=2.*local"):
+        RunConfig(inference=InferenceConfig(workers=2), rollout=RolloutConfig(workers=2), launch=local)
 
 
 def test_schedules_that_cannot_be_are_refused():

@@ -57,6 +57,8 @@ LOOK_S = 1.0
 class InferenceConfig:
     """How decisions are batched."""
 
+    workers: int = 1
+    """Inference processes, each with a copy of the policy; rollout workers are dealt out over them."""
     max_batch: int = 16
     """Observations per forward pass at most."""
     max_wait_s: float = 0.002
@@ -65,7 +67,7 @@ class InferenceConfig:
     """CPU threads of the forward pass."""
 
     def __post_init__(self) -> None:
-        for name in ("max_batch", "num_threads"):
+        for name in ("workers", "max_batch", "num_threads"):
             if getattr(self, name) < 1:
                 raise InputError(f"inference.{name}", getattr(self, name), "use at least 1")
         if not 0 <= self.max_wait_s < 10:
@@ -82,6 +84,7 @@ class InferenceWorker:
         state: the ``training_state`` that holds these; None: they are the checkpoint's.
         load: makes the adapter; None: of LeRobot's checkpoint.
         timeline: folder of the timeline; None: none is kept.
+        name: its row there.
     """
 
     def __init__(
@@ -92,8 +95,9 @@ class InferenceWorker:
         state: Path | None = None,
         load: Load | None = None,
         timeline: Path | None = None,
+        name: str = "inference",
     ) -> None:
-        self._clock = open_clock(timeline, "inference")
+        self._clock = open_clock(timeline, name)
         import torch
 
         torch.set_num_threads(config.num_threads)

@@ -1,0 +1,65 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Several inference services beside each other: which caller asks which, and what they say together.
+
+Rollout workers are dealt out in turn, worker i to service i modulo their number, and stay where they are:
+each service serves whole workers, so that what they ask is batched together.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+from accerl_lerobot.inference.batcher import BatcherStats
+
+LARGEST = ("wait_max_s", "swap_s", "publish_to_served_s")
+
+
+def dealt(workers: int, services: int) -> list[int]:
+    """Rollout workers of each service."""
+    return [len(range(index, workers, services)) for index in range(services)]
+
+
+def together(metrics: Sequence[dict[str, float]]) -> dict[str, float]:
+    """What services report, as one: sums of batches, means over batches and requests, the oldest version;
+    nothing of none."""
+    if len(metrics) < 2:
+        return dict(*metrics)
+    batches = sum(m["batches"] for m in metrics)
+    observations = [m["batches"] * m["batch_size_mean"] for m in metrics]
+    asked = max(sum(observations), 1.0)
+    waited = sum(m["wait_mean_s"] * n for m, n in zip(metrics, observations, strict=True))
+    found = {
+        "batches": batches,
+        "batch_size_mean": sum(observations) / max(batches, 1.0),
+        "wait_mean_s": waited / asked,
+        "version": min(m["version"] for m in metrics),
+        "busy_share": sum(m["busy_share"] for m in metrics) / len(metrics),
+    }
+    return found | {name: max(m[name] for m in metrics) for name in LARGEST}
+
+
+def added(stats: Sequence[BatcherStats]) -> BatcherStats:
+    """What services have batched, as one."""
+    sizes: Counter[int] = sum((Counter(s.batch_sizes) for s in stats), Counter())
+    return BatcherStats(
+        batches=sum(s.batches for s in stats),
+        requests=sum(s.requests for s in stats),
+        observations=sum(s.observations for s in stats),
+        batch_sizes=dict(sizes),
+        wait_sum_s=sum(s.wait_sum_s for s in stats),
+        wait_max_s=max(s.wait_max_s for s in stats),
+        waits=sum((s.waits for s in stats), Counter()),
+    )
