@@ -87,11 +87,19 @@ class ReplayConfig:
 
         Raises:
             InputError: both sides could wait for each other forever, or the trainer for the warm start, or
-                segments would be evicted unused.
+                segments would be evicted or retired unused.
         """
         if self.ahead < batch_decisions:
             remedy = f"use at least one batch, {batch_decisions}, or both sides wait for each other"
             raise InputError(f"{field}.ahead", self.ahead, remedy)
+        # Each of a segment's draws is for another update.
+        oldest = math.ceil(self.samples_per_insert) - 1
+        if self.max_lag < oldest:
+            remedy = (
+                f"with {field}.samples_per_insert={self.samples_per_insert:g} what is drawn last is {oldest} "
+                f"updates old at least; use {oldest} or more, rather several times as many"
+            )
+            raise InputError(f"{field}.max_lag", self.max_lag, remedy)
         least = max(self.min_decisions, self.ahead) + segment_decisions - 1
         if self.capacity < least:
             remedy = f"use at least {least}: the larger of min_decisions and ahead, and one segment"

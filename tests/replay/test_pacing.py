@@ -249,7 +249,8 @@ def test_promises_hold_under_hostile_schedules(
 
 @pytest.mark.parametrize("max_lag", [0, 1, 4])
 def test_a_tight_max_lag_retires_but_never_stalls(max_lag: int) -> None:
-    config = ReplayConfig(capacity=64, min_decisions=16, samples_per_insert=2.0, ahead=32, max_lag=max_lag)
+    reuse = min(2.0, 1.0 + max_lag)
+    config = ReplayConfig(capacity=64, min_decisions=16, samples_per_insert=reuse, ahead=32, max_lag=max_lag)
     simulation = Simulation(
         config=config, batch=8, longest=4, workers=5, in_flight=40, publish_every=1, gate="insert", seed=1
     )
@@ -291,3 +292,11 @@ def test_evenly_matched_sides_waste_nothing() -> None:
     c = simulation.replay.counters
     assert c.evicted_unused == 0 and c.retired_segments == 0 and c.unspent_draws < 0.01 * c.trained_decisions
     assert c.trained_decisions > 0.98 * 2.0 * c.inserted_decisions
+
+
+def test_reuse_that_the_largest_lag_does_not_allow_is_refused() -> None:
+    sizes = {"capacity": 64, "min_decisions": 8, "ahead": 16}
+    with pytest.raises(InputError, match=r"replay\.max_lag=0: .*samples_per_insert=1\.5 .* 1 updates old"):
+        ReplayConfig(**sizes, samples_per_insert=1.5, max_lag=0).check(batch_decisions=8, segment_decisions=4)
+    ReplayConfig(**sizes, samples_per_insert=1.5, max_lag=1).check(batch_decisions=8, segment_decisions=4)
+    ReplayConfig(**sizes, max_lag=0).check(batch_decisions=8, segment_decisions=4)
