@@ -149,8 +149,10 @@ def test_a_run_in_turn(light_ray: None, schedule: Any):
             assert lags[0] == 0.0 and set(lags[1:]) <= {0.0, 1.0} and 1.0 in lags
         end = history[-1]
         if schedule != ASYNCHRONOUS:
-            # In lock step all four decide together, in two batches of at most three.
-            assert end.inference["batch_size_mean"] == pytest.approx(2.0, abs=0.25)
+            # In lock step all four decide together, in batches of three and one; not so when training has ended.
+            sizes = Counter(engine.batching().batch_sizes)
+            assert sizes[3] + sizes[1] > 0.9 * sizes.total()
+            assert abs(sizes[3] - sizes[1]) < 0.15 * sizes.total()
         # Nothing is lost on the way from the worlds to the trainer.
         assert end.replay["trained_decisions"] == 6 * 16
         assert np.isfinite([u["loss"] for u in updates]).all()
@@ -181,7 +183,6 @@ def test_several_services_share_the_worlds_out(light_ray: None):
         assert sizes[4] + sizes[2] > 0.9 * sizes.total()  # all but what comes when training has ended
         # They do not wait for each other: the quicker one may begin the next round before the batch is whole.
         assert max(u["lag_max"] for p in history for u in p.updates) <= 1.0
-        assert history[-1].inference["batch_size_mean"] == pytest.approx(3.0, abs=0.3)
         engine.plan(evaluation_plans(("match",), 6, "after"))
         results = collect(engine, "after", 6)
         assert {r.versions for r in results} == {(6, 6)}  # both have the last weights
