@@ -149,7 +149,7 @@ def test_a_run_in_turn(light_ray: None, schedule: Any):
             assert lags[0] == 0.0 and set(lags[1:]) <= {0.0, 1.0} and 1.0 in lags
         end = history[-1]
         if schedule != ASYNCHRONOUS:
-            # In lock step all four decide together, in batches of three and one; not so when training has ended.
+            # In lock step all four decide together, in batches of three and one, until training has ended.
             sizes = Counter(engine.batching().batch_sizes)
             assert sizes[3] + sizes[1] > 0.9 * sizes.total()
             assert abs(sizes[3] - sizes[1]) < 0.15 * sizes.total()
