@@ -167,6 +167,9 @@ class RunConfig:
         if self.trainer.publish_changes and self.launch.engine == "local":
             remedy = "launch.engine=local is one process, where nothing is sent; leave the field out"
             raise InputError("trainer.publish_changes", True, remedy)
+        if self.trainer.publish_changes and self.launch.transport == "ray":
+            remedy = "it needs shared memory: use launch.transport=auto, or leave the field out"
+            raise InputError("trainer.publish_changes", True, remedy)
         if self.inference.workers > 1 and self.launch.engine == "local":
             remedy = "launch.engine=local is one process; use launch.engine=ray, or 1"
             raise InputError("inference.workers", self.inference.workers, remedy)
@@ -193,9 +196,12 @@ class RunConfig:
         if imagination.share and self.launch.schedule != ASYNCHRONOUS:
             remedy = "use asynchronous: those who dream take no turns"
             raise InputError("launch.schedule", self.launch.schedule, remedy)
-        if self.rollout.episodes and self.launch.schedule != ASYNCHRONOUS:
-            remedy = "use asynchronous, or leave out rollout.episodes: worlds that have ended are waited for"
-            raise InputError("launch.schedule", self.launch.schedule, remedy)
+        for name in ("episodes", "group_size"):
+            if getattr(self.rollout, name) and self.launch.schedule != ASYNCHRONOUS:
+                remedy = (
+                    f"use asynchronous, or leave out rollout.{name}: a world that has to pause is waited for"
+                )
+                raise InputError("launch.schedule", self.launch.schedule, remedy)
         if imagination.share and self.algorithm.advantage == "group":
             remedy = "use algorithm.advantage=gae: dreams do not begin alike, so they are not compared"
             raise InputError("imagination.share", imagination.share, remedy)

@@ -236,6 +236,13 @@ class RayEngine(Engine):
         imagination = c.imagination
         users = c.inference.workers + (imagination.share > 0) + imagination.learns
         of_rank, share = c.trainer.gpu_shares(0 if c.policy.device == "cpu" else gpus, users)
+        # The ranks first: Ray fills the GPU that is fullest, and each of them needs more than half of one.
+        learner = (c.policy, c.algorithm, c.trainer, c.seed, self._state, self._load)
+        peer = ray.remote(TrainerRank).options(num_cpus=0, num_gpus=of_rank)
+        ranks = [peer.remote(rank, *learner) for rank in range(1, c.trainer.ranks)]
+        threads = {"num_cpus": 0, "num_gpus": share, "max_concurrency": 4}
+        first = ray.remote(TrainerWorker).options(**threads | {"num_gpus": of_rank})
+        trainer = first.remote(*learner, timeline, ranks)
         inference = ray.remote(InferenceWorker).options(num_cpus=0, num_gpus=share, max_concurrency=1000)
         serves = (c.policy, c.inference, self._version, self._state, self._load, timeline)
         several = c.inference.workers > 1
@@ -247,14 +254,8 @@ class RayEngine(Engine):
             "replay",
             replay.remote(c.replay, c.seed, imagined, counted, self._state, journal_folder(c), timeline),
         )
-        threads = {"num_cpus": 0, "num_gpus": share, "max_concurrency": 4}
-        learner = (c.policy, c.algorithm, c.trainer, c.seed, self._state, self._load)
-        peer = ray.remote(TrainerRank).options(num_cpus=0, num_gpus=of_rank)
-        for rank in range(1, c.trainer.ranks):
-            self._ranks.append(self._service(f"trainer rank {rank}", peer.remote(rank, *learner)))
-        trainer = ray.remote(TrainerWorker).options(**threads | {"num_gpus": of_rank})
-        handles = [rank.actor for rank in self._ranks]
-        self._trainer = self._service("trainer", trainer.remote(*learner, timeline, handles))
+        self._ranks = [self._service(f"trainer rank {i}", rank) for i, rank in enumerate(ranks, start=1)]
+        self._trainer = self._service("trainer", trainer)
         if imagination.share:
             from accerl_lerobot.world_model.worker import DreamWorker, WorldLearningWorker
 

@@ -37,7 +37,8 @@ def check_start(config: RunConfig) -> int:
         The policy's ``n_obs_steps``; 1 where LeRobot's trainer will tell.
 
     Raises:
-        InputError: see above; more ranks than GPUs; also what `check_sft_policy` raises.
+        InputError: see above; more ranks than GPUs, or no GPU to offload from; also what `check_sft_policy`
+            raises.
     """
     if config.policy.path is None and not config.sft.steps:
         remedy = "give a LeRobot checkpoint, or sft.steps > 0 to make one; recipes/quickstart.yaml does"
@@ -46,6 +47,12 @@ def check_start(config: RunConfig) -> int:
         import torch
 
         config.trainer.gpu_shares(torch.cuda.device_count(), others=1)
+    if config.trainer.cpu_offload:
+        from accerl_lerobot.policies.loading import resolve_device
+
+        if resolve_device(config.policy.device).type == "cpu":
+            remedy = "there is no GPU here, and the CPU's memory has everything already; leave the field out"
+            raise InputError("trainer.cpu_offload", True, remedy)
     if config.policy.path is not None:
         from accerl_lerobot.policies.loading import load_lerobot_config
 

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import json
 import statistics
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +75,12 @@ class BenchAsyncVsSyncConfig(MachineryConfig):
             raise InputError("seconds", self.seconds, "use a positive time")
         if self.rounds < 1:
             raise InputError("rounds", self.rounds, "use at least 1")
+        if self.learning_updates < 0:
+            raise InputError("learning_updates", self.learning_updates, "use 0 (none) or more")
+        for cv in self.cvs:  # what a run would refuse is refused now
+            replace_law(self, cv).run_config()
+        for seed in self.seeds if self.learning_updates else ():
+            LEARNING.run_config(updates=self.learning_updates, seed=seed)
 
 
 def bench_async_vs_sync(config: BenchAsyncVsSyncConfig) -> dict[str, Any]:
@@ -92,8 +98,10 @@ def bench_async_vs_sync(config: BenchAsyncVsSyncConfig) -> dict[str, Any]:
             law = _law(config, cv)
             result["laws"].append(law)
             stage.update(len(result["laws"]), f"CV {cv:g}: S {law['speed_up']['median']:.2f}")
-    result["learning"] = _learning(config, console) if config.learning_updates else {}
-    result["host_after"] = host()
+    result |= {"learning": {}, "host_after": host()}
+    (root / "async_vs_sync.json").write_text(json.dumps(result, indent=2) + "\n")
+    if config.learning_updates:
+        result["learning"] = _learning(config, console)
     (root / "async_vs_sync.json").write_text(json.dumps(result, indent=2) + "\n")
     (root / "async_vs_sync.md").write_text(markdown(result))
     _draw(root / "async_vs_sync.png", result)
@@ -146,8 +154,14 @@ def markdown(result: dict[str, Any]) -> str:
     return text
 
 
+def replace_law(config: MachineryConfig, cv: float) -> MachineryConfig:
+    """The same machinery under another law."""
+    sizes = {field.name: getattr(config, field.name) for field in fields(MachineryConfig)}
+    return MachineryConfig(**sizes | {"latency_cv": cv})
+
+
 def _law(config: BenchAsyncVsSyncConfig, cv: float) -> dict[str, Any]:
-    of = replace(config, latency_cv=cv)
+    of = replace_law(config, cv)
     with of.open() as engine:
         order = config.rounds * (*ARMS, *reversed(ARMS))
         return compare(of, [engine.block(arm, config.seconds) for arm in order])

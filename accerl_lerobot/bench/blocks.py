@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -26,7 +27,7 @@ from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.turns import Schedule
 
 SETTLE = 2
-"""Updates after a change that are not counted."""
+"""Updates after a change that are not counted, beside those that need nothing new."""
 MOST_BUSY = 0.6
 """Share of all cores above which the processors, and not what is slept, may be what is measured."""
 
@@ -76,6 +77,8 @@ class Measured:
         from accerl_lerobot.launch import RayEngine
 
         self.engine = RayEngine(config, tasks, history, load=load)
+        # What is collected once is learned from so often: a block has whole rounds of it.
+        self._round = math.ceil(config.replay.samples_per_insert)
         self.engine.train()
 
     def __enter__(self) -> Measured:
@@ -87,7 +90,8 @@ class Measured:
     def block(self, schedule: Schedule, seconds: float) -> Block:
         """Measures at least so many seconds of a schedule, in whole updates, after a change has settled."""
         self.engine.follow(schedule)
-        self._updates(SETTLE, 0.0)
+        self._updates(1, 0.0)  # what was made before is heard first
+        self._updates(SETTLE + self._round, 0.0)
         processors, first, started = Processors(), self.engine.poll(), time.perf_counter()
         updates, polls = self._updates(1, seconds)
         wall = time.perf_counter() - started
@@ -113,14 +117,20 @@ class Measured:
         )
 
     def _updates(self, count: int, seconds: float) -> tuple[list[dict[str, float]], list[Progress]]:
-        """Polls until there are so many updates, which took so long."""
+        """Polls until there are so many updates, in whole rounds, which took so long."""
         updates: list[dict[str, float]] = []
         polls: list[Progress] = []
-        while len(updates) < count or sum(_seconds(u) for u in updates) < seconds:
+        while True:
             progress = self.engine.poll()
             updates += progress.updates
             polls.append(progress)
-        return updates, polls
+            whole = updates[: len(updates) // self._round * self._round]
+            if len(whole) >= count and sum(_seconds(u) for u in whole) >= seconds:
+                return whole, polls
+            if progress.done:
+                raise RuntimeError(
+                    "the run that was to be measured has ended: it learns from a number of episodes only"
+                )
 
 
 def as_rows(blocks: list[Block]) -> list[dict[str, Any]]:

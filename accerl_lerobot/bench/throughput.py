@@ -20,7 +20,7 @@ replay, was thrown away for a reason that is counted, or is under way.
 from __future__ import annotations
 
 import statistics
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from rich.table import Table
@@ -87,6 +87,8 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
             "--trainer.schedule=constant",
         ],
     )
+    for schedule in config.schedules:  # what cannot be under one of them is refused
+        replace(run, launch=replace(run.launch, schedule=schedule))
     tasks = check_world(run)
     result: dict[str, Any] = {"config": asdict(config), "host": host()}
     order = config.rounds * (*config.schedules, *reversed(config.schedules))

@@ -201,7 +201,7 @@ class Floor:
         reply = memoryview(bytearray(REPLY))
 
         def pipe() -> None:
-            os.write(self._to, SIZE.pack(len(raw)) + raw)
+            os.writev(self._to, [SIZE.pack(len(raw)), raw])
             read_all(self._from, reply)
 
         def slot() -> None:

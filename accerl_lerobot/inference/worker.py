@@ -28,12 +28,11 @@ only hands them over.
 from __future__ import annotations
 
 import asyncio
-import copy
 import os
 import threading
 import time
-from collections import deque
-from dataclasses import dataclass
+from collections import Counter, deque
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -117,6 +116,8 @@ class InferenceWorker:
         self._unserved_since: float | None = None
         self._failure: BaseException | None = None
         self._over = False
+        self._turn: float | None = None
+        """When the thread that serves last went round; None while there is none."""
         self._busy_s = self._busy_told_s = 0.0
         self._since = time.monotonic()
         self._clock.enter(WAIT_IN)
@@ -191,12 +192,17 @@ class InferenceWorker:
         try:
             await ended
         finally:
-            self._over = True
+            self._over, self._turn = True, None
             self._server.wake()
 
     async def metrics(self) -> dict[str, float]:
         """Batching statistics, the version served, the busy share since the last call, and of the last
-        swap of weights how long it took and how long after their publication they served first."""
+        swap of weights how long it took and how long after their publication they served first.
+
+        Answers while the thread that serves goes round, and is as silent as that one otherwise.
+        """
+        while self._turn is not None and time.monotonic() - self._turn > 2 * LOOK_S:
+            await asyncio.sleep(0.1)
         self._clock.beat()
         now, busy_s = time.monotonic(), self._busy_s
         share = (busy_s - self._busy_told_s) / max(1e-9, now - self._since)
@@ -211,12 +217,15 @@ class InferenceWorker:
 
     async def batching(self) -> BatcherStats:
         """What has been batched so far."""
-        return copy.deepcopy(self._batcher.stats)
+        stats = self._batcher.stats
+        # Copied in one go each: the other thread adds to them.
+        return replace(stats, batch_sizes=dict(stats.batch_sizes), waits=Counter(stats.waits))
 
     def _serve(self) -> None:
         batch: list[Asked] = []
         try:
             while not self._over:
+                self._turn = time.monotonic()
                 self._clock.enter(WAIT_IN)
                 self._server.poll(self._patience())
                 if self._together:
@@ -227,7 +236,7 @@ class InferenceWorker:
                     self._serve_batch(batch)
                     batch = []
         except BaseException as error:
-            self._failure = error
+            self._failure, self._turn = error, None
             if self._reader is not None:
                 self._reader.close()
             self._server.poll(0.0)

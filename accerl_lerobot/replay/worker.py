@@ -141,7 +141,10 @@ class ReplayWorker:
                         self._episodes.append(segment.episode)
             self._clock.enter(WAIT_IN)
             self._changed.notify_all()
+            kept = time.monotonic()
             await self._changed.wait_for(lambda: self._closed or self._turns.may_collect(self._ready))
+            if source == REAL:
+                self._insert_wait_s += time.monotonic() - kept
         return True
 
     async def sample(self, num_decisions: int, trainer_version: int) -> list[Segment]:

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.timeline.parts import part_paths, read_entries, read_head
 from accerl_lerobot.timeline.read import divided
 from accerl_lerobot.timeline.states import bubble, role_of
@@ -56,7 +57,8 @@ class Watch:
         spent: dict[str, np.ndarray] = {}
         for section, paths in part_paths(self._folder).items():
             before = self._places.get(section)
-            with contextlib.suppress(FileNotFoundError):  # its worker has begun another part meanwhile
+            # Its worker has begun another part meanwhile; or it is damaged, which must not end a run.
+            with contextlib.suppress(FileNotFoundError, InputError):
                 if (place := _read_on(paths[-1], before)) is not None:
                     self._places[section] = place
                     new = place.totals if before is None else place.totals - before.totals

@@ -24,6 +24,7 @@ after ``trainer.rank_timeout_s``, and is named in the error.
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
@@ -45,6 +46,8 @@ if TYPE_CHECKING:
 
 LOAD_S = 600.0
 """How long a rank may take to load its policy."""
+PATIENCE = 0.9
+"""Share of ``trainer.rank_timeout_s`` after which the first rank has waited for another."""
 BLAME_S = 10.0
 """How long to wait for the failure that the first rank's own is the consequence of."""
 
@@ -187,10 +190,13 @@ class Peers:
             RankError: one of them failed, with its traceback, or was not there in time.
         """
         calls = [getattr(actor, method).remote(*arguments) for actor in self._actors]
+        began = time.monotonic()
         try:
             yield
         except Exception as error:
-            if calls and (lost := self._failure(method, calls)) is not None:
+            # Who waits for the first rank is silent too: it is another's silence only if it was waited for.
+            waited = time.monotonic() - began > PATIENCE * self._config.rank_timeout_s
+            if calls and (lost := self._failure(method, calls, silence=waited, own=error)) is not None:
                 raise lost from error
             raise
         self._collect(method, calls, self._config.rank_timeout_s)
@@ -208,15 +214,27 @@ class Peers:
         except RayError as error:
             raise self._failure(method, calls) or error from error
 
-    def _failure(self, method: str, calls: list[Any]) -> RankError | None:
-        """What is wrong with the others, if anything: first the dead, then the silent, then the rest."""
+    def _failure(
+        self, method: str, calls: list[Any], silence: bool = True, own: Exception | None = None
+    ) -> RankError | None:
+        """What is wrong with the others, if anything: first the dead, then the silent, then the rest.
+
+        Args:
+            method: what they were to do.
+            calls: for it.
+            silence: whether silence is a fault.
+            own: what the first rank has raised; what all ranks raise alike is not theirs.
+        """
         done, silent = ray.wait(calls, num_returns=len(calls), timeout=BLAME_S)
         failures = {call: error for call in done if (error := _error(call)) is not None}
         # A process that is gone made the others fail; what they say of it is only that it is gone.
         gone = [call for call, error in failures.items() if isinstance(error, RayActorError)]
-        if not gone and silent:
+        if not gone and silent and silence:
             return RankError(f"trainer {self._names(silent, calls)} did not do {method}: no answer")
-        for call in gone or failures:
+        alike = [
+            c for c, e in failures.items() if own is not None and type(getattr(e, "cause", None)) is type(own)
+        ]
+        for call in gone or [c for c in failures if c not in alike]:
             return RankError(f"trainer {self._names([call], calls)} failed in {method}:\n{failures[call]}")
         return None
 

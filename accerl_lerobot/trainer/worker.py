@@ -76,6 +76,8 @@ class TrainerWorker:
         self._lock = threading.Lock()
         self._kept: Any = None
         self._in_turn = False
+        self._handed_over = -1
+        """Version of the weights that were published last."""
         self._history: deque[dict[str, float]] = deque()  # filled on one thread, emptied on another
         self._clock.enter(WAIT_IN)
 
@@ -95,7 +97,8 @@ class TrainerWorker:
         publisher = make_publisher(readers, transport, changes=self._config.publish_changes)
         try:
             # A checkpoint need not hold a critic: all start from this one.
-            publisher.publish(self._update.version, self._view())
+            with self._lock:
+                self._hand_over(publisher, self._update.version, self._view())
             self._train(replay, publisher)
             self._clock.enter(WEIGHT_SYNC)
             publisher.flush()
@@ -131,6 +134,8 @@ class TrainerWorker:
                 version = self._update.version
                 if config.publishes(version):
                     self._publish(publisher, held, last=version == config.updates)
+                if self._in_turn:
+                    publisher.flush()
                 metrics |= {
                     "update": float(self._update.version),
                     "wait_s": waited,
@@ -139,22 +144,23 @@ class TrainerWorker:
                 }
                 self._history.append(metrics)
             asked = time.monotonic()
-            if self._in_turn:
-                self._clock.enter(WEIGHT_SYNC)
-                publisher.flush()
             replay.learnt.remote()
-        version = self._update.version
-        if version < config.updates and (config.hold_back or not config.publishes(version)):
-            # It has ended early, and what is evaluated is to be what is saved.
-            self._publish(publisher, held, last=True)
+        with self._lock:
+            if self._handed_over < self._update.version:
+                # It has ended early, and what is evaluated is to be what is saved.
+                self._publish(publisher, held, last=True)
 
     def _publish(self, publisher: Publisher, held: HeldBack, last: bool) -> None:
         """Hands the weights of now over, or those that are old enough."""
         if not held.updates:
-            publisher.publish(self._update.version, self._view())
+            self._hand_over(publisher, self._update.version, self._view())
             return
         for due in held.push(self._update.version, self._export(), last=last):
-            publisher.publish(*due)
+            self._hand_over(publisher, *due)
+
+    def _hand_over(self, publisher: Publisher, version: int, tensors: dict[str, Any]) -> None:
+        publisher.publish(version, tensors)
+        self._handed_over = version
 
     def metrics(self) -> list[dict[str, float]]:
         """One record per update since the last call."""

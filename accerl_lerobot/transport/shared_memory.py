@@ -114,11 +114,13 @@ class SharedMemoryCaller(Caller):
         encoded = encode(message)
         if not self._free and len(self._slots) == SLOTS:
             raise TimeoutError(f"{self.name}: none of {SLOTS} messages under way has been answered")
-        index = self._free.pop() if self._free else len(self._slots)
+        index = self._free[-1] if self._free else len(self._slots)
         file = None
         if index == len(self._slots) or self._slots[index].size < encoded.size:
             file = new_file(encoded.size + LEAST)
             self._slots[index : index + 1] = [Slot(file)]
+        if self._free:
+            self._free.pop()
         encoded.write(self._slots[index].memory, 0)
         self._sent += 1
         self._under_way[self._sent] = index
@@ -130,8 +132,9 @@ class SharedMemoryCaller(Caller):
 
     def done(self, timeout: float) -> list[tuple[int, object]]:
         replies: list[tuple[int, object]] = []
+        end = time.monotonic() + timeout
         try:
-            while self._readable.poll(0 if replies else 1000 * timeout):
+            while self._readable.poll(0 if replies else max(0.0, 1000 * (end - time.monotonic()))):
                 received = receive(self._socket)
                 if received is None:
                     raise self._gone("its end of the connection is closed")

@@ -30,7 +30,7 @@ from accerl_lerobot.bench.host import Processors, floors, host, spread
 from accerl_lerobot.bench.machinery import MachineryConfig
 from accerl_lerobot.bench.scaling import BenchScalingConfig, bench_scaling
 from accerl_lerobot.bench.scaling import compare as compare_counts
-from accerl_lerobot.bench.throughput import BenchThroughputConfig, books
+from accerl_lerobot.bench.throughput import BenchThroughputConfig, bench_throughput, books
 from accerl_lerobot.config import RunConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
@@ -137,6 +137,12 @@ def test_a_small_run_of_scaling(light_ray: None, tmp_path: Path):
     ).read_text()
 
 
+def test_a_recipe_that_a_schedule_cannot_have_is_refused(tmp_path: Path):
+    config = BenchThroughputConfig(recipe="recipes/dreams.yaml", policy_path=str(tmp_path))
+    with pytest.raises(InputError, match=r"launch\.schedule=overlap"):
+        bench_throughput(config)
+
+
 def test_the_machine_is_described():
     assert host()["cores"] >= 1 and "ray" in host()["versions"]
     assert set(floors()) == {"memcpy_gb_per_s", "sleep_overshoot_us", "pipe_us"}
@@ -154,6 +160,9 @@ def test_the_machine_is_described():
         (lambda: MachineryConfig(segment_length=5), "segment_length"),
         (lambda: BenchAsyncVsSyncConfig(cvs=()), "cvs"),
         (lambda: BenchAsyncVsSyncConfig(rounds=0), "rounds"),
+        (lambda: BenchAsyncVsSyncConfig(cvs=(11.0,)), "latency_cv"),
+        (lambda: BenchAsyncVsSyncConfig(seeds=(100,)), "seed"),
+        (lambda: BenchAsyncVsSyncConfig(learning_updates=-1), "learning_updates"),
         (lambda: BenchScalingConfig(counts=(0,)), "counts"),
         (lambda: BenchScalingConfig(counts=(2, 2)), "counts"),
         (lambda: BenchThroughputConfig(), "policy_path"),

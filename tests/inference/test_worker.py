@@ -25,6 +25,7 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.experience import TASK, Decision, Request
+from accerl_lerobot.inference import worker as inference
 from accerl_lerobot.inference.worker import InferenceConfig, InferenceWorker
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
@@ -384,3 +385,22 @@ def test_a_service_that_fails_is_heard_of_by_the_trainer(play):
 
     play(scene, max_batch=1)
     publisher.close()
+
+
+def test_a_service_that_hangs_is_silent(play, monkeypatch: pytest.MonkeyPatch):
+    """Its event loop is fine, and must not answer for the thread that is not."""
+    monkeypatch.setattr(inference, "LOOK_S", 0.05)
+
+    async def scene(worker, adapter):
+        await worker.metrics()
+        adapter.gate = threading.Event()
+        asked = asyncio.create_task(worker.decide(requests(1)))
+        await asyncio.to_thread(adapter.entered.wait, 10)
+        await asyncio.sleep(0.2)
+        answer = asyncio.create_task(worker.metrics())
+        await asyncio.sleep(0.3)
+        assert not answer.done()
+        adapter.gate.set()
+        assert (await answer)["batches"] == 1 and await asked
+
+    play(scene, max_batch=1)

@@ -106,13 +106,22 @@ def test_one_that_is_gone_is_named_and_not_those_that_fail_for_it(
 ):
     """A collective that breaks breaks for all: what rank 1 and the first one say of it is of no use."""
     with pytest.raises(RankError, match=says) as lost, peers("fails", how).joining("step", ""):
+        if how == "hangs":
+            time.sleep(THREE.rank_timeout_s)  # as a collective does
         raise RuntimeError("connection closed by peer")
     assert "connection closed by peer" in str(lost.value.__cause__)
 
 
-def test_what_the_first_does_wrong_is_its_own(peers: Callable[[str, str], Peers]):
-    with pytest.raises(KeyError, match="mine"), peers("fine", "fine").joining("step", ""):
+@pytest.mark.parametrize("others", ["fine", "hangs"])
+def test_what_the_first_does_wrong_is_its_own(peers: Callable[[str, str], Peers], others: str):
+    """Also while the others wait for it in a collective."""
+    with pytest.raises(KeyError, match="mine"), peers(others, others).joining("step", ""):
         raise KeyError("mine")
+
+
+def test_what_all_do_wrong_is_told_as_the_first_one_s(peers: Callable[[str, str], Peers]):
+    with pytest.raises(ArithmeticError, match="not finite"), peers("fails", "fails").joining("step", ""):
+        raise ArithmeticError("not finite")
 
 
 def test_a_lone_rank_waits_for_nobody():

@@ -284,6 +284,18 @@ def test_no_two_ranks_share_a_gpu(ranks: int, gpus: int, others: int, shares: tu
     assert ranks == 1 or not gpus or found[0] > 0.5
 
 
+@pytest.mark.parametrize("gpus", [2, 3, 4, 8])
+def test_whoever_needs_a_part_of_a_gpu_finds_one(gpus: int):
+    """Ranks are placed first, each on the fullest GPU that has room, as Ray does."""
+    for ranks in range(2, gpus + 1):
+        for others in range(1, 9):
+            shares = TrainerConfig(ranks=ranks, sharding="zero2").gpu_shares(gpus, others)
+            free = [1.0] * gpus
+            for share in [shares[0]] * ranks + [shares[1]] * others:
+                room = min((g for g in range(gpus) if free[g] >= share - 1e-9), key=lambda g: free[g])
+                free[room] -= share
+
+
 def test_more_ranks_than_gpus_are_refused_with_the_arithmetic():
     config = TrainerConfig(ranks=4, sharding="zero2")
     with pytest.raises(

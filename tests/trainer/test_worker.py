@@ -185,3 +185,21 @@ def test_what_is_saved_is_a_whole_version(monkeypatch: pytest.MonkeyPatch, tmp_p
         assert snapshot.load(state / "trainer")["version"] == version
         weights = snapshot.load(state / "weights")
         assert all(np.array_equal(weights[k], files[i][k]) for k in files[i])
+
+
+@pytest.mark.parametrize("settings", [{"hold_back": 2}, {"publish_every": 4}, {}])
+def test_a_trainer_without_batches_ends_with_the_weights_it_began_with(settings: dict[str, int]):
+    """As when a run whose episodes are used up is gone on with."""
+    stage = Stage(batches=0, **settings)
+    assert stage.run() == 0
+    assert [version for version, _ in stage.received] == [0]
+
+
+def test_in_turn_the_wait_for_a_batch_does_not_hold_that_for_the_readers(monkeypatch: pytest.MonkeyPatch):
+    flushed: list[int] = []
+    stage = Stage(updates=3)
+    monkeypatch.setattr(Prompt, "flush", lambda self: flushed.append(len(stage.worker._history)))
+    stage.worker.follow("synchronous")
+    stage.run()
+    # Twice for each version, of which one in turn: before its record is complete.
+    assert flushed == [0, 0, 0, 1, 1, 2, 2, 3]
