@@ -16,6 +16,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 TOKEN = re.compile(r"\bhf_\w{6,}")
 """A token of the Hub, which somebody may have typed where it does not belong; it is not repeated."""
@@ -46,3 +47,13 @@ class InputError(ValueError):
         if len(value) > LONGEST:
             value = f"{value[: LONGEST - 1]}…"
         return TOKEN.sub("<token>", " ".join(f"{self.field}={value}: {self.remedy}".split()))
+
+
+def check_absent(path: Path) -> None:
+    """Refuses a folder for results that exists.
+
+    Raises:
+        InputError: it does.
+    """
+    if path.exists():
+        raise InputError("output_dir", str(path), "the folder exists; choose another or remove it")

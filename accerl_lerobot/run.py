@@ -53,7 +53,7 @@ from accerl_lerobot.config import RunConfig, encode, timeline_folder
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import Engine, WorkerError
 from accerl_lerobot.envs import make_world
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.loop import Loop, Times, heed_stop
 from accerl_lerobot.metrics import METRICS, MetricsLog
 from accerl_lerobot.replay.journal import EPISODES
@@ -91,8 +91,7 @@ def make_output_dir(config: Placed) -> Path:
         path = Path("outputs") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}_{config.job_name}"
     else:
         path = Path(config.output_dir).expanduser()
-    if path.exists():
-        raise InputError("output_dir", str(path), "the folder exists; choose another or remove it")
+    check_absent(path)
     path.mkdir(parents=True)
     return path
 

@@ -49,7 +49,7 @@ from accerl_lerobot.checkpoint import CONFIG
 from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.export import ExportConfig
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.hub.config import PullConfig, PushConfig
 from accerl_lerobot.parsing import read_arguments
 from accerl_lerobot.report.config import ReportConfig
@@ -147,8 +147,8 @@ def evaluate(arguments: list[str]) -> int:
     """``accerl eval``."""
     config: EvalRun = parse(EvalRun, arguments, recipe_class=RunConfig)
     out = Path(config.output_dir).expanduser() if config.output_dir else None
-    if out is not None and out.exists():
-        raise InputError("output_dir", str(out), "the folder exists; choose another or remove it")
+    if out is not None:
+        check_absent(out)
     from accerl_lerobot import run
     from accerl_lerobot.evaluation.config import evaluation_plans
     from accerl_lerobot.evaluation.summary import summarise, table

@@ -25,7 +25,6 @@ hence runs of equally many updates under each schedule, on a problem that the po
 
 from __future__ import annotations
 
-import json
 import statistics
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -34,12 +33,13 @@ from typing import Any
 from rich.console import Group
 
 from accerl_lerobot.bench.blocks import MOST_BUSY, Block, as_rows
-from accerl_lerobot.bench.host import floors, host, spread
+from accerl_lerobot.bench.host import floors, host, ranged, spread
 from accerl_lerobot.bench.machinery import MachineryConfig
-from accerl_lerobot.bench.study import as_markdown, as_table
+from accerl_lerobot.bench.study import as_markdown, as_table, write
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import evaluation_plans
+from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
 
@@ -99,12 +99,10 @@ def bench_async_vs_sync(config: BenchAsyncVsSyncConfig) -> dict[str, Any]:
             result["laws"].append(law)
             stage.update(len(result["laws"]), f"CV {cv:g}: S {law['speed_up']['median']:.2f}")
     result |= {"learning": {}, "host_after": host()}
-    (root / "async_vs_sync.json").write_text(json.dumps(result, indent=2) + "\n")
+    write(root, "async_vs_sync", result, markdown(result))
     if config.learning_updates:
         result["learning"] = _learning(config, console)
-    (root / "async_vs_sync.json").write_text(json.dumps(result, indent=2) + "\n")
-    (root / "async_vs_sync.md").write_text(markdown(result))
-    _draw(root / "async_vs_sync.png", result)
+    write(root, "async_vs_sync", result, markdown(result), _draw)
     console.say(f"wrote async_vs_sync.json, .md and .png into {root}")
     return result
 
@@ -207,11 +205,11 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
         rows.append(
             [
                 f"{law['latency_cv']:g}",
-                *(_ranged(law["rates"][arm], ".0f") for arm in ARMS),
-                _ranged(law["speed_up"], ".2f"),
-                _ranged(law["speed_up_over_overlap"], ".2f"),
+                *(ranged(law["rates"][arm], ".0f") for arm in ARMS),
+                ranged(law["speed_up"], ".2f"),
+                ranged(law["speed_up_over_overlap"], ".2f"),
                 f"{law['largest_speed_up']:.2f}",
-                _ranged(law["share_of_largest"], ".2f"),
+                ranged(law["share_of_largest"], ".2f"),
                 " / ".join(f"{law['trainer_waits'][arm]:.0%}" for arm in ARMS),
                 "processors busy" if law["processor_bound"] else "",
             ]
@@ -232,40 +230,27 @@ def _learnt(result: dict[str, Any]) -> str:
     return f"Success after {result['learning']['updates']} updates of equally many decisions"
 
 
-def _ranged(value: dict[str, Any], form: str) -> str:
-    return f"{value['median']:{form}} ({value['min']:{form}} to {value['max']:{form}})"
-
-
 def _draw(path: Path, result: dict[str, Any]) -> None:
     """Speed-up by law, beside the largest one possible."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
     laws = result["laws"]
     x = range(len(laws))
-    figure, axes = plt.subplots(figsize=(7, 4), dpi=120)
-    axes.plot(x, [law["largest_speed_up"] for law in laws], "k_", ms=30, label="S*, the most possible")
-    for name, key, place in (
-        ("over synchronous", "speed_up", -0.1),
-        ("over overlap", "speed_up_over_overlap", 0.1),
-    ):
-        middle = [law[key]["median"] for law in laws]
-        error = [
-            [m - law[key]["min"] for m, law in zip(middle, laws, strict=True)],
-            [law[key]["max"] - m for m, law in zip(middle, laws, strict=True)],
-        ]
-        axes.errorbar([i + place for i in x], middle, yerr=error, fmt="o", capsize=3, label=name)
-    axes.set_xticks(list(x), [f"{law['latency_cv']:g}" for law in laws])
-    axes.set(
-        xlabel="latency of the worlds: standard deviation over mean",
-        ylabel="speed-up of the asynchronous schedule",
-        title=f"{result['config']['worlds']} worlds, decisions learned from per second",
-    )
-    axes.set_ylim(bottom=0)
-    axes.grid(alpha=0.3)
-    axes.legend()
-    figure.tight_layout()
-    figure.savefig(path)
-    plt.close(figure)
+    with drawing(path) as axes:
+        axes.plot(x, [law["largest_speed_up"] for law in laws], "k_", ms=30, label="S*, the most possible")
+        for name, key, place in (
+            ("over synchronous", "speed_up", -0.1),
+            ("over overlap", "speed_up_over_overlap", 0.1),
+        ):
+            middle = [law[key]["median"] for law in laws]
+            error = [
+                [m - law[key]["min"] for m, law in zip(middle, laws, strict=True)],
+                [law[key]["max"] - m for m, law in zip(middle, laws, strict=True)],
+            ]
+            axes.errorbar([i + place for i in x], middle, yerr=error, fmt="o", capsize=3, label=name)
+        axes.set_xticks(list(x), [f"{law['latency_cv']:g}" for law in laws])
+        axes.set(
+            xlabel="latency of the worlds: standard deviation over mean",
+            ylabel="speed-up of the asynchronous schedule",
+            title=f"{result['config']['worlds']} worlds, decisions learned from per second",
+        )
+        axes.set_ylim(bottom=0)
+        axes.legend()

@@ -20,7 +20,6 @@ back in one run.
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -29,9 +28,9 @@ from typing import Any
 from rich.table import Table
 
 from accerl_lerobot.bench.blocks import MOST_BUSY
-from accerl_lerobot.bench.host import floors, host, spread
+from accerl_lerobot.bench.host import floors, host, ranged, spread
 from accerl_lerobot.bench.machinery import MachineryConfig
-from accerl_lerobot.bench.study import as_markdown, as_table
+from accerl_lerobot.bench.study import as_markdown, as_table, write
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.batcher import quantile
@@ -85,8 +84,7 @@ def bench_batching(config: BenchBatchingConfig) -> dict[str, Any]:
             stage.update(done, f"{name}: {found[name][-1]['decisions_per_s'][-1]:.0f} decisions/s")
     result["rules"] = {name: summed(turns) for name, turns in found.items()}
     result["host_after"] = host()
-    (root / "batching.json").write_text(json.dumps(result, indent=2) + "\n")
-    (root / "batching.md").write_text(as_markdown(_COLUMNS, _rows(result)))
+    write(root, "batching", result, as_markdown(_COLUMNS, _rows(result)))
     console.say(f"wrote batching.json and .md into {root}")
     return result
 
@@ -137,7 +135,7 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
     return [
         [
             name,
-            f"{rate['median']:.0f} ({rate['min']:.0f} to {rate['max']:.0f})",
+            ranged(found["decisions_per_s"], ".0f"),
             f"{found['batch_size']:.1f}",
             f"{found['wait_p50_ms']:.1f} ms",
             f"{found['wait_p99_ms']:.1f} ms",
@@ -145,5 +143,4 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
             "processors busy" if found["processor_bound"] else "",
         ]
         for name, found in result["rules"].items()
-        for rate in [found["decisions_per_s"]]
     ]

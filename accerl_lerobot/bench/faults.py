@@ -41,7 +41,7 @@ from accerl_lerobot.bench.victims import CLASSES, Victim, alive, await_hit, hit
 from accerl_lerobot.checkpoint import CHECKPOINTS, LAST, PRETRAINED, newest_whole
 from accerl_lerobot.config import RunConfig, parse
 from accerl_lerobot.console import Console
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, check_absent
 
 SIGNALS = {"kill": signal.SIGKILL, "stop": signal.SIGSTOP}
 """Fault → what is sent."""
@@ -106,8 +106,7 @@ def bench_faults(config: BenchFaultsConfig) -> dict[str, Any]:
     for target in ("dream", "world learning"):
         if target in config.targets and not recipe.imagination.share:
             raise InputError("targets", target, "nothing is imagined in this recipe")
-    if root.exists():
-        raise InputError("output_dir", str(root), "the folder exists; choose another or remove it")
+    check_absent(root)
     root.mkdir(parents=True)
     start = _policy(config, recipe, root, console)
     cells = []

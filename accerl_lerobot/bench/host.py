@@ -79,6 +79,11 @@ def spread(values: list[float]) -> dict[str, Any]:
     return {"median": statistics.median(values), "min": min(values), "max": max(values), "blocks": values}
 
 
+def ranged(values: dict[str, Any], form: str) -> str:
+    """What `spread` gives, for people: median and range in this form."""
+    return f"{values['median']:{form}} ({values['min']:{form}} to {values['max']:{form}})"
+
+
 def _seconds(work: Any) -> float:
     started = time.perf_counter()
     work()

@@ -31,6 +31,7 @@ from rich.table import Table
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate
 
 LEAST = 3
@@ -155,19 +156,12 @@ def table(result: dict[str, Any]) -> Table:
 
 def draw(path: Path, result: dict[str, Any]) -> None:
     """Real over dreamt success, a dot with 95 % Wilson intervals per policy."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(4.5, 4.5), dpi=120)
-    axes.plot([0, 1], [0, 1], color="0.7", lw=1, ls="--")
-    for row in result["policies"]:
-        real, dreamt = (Rate(successes=row[kind], n=row["n"]) for kind in ("real", "dreamt"))
-        ends = [[[r.value - r.interval().low], [r.interval().high - r.value]] for r in (dreamt, real)]
-        axes.errorbar(dreamt.value, real.value, xerr=ends[0], yerr=ends[1], fmt="o", color="C0", alpha=0.7)
-    axes.set(xlabel="success in dreams", ylabel="success", xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
-    axes.grid(alpha=0.3)
-    figure.tight_layout()
-    figure.savefig(path)
-    plt.close(figure)
+    with drawing(path, (4.5, 4.5)) as axes:
+        axes.plot([0, 1], [0, 1], color="0.7", lw=1, ls="--")
+        for row in result["policies"]:
+            real, dreamt = (Rate(successes=row[kind], n=row["n"]) for kind in ("real", "dreamt"))
+            ends = [[[r.value - r.interval().low], [r.interval().high - r.value]] for r in (dreamt, real)]
+            axes.errorbar(
+                dreamt.value, real.value, xerr=ends[0], yerr=ends[1], fmt="o", color="C0", alpha=0.7
+            )
+        axes.set(xlabel="success in dreams", ylabel="success", xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))

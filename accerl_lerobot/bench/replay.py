@@ -31,7 +31,7 @@ import numpy as np
 from rich.table import Table
 
 from accerl_lerobot import snapshot
-from accerl_lerobot.bench.host import floors, host, spread
+from accerl_lerobot.bench.host import floors, host, ranged, spread
 from accerl_lerobot.bench.study import as_table
 from accerl_lerobot.checkpoint import save_checkpoint
 from accerl_lerobot.errors import InputError
@@ -106,10 +106,7 @@ def bench_replay(config: BenchReplayConfig) -> dict[str, Any]:
 
 def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
-    rows = [
-        [name, f"{us['median']:.1f} ({us['min']:.1f} to {us['max']:.1f})"]
-        for name, us in result["us"].items()
-    ]
+    rows = [[name, ranged(us, ".1f")] for name, us in result["us"].items()]
     title = f"a decision of {result['bytes'] / 1000:.0f} kB; a checkpoint of {result['checkpoint_mb']:.0f} MB"
     return as_table(title, ("", "µs a decision"), rows)
 

@@ -22,7 +22,6 @@ were busy for more than `MOST_BUSY` of the time, they may be what was measured, 
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,11 +29,12 @@ from typing import Any
 from rich.table import Table
 
 from accerl_lerobot.bench.blocks import MOST_BUSY, Block, as_rows
-from accerl_lerobot.bench.host import floors, host, spread
+from accerl_lerobot.bench.host import floors, host, ranged, spread
 from accerl_lerobot.bench.machinery import MachineryConfig
-from accerl_lerobot.bench.study import as_markdown, as_table
+from accerl_lerobot.bench.study import as_markdown, as_table, write
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.replay.turns import ASYNCHRONOUS
 
 
@@ -85,9 +85,7 @@ def bench_scaling(config: BenchScalingConfig) -> dict[str, Any]:
                 blocks[n] += [engine.block(ASYNCHRONOUS, config.seconds) for _ in range(repeats)]
             stage.update(done, f"{n} worlds: {blocks[n][-1].decisions_per_s:.0f} decisions/s")
     result |= {"counts": compare(config, blocks), "host_after": host()}
-    (root / "scaling.json").write_text(json.dumps(result, indent=2) + "\n")
-    (root / "scaling.md").write_text(as_markdown(_COLUMNS, _rows(result)))
-    _draw(root / "scaling.png", result)
+    write(root, "scaling", result, as_markdown(_COLUMNS, _rows(result)), _draw)
     console.say(f"wrote scaling.json, .md and .png into {root}")
     return result
 
@@ -125,7 +123,7 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
     return [
         [
             str(row["worlds"]),
-            f"{rate['median']:.1f} ({rate['min']:.1f} to {rate['max']:.1f})",
+            ranged(row["decisions_per_s"], ".1f"),
             f"{row['efficiency']['median']:.2f}",
             f"{row['share_of_bound']:.2f}",
             f"{row['batch_size']:.1f}",
@@ -133,34 +131,26 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
             "processors busy" if row["processor_bound"] else "",
         ]
         for row in result["counts"]
-        for rate in [row["decisions_per_s"]]
     ]
 
 
 def _draw(path: Path, result: dict[str, Any]) -> None:
     """Decisions per second over worlds, beside the bound."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
     rows = sorted(result["counts"], key=lambda row: row["worlds"])
     x = [row["worlds"] for row in rows]
-    figure, axes = plt.subplots(figsize=(7, 4), dpi=120)
-    axes.plot(x, [row["bound"] for row in rows], "k--", lw=1, label="bound")
-    axes.plot(x, [row["decisions_per_s"]["median"] for row in rows], "o-", label="measured")
-    for row in rows:
-        place = (row["worlds"], row["decisions_per_s"]["median"])
-        text = f"{row['efficiency']['median']:.2f}"
-        axes.annotate(text, place, textcoords="offset points", xytext=(6, -10), fontsize=8)
-    axes.set_xscale("log", base=2)
-    axes.set_yscale("log", base=2)
-    axes.set_xticks(x, [str(n) for n in x])
-    axes.set(
-        xlabel="worlds, a process each", ylabel="decisions per second", title="with E(N) beside each point"
-    )
-    axes.grid(alpha=0.3)
-    axes.legend()
-    figure.tight_layout()
-    figure.savefig(path)
-    plt.close(figure)
+    with drawing(path) as axes:
+        axes.plot(x, [row["bound"] for row in rows], "k--", lw=1, label="bound")
+        axes.plot(x, [row["decisions_per_s"]["median"] for row in rows], "o-", label="measured")
+        for row in rows:
+            place = (row["worlds"], row["decisions_per_s"]["median"])
+            text = f"{row['efficiency']['median']:.2f}"
+            axes.annotate(text, place, textcoords="offset points", xytext=(6, -10), fontsize=8)
+        axes.set_xscale("log", base=2)
+        axes.set_yscale("log", base=2)
+        axes.set_xticks(x, [str(n) for n in x])
+        axes.set(
+            xlabel="worlds, a process each",
+            ylabel="decisions per second",
+            title="with E(N) beside each point",
+        )
+        axes.legend()

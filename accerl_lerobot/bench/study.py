@@ -37,6 +37,7 @@ from accerl_lerobot.checkpoint import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUM
 from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate
 from accerl_lerobot.resume import locked
 
@@ -170,31 +171,22 @@ def draw_lines(
             middle one.
         dress: gives the axes their ticks, x label and legend.
     """
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(7, 4), dpi=120)
-    for i, name in enumerate(names):
-        groups = [g for g in result["groups"] if g[key] == name]
-        rates = [Rate(successes=g["successes"], n=g["n"]) for g in groups]
-        x = places(i - (len(names) - 1) / 2)
-        y = [r.value for r in rates]
-        low = [max(0.0, r.value - r.interval().low) for r in rates]
-        high = [max(0.0, r.interval().high - r.value) for r in rates]
-        axes.errorbar(x, y, yerr=[low, high], marker="o", capsize=3, color=f"C{i}", label=name)
-        for place, group in zip(x, groups, strict=True):
-            seeds = group["by_seed"]
-            axes.scatter([place] * len(seeds), seeds, s=12, color=f"C{i}", alpha=0.4, linewidths=0)
-    start = sum(result["starts"].values()) / len(result["starts"])
-    axes.axhline(start, color="0.6", ls="--", lw=1, label="before")
-    axes.set(ylabel="success", ylim=(-0.02, 1.02))
-    axes.grid(alpha=0.3)
-    dress(axes)
-    figure.tight_layout()
-    figure.savefig(path)
-    plt.close(figure)
+    with drawing(path) as axes:
+        for i, name in enumerate(names):
+            groups = [g for g in result["groups"] if g[key] == name]
+            rates = [Rate(successes=g["successes"], n=g["n"]) for g in groups]
+            x = places(i - (len(names) - 1) / 2)
+            y = [r.value for r in rates]
+            low = [max(0.0, r.value - r.interval().low) for r in rates]
+            high = [max(0.0, r.interval().high - r.value) for r in rates]
+            axes.errorbar(x, y, yerr=[low, high], marker="o", capsize=3, color=f"C{i}", label=name)
+            for place, group in zip(x, groups, strict=True):
+                seeds = group["by_seed"]
+                axes.scatter([place] * len(seeds), seeds, s=12, color=f"C{i}", alpha=0.4, linewidths=0)
+        start = sum(result["starts"].values()) / len(result["starts"])
+        axes.axhline(start, color="0.6", ls="--", lw=1, label="before")
+        axes.set(ylabel="success", ylim=(-0.02, 1.02))
+        dress(axes)
 
 
 def write(
@@ -202,12 +194,13 @@ def write(
     name: str,
     result: dict[str, Any],
     markdown: str,
-    draw: Callable[[Path, dict[str, Any]], object],
+    draw: Callable[[Path, dict[str, Any]], object] | None = None,
 ) -> None:
-    """Into the study's folder: the numbers, the table and the picture, under one name."""
+    """Into a folder that is there: the numbers, the table and the picture, if any, under one name."""
     (root / f"{name}.json").write_text(json.dumps(result, indent=2) + "\n")
     (root / f"{name}.md").write_text(markdown)
-    draw(root / f"{name}.png", result)
+    if draw is not None:
+        draw(root / f"{name}.png", result)
 
 
 class Study:

@@ -27,7 +27,7 @@ from rich.table import Table
 
 from accerl_lerobot.bench.async_vs_sync import ARMS
 from accerl_lerobot.bench.blocks import Block, Measured, as_rows
-from accerl_lerobot.bench.host import host, spread
+from accerl_lerobot.bench.host import host, ranged, spread
 from accerl_lerobot.bench.study import as_table
 from accerl_lerobot.config import RunConfig, parse
 from accerl_lerobot.console import Console
@@ -133,7 +133,7 @@ def table(result: dict[str, Any]) -> Table:
     for name, found in result["schedules"].items():
         cells = [name]
         for key in ("env_steps_per_s", "decisions_per_s"):
-            cells.append(f"{found[key]['median']:.0f} ({found[key]['min']:.0f} to {found[key]['max']:.0f})")
+            cells.append(ranged(found[key], ".0f"))
         shares = (f"{found[key]:.0%}" for key in ("trainer_waits", "inference_busy", "processors"))
         rows.append([*cells, f"{found['updates_per_s']:.2f}", f"{found['lag_mean']:.1f}", *shares])
     title = (

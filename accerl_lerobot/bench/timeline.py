@@ -23,9 +23,6 @@ that recording takes.
 
 from __future__ import annotations
 
-import os
-import platform
-import statistics
 import tempfile
 import time
 from dataclasses import asdict, dataclass
@@ -35,7 +32,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot import __version__
+from accerl_lerobot.bench.host import host, spread
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.timeline.clock import Clock, NoClock
 from accerl_lerobot.timeline.parts import Parts
@@ -73,10 +70,11 @@ def bench_timeline(config: BenchTimelineConfig) -> dict[str, Any]:
     Returns:
         ``arms[name]``: nanoseconds per entry, median, min, max and blocks. ``times_floor``: of ``on``, median
         of the pairs and their range. ``workers``, with a run: by name, ``entries_per_s`` and ``share``, what
-        recording takes of the worker's time. ``config`` and ``host``.
+        recording takes of the worker's time. ``config``; ``host`` and
+        ``host_after``.
     """
     workers = {} if config.run is None else entries_per_s(Path(config.run).expanduser())
-    host = {**_host(), "load_before": os.getloadavg()}
+    before = host()
     blocks: dict[str, list[float]] = {ON: [], OFF: [], FLOOR: []}
     with tempfile.TemporaryDirectory(dir=config.folder) as folder:
         clock, none = Clock(Parts(Path(folder), "bench")), NoClock()
@@ -88,14 +86,15 @@ def bench_timeline(config: BenchTimelineConfig) -> dict[str, Any]:
             blocks[name].append(1e9 * seconds / config.entries)
         clock.close()
     blocks = {name: values[1:] for name, values in blocks.items()}  # the first round warmed everything
-    arms = {name: _spread(values) for name, values in blocks.items()}
+    arms = {name: spread(values) for name, values in blocks.items()}
     cost = arms[ON]["median"] / 1e9
     return {
         "config": asdict(config),
         "arms": arms,
-        "times_floor": _spread([on / floor for on, floor in zip(blocks[ON], blocks[FLOOR], strict=True)]),
+        "times_floor": spread([on / floor for on, floor in zip(blocks[ON], blocks[FLOOR], strict=True)]),
         "workers": {name: {"entries_per_s": rate, "share": rate * cost} for name, rate in workers.items()},
-        "host": {**host, "load_after": os.getloadavg()},
+        "host": before,
+        "host_after": host(),
     }
 
 
@@ -148,16 +147,3 @@ def _ask(entries: int) -> float:
         now()
         now()
     return time.perf_counter() - started
-
-
-def _host() -> dict[str, Any]:
-    return {
-        "accerl": __version__,
-        "python": platform.python_version(),
-        "cores": os.cpu_count(),
-        "machine": platform.machine(),
-    }
-
-
-def _spread(values: list[float]) -> dict[str, Any]:
-    return {"median": statistics.median(values), "min": min(values), "max": max(values), "blocks": values}

@@ -40,7 +40,8 @@ from rich.table import Table
 
 from accerl_lerobot.bench.host import host, spread
 from accerl_lerobot.console import Console
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, check_absent
+from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.experience import Decision, Request
 
 RAY, RAY_PUT, SHARED_MEMORY = "ray", "ray_put", "shared_memory"
@@ -124,8 +125,8 @@ def bench_transport(config: BenchTransportConfig) -> dict[str, Any]:
     from accerl_lerobot.bench.transport_ends import Crowd
 
     folder = None if config.output_dir is None else Path(config.output_dir).expanduser()
-    if folder is not None and folder.exists():
-        raise InputError("output_dir", str(folder), "the folder exists; choose another or remove it")
+    if folder is not None:
+        check_absent(folder)
     console, before = Console(), host()
     results = []
     with Crowd(max(config.callers), config.seed) as crowd:
@@ -155,12 +156,12 @@ def measure(crowd: Any, config: BenchTransportConfig, size: str, callers: int, t
             low, high = np.percentile(np.concatenate(seconds), (50, 99)) * 1e6
             blocks[arm].append((float(low), float(high), callers * config.calls / wall))
         tell(number + 1, "")
+    nbytes = sum(array.nbytes for array in arrays_of(request_of(size, config.seed)))
     found = []
     for arm, values in blocks.items():
         p50, p99, rate = (spread(list(column)) for column in zip(*values, strict=True))
-        row = {"size": size, "callers": callers, "arm": arm, "p50_us": p50, "p99_us": p99}
-        row["bytes"] = sum(array.nbytes for array in arrays_of(request_of(size, config.seed)))
-        row["calls_per_s"] = rate
+        row = {"size": size, "callers": callers, "arm": arm, "bytes": nbytes}
+        row |= {"p50_us": p50, "p99_us": p99, "calls_per_s": rate}
         if callers == 1:
             pairs = zip(blocks[SLOT], values, strict=True)
             row["of_floor"] = spread([floor[0] / own[0] for floor, own in pairs])
@@ -196,28 +197,20 @@ def table(result: dict[str, Any]) -> Table:
 
 def draw(path: Path, result: dict[str, Any]) -> None:
     """p50 with the range of its blocks, a group of bars per size and number of callers."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
     rows = result["results"]
     cases = list(dict.fromkeys((row["size"], row["callers"]) for row in rows))
     arms = [arm for arm in (*ARMS, *FLOORS) if any(row["arm"] == arm for row in rows)]
-    figure, axes = plt.subplots(figsize=(7, 4), dpi=120)
-    for i, arm in enumerate(arms):
-        of = {(row["size"], row["callers"]): row["p50_us"] for row in rows if row["arm"] == arm}
-        x = [place + (i - (len(arms) - 1) / 2) * 0.13 for place, case in enumerate(cases) if case in of]
-        y = [of[case]["median"] for case in cases if case in of]
-        ends = [
-            [abs(of[case][end] - of[case]["median"]) for case in cases if case in of]
-            for end in ("min", "max")
-        ]
-        axes.bar(x, y, 0.12, yerr=ends, capsize=2, label=arm, color=f"C{i}", error_kw={"lw": 0.8})
-    axes.set(yscale="log", ylabel="µs, p50")
-    axes.set_xticks(range(len(cases)), [f"{size}, {n} caller{'s' * (n > 1)}" for size, n in cases])
-    axes.grid(alpha=0.3, axis="y")
-    axes.legend(fontsize=8, ncols=2)
-    figure.tight_layout()
-    figure.savefig(path)
-    plt.close(figure)
+    with drawing(path) as axes:
+        for i, arm in enumerate(arms):
+            of = {(row["size"], row["callers"]): row["p50_us"] for row in rows if row["arm"] == arm}
+            x = [place + (i - (len(arms) - 1) / 2) * 0.13 for place, case in enumerate(cases) if case in of]
+            y = [of[case]["median"] for case in cases if case in of]
+            ends = [
+                [abs(of[case][end] - of[case]["median"]) for case in cases if case in of]
+                for end in ("min", "max")
+            ]
+            axes.bar(x, y, 0.12, yerr=ends, capsize=2, label=arm, color=f"C{i}", error_kw={"lw": 0.8})
+        axes.set(yscale="log", ylabel="µs, p50")
+        axes.set_xticks(range(len(cases)), [f"{size}, {n} caller{'s' * (n > 1)}" for size, n in cases])
+        axes.grid(visible=False, axis="x")
+        axes.legend(fontsize=8, ncols=2)

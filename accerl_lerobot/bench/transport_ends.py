@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import mmap
 import os
-import secrets
 import socket
 import struct
 import threading
@@ -47,6 +46,7 @@ from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.launch import start_ray
 from accerl_lerobot.transport.contract import Caller
 from accerl_lerobot.transport.endpoint import Endpoint, listens
+from accerl_lerobot.transport.nameless import listening, new_name, new_socket
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
 
 LONG_S = 120.0
@@ -80,10 +80,8 @@ class Answering:
 
     async def floor(self) -> str:
         """Where a `Floor` connects to, once."""
-        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        name = f"accerl-{secrets.token_hex(16)}"
-        listener.bind(f"\0{name}")
-        listener.listen(1)
+        name = new_name()
+        listener = listening(name, 1)
         threading.Thread(target=serve_floor, args=(listener,), daemon=True).start()
         return name
 
@@ -184,7 +182,7 @@ class Floor:
     """What no transport can beat: bare pipes and a bare socket between the same two processes."""
 
     def __init__(self, name: str) -> None:
-        self._token = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._token = new_socket()
         self._token.settimeout(LONG_S)
         self._token.connect(f"\0{name}")
         there, self._to = os.pipe()

@@ -26,7 +26,6 @@ reader processes; of each block the last publication counts, when all memory has
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import perf_counter
@@ -36,11 +35,11 @@ import numpy as np
 from rich.table import Table
 
 from accerl_lerobot import snapshot
-from accerl_lerobot.bench.host import host, spread
-from accerl_lerobot.bench.study import as_markdown, as_table, named
+from accerl_lerobot.bench.host import host, ranged, spread
+from accerl_lerobot.bench.study import as_markdown, as_table, named, write
 from accerl_lerobot.checkpoint import TRAINING_STATE, WEIGHTS
 from accerl_lerobot.console import Console
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, check_absent
 
 ARMS: dict[str, tuple[str, bool, float]] = {
     "shared memory": ("shared_memory", False, 1.0),
@@ -99,8 +98,8 @@ def bench_weights(config: BenchWeightsConfig) -> dict[str, Any]:
         InputError: the folder exists, or there are no checkpoints.
     """
     root = None if config.output_dir is None else Path(config.output_dir).expanduser()
-    if root is not None and root.exists():
-        raise InputError("output_dir", str(root), "the folder exists; choose another or remove it")
+    if root is not None:
+        check_absent(root)
     changed = [] if config.checkpoints is None else changed_shares(Path(config.checkpoints).expanduser())
     before, console, cells = host(), Console(), []
     for size in config.sizes_mb:
@@ -110,9 +109,7 @@ def bench_weights(config: BenchWeightsConfig) -> dict[str, Any]:
     result = {"config": asdict(config), "cells": cells, "changed": changed, "host": [before, host()]}
     if root is not None:
         root.mkdir(parents=True)
-        (root / "weights.json").write_text(json.dumps(result, indent=2) + "\n")
-        (root / "weights.md").write_text(as_markdown(_COLUMNS, _rows(result)))
-        draw(root / "weights.png", result)
+        write(root, "weights", result, as_markdown(_COLUMNS, _rows(result)), draw)
     return result
 
 
@@ -273,12 +270,8 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
     rows = []
     for cell in result["cells"]:
         row = [str(cell["size_mb"]), str(cell["readers"]), cell["arm"], f"{cell['mb']['median']:.3g}"]
-        row.append(_ranged(cell["memcpy_ms"], ".3g"))
+        row.append(ranged(cell["memcpy_ms"], ".3g"))
         for kind in ("stall", "applied", "pause"):
-            row += [_ranged(cell[f"{kind}_ms"], ".3g"), f"{cell[kind]['median']:.0%}"]
+            row += [ranged(cell[f"{kind}_ms"], ".3g"), f"{cell[kind]['median']:.0%}"]
         rows.append(row)
     return rows
-
-
-def _ranged(values: dict[str, Any], shape: str) -> str:
-    return f"{values['median']:{shape}} ({values['min']:{shape}} to {values['max']:{shape}})"

@@ -24,8 +24,6 @@ import contextlib
 import itertools
 import multiprocessing
 import os
-import platform
-import statistics
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -35,6 +33,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from accerl_lerobot.bench.host import host, spread
 from accerl_lerobot.envs.gl import import_mujoco
 from accerl_lerobot.envs.metaworld import ACTION_DIM, MetaWorld, MetaWorldConfig
 from accerl_lerobot.errors import InputError
@@ -97,19 +96,19 @@ def bench_world(config: BenchWorldConfig) -> dict[str, Any]:
         }
         for name in (*_ARMS, *config.rounds * (*_ARMS, *reversed(_ARMS))):
             blocks[name].append(pools[name].submit(_measure, config.seconds).result())
-        host = pools[OURS].submit(_host).result()
+        machine = pools[OURS].submit(_host).result()
     blocks = {
         name: values[1:] for name, values in blocks.items()
     }  # the first round built and warmed everything
     rates = {
         name: {
-            "env_steps_per_s": _spread([steps for steps, _ in values]),
-            "decisions_per_s": _spread([decisions for _, decisions in values]),
+            "env_steps_per_s": spread([steps for steps, _ in values]),
+            "decisions_per_s": spread([decisions for _, decisions in values]),
         }
         for name, values in blocks.items()
     }
     pairs = [ours[0] / theirs[0] for ours, theirs in zip(blocks[OURS], blocks[STOCK], strict=True)]
-    return {"config": asdict(config), "arms": rates, "ratio": _spread(pairs), "host": host}
+    return {"config": asdict(config), "arms": rates, "ratio": spread(pairs), "host": machine}
 
 
 def table(result: dict[str, Any]) -> Table:
@@ -187,13 +186,4 @@ def _measure(seconds: float) -> tuple[float, float]:
 
 
 def _host() -> dict[str, Any]:
-    return {
-        "cores": os.cpu_count(),
-        "machine": platform.machine(),
-        "mujoco": import_mujoco().__version__,
-        "gl": os.environ.get("MUJOCO_GL", ""),
-    }
-
-
-def _spread(values: list[float]) -> dict[str, Any]:
-    return {"median": statistics.median(values), "min": min(values), "max": max(values), "blocks": values}
+    return host() | {"mujoco": import_mujoco().__version__, "gl": os.environ.get("MUJOCO_GL", "")}

@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import Any
 
 from accerl_lerobot.checkpoint import BACKBONE, displaced, relocate
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.policies.backbone import BackboneConfig, write_backbone
 from accerl_lerobot.policies.files import fetched_checkpoint
 from accerl_lerobot.policies.plugins import discovery, register_policies
@@ -174,8 +174,7 @@ def run_sft(
         InputError: `output_dir` exists; the checkpoint to start from, or the dataset, is not to be trusted.
         RuntimeError: the trainer failed; carries the end of its log.
     """
-    if output_dir.exists():
-        raise InputError("output_dir", str(output_dir), "the folder exists; choose another or remove it")
+    check_absent(output_dir)
     config = _checked_start(config)
     output_dir.parent.mkdir(parents=True, exist_ok=True)
     if config.init_path is None and config.backbone is not None:

@@ -15,7 +15,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,29 @@ BORDER = 5
 """Width, in pixels, of the frame that tells how an episode ended."""
 
 
+@contextmanager
+def drawing(path: Path, size: tuple[float, float] = (7, 4)) -> Iterator[Any]:
+    """Axes to draw on, with a grid, which are a PNG when the context is left.
+
+    Args:
+        path: of it.
+        size: in inches of 120 pixels.
+    """
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(figsize=size, dpi=120)
+    axes.grid(alpha=0.3)
+    try:
+        yield axes
+        figure.tight_layout()
+        figure.savefig(path)
+    finally:
+        plt.close(figure)
+
+
 def success_curve(
     path: Path, evaluations: Sequence[dict[str, Any]], training: Sequence[tuple[float, float]]
 ) -> None:
@@ -39,31 +63,24 @@ def success_curve(
         evaluations: `summarise` results with an ``env_steps`` entry.
         training: (env steps, share of successful exploring episodes) pairs.
     """
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(7, 4), dpi=120)
-    if training:
-        steps, share = zip(*training, strict=True)
-        axes.plot(steps, share, color="0.7", lw=1.5, label="while exploring")
-    evaluations = sorted(evaluations, key=lambda e: e["env_steps"])
-    x = [e["env_steps"] for e in evaluations]
-    y = [e["success"] for e in evaluations]
-    # Rounding may leave the rate a hair outside its interval, and matplotlib refuses negative lengths.
-    low = [max(0.0, e["success"] - e["ci95"][0]) for e in evaluations]
-    high = [max(0.0, e["ci95"][1] - e["success"]) for e in evaluations]
-    axes.errorbar(x, y, yerr=[low, high], marker="o", capsize=3, color="C0", label="evaluation, 95 % Wilson")
-    for e in (evaluations[0], evaluations[-1]):
-        place = (e["env_steps"], e["success"])
-        axes.annotate(f"n={e['n']}", place, textcoords="offset points", xytext=(6, -12), fontsize=8)
-    axes.set(xlabel="env steps of online experience", ylabel="success", ylim=(-0.02, 1.02))
-    axes.grid(alpha=0.3)
-    axes.legend(loc="lower right")
-    figure.tight_layout()
-    figure.savefig(path)
-    plt.close(figure)
+    with drawing(path) as axes:
+        if training:
+            steps, share = zip(*training, strict=True)
+            axes.plot(steps, share, color="0.7", lw=1.5, label="while exploring")
+        evaluations = sorted(evaluations, key=lambda e: e["env_steps"])
+        x = [e["env_steps"] for e in evaluations]
+        y = [e["success"] for e in evaluations]
+        # Rounding may leave the rate a hair outside its interval, and matplotlib refuses negative lengths.
+        low = [max(0.0, e["success"] - e["ci95"][0]) for e in evaluations]
+        high = [max(0.0, e["ci95"][1] - e["success"]) for e in evaluations]
+        axes.errorbar(
+            x, y, yerr=[low, high], marker="o", capsize=3, color="C0", label="evaluation, 95 % Wilson"
+        )
+        for e in (evaluations[0], evaluations[-1]):
+            place = (e["env_steps"], e["success"])
+            axes.annotate(f"n={e['n']}", place, textcoords="offset points", xytext=(6, -12), fontsize=8)
+        axes.set(xlabel="env steps of online experience", ylabel="success", ylim=(-0.02, 1.02))
+        axes.legend(loc="lower right")
 
 
 def write_video(path: Path, rows: Sequence[Sequence[Sequence[np.ndarray]]], fps: int) -> None:

@@ -35,10 +35,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from accerl_lerobot.snapshot import field_names, kind_named
+from accerl_lerobot.transport.nameless import aligned
 
 SIZES = struct.Struct("<II")
-ALIGNMENT = 64
-"""Of arrays, in bytes: a line of the cache."""
 REMEMBERED = 1024
 """Structures that are remembered; a process that has met more begins anew."""
 NUMBERS = "biuf"
@@ -101,7 +100,7 @@ class Encoded(NamedTuple):
         return self.layout.end + len(self.values)
 
     def write(self, buffer: Any, start: int) -> None:
-        """Copies it into a writable buffer from `start` on, a multiple of `ALIGNMENT`."""
+        """Copies it into a writable buffer from `start` on, a multiple of `nameless.ALIGNMENT`."""
         skeleton, offsets, end = self.layout
         head = start + SIZES.size
         SIZES.pack_into(buffer, start, len(skeleton), len(self.values))
@@ -170,11 +169,6 @@ def decode(buffer: Any, start: int, size: int, *, copy: bool = True) -> Any:
         return plan.build(iter(values).__next__, iter(arrays).__next__)
     except (ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError) as error:
         raise DamagedMessageError(f"a message that cannot be read: {error}") from error
-
-
-def aligned(offset: int) -> int:
-    """The next place at which an array may begin."""
-    return -(-offset // ALIGNMENT) * ALIGNMENT
 
 
 _layouts: dict[tuple[Any, ...], Layout] = {}

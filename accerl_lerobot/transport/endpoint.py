@@ -20,7 +20,8 @@ from typing import Any, Literal
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.transport.contract import Caller
-from accerl_lerobot.transport.shared_memory import Address, SharedMemoryCaller, available, this_node
+from accerl_lerobot.transport.nameless import available
+from accerl_lerobot.transport.shared_memory import Address, SharedMemoryCaller, this_node
 
 Transport = Literal["auto", "ray", "shared_memory"]
 FIELD = "launch.transport"

@@ -20,17 +20,14 @@ Tokens go through a Unix socket that keeps their borders (SOCK_SEQPACKET); a slo
 of them. A message that is too large for its slot, or a reply, has whoever writes it replace the slot by a
 larger one. When a process dies the kernel closes its socket, which the other end sees at once.
 
-The socket's name is in Linux's abstract namespace: no file is left by a process that is killed, and no folder
-has to be agreed on. Other users could see the name, which says nothing, and connect; each end asks the kernel
-whose process the other one is (SO_PEERCRED) and talks to its own user only.
+Neither slots nor sockets have a name in a file system, see `nameless`: nothing is left by a process that is
+killed, and no folder has to be agreed on.
 """
 
 from __future__ import annotations
 
-import functools
 import logging
 import os
-import secrets
 import select
 import socket
 import time
@@ -38,8 +35,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from accerl_lerobot.transport.codec import DamagedMessageError, aligned, decode, encode
+from accerl_lerobot.transport.codec import DamagedMessageError, decode, encode
 from accerl_lerobot.transport.contract import Asked, Caller, Server, ServiceStoppedError
+from accerl_lerobot.transport.nameless import aligned, listening, new_name, new_socket, same_user
 from accerl_lerobot.transport.slots import (
     ANSWER,
     ASK,
@@ -50,7 +48,6 @@ from accerl_lerobot.transport.slots import (
     Token,
     new_file,
     receive,
-    same_user,
     send,
 )
 
@@ -66,18 +63,6 @@ class Address(NamedTuple):
     node: str
     """See `this_node`."""
     name: str
-
-
-@functools.cache
-def available() -> bool:
-    """Whether this system has what it takes."""
-    try:
-        os.close(new_file(1))
-        select.epoll().close()
-        os.close(os.eventfd(0))
-    except (AttributeError, OSError):
-        return False
-    return True
 
 
 def this_node() -> str:
@@ -178,7 +163,7 @@ class SharedMemoryCaller(Caller):
 
 def _connected(name: str, address: Address) -> socket.socket:
     """A socket whose other end is a service of this user."""
-    end = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    end = new_socket()
     end.setblocking(False)
     deadline = time.monotonic() + CONNECT_S
     while True:
@@ -209,11 +194,9 @@ class SharedMemoryServer(Server):
     def __init__(self, take: Callable[[Asked], None], *, copy: bool) -> None:
         super().__init__(take)
         self._copy = copy
-        self.address = Address(this_node(), f"accerl-{secrets.token_hex(16)}")
-        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.address = Address(this_node(), new_name())
+        self._listener = listening(self.address.name, SLOTS)
         self._listener.setblocking(False)
-        self._listener.bind(f"\0{self.address.name}")
-        self._listener.listen(SLOTS)
         self._bell = open(os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK), "rb+", buffering=0)  # noqa: SIM115
         self._epoll = select.epoll()
         for source in (self._listener, self._bell):

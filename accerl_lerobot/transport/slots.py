@@ -13,13 +13,11 @@
 # limitations under the License.
 """Memory that two processes share, and the tokens that say what is in it.
 
-A slot is a memfd: it has no name, so nothing is left of it when whoever maps it is gone, however that ended.
-Its size is sealed, so that neither end can take pages away under the other's feet.
+A slot is memory without a name, see `nameless`.
 """
 
 from __future__ import annotations
 
-import fcntl
 import mmap
 import os
 import socket
@@ -27,6 +25,7 @@ import struct
 from typing import NamedTuple
 
 from accerl_lerobot.transport.codec import DamagedMessageError
+from accerl_lerobot.transport.nameless import is_sealed, new_memory
 
 LARGEST = 2**31
 """Bytes of a slot at most."""
@@ -69,7 +68,7 @@ class Slot:
     def __init__(self, file: int) -> None:
         try:
             self.size = os.fstat(file).st_size
-            if not LEAST <= self.size <= LARGEST or not _sealed(file):
+            if not LEAST <= self.size <= LARGEST or not is_sealed(file):
                 raise DamagedMessageError(f"no slot, but a file of {self.size} bytes whose size may change")
             self.memory = mmap.mmap(file, self.size)
         except OSError as error:
@@ -85,14 +84,7 @@ def new_file(room: int) -> int:
     size = max(LEAST, 1 << (room - 1).bit_length())
     if size > LARGEST:
         raise TypeError(f"a message of {room} bytes cannot be sent; there is room for {LARGEST}")
-    file = os.memfd_create("accerl", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-    try:
-        os.ftruncate(file, size)
-        fcntl.fcntl(file, fcntl.F_ADD_SEALS, _wanted_seals())
-    except BaseException:
-        os.close(file)
-        raise
-    return file
+    return new_memory(size)
 
 
 def send(connection: socket.socket, token: Token, file: int | None = None) -> None:
@@ -126,19 +118,3 @@ def receive(connection: socket.socket) -> tuple[Token, Slot | None] | None:
     finally:
         if file is not None:
             os.close(file)
-
-
-def same_user(connection: socket.socket) -> bool:
-    """Whether the process at the other end is of this user."""
-    size = struct.calcsize("3i")
-    _, user, _ = struct.unpack("3i", connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size))
-    return bool(user == os.getuid())
-
-
-def _wanted_seals() -> int:
-    return fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
-
-
-def _sealed(file: int) -> bool:
-    wanted = _wanted_seals()
-    return fcntl.fcntl(file, fcntl.F_GET_SEALS) & wanted == wanted

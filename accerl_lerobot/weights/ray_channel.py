@@ -21,16 +21,17 @@ for the store nor for a reader.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, get_args
 
 import ray
 
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.transport.endpoint import FIELD, Transport
+from accerl_lerobot.transport.nameless import available
 from accerl_lerobot.weights.publisher import Publisher
-from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher, is_available
+from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
 from accerl_lerobot.weights.slab import Slab
 
-TRANSPORTS = ("auto", "ray", "shared_memory")
 CONNECT_S = 60.0
 """How long readers may take to say whether they can map the trainer's memory."""
 _POLL_S = 0.02
@@ -51,9 +52,9 @@ def make_publisher(readers: Sequence[Any], transport: str = "auto", *, changes: 
         InputError: shared memory is asked for and not to be had.
         ray.exceptions.RayError: a reader has died.
     """
-    if transport not in TRANSPORTS:
-        raise InputError("launch.transport", transport, f"use one of {', '.join(TRANSPORTS)}")
-    if transport != "ray" and is_available():
+    if transport not in get_args(Transport):
+        raise InputError(FIELD, transport, f"use one of {', '.join(get_args(Transport))}")
+    if transport != "ray" and available():
         publisher = SharedMemoryPublisher(len(readers), changes=changes)
         try:
             answers = [reader.open_weights.remote(publisher.address) for reader in readers]
@@ -64,9 +65,7 @@ def make_publisher(readers: Sequence[Any], transport: str = "auto", *, changes: 
             raise
         publisher.close()
     if transport == "shared_memory":
-        raise InputError(
-            "launch.transport", transport, "it needs Linux and all workers on one machine; use ray"
-        )
+        raise InputError(FIELD, transport, "it needs Linux and all workers on one machine; use ray")
     if changes:
         raise InputError("trainer.publish_changes", changes, "it needs shared memory: see launch.transport")
     return RayPublisher(readers)

@@ -27,6 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from accerl_lerobot.transport.nameless import aligned, new_socket, same_user
 from accerl_lerobot.weights import changes as changed_words
 from accerl_lerobot.weights.changes import Changes
 from accerl_lerobot.weights.channel import Tensors
@@ -37,10 +38,8 @@ from accerl_lerobot.weights.shared_memory import (
     NOT_ONLY_CHANGES,
     TALK_S,
     Message,
-    is_own,
-    make_socket,
 )
-from accerl_lerobot.weights.slab import Layout, Slab, TornSetError, aligned, digest
+from accerl_lerobot.weights.slab import Layout, Slab, TornSetError, digest
 
 CONFIRM_S = 60.0
 """How long the trainer's process may take to read a set once, among all else that it does."""
@@ -85,11 +84,11 @@ class SharedMemoryReader:
         """The last set, if changes against it may come."""
         self._own_version = -1
         self._closing = False
-        self._socket = make_socket()
+        self._socket = new_socket()
         try:
             self._socket.settimeout(TALK_S)
             self._socket.connect(f"\0{address}")
-            if not is_own(self._socket):
+            if not same_user(self._socket):
                 raise PermissionError("another user listens at the trainer's address")
         except BaseException:
             self._socket.close()

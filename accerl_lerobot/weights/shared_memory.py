@@ -17,8 +17,8 @@
        └── version and, once, the slab's file descriptor over a Unix socket ──┘
        └── the digest, which both have reckoned meanwhile ────────────────────┘
 
-The socket's name is an abstract one and slabs have none at all, so nothing is left behind whoever is killed.
-Both sides talk to processes of the same user only. A slab that a reader holds is never written to: with R
+Socket and slabs are in no file system, see `transport.nameless`: nothing is left behind whoever is killed,
+and both sides talk to processes of the same user only. A slab that a reader holds is never written to: with R
 readers there are R for them, one that is being sent, one to write to, and one to compare with if only changes
 are sent.
 """
@@ -27,24 +27,22 @@ from __future__ import annotations
 
 import contextlib
 import os
-import secrets
 import selectors
 import socket
 import struct
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from accerl_lerobot.transport.nameless import aligned, listening, new_name, same_user
 from accerl_lerobot.weights import changes as changed_words
 from accerl_lerobot.weights.changes import LIMIT, Changes
 from accerl_lerobot.weights.publisher import Publisher, ReaderLostError, Shipment
-from accerl_lerobot.weights.slab import Layout, Slab, aligned, digest
+from accerl_lerobot.weights.slab import Layout, Slab, digest
 
 NOT_ONLY_CHANGES = -1
 TALK_S = 10.0
 """How long a message of some hundred bytes may take."""
-_PEER = struct.Struct("3i")
 
 
 class Message(NamedTuple):
@@ -81,22 +79,6 @@ APPLIED = struct.Struct("<q")
 """What a reader answers: the version that it has applied, so that it does not hold the slab any more."""
 
 
-def is_available() -> bool:
-    """Whether this system has memory that is shared without a name."""
-    return sys.platform == "linux" and hasattr(os, "memfd_create")
-
-
-def make_socket() -> socket.socket:
-    """Messages stay whole and in order, and take file descriptors along."""
-    return socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-
-
-def is_own(connection: socket.socket) -> bool:
-    """Whether a process of this user is at the other end."""
-    _, uid, _ = _PEER.unpack(connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
-    return bool(uid == os.getuid())
-
-
 @dataclass(eq=False)
 class _Reader:
     """One of them as the publisher sees it."""
@@ -122,16 +104,13 @@ class SharedMemoryPublisher(Publisher):
         self._readers: list[_Reader] = []
         self._base: Shipment | None = None
         self._difference: Changes | None = None
-        name = f"accerl-weights-{secrets.token_hex(16)}"
-        self._listener = make_socket()
-        self._listener.bind(f"\0{name}")
-        self._listener.listen(readers)
+        self.address = new_name()
+        """What readers connect to, on this machine."""
+        self._listener = listening(self.address, readers)
         self._event = os.eventfd(0, os.EFD_CLOEXEC)
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._event, selectors.EVENT_READ)
         self._selector.register(self._listener, selectors.EVENT_READ)
-        self.address = name
-        """What readers connect to, on this machine."""
         self._thread.start()
 
     def close(self) -> None:
@@ -159,7 +138,7 @@ class SharedMemoryPublisher(Publisher):
 
     def _accept(self) -> None:
         connection, _ = self._listener.accept()
-        if not is_own(connection):
+        if not same_user(connection):
             connection.close()
             return
         connection.settimeout(TALK_S)

@@ -18,12 +18,11 @@
     changes   index and new value of what differs from an earlier set, if anybody asked for it
 
 The digest is of version, layout and data, so a set of which any part belongs to another one is noticed.
-Memory that is to be shared is a memfd: it has no name, and goes with the last process that holds it.
+Memory that is to be shared has no name, and goes with the last process that holds it.
 """
 
 from __future__ import annotations
 
-import fcntl
 import json
 import mmap
 import os
@@ -34,9 +33,7 @@ from typing import NamedTuple
 import numpy as np
 import xxhash
 
-ALIGNMENT = 64
-_SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
-"""A memfd that could shrink would end its readers with SIGBUS."""
+from accerl_lerobot.transport.nameless import aligned, new_memory
 
 
 class TornSetError(RuntimeError):
@@ -136,10 +133,8 @@ class Slab:
     @classmethod
     def shared(cls, size: int) -> Slab:
         """Memory that other processes can map once they are sent `fd`."""
-        fd = os.memfd_create("accerl-weights", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        fd = new_memory(max(size, mmap.PAGESIZE))
         try:
-            os.ftruncate(fd, max(size, mmap.PAGESIZE))
-            fcntl.fcntl(fd, fcntl.F_ADD_SEALS, _SEALS)
             return cls(size, fd)
         except BaseException:
             os.close(fd)
@@ -174,8 +169,3 @@ def digest(version: int, layout: Layout, data: np.ndarray) -> bytes:
     found.update(layout.text)
     found.update(memoryview(data[: layout.size]))
     return found.digest()
-
-
-def aligned(offset: int) -> int:
-    """The next multiple of `ALIGNMENT`."""
-    return -(-offset // ALIGNMENT) * ALIGNMENT

@@ -37,7 +37,7 @@ from accerl_lerobot.bench.transport import (
     table,
 )
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.transport.shared_memory import available
+from accerl_lerobot.transport.nameless import available
 from tests.light_workers import light_ray
 
 __all__ = ["light_ray"]

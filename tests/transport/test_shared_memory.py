@@ -30,10 +30,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.transport import shared_memory, slots
+from accerl_lerobot.transport import nameless, shared_memory, slots
 from accerl_lerobot.transport.codec import encode
 from accerl_lerobot.transport.contract import Asked, Caller, ServiceStoppedError
-from accerl_lerobot.transport.shared_memory import SharedMemoryCaller, SharedMemoryServer, available
+from accerl_lerobot.transport.nameless import available
+from accerl_lerobot.transport.shared_memory import SharedMemoryCaller, SharedMemoryServer
 from accerl_lerobot.transport.slots import ASK, LEAST, SLOTS, Token, new_file
 
 pytestmark = pytest.mark.skipif(not available(), reason="no memfd, epoll and eventfd here")
@@ -253,8 +254,8 @@ def test_threads_of_the_same_process_call_and_wake(stage):
 def test_other_users_are_refused_at_both_ends(stage, monkeypatch: pytest.MonkeyPatch):
     one = stage()
     end = one.raw()
-    assert slots.same_user(end)
-    monkeypatch.setattr(slots.os, "getuid", lambda: os.geteuid() + 1)
+    assert nameless.same_user(end)
+    monkeypatch.setattr(nameless.os, "getuid", lambda: os.geteuid() + 1)
     with pytest.raises(ServiceStoppedError, match="service: another user's process has taken its place"):
         one.caller()
     one.server.poll(LONG_S)
@@ -283,13 +284,6 @@ def unsealed() -> int:
     return file
 
 
-def tiny() -> int:
-    file = os.memfd_create("accerl", os.MFD_ALLOW_SEALING)
-    os.ftruncate(file, 100)
-    slots.fcntl.fcntl(file, slots.fcntl.F_ADD_SEALS, slots._wanted_seals())
-    return file
-
-
 NONSENSE: dict[str, Callable[[socket.socket], None]] = {
     "short": lambda end: end.send(b"x"),
     "long": lambda end: end.send(b"x" * 1000),
@@ -300,7 +294,7 @@ NONSENSE: dict[str, Callable[[socket.socket], None]] = {
     "beyond the slot": lambda end: slots.send(end, asks(0, 0, LEAST + 1), new_file(1)),
     "far beyond": lambda end: slots.send(end, asks(0, 64, 2**63), new_file(1)),
     "not sealed": lambda end: slots.send(end, asks(0, 0, 100), unsealed()),
-    "too small": lambda end: slots.send(end, asks(0, 0, 100), tiny()),
+    "too small": lambda end: slots.send(end, asks(0, 0, 100), nameless.new_memory(100)),
     "no memory": lambda end: slots.send(end, asks(0, 0, 100), os.open("/dev/null", os.O_RDWR)),
     "a folder": lambda end: slots.send(end, asks(0, 0, 100), os.open("/", os.O_RDONLY)),
 }

@@ -25,8 +25,9 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.transport import endpoint as module
 from accerl_lerobot.transport.contract import Caller, ServiceStoppedError
 from accerl_lerobot.transport.endpoint import Endpoint, Transport, listens
+from accerl_lerobot.transport.nameless import available
 from accerl_lerobot.transport.ray_calls import RayCaller
-from accerl_lerobot.transport.shared_memory import Address, SharedMemoryCaller, available
+from accerl_lerobot.transport.shared_memory import Address, SharedMemoryCaller
 from tests.light_workers import LightInference, light_ray
 from tests.transport.contract import CHECKS, Check, Service, messages, same
 

@@ -88,7 +88,7 @@ def test_the_choice(here: tuple[bool, ...], transport: str, expected: type):
 
 
 def test_without_memfd_there_is_ray(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(ray_channel, "is_available", lambda: False)
+    monkeypatch.setattr(ray_channel, "available", lambda: False)
     publisher = make_publisher([Inference().handle])
     assert isinstance(publisher, RayPublisher)
     publisher.close()

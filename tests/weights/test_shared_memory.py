@@ -302,7 +302,7 @@ def test_sets_that_grow_find_room():
 
 def test_a_stranger_is_turned_away(monkeypatch: pytest.MonkeyPatch):
     publisher = published(1)
-    monkeypatch.setattr(shared_memory, "is_own", lambda connection: False)
+    monkeypatch.setattr(shared_memory, "same_user", lambda connection: False)
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as stranger:
         stranger.settimeout(30)
         stranger.connect(f"\0{publisher.address}")
