@@ -242,7 +242,7 @@ class RayEngine(Engine):
         ranks = [peer.remote(rank, *learner) for rank in range(1, c.trainer.ranks)]
         threads = {"num_cpus": 0, "num_gpus": share, "max_concurrency": 4}
         first = ray.remote(TrainerWorker).options(**threads | {"num_gpus": of_rank})
-        trainer = first.remote(*learner, timeline, ranks)
+        trainer = first.remote(*learner, timeline, ranks, journal_folder(c))
         inference = ray.remote(InferenceWorker).options(num_cpus=0, num_gpus=share, max_concurrency=1000)
         serves = (c.policy, c.inference, self._version, self._state, self._load, timeline)
         several = c.inference.workers > 1

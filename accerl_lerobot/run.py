@@ -56,6 +56,7 @@ from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.loop import Loop, Times, heed_stop
 from accerl_lerobot.metrics import METRICS, MetricsLog
+from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.journal import EPISODES
 from accerl_lerobot.stopping import Stopping
 from accerl_lerobot.timeline import RECOVERY, open_clock
@@ -96,7 +97,13 @@ def make_output_dir(config: Placed) -> Path:
     return path
 
 
-def make_engine(config: RunConfig, tasks: tuple[str, ...], history: int, state: Path | None = None) -> Engine:
+def make_engine(
+    config: RunConfig,
+    tasks: tuple[str, ...],
+    history: int,
+    state: Path | None = None,
+    load: Load | None = None,
+) -> Engine:
     """The engine that ``launch.engine`` names.
 
     Args:
@@ -104,15 +111,16 @@ def make_engine(config: RunConfig, tasks: tuple[str, ...], history: int, state: 
         tasks: the training tasks.
         history: env steps that the policy sees at a time.
         state: the ``training_state`` to go on from; None: begin.
+        load: makes the policy's adapter; None: of LeRobot's checkpoint.
     """
     if config.launch.engine == "local":
         from accerl_lerobot.local import LocalEngine
 
-        return LocalEngine(config, tasks, history, state)
+        return LocalEngine(config, tasks, history, state, load)
     ray_environment.prepare()
     from accerl_lerobot.launch import RayEngine
 
-    return RayEngine(config, tasks, history, state)
+    return RayEngine(config, tasks, history, state, load)
 
 
 def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfig:
@@ -148,7 +156,13 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
     return _improving(config, path)
 
 
-def train(config: RunConfig, directory: Path, console: Console, wanted: str | None = None) -> dict[str, Any]:
+def train(
+    config: RunConfig,
+    directory: Path,
+    console: Console,
+    wanted: str | None = None,
+    load: Load | None = None,
+) -> dict[str, Any]:
     """Runs everything and returns the summary, which is also in ``summary.json``.
 
     Args:
@@ -157,6 +171,7 @@ def train(config: RunConfig, directory: Path, console: Console, wanted: str | No
         console: progress for people.
         wanted: the checkpoint to go on from, where the run has been begun before; see
             `checkpoint.newest_whole`.
+        load: makes the policy's adapter, and may be given a path of its own; None: of LeRobot's checkpoint.
 
     Raises:
         InputError: the settings do not fit each other, or no checkpoint can be gone on from.
@@ -187,7 +202,7 @@ def train(config: RunConfig, directory: Path, console: Console, wanted: str | No
         recovery = Recovery(config.launch.max_recoveries)
         while True:
             try:
-                return _attempt(config, directory, checkpoint, console, log, tasks, times, stop)
+                return _attempt(config, directory, checkpoint, console, log, tasks, times, stop, load)
             except WorkerError as error:
                 times.clock.enter(RECOVERY)
                 heed_stop(stop, directory)
@@ -206,12 +221,13 @@ def _attempt(
     tasks: tuple[str, ...],
     times: Times,
     stop: Stopping,
+    load: Load | None,
 ) -> dict[str, Any]:
     """The run, or what is left of it, by one set of workers, which have ended when this returns or raises."""
-    history = check_policy(config)
+    history = 1 if load is not None else check_policy(config)
     state = None if checkpoint is None else checkpoint / TRAINING_STATE
     with console.stage("starting workers"):
-        engine = make_engine(config, tasks, history, state)
+        engine = make_engine(config, tasks, history, state, load)
     with contextlib.closing(engine):
         return Loop(config, directory, console, engine, log, tasks, times, stop).run(state)
 

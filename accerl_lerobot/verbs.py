@@ -52,14 +52,20 @@ from accerl_lerobot.demos.export import ExportConfig
 from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.hub.config import PullConfig, PushConfig
 from accerl_lerobot.parsing import read_arguments
+from accerl_lerobot.policies.config import Load
 from accerl_lerobot.report.config import ReportConfig
 from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.timeline.config import TimelineConfig
 from accerl_lerobot.verb_configs import DemosRun, EvalRun, SFTRun, WorldModelEvalRun, WorldModelRun
 
 
-def train(arguments: list[str]) -> int:
-    """``accerl train``."""
+def train(arguments: list[str], load: Load | None = None) -> int:
+    """``accerl train``.
+
+    Args:
+        arguments: of the command line.
+        load: makes the policy's adapter; None: of LeRobot's checkpoint.
+    """
     config: RunConfig = parse(RunConfig, arguments)
     from accerl_lerobot import run
     from accerl_lerobot.preflight import check_start
@@ -67,14 +73,15 @@ def train(arguments: list[str]) -> int:
     from accerl_lerobot.stopping import StoppedError
 
     begun = begun_run(read_arguments(arguments)[0], config) if config.resume else None
-    check_start(config)
+    if load is None:
+        check_start(config)
     console = Console()
     directory = run.make_output_dir(config) if begun is None else begun.directory
     console.say(f"run {directory}")
     try:
         with redirect_stdout(sys.stderr), locked(directory, "config_path", "another process goes on with it"):
             wanted = None if begun is None else begun.checkpoint
-            summary = run.train(config, directory, console, wanted)
+            summary = run.train(config, directory, console, wanted, load)
     except InputError:
         if begun is None:
             _discard_unused(directory)

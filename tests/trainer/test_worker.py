@@ -24,7 +24,7 @@ import pytest
 
 from accerl_lerobot import snapshot
 from accerl_lerobot.algorithms import GIPOConfig
-from accerl_lerobot.checkpoint import TRAINING_STATE
+from accerl_lerobot.checkpoint import PRETRAINED, TRAINING_STATE
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
@@ -161,12 +161,7 @@ def test_what_is_saved_is_a_whole_version(monkeypatch: pytest.MonkeyPatch, tmp_p
         seen.append((version, stage.worker._update.version))
         return before
 
-    def save(adapter: LinearAdapter, directory: Path, policy: PolicyConfig, weights: dict[str, Any]) -> None:
-        files.append(weights)
-
-    files: list[dict[str, Any]] = []
-    monkeypatch.setattr(loading, "copy_weights", copy_weights)
-    monkeypatch.setattr(loading, "save_pretrained", save)
+    monkeypatch.setattr(LinearAdapter, "copy_weights", copy_weights)
     runner = threading.Thread(target=stage.run)
     runner.start()
     while stage.worker._update.version < 3:
@@ -184,7 +179,9 @@ def test_what_is_saved_is_a_whole_version(monkeypatch: pytest.MonkeyPatch, tmp_p
         state = tmp_path / str(i) / TRAINING_STATE
         assert snapshot.load(state / "trainer")["version"] == version
         weights = snapshot.load(state / "weights")
-        assert all(np.array_equal(weights[k], files[i][k]) for k in files[i])
+        written = snapshot.load(tmp_path / str(i) / PRETRAINED / "linear")
+        assert written.keys() == weights.keys()
+        assert all(np.array_equal(weights[k], written[k].numpy()) for k in written)
 
 
 @pytest.mark.parametrize("settings", [{"hold_back": 2}, {"publish_every": 4}, {}])
