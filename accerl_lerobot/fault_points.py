@@ -40,6 +40,8 @@ VARIABLE = "ACCERL_FAULTS"
 CRASHES = ("exception", "exit", "kill", "stop", "hang")
 """exception: one is raised. exit: the process ends with code 0. kill: by SIGKILL. stop: SIGSTOP, so that the
 process hangs. hang: one thread does, and the others of the process answer as if nothing were wrong."""
+SAVING = ("exception", "exit", "kill", "stop")
+"""Of these, what can befall a worker that saves: how long a thread needs for that, nobody knows."""
 UNWATCHED = ("exception", "exit", "kill")
 """What can befall the run's own process, which nobody watches."""
 NAN, FULL, TORN = "nan", "full", "torn"
@@ -54,12 +56,12 @@ POINTS: dict[str, tuple[str, ...]] = {
     "replay.insert": CRASHES,
     "replay.journal": (FULL,),
     "replay.sample": CRASHES,
-    "replay.save": (*CRASHES, FULL),
+    "replay.save": (*SAVING, FULL),
     "trainer.update": CRASHES,
     "trainer.loss": (NAN,),
     "trainer.backward": CRASHES,
     "trainer.publish": CRASHES,
-    "trainer.write": (*CRASHES, FULL),
+    "trainer.write": (*SAVING, FULL),
     "rank.step": CRASHES,
     "dream.step": CRASHES,
     "learning.step": CRASHES,

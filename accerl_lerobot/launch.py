@@ -184,14 +184,15 @@ class RayEngine(Engine):
         told = self._updates + (self._hear(self._trainer, self._limit) or [])
         self._updates = []
         limit = max(START_S, self._limit)  # files may be large
-        version, records = self._trainer.call("hold", timeout=limit)
+        alive = {"timeout": limit, "silence": self._limit}
+        version, records = self._trainer.call("hold", timeout=self._limit)  # it waits for an update at most
         # At once, so that little comes in that was decided by weights of later updates. Those who dream may
         # know of more than replay then; they are told anew of what comes after.
-        self._replay.call("save", state, version, timeout=limit)
+        self._replay.call("save", state, version, **alive)
         for imaginer in (self._learner, self._dreamer):
             if imaginer is not None:
-                imaginer.call("save", directory, timeout=limit)
-        self._trainer.call("write", directory, timeout=limit)
+                imaginer.call("save", directory, **alive)
+        self._trainer.call("write", directory, **alive)
         self._seats.save(state)
         self._last_change = time.monotonic()
         return Saved(version, told + records)
@@ -377,7 +378,7 @@ class RayEngine(Engine):
         waiting = self._seats.outstanding or (self._training and not self._done)
         # Where one worker is to blame, `_check_hung` comes to it a moment later.
         silent = max(worker.silent_s() for worker in self._everyone())
-        suspect = max(silent, self._seats.in_world_s) > self._limit / 2
+        suspect = max(silent, self._seats.stuck_s) > self._limit / 2
         if state != self._last_state or not waiting:
             self._last_state, self._last_change = state, now
         elif now - self._last_change > self._limit and not suspect:

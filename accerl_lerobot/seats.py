@@ -60,6 +60,7 @@ class Seat:
     unsent: list[EpisodePlan] = field(default_factory=list)
     counters: dict[str, float] = field(default_factory=dict)
     in_world_s: float = 0.0
+    stuck_s: float = 0.0
     budget: int | None = None
     """Exploring episodes that are still to be played; None: no end."""
     spent: bool = False
@@ -134,7 +135,8 @@ class Seats:
                 raise WorkerError(f"{seat.worker.name} worker failed to report:\n{error}") from error
             if report is None:
                 continue
-            seat.counters, seat.in_world_s, seat.spent = report.counters, report.in_world_s, report.spent
+            seat.counters, seat.spent = report.counters, report.spent
+            seat.in_world_s, seat.stuck_s = report.in_world_s, report.stuck_s
             if seat.budget is not None:
                 seat.budget -= sum(e.plan.explore for e in report.episodes)
             for episode in report.episodes:
@@ -162,9 +164,9 @@ class Seats:
         return all(seat.spent for seat in self._seats)
 
     @property
-    def in_world_s(self) -> float:
-        """How long the slowest world has been at what it does now."""
-        return max(seat.in_world_s for seat in self._seats)
+    def stuck_s(self) -> float:
+        """How long the slowest of them, or of their worlds, has been at what it does now."""
+        return max(max(seat.in_world_s, seat.stuck_s) for seat in self._seats)
 
     def restart_worker(self, worker: Watched, error: Exception) -> bool:
         """Starts a worker again that has failed; False if it is none of these.
@@ -179,7 +181,7 @@ class Seats:
         return False
 
     def check_hung(self) -> None:
-        """Starts those again that do not answer or whose world does not return.
+        """Starts those again that do not answer, do nothing, or whose world does not return.
 
         Raises:
             WorkerError: see `restart_worker`.
@@ -191,6 +193,8 @@ class Seats:
                 self._restart(seat, RuntimeError(f"no answer for {silent:.0f} s"))
             elif seat.in_world_s > limit:
                 self._restart(seat, RuntimeError(f"its world has not returned for {seat.in_world_s:.0f} s"))
+            elif seat.stuck_s > limit:
+                self._restart(seat, RuntimeError(f"it has done nothing for {seat.stuck_s:.0f} s"))
 
     def save(self, directory: Path) -> None:
         """Writes their part of ``training_state``."""
@@ -243,7 +247,7 @@ class Seats:
         self._past["restarts"] += 1
         for key, value in seat.counters.items():
             self._past[key] = self._past.get(key, 0.0) + value
-        seat.counters, seat.in_world_s = {}, 0.0
+        seat.counters, seat.in_world_s, seat.stuck_s = {}, 0.0, 0.0
         seat.incarnation += 1
         seat.restarts += 1
         if seat.budget is not None:

@@ -40,6 +40,7 @@ from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.ranking import BenchRankingConfig
 from accerl_lerobot.bench.replay import BenchReplayConfig
 from accerl_lerobot.bench.scaling import BenchScalingConfig
+from accerl_lerobot.bench.soak import BenchSoakConfig
 from accerl_lerobot.bench.throughput import BenchThroughputConfig
 from accerl_lerobot.bench.timeline import BenchTimelineConfig
 from accerl_lerobot.bench.transport import BenchTransportConfig
@@ -333,6 +334,7 @@ CONFIGS: dict[str, type[Any]] = {
     "bench dream": BenchDreamConfig,
     "bench efficiency": BenchEfficiencyConfig,
     "bench faults": BenchFaultsConfig,
+    "bench soak": BenchSoakConfig,
     "bench ranking": BenchRankingConfig,
 }
 """Verb → what its command line is parsed into."""

@@ -24,6 +24,9 @@ from ray.exceptions import GetTimeoutError, RayError
 from accerl_lerobot.engine import WorkerError
 from accerl_lerobot.transport.endpoint import Endpoint, Transport, listens
 
+LOOK_S = 1.0
+"""Between two looks at whether a process that takes long is still there."""
+
 
 class Watched:
     """One long call that must not end unasked, and one question at a time.
@@ -81,13 +84,35 @@ class Watched:
         """For how long an answer has been owed, in seconds."""
         return 0.0 if self._question is None else time.monotonic() - self._asked
 
-    def call(self, method: str, *arguments: Any, timeout: float) -> Any:
+    def call(self, method: str, *arguments: Any, timeout: float, silence: float | None = None) -> Any:
         """Waits for one answer.
+
+        Args:
+            method: of the actor.
+            arguments: of the method.
+            timeout: seconds until the answer.
+            silence: seconds in which it must say meanwhile that it is there; None: it need not.
 
         Raises:
             WorkerError: it failed, with its traceback, or did not come in time.
         """
-        return self.result(getattr(self.actor, method).remote(*arguments), method, timeout)
+        reference = getattr(self.actor, method).remote(*arguments)
+        if silence is not None:
+            self._listen(reference, method, timeout, silence)
+        return self.result(reference, method, timeout)
+
+    def _listen(self, reference: Any, method: str, timeout: float, silence: float) -> None:
+        """Waits for an answer that may take long, from a process that must not hang."""
+        deadline = time.monotonic() + timeout
+        beat, asked = self.actor.ready.remote(), time.monotonic()
+        while not ray.wait([reference], timeout=min(LOOK_S, silence / 4))[0]:
+            now = time.monotonic()
+            if now > deadline:
+                return  # `result` says so
+            if ray.wait([beat], timeout=0)[0]:
+                beat, asked = self.actor.ready.remote(), now
+            elif now - asked > silence:
+                raise WorkerError(f"{self.name} worker has not answered for {now - asked:.0f} s, in {method}")
 
     def result(self, reference: Any, method: str, timeout: float) -> Any:
         """As `call`, for a call that has been made."""

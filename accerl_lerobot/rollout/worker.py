@@ -64,6 +64,8 @@ class Report:
     """Since this process began."""
     in_world_s: float
     """How long the world has been at what it does now, in seconds; 0 while none is stepped."""
+    stuck_s: float = 0.0
+    """How long ago the thread that steps worlds last did anything, in seconds; 0 while one is stepped."""
     spent: bool = False
     """Every exploring episode that was paid for has been played, and replay has it."""
 
@@ -113,6 +115,7 @@ class RolloutWorker:
         self._results: deque[EpisodeResult] = deque()
         self._training = threading.Event()
         self._entered: float | None = None
+        self._moved: float | None = None
         self._outbox: list[Segment] = []
         worlds = [make_world(env, history) for _ in range(config.worlds)]
         name = f"rollout{index}.{incarnation}"
@@ -145,11 +148,12 @@ class RolloutWorker:
         self._at_the_door = 1 if in_turn else AT_THE_DOOR
         (self._training.set if training else self._training.clear)()
         episodes = [self._results.popleft() for _ in range(len(self._results))]
-        entered = self._entered
+        entered, moved, now = self._entered, self._moved, time.monotonic()
         return Report(
             episodes=episodes,
             counters={k: float(v) for k, v in vars(self._runner.counters).items()},
-            in_world_s=0.0 if entered is None else time.monotonic() - entered,
+            in_world_s=0.0 if entered is None else now - entered,
+            stuck_s=0.0 if moved is None or entered is not None else now - moved,
             spent=self._spent,
         )
 
@@ -163,6 +167,7 @@ class RolloutWorker:
         size = max(1, len(self._runner) // PARTS)
         patience = 0.0
         while True:
+            self._moved = time.monotonic()
             at_the_door -= {ticket for ticket, _ in door.done(patience)}
             self._bring(door, at_the_door, size)
             self._spent = self._plans.spent and not self._runner.exploring and not at_the_door
@@ -227,7 +232,7 @@ class RolloutWorker:
         """Lets `report` tell a world that hangs from a worker that waits."""
         self._entered = time.monotonic()
         yield
-        self._entered = None
+        self._moved, self._entered = time.monotonic(), None
 
     def _ended(self, result: EpisodeResult) -> None:
         self._plans.report(result)
