@@ -69,9 +69,12 @@ POINTS: dict[str, tuple[str, ...]] = {
     "driver.save": (*UNWATCHED, FULL),
     "driver.files": UNWATCHED,
     "driver.renamed": (*UNWATCHED, TORN),
+} | {
+    f"{role}.timeline": (FULL,)
+    for role in ("rollout", "inference", "replay", "trainer", "dream", "learning", "driver")
 }
-"""Point → what can be made to happen there. What stands before the dot is whose it is; points of ``trainer``
-are reached by all of its ranks, but for ``update``, ``publish`` and ``write``."""
+"""Point → what can be made to happen there. What stands before the dot is whose it is; ``trainer.loss`` and
+``trainer.backward`` are reached by all of its ranks."""
 _ARMED, _TAKEN = ".armed", ".taken"
 
 

@@ -124,7 +124,11 @@ class Seats:
                 seat.unsent = []
 
     def listen(self) -> list[EpisodeResult]:
-        """Picks up the reports that have come; returns the episodes in them."""
+        """Picks up the reports that have come; returns the episodes in them. Who fails is started again.
+
+        Raises:
+            WorkerError: see `restart_worker`.
+        """
         episodes: list[EpisodeResult] = []
         for seat in self._seats:
             try:
@@ -132,7 +136,8 @@ class Seats:
             except RayActorError:
                 continue  # its `run` has ended as well, and the engine deals with that
             except RayError as error:
-                raise WorkerError(f"{seat.worker.name} worker failed to report:\n{error}") from error
+                self._restart(seat, error)
+                continue
             if report is None:
                 continue
             seat.counters, seat.spent = report.counters, report.spent

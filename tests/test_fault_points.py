@@ -134,5 +134,6 @@ def test_every_point_is_in_the_code_once_and_no_other_is():
         for path in Path(accerl_lerobot.__file__).parent.rglob("*.py")
         for point in re.findall(r'\breach\("([a-z.]+)"', path.read_text())
     ]
-    assert sorted(found) == sorted(POINTS)
+    # Every worker's timeline is written by the same line.
+    assert sorted(found) == sorted(point for point in POINTS if not point.endswith(".timeline"))
     assert all(set(faults) <= {*CRASHES, "nan", "full", "torn"} for faults in POINTS.values())

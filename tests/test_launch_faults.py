@@ -31,6 +31,7 @@ import ray
 
 from accerl_lerobot import launch
 from accerl_lerobot.config import LaunchConfig
+from accerl_lerobot.engine import WorkerError
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
@@ -39,7 +40,7 @@ from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.trainer import worker as trainer_worker
 from accerl_lerobot.trainer.config import TrainerConfig
-from tests.light_workers import FULL, NO_WEIGHTS, LightInference, LightTrainer, light_ray
+from tests.light_workers import FULL, HANGS, NO_WEIGHTS, LightInference, LightTrainer, light_ray
 from tests.runs import collect, drive, polls, tiny_run
 
 __all__ = ["light_ray"]
@@ -227,6 +228,15 @@ def test_an_exception_in_the_inference_service_is_reported_as_its_own(engine):
     text = until_failure(one)
     assert text.startswith("inference worker failed for good:")
     assert "the forward pass fell over" in text and "serve" in text
+
+
+def test_a_trainer_that_hangs_while_it_is_saved_is_found_as_soon_as_any(engine, tmp_path: Path):
+    one = engine(trainer=ENDLESS, launch=LaunchConfig(stall_s=5.0))
+    until_training(one)
+    began = time.monotonic()
+    with pytest.raises(WorkerError, match="trainer worker has not answered for 5 s, in write"):
+        one.save(tmp_path / HANGS)
+    assert time.monotonic() - began < 30, "and not after the minutes that large files may take"
 
 
 def test_a_world_that_does_not_return_is_no_reason_to_wait_for_ever(engine):

@@ -23,6 +23,7 @@ the end, when it has been asked to stop, its segments (`audit.py`) and what it h
 
 from __future__ import annotations
 
+import json
 import random
 import statistics
 import subprocess
@@ -41,11 +42,12 @@ from accerl_lerobot.bench.host import host
 from accerl_lerobot.bench.light_run import light_config
 from accerl_lerobot.bench.study import as_markdown, as_table, last_words, write
 from accerl_lerobot.bench.victims import CLASSES, DRIVER, EVERYTHING, LIGHT, TRAIN, Victim, alive
-from accerl_lerobot.checkpoint import CHECKPOINTS, LAST, PRETRAINED
+from accerl_lerobot.checkpoint import CHECKPOINTS, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.evaluation.pictures import drawing
+from accerl_lerobot.evaluation.stats import Rate
 
 IMAGINING = ("dream", "world learning")
 """Targets that are there where anything is imagined."""
@@ -83,6 +85,9 @@ class BenchFaultsConfig:
     """Hits of each cell."""
     stall_s: float = 10.0
     """``launch.stall_s`` of the runs: how long a process that hangs is waited for."""
+    updates: int = 0
+    """When what was to befall everything has, that run goes on to so many updates and ends by itself, and so
+    does one that was left alone, to compare what they have learnt; 0: it is asked to stop like others."""
     seed: int = 0
     """Of the order, the places and the moments."""
 
@@ -91,6 +96,8 @@ class BenchFaultsConfig:
             given = getattr(self, name)
             if not given or len(set(given)) < len(given) or not set(given) <= set(names):
                 raise InputError(name, given, f"use some of {', '.join(names)}, none twice")
+        if self.updates < 0:
+            raise InputError("updates", self.updates, "use 0 (none) or more")
         if self.repeats < 1:
             raise InputError("repeats", self.repeats, "use at least 1")
         if not self.stall_s >= 5:
@@ -253,6 +260,8 @@ def _target(
                 if struck.outcome == "lost":
                     break
             found |= end_run(victim)
+            if target == EVERYTHING and config.updates:
+                found["success"] = _finish(victim, start, config.updates)
         except (RuntimeError, subprocess.TimeoutExpired) as error:
             found["error"] = str(error)
             if not any(hit["target"] == target for hit in result["hits"]):
@@ -275,6 +284,23 @@ def end_run(victim: Victim) -> dict[str, Any]:
     skipped = [record["skipped"] for record in victim.records() if "skipped" in record]
     left = sum(alive(pid) for pid in below)
     return {"exit": code, "left_behind": left, "skipped_updates": (skipped or [0])[-1]}
+
+
+def _finish(victim: Victim, start: Start, updates: int) -> dict[str, Any]:
+    """Success at the end of a run that things were done to, and of one that was left alone."""
+    alone = start.run("alone", f"--trainer.updates={updates}")
+    found = {}
+    try:
+        victim.go_on(f"--trainer.updates={updates}")
+        for name, one in (("struck", victim), ("alone", alone)):
+            if code := one.process.wait():
+                raise RuntimeError(f"{name}: it ended with code {code}:\n{last_words(one.log)}")
+            summary = json.loads((one.folder / SUMMARY).read_text())
+            rate = Rate(successes=round(summary["success_after"] * summary["n"]), n=summary["n"])
+            found[name] = str(rate)
+    finally:
+        alone.kill()
+    return found
 
 
 def table(result: dict[str, Any]) -> Table:
@@ -320,6 +346,8 @@ def _run_row(run: dict[str, Any]) -> list[str]:
     ended = run["error"].splitlines()[0] if "error" in run else f"exit {run['exit']}"
     if run.get("left_behind"):
         ended += f", {run['left_behind']} processes left behind"
+    if "success" in run:
+        ended += f"; in the end {run['success']['struck']}, left alone {run['success']['alone']}"
     books = {True: "add up", False: "DO NOT", None: "–"}[run["books"]]
     names = ("updates", "lost", "doubled", "segments", "segments_lost", "segments_doubled")
     return [run["target"], *(str(run.get(name, "–")) for name in names), books, ended]

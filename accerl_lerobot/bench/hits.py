@@ -174,13 +174,14 @@ def _befall(
 
 
 def _recover(victim: Victim, target: str, fault: str, pid: int, count: int) -> None:
-    """Waits until the run has, with as many processes of the target.
+    """Waits until the run has, with as many processes of the target as before.
 
     Raises:
         RuntimeError: its process has ended, or it has not in time.
     """
+    last = max(victim.updates(), default=0)
     if fault == NAN:
-        victim.await_update(max(victim.updates(), default=0) + SPARE, START_S)
+        victim.await_update(last + SPARE, START_S)
     elif target in (DRIVER, EVERYTHING):
         try:
             code = victim.process.wait(START_S)
@@ -192,7 +193,7 @@ def _recover(victim: Victim, target: str, fault: str, pid: int, count: int) -> N
         victim.await_successors(target, pid, count, START_S)
         if target != "rollout":
             # Who is there now was started from a checkpoint, long after what was made before was told.
-            victim.await_update(max(victim.updates(), default=0) + 1, START_S)
+            victim.await_update(max(last, *victim.updates()) + 1, START_S)
 
 
 def _reason(victim: Victim, error: RuntimeError) -> str:
