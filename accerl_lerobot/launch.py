@@ -47,13 +47,13 @@ from accerl_lerobot.engine import Engine, Progress, Saved, WorkerError
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.inference.pool import added, dealt, together
 from accerl_lerobot.policies.config import Load
+from accerl_lerobot.private_ray import PrivateRay
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seats import START_S, Seats
-from accerl_lerobot.stopping import Stopping
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from accerl_lerobot.transport.endpoint import listens
-from accerl_lerobot.watched import Watched
+from accerl_lerobot.watched import Watched, end
 from accerl_lerobot.weights.publisher import ReaderLostError
 
 logger = logging.getLogger(__name__)
@@ -61,18 +61,6 @@ logger = logging.getLogger(__name__)
 POLL_S = 0.5
 BLAME_S = 10.0
 """How long to wait for the failure that another failure is the consequence of."""
-
-
-def start_ray() -> None:
-    """A private Ray on this machine, without a dashboard; `ray_environment` says what keeps it private."""
-    with Stopping.kept():
-        ray.init(
-            address="local",
-            include_dashboard=False,
-            _node_ip_address="127.0.0.1",
-            log_to_driver=False,
-            configure_logging=False,
-        )
 
 
 class RayEngine(Engine):
@@ -84,6 +72,7 @@ class RayEngine(Engine):
         history: env steps that an observation holds, the policy's ``n_obs_steps``.
         state: the ``training_state`` to go on from, but for episodes under way, which are lost; None: begin.
         load: makes the policy's adapter, in the processes that have one; None: of LeRobot's checkpoint.
+        own: the Ray to use, which outlives this engine; None: one that ends with it.
 
     Raises:
         InputError: the state is of a run in one process, or this system has no shared memory.
@@ -97,6 +86,7 @@ class RayEngine(Engine):
         history: int = 1,
         state: Path | None = None,
         load: Load | None = None,
+        own: PrivateRay | None = None,
     ) -> None:
         listens(config.launch.transport)
         self._config, self._state, self._load = config, state, load
@@ -116,10 +106,10 @@ class RayEngine(Engine):
         self._version = 0 if state is None else saved_version(state)
         self._last_change = time.monotonic()
         self._last_state: tuple[object, ...] = ()
-        self._started_ray = not ray.is_initialized()
+        self._ray = PrivateRay() if own is None else own
+        self._lasting = own is not None
         try:
-            if self._started_ray:
-                start_ray()
+            self._ray.start()
             self._start()
         except BaseException:
             self.close()
@@ -202,10 +192,9 @@ class RayEngine(Engine):
             return
         self._closed = True
         try:
-            for worker in self._everyone():
-                ray.kill(worker.actor)
-            if self._started_ray and ray.is_initialized():
-                ray.shutdown()
+            end(self._everyone())
+            if not self._lasting:
+                self._ray.close()
         except Exception:
             logger.exception("could not end all workers")
 
@@ -269,7 +258,7 @@ class RayEngine(Engine):
         self._seats.start()
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
         for worker, reference in ready:
-            worker.result(reference, "ready", max(START_S, self._limit))
+            worker.await_start(reference, max(START_S, self._limit))
         way = c.launch.transport, self._limit
         deciding = [service.endpoint("decide", *way) for service in self._inference]
         inserting = self._replay.endpoint("insert", *way)

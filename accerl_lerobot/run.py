@@ -34,7 +34,7 @@ import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import yaml
 
@@ -60,6 +60,9 @@ from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.journal import EPISODES
 from accerl_lerobot.stopping import Stopping
 from accerl_lerobot.timeline import RECOVERY, open_clock
+
+if TYPE_CHECKING:
+    from accerl_lerobot.private_ray import PrivateRay
 
 logger = logging.getLogger(__name__)
 
@@ -103,6 +106,7 @@ def make_engine(
     history: int,
     state: Path | None = None,
     load: Load | None = None,
+    own: PrivateRay | None = None,
 ) -> Engine:
     """The engine that ``launch.engine`` names.
 
@@ -112,6 +116,7 @@ def make_engine(
         history: env steps that the policy sees at a time.
         state: the ``training_state`` to go on from; None: begin.
         load: makes the policy's adapter; None: of LeRobot's checkpoint.
+        own: the Ray to use, which outlives the engine; None: one that ends with it.
     """
     if config.launch.engine == "local":
         from accerl_lerobot.local import LocalEngine
@@ -120,7 +125,7 @@ def make_engine(
     ray_environment.prepare()
     from accerl_lerobot.launch import RayEngine
 
-    return RayEngine(config, tasks, history, state, load)
+    return RayEngine(config, tasks, history, state, load, own)
 
 
 def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfig:
@@ -199,10 +204,11 @@ def train(
         stop = stack.enter_context(Stopping())
         times.clock = stack.enter_context(contextlib.closing(open_clock(timeline_folder(config), "driver")))
         log = stack.enter_context(contextlib.closing(MetricsLog(directory, config.wandb, encode(config))))
+        own = None if config.launch.engine == "local" else stack.enter_context(contextlib.closing(_own_ray()))
         recovery = Recovery(config.launch.max_recoveries)
         while True:
             try:
-                return _attempt(config, directory, checkpoint, console, log, tasks, times, stop, load)
+                return _attempt(config, directory, checkpoint, console, log, tasks, times, stop, load, own)
             except WorkerError as error:
                 times.clock.enter(RECOVERY)
                 heed_stop(stop, directory)
@@ -210,6 +216,13 @@ def train(
                 heed_stop(stop, directory)
                 go_back_to(checkpoint)
                 config = _going_on(config, directory, checkpoint)
+
+
+def _own_ray() -> PrivateRay:
+    ray_environment.prepare()
+    from accerl_lerobot.private_ray import PrivateRay
+
+    return PrivateRay()
 
 
 def _attempt(
@@ -222,12 +235,13 @@ def _attempt(
     times: Times,
     stop: Stopping,
     load: Load | None,
+    own: PrivateRay | None,
 ) -> dict[str, Any]:
     """The run, or what is left of it, by one set of workers, which have ended when this returns or raises."""
     history = 1 if load is not None else check_policy(config)
     state = None if checkpoint is None else checkpoint / TRAINING_STATE
     with console.stage("starting workers"):
-        engine = make_engine(config, tasks, history, state, load)
+        engine = make_engine(config, tasks, history, state, load, own)
     with contextlib.closing(engine):
         return Loop(config, directory, console, engine, log, tasks, times, stop).run(state)
 

@@ -15,15 +15,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
+from collections.abc import Iterable
 from typing import Any
 
+import psutil
 import ray
 from ray.exceptions import GetTimeoutError, RayError
 
 from accerl_lerobot.engine import WorkerError
 from accerl_lerobot.transport.endpoint import Endpoint, Transport, listens
 
+GONE_S = 3.0
+"""How long a process may take to go that was told to."""
 LOOK_S = 1.0
 """Between two looks at whether a process that takes long is still there."""
 
@@ -50,9 +55,25 @@ class Watched:
     def __init__(self, name: str, actor: Any) -> None:
         self.name, self.actor = name, actor
         self.work: Any = None
+        self.process: psutil.Process | None = None
+        """None: it has not said yet which one it is."""
         self.answered = False
         self._question: Any = None
         self._asked = 0.0
+
+    def await_start(self, reference: Any, timeout: float) -> None:
+        """Waits until it is ready.
+
+        Args:
+            reference: of the call that asks whether it is.
+            timeout: seconds.
+
+        Raises:
+            WorkerError: it did not start.
+        """
+        pid = self.result(reference, "ready", timeout)
+        with contextlib.suppress(psutil.NoSuchProcess):  # whoever asks it anything will hear of that
+            self.process = psutil.Process(pid)
 
     def endpoint(self, method: str, transport: Transport, timeout: float) -> Endpoint:
         """Where other workers reach it, by this method."""
@@ -122,3 +143,19 @@ class Watched:
             raise WorkerError(f"{self.name} worker did not answer {method} within {timeout:.0f} s") from error
         except RayError as error:
             raise WorkerError(f"{self.name} worker failed in {method}:\n{error}") from error
+
+
+def end(workers: Iterable[Watched]) -> None:
+    """Ends them, and waits until they are gone: nobody is to write any more where others begin anew.
+
+    Ray tells a process to go, which one that was stopped does not hear.
+    """
+    workers = list(workers)
+    for worker in workers:
+        ray.kill(worker.actor)
+    processes = [worker.process for worker in workers if worker.process is not None]
+    left = psutil.wait_procs(processes, timeout=GONE_S)[1]
+    for process in left:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            process.kill()
+    psutil.wait_procs(left, timeout=GONE_S)

@@ -37,10 +37,19 @@ from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
 from accerl_lerobot.launch import RayEngine
 from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.rollout import worker as rollout_worker
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.trainer import worker as trainer_worker
 from accerl_lerobot.trainer.config import TrainerConfig
-from tests.light_workers import FULL, HANGS, NO_WEIGHTS, LightInference, LightTrainer, light_ray
+from tests.light_workers import (
+    FULL,
+    HANGS,
+    NO_WEIGHTS,
+    FalteringRollout,
+    LightInference,
+    LightTrainer,
+    light_ray,
+)
 from tests.runs import collect, drive, polls, tiny_run
 
 __all__ = ["light_ray"]
@@ -212,6 +221,18 @@ def test_a_rollout_worker_that_hangs_is_replaced_and_an_inference_that_hangs_end
     assert "inference worker has not answered for" in until_failure(one)
     one.close()
     assert gone(pid)
+
+
+def test_a_rollout_worker_that_fails_to_report_is_replaced(engine, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(rollout_worker, "RolloutWorker", FalteringRollout)
+    one = engine(rollout=TWO, trainer=ENDLESS)
+    one.plan(evaluation_plans(("match",), 12, "before"))
+    assert sorted(r.plan.index for r in collect(one, "before", 12)) == list(range(12))
+    one.train()
+    for progress in polls(one):
+        if progress.rollout["restarts"] >= 1 and progress.version >= 3:
+            break
+    assert progress.rollout["restarts"] == 1 and progress.replay["duplicates"] == 0
 
 
 def test_an_inference_that_is_killed_ends_the_run_and_not_those_who_relied_on_it(engine):
