@@ -37,6 +37,7 @@ from pathlib import Path
 from typing import Any
 
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.fault_points import reach
 from accerl_lerobot.safety import Origin, safe_join
 
 PRETRAINED, TRAINING_STATE, WORLD_MODEL = "pretrained_model", "training_state", "world_model"
@@ -90,8 +91,10 @@ def save_checkpoint(checkpoints: Path, write: Callable[[Path], int]) -> Path:
     temporary = checkpoints / f"{WRITING}{os.getpid()}"
     try:
         temporary.mkdir()
+        reach("driver.save")
         version = write(temporary)
         final = checkpoints / f"{version:06d}"
+        reach("driver.files")
         relocate(temporary / PRETRAINED, final / PRETRAINED)
         (temporary / TRAINING_STATE).mkdir(exist_ok=True)
         step = json.dumps({"step": version}, indent=2)
@@ -101,6 +104,7 @@ def save_checkpoint(checkpoints: Path, write: Callable[[Path], int]) -> Path:
         if final.exists():
             final.rename(checkpoints / f"{REPLACED}{final.name}")
         temporary.rename(final)
+        reach("driver.renamed", final)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     _point_at(final)

@@ -46,32 +46,20 @@ from accerl_lerobot.config import RunConfig, journal_folder, timeline_folder
 from accerl_lerobot.engine import Engine, Progress, Saved, WorkerError
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.policies.config import Load
+from accerl_lerobot.private_ray import PrivateRay
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seats import START_S, Seats
 from accerl_lerobot.services import Services
-from accerl_lerobot.stopping import Stopping
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from accerl_lerobot.transport.endpoint import Endpoint, listens
-from accerl_lerobot.watched import Watched
+from accerl_lerobot.watched import Watched, end
 
 logger = logging.getLogger(__name__)
 
 POLL_S = 0.5
 BLAME_S = 10.0
 """How long to wait for the failure that another failure is the consequence of."""
-
-
-def start_ray() -> None:
-    """A private Ray on this machine, without a dashboard; `ray_environment` says what keeps it private."""
-    with Stopping.kept():
-        ray.init(
-            address="local",
-            include_dashboard=False,
-            _node_ip_address="127.0.0.1",
-            log_to_driver=False,
-            configure_logging=False,
-        )
 
 
 class RayEngine(Engine):
@@ -83,6 +71,7 @@ class RayEngine(Engine):
         history: env steps that an observation holds, the policy's ``n_obs_steps``.
         state: the ``training_state`` to go on from, but for episodes under way, which are lost; None: begin.
         load: makes the policy's adapter, in the processes that have one; None: of LeRobot's checkpoint.
+        own: the Ray to use, which outlives this engine; None: one that ends with it.
 
     Raises:
         InputError: the state is of a run in one process, or this system has no shared memory.
@@ -96,6 +85,7 @@ class RayEngine(Engine):
         history: int = 1,
         state: Path | None = None,
         load: Load | None = None,
+        own: PrivateRay | None = None,
     ) -> None:
         listens(config.launch.transport)
         self._config, self._state, self._load = config, state, load
@@ -117,10 +107,10 @@ class RayEngine(Engine):
         self._inference = Services(config, self._version, state, load)
         self._last_change = time.monotonic()
         self._last_state: tuple[object, ...] = ()
-        self._started_ray = not ray.is_initialized()
+        self._ray = PrivateRay() if own is None else own
+        self._lasting = own is not None
         try:
-            if self._started_ray:
-                start_ray()
+            self._ray.start()
             self._start()
         except BaseException:
             self.close()
@@ -183,14 +173,15 @@ class RayEngine(Engine):
         told = self._updates + (self._hear(self._trainer, self._limit) or [])
         self._updates = []
         limit = max(START_S, self._limit)  # files may be large
-        version, records = self._trainer.call("hold", timeout=limit)
+        alive = {"timeout": limit, "silence": self._limit}
+        version, records = self._trainer.call("hold", timeout=self._limit)  # it waits for an update at most
         # At once, so that little comes in that was decided by weights of later updates. Those who dream may
         # know of more than replay then; they are told anew of what comes after.
-        self._replay.call("save", state, version, timeout=limit)
+        self._replay.call("save", state, version, **alive)
         for imaginer in (self._learner, self._dreamer):
             if imaginer is not None:
-                imaginer.call("save", directory, timeout=limit)
-        self._trainer.call("write", directory, timeout=limit)
+                imaginer.call("save", directory, **alive)
+        self._trainer.call("write", directory, **alive)
         self._seats.save(state)
         self._last_change = time.monotonic()
         return Saved(version, told + records)
@@ -200,10 +191,9 @@ class RayEngine(Engine):
             return
         self._closed = True
         try:
-            for worker in self._everyone():
-                ray.kill(worker.actor)
-            if self._started_ray and ray.is_initialized():
-                ray.shutdown()
+            end(self._everyone())
+            if not self._lasting:
+                self._ray.close()
         except Exception:
             logger.exception("could not end all workers")
 
@@ -241,7 +231,7 @@ class RayEngine(Engine):
         ranks = [peer.remote(rank, *learner) for rank in range(1, c.trainer.ranks)]
         threads = {"num_cpus": 0, "num_gpus": share, "max_concurrency": 4}
         first = ray.remote(TrainerWorker).options(**threads | {"num_gpus": of_rank})
-        trainer = first.remote(*learner, timeline, ranks)
+        trainer = first.remote(*learner, timeline, ranks, journal_folder(c))
         self._inference.start(share)
         replay = ray.remote(ReplayWorker).options(num_cpus=0, num_gpus=0, max_concurrency=1000)
         imagined, counted = imagination.replay if imagination.share else None, c.rollout.episodes > 0
@@ -263,7 +253,7 @@ class RayEngine(Engine):
         self._seats.start()
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
         for worker, reference in ready:
-            worker.result(reference, "ready", max(START_S, self._limit))
+            worker.await_start(reference, max(START_S, self._limit))
         way = c.launch.transport, self._limit
         deciding, inserting = self._inference.open(), self._replay.endpoint("insert", *way)
         self._dreams_ask = deciding[-1], inserting  # those that get one rollout worker more come first
@@ -379,7 +369,7 @@ class RayEngine(Engine):
         waiting = self._seats.outstanding or (self._training and not self._done)
         # Where one worker is to blame, `_check_hung` comes to it a moment later.
         silent = max(worker.silent_s() for worker in self._everyone())
-        suspect = max(silent, self._seats.in_world_s) > self._limit / 2
+        suspect = max(silent, self._seats.stuck_s) > self._limit / 2
         # A service that is to come has a limit of its own.
         if state != self._last_state or not waiting or not all(self._inference.up):
             self._last_state, self._last_change = state, now

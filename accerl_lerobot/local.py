@@ -37,12 +37,14 @@ from accerl_lerobot.engine import Engine, Progress, Saved, check_new, episode_ke
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Request, Segment
+from accerl_lerobot.policies.config import Load, loader
 from accerl_lerobot.replay import MixedReplay
 from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutRunner
 from accerl_lerobot.seeds import global_generators, restore_global_generators
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, WEIGHT_SYNC, open_clock
+from accerl_lerobot.trainer.nonfinite import keeping
 from accerl_lerobot.weights.held_back import HeldBack
 
 logger = logging.getLogger(__name__)
@@ -59,28 +61,33 @@ class LocalEngine(Engine):
         tasks: the training tasks.
         history: env steps that an observation holds, the policy's ``n_obs_steps``.
         state: the ``training_state`` to go on from, as if it had never been left; None: begin.
+        load: makes the policy's adapter; None: of LeRobot's checkpoint.
 
     Raises:
         InputError: the state is of an asynchronous run.
     """
 
     def __init__(
-        self, config: RunConfig, tasks: tuple[str, ...], history: int = 1, state: Path | None = None
+        self,
+        config: RunConfig,
+        tasks: tuple[str, ...],
+        history: int = 1,
+        state: Path | None = None,
+        load: Load | None = None,
     ) -> None:
         self._clock = open_clock(timeline_folder(config), LOCAL)
         import torch
 
-        from accerl_lerobot.policies.loading import load_adapter
         from accerl_lerobot.trainer.update import Update
 
         torch.manual_seed(config.seed)
         torch.set_num_threads(config.trainer.num_threads)
         self._config = config
-        self._adapter = load_adapter(config.policy)
+        self._adapter = loader(load)(config.policy)
         self._update = Update(self._adapter, config.algorithm, config.trainer)
         self._held, self._acting, self._acting_version = HeldBack(config.trainer.hold_back), self._adapter, 0
         if config.trainer.hold_back:
-            self._acting = load_adapter(config.policy)
+            self._acting = loader(load)(config.policy)
             self._acting.load_trainable(self._adapter.export_trainable())
         imagination = config.imagination
         folder, counted = journal_folder(config), config.rollout.episodes > 0
@@ -142,7 +149,8 @@ class LocalEngine(Engine):
         if self._exploring and self._replay.may_sample(n):
             segments = self._replay.sample(n, self._update.version, self._rng)
             if segments:
-                updates.append(self._update.step(segments) | {"update": float(self._update.version)})
+                with keeping(journal_folder(self._config), self._update, segments):
+                    updates.append(self._update.step(segments) | {"update": float(self._update.version)})
                 self._publish()
         self._clock.enter(WAIT_IN)
         episodes = list(self._episodes)
@@ -160,10 +168,8 @@ class LocalEngine(Engine):
         )
 
     def save(self, directory: Path) -> Saved:
-        from accerl_lerobot.policies.loading import save_pretrained
-
         self._clock.enter(CHECKPOINT)
-        save_pretrained(self._adapter, directory / PRETRAINED, self._config.policy)
+        self._adapter.save(directory / PRETRAINED, self._config.policy, self._adapter.copy_weights())
         state = directory / TRAINING_STATE
         snapshot.save(state / WEIGHTS, self._adapter.export_trainable())
         snapshot.save(state / "trainer", self._update.state())

@@ -30,6 +30,8 @@ from typing import Any
 
 import numpy as np
 
+from accerl_lerobot.fault_points import reach
+
 METRICS = "metrics.jsonl"
 """Name of the file in a run's folder."""
 
@@ -99,6 +101,7 @@ class MetricsLog:
         """
         finite = plain(values)
         record = {"kind": kind, "wall_s": round(self.wall_s, 3), "update": update, **finite}
+        reach("driver.metrics")
         self._file.write(json.dumps(record) + "\n")
         scalars = {k: float(v) for k, v in finite.items() if isinstance(v, (int, float))}
         summary = self._summary(

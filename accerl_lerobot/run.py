@@ -34,7 +34,7 @@ import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import yaml
 
@@ -57,10 +57,14 @@ from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.hub.portable import AWAY
 from accerl_lerobot.loop import Loop, Times, heed_stop
 from accerl_lerobot.metrics import METRICS, MetricsLog
+from accerl_lerobot.policies.config import Load
 from accerl_lerobot.preflight import check_start
 from accerl_lerobot.replay.journal import EPISODES
 from accerl_lerobot.stopping import Stopping
 from accerl_lerobot.timeline import RECOVERY, open_clock
+
+if TYPE_CHECKING:
+    from accerl_lerobot.private_ray import PrivateRay
 
 logger = logging.getLogger(__name__)
 
@@ -100,7 +104,14 @@ def make_output_dir(config: Placed) -> Path:
     return path
 
 
-def make_engine(config: RunConfig, tasks: tuple[str, ...], history: int, state: Path | None = None) -> Engine:
+def make_engine(
+    config: RunConfig,
+    tasks: tuple[str, ...],
+    history: int,
+    state: Path | None = None,
+    load: Load | None = None,
+    own: PrivateRay | None = None,
+) -> Engine:
     """The engine that ``launch.engine`` names.
 
     Args:
@@ -108,15 +119,17 @@ def make_engine(config: RunConfig, tasks: tuple[str, ...], history: int, state: 
         tasks: the training tasks.
         history: env steps that the policy sees at a time.
         state: the ``training_state`` to go on from; None: begin.
+        load: makes the policy's adapter; None: of LeRobot's checkpoint.
+        own: the Ray to use, which outlives the engine; None: one that ends with it.
     """
     if config.launch.engine == "local":
         from accerl_lerobot.local import LocalEngine
 
-        return LocalEngine(config, tasks, history, state)
+        return LocalEngine(config, tasks, history, state, load)
     ray_environment.prepare()
     from accerl_lerobot.launch import RayEngine
 
-    return RayEngine(config, tasks, history, state)
+    return RayEngine(config, tasks, history, state, load, own)
 
 
 def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfig:
@@ -152,7 +165,13 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
     return _improving(config, path)
 
 
-def train(config: RunConfig, directory: Path, console: Console, wanted: str | None = None) -> dict[str, Any]:
+def train(
+    config: RunConfig,
+    directory: Path,
+    console: Console,
+    wanted: str | None = None,
+    load: Load | None = None,
+) -> dict[str, Any]:
     """Runs everything and returns the summary, which is also in ``summary.json``.
 
     Args:
@@ -161,6 +180,7 @@ def train(config: RunConfig, directory: Path, console: Console, wanted: str | No
         console: progress for people.
         wanted: the checkpoint to go on from, where the run has been begun before; see
             `checkpoint.newest_whole`.
+        load: makes the policy's adapter, and may be given a path of its own; None: of LeRobot's checkpoint.
 
     Raises:
         InputError: the settings do not fit each other, or no checkpoint can be gone on from.
@@ -189,10 +209,11 @@ def train(config: RunConfig, directory: Path, console: Console, wanted: str | No
         stop = stack.enter_context(Stopping())
         times.clock = stack.enter_context(contextlib.closing(open_clock(timeline_folder(config), "driver")))
         log = stack.enter_context(contextlib.closing(MetricsLog(directory, config.wandb, encode(config))))
+        own = None if config.launch.engine == "local" else stack.enter_context(contextlib.closing(_own_ray()))
         recovery = Recovery(config.launch.max_recoveries)
         while True:
             try:
-                return _attempt(config, directory, checkpoint, console, log, tasks, times, stop)
+                return _attempt(config, directory, checkpoint, console, log, tasks, times, stop, load, own)
             except WorkerError as error:
                 times.clock.enter(RECOVERY)
                 heed_stop(stop, directory)
@@ -200,6 +221,13 @@ def train(config: RunConfig, directory: Path, console: Console, wanted: str | No
                 heed_stop(stop, directory)
                 go_back_to(checkpoint)
                 config = _going_on(config, directory, checkpoint, console)
+
+
+def _own_ray() -> PrivateRay:
+    ray_environment.prepare()
+    from accerl_lerobot.private_ray import PrivateRay
+
+    return PrivateRay()
 
 
 def _attempt(
@@ -211,12 +239,14 @@ def _attempt(
     tasks: tuple[str, ...],
     times: Times,
     stop: Stopping,
+    load: Load | None,
+    own: PrivateRay | None,
 ) -> dict[str, Any]:
     """The run, or what is left of it, by one set of workers, which have ended when this returns or raises."""
-    history = check_policy(config)
+    history = 1 if load is not None else check_policy(config)
     state = None if checkpoint is None else checkpoint / TRAINING_STATE
     with console.stage("starting workers"):
-        engine = make_engine(config, tasks, history, state)
+        engine = make_engine(config, tasks, history, state, load, own)
     with contextlib.closing(engine):
         return Loop(config, directory, console, engine, log, tasks, times, stop).run(state)
 

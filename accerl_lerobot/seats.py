@@ -62,6 +62,7 @@ class Seat:
     unsent: list[EpisodePlan] = field(default_factory=list)
     counters: dict[str, float] = field(default_factory=dict)
     in_world_s: float = 0.0
+    stuck_s: float = 0.0
     away: tuple[float, str] = (0.0, "")
     """For how long it has not found inference where it was told, in seconds, and why."""
     moved: Endpoint | None = None
@@ -144,7 +145,11 @@ class Seats:
                 seat.unsent = []
 
     def listen(self) -> list[EpisodeResult]:
-        """Picks up the reports that have come; returns the episodes in them."""
+        """Picks up the reports that have come; returns the episodes in them. Who fails is started again.
+
+        Raises:
+            WorkerError: see `restart_worker`.
+        """
         episodes: list[EpisodeResult] = []
         for seat in self._seats:
             try:
@@ -152,10 +157,12 @@ class Seats:
             except RayActorError:
                 continue  # its `run` has ended as well, and the engine deals with that
             except RayError as error:
-                raise WorkerError(f"{seat.worker.name} worker failed to report:\n{error}") from error
+                self._restart(seat, error)
+                continue
             if report is None:
                 continue
-            seat.counters, seat.in_world_s, seat.spent = report.counters, report.in_world_s, report.spent
+            seat.counters, seat.spent = report.counters, report.spent
+            seat.in_world_s, seat.stuck_s = report.in_world_s, report.stuck_s
             seat.away = report.away_s, report.away_why
             if seat.budget is not None:
                 seat.budget -= sum(e.plan.explore for e in report.episodes)
@@ -184,9 +191,9 @@ class Seats:
         return all(seat.spent for seat in self._seats)
 
     @property
-    def in_world_s(self) -> float:
-        """How long the slowest world has been at what it does now."""
-        return max(seat.in_world_s for seat in self._seats)
+    def stuck_s(self) -> float:
+        """How long the slowest of them, or of their worlds, has been at what it does now."""
+        return max(max(seat.in_world_s, seat.stuck_s) for seat in self._seats)
 
     def restart_worker(self, worker: Watched, error: Exception) -> bool:
         """Starts a worker again that has failed; False if it is none of these.
@@ -201,7 +208,8 @@ class Seats:
         return False
 
     def check_hung(self, served: list[bool]) -> None:
-        """Starts those again that do not answer, whose world does not return, or who do not find inference.
+        """Starts those again that do not answer, do nothing, whose world does not return, or who do not find
+        inference.
 
         Args:
             served: of each inference service, whether it is there.
@@ -221,6 +229,8 @@ class Seats:
                 self._restart(
                     seat, RuntimeError(f"without inference, which is there, for {away_s:.0f} s: {why}")
                 )
+            elif seat.stuck_s > limit:
+                self._restart(seat, RuntimeError(f"it has done nothing for {seat.stuck_s:.0f} s"))
 
     def save(self, directory: Path) -> None:
         """Writes their part of ``training_state``."""
@@ -273,7 +283,8 @@ class Seats:
         self._past["restarts"] += 1
         for key, value in seat.counters.items():
             self._past[key] = self._past.get(key, 0.0) + value
-        seat.counters, seat.in_world_s, seat.away, seat.moved = {}, 0.0, (0.0, ""), None
+        seat.counters, seat.in_world_s, seat.stuck_s = {}, 0.0, 0.0
+        seat.away, seat.moved = (0.0, ""), None
         seat.incarnation += 1
         seat.restarts += 1
         if seat.budget is not None:

@@ -40,6 +40,7 @@ from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.ranking import BenchRankingConfig
 from accerl_lerobot.bench.replay import BenchReplayConfig
 from accerl_lerobot.bench.scaling import BenchScalingConfig
+from accerl_lerobot.bench.soak import BenchSoakConfig
 from accerl_lerobot.bench.throughput import BenchThroughputConfig
 from accerl_lerobot.bench.timeline import BenchTimelineConfig
 from accerl_lerobot.bench.transport import BenchTransportConfig
@@ -52,14 +53,20 @@ from accerl_lerobot.demos.export import ExportConfig
 from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.hub.config import PullConfig, PushConfig
 from accerl_lerobot.parsing import read_arguments
+from accerl_lerobot.policies.config import Load
 from accerl_lerobot.report.config import ReportConfig
 from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.timeline.config import TimelineConfig
 from accerl_lerobot.verb_configs import DemosRun, EvalRun, SFTRun, WorldModelEvalRun, WorldModelRun
 
 
-def train(arguments: list[str]) -> int:
-    """``accerl train``."""
+def train(arguments: list[str], load: Load | None = None) -> int:
+    """``accerl train``.
+
+    Args:
+        arguments: of the command line.
+        load: makes the policy's adapter; None: of LeRobot's checkpoint.
+    """
     config: RunConfig = parse(RunConfig, arguments)
     from accerl_lerobot import run
     from accerl_lerobot.preflight import check_start
@@ -67,7 +74,7 @@ def train(arguments: list[str]) -> int:
     from accerl_lerobot.stopping import StoppedError
 
     begun = begun_run(read_arguments(arguments)[0], config) if config.resume else None
-    if begun is None:
+    if load is None and begun is None:
         check_start(config)  # before there is a folder
     console = Console()
     directory = run.make_output_dir(config) if begun is None else begun.directory
@@ -75,7 +82,7 @@ def train(arguments: list[str]) -> int:
     try:
         with redirect_stdout(sys.stderr), locked(directory, "config_path", "another process goes on with it"):
             wanted = None if begun is None else begun.checkpoint
-            summary = run.train(config, directory, console, wanted)
+            summary = run.train(config, directory, console, wanted, load)
     except InputError:
         if begun is None:
             _discard_unused(directory)
@@ -327,6 +334,7 @@ CONFIGS: dict[str, type[Any]] = {
     "bench dream": BenchDreamConfig,
     "bench efficiency": BenchEfficiencyConfig,
     "bench faults": BenchFaultsConfig,
+    "bench soak": BenchSoakConfig,
     "bench ranking": BenchRankingConfig,
 }
 """Verb → what its command line is parsed into."""

@@ -15,14 +15,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
+from collections.abc import Iterable
 from typing import Any
 
+import psutil
 import ray
 from ray.exceptions import GetTimeoutError, RayError
 
 from accerl_lerobot.engine import WorkerError
 from accerl_lerobot.transport.endpoint import Endpoint, Transport, listens
+
+GONE_S = 3.0
+"""How long a process may take to go that was told to."""
+LOOK_S = 1.0
+"""Between two looks at whether a process that takes long is still there."""
 
 
 class Watched:
@@ -47,9 +55,25 @@ class Watched:
     def __init__(self, name: str, actor: Any) -> None:
         self.name, self.actor = name, actor
         self.work: Any = None
+        self.process: psutil.Process | None = None
+        """None: it has not said yet which one it is."""
         self.answered = False
         self._question: Any = None
         self._asked = 0.0
+
+    def await_start(self, reference: Any, timeout: float) -> None:
+        """Waits until it is ready.
+
+        Args:
+            reference: of the call that asks whether it is.
+            timeout: seconds.
+
+        Raises:
+            WorkerError: it did not start.
+        """
+        pid = self.result(reference, "ready", timeout)
+        with contextlib.suppress(psutil.NoSuchProcess):  # whoever asks it anything will hear of that
+            self.process = psutil.Process(pid)
 
     def endpoint(self, method: str, transport: Transport, timeout: float) -> Endpoint:
         """Where other workers reach it, by this method."""
@@ -81,13 +105,35 @@ class Watched:
         """For how long an answer has been owed, in seconds."""
         return 0.0 if self._question is None else time.monotonic() - self._asked
 
-    def call(self, method: str, *arguments: Any, timeout: float) -> Any:
+    def call(self, method: str, *arguments: Any, timeout: float, silence: float | None = None) -> Any:
         """Waits for one answer.
+
+        Args:
+            method: of the actor.
+            arguments: of the method.
+            timeout: seconds until the answer.
+            silence: seconds in which it must say meanwhile that it is there; None: it need not.
 
         Raises:
             WorkerError: it failed, with its traceback, or did not come in time.
         """
-        return self.result(getattr(self.actor, method).remote(*arguments), method, timeout)
+        reference = getattr(self.actor, method).remote(*arguments)
+        if silence is not None:
+            self._listen(reference, method, timeout, silence)
+        return self.result(reference, method, timeout)
+
+    def _listen(self, reference: Any, method: str, timeout: float, silence: float) -> None:
+        """Waits for an answer that may take long, from a process that must not hang."""
+        deadline = time.monotonic() + timeout
+        beat, asked = self.actor.ready.remote(), time.monotonic()
+        while not ray.wait([reference], timeout=min(LOOK_S, silence / 4))[0]:
+            now = time.monotonic()
+            if now > deadline:
+                return  # `result` says so
+            if ray.wait([beat], timeout=0)[0]:
+                beat, asked = self.actor.ready.remote(), now
+            elif now - asked > silence:
+                raise WorkerError(f"{self.name} worker has not answered for {now - asked:.0f} s, in {method}")
 
     def result(self, reference: Any, method: str, timeout: float) -> Any:
         """As `call`, for a call that has been made."""
@@ -97,3 +143,19 @@ class Watched:
             raise WorkerError(f"{self.name} worker did not answer {method} within {timeout:.0f} s") from error
         except RayError as error:
             raise WorkerError(f"{self.name} worker failed in {method}:\n{error}") from error
+
+
+def end(workers: Iterable[Watched]) -> None:
+    """Ends them, and waits until they are gone: nobody is to write any more where others begin anew.
+
+    Ray tells a process to go, which one that was stopped does not hear.
+    """
+    workers = list(workers)
+    for worker in workers:
+        ray.kill(worker.actor)
+    processes = [worker.process for worker in workers if worker.process is not None]
+    left = psutil.wait_procs(processes, timeout=GONE_S)[1]
+    for process in left:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            process.kill()
+    psutil.wait_procs(left, timeout=GONE_S)

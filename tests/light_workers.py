@@ -18,6 +18,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -30,6 +31,7 @@ import pytest
 from accerl_lerobot import snapshot
 from accerl_lerobot.checkpoint import TRAINING_STATE
 from accerl_lerobot.experience import Decision, Request
+from accerl_lerobot.rollout.worker import Report, RolloutWorker
 from accerl_lerobot.transport.on_loop import serve_on_loop
 from accerl_lerobot.transport.shared_memory import Address
 
@@ -39,7 +41,7 @@ def light_ray() -> Iterator[None]:
     """Ray for the rest of the test session; engines that find it leave it running."""
     import ray
 
-    from accerl_lerobot.launch import start_ray
+    from accerl_lerobot.private_ray import start_ray
 
     if not ray.is_initialized():
         start_ray()
@@ -48,6 +50,8 @@ def light_ray() -> Iterator[None]:
 
 
 NO_WEIGHTS = "a path without weights"
+HANGS = "hangs"
+"""A folder that whoever writes into it hangs."""
 FULL = "full"
 """A folder that nothing can be written into."""
 
@@ -93,6 +97,22 @@ def _decision(request: Request, version: int) -> Decision:
     return Decision(
         chunk=chunk, latent={"x": chunk}, log_prob=np.zeros(4, np.float32), value=0.0, version=version
     )
+
+
+class FalteringRollout(RolloutWorker):
+    """The first process in the first seat fails when it is to report for the third time."""
+
+    def __init__(
+        self, env: Any, config: Any, tasks: Any, seed: int, index: int, incarnation: int, *rest: Any
+    ) -> None:
+        super().__init__(env, config, tasks, seed, index, incarnation, *rest)
+        self._left = 2 if (index, incarnation) == (0, 0) else 1_000_000
+
+    def report(self, *arguments: Any) -> Report:
+        self._left -= 1
+        if self._left < 0:
+            raise OSError("no space left for the timeline")
+        return super().report(*arguments)
 
 
 class LightTrainer:
@@ -170,6 +190,8 @@ class LightTrainer:
         return len(self._kept), records
 
     def write(self, directory: Path) -> None:
+        if directory.name == HANGS:
+            os.kill(os.getpid(), signal.SIGSTOP)
         if directory.name == FULL:
             raise OSError("no space left on the device")
         snapshot.save(directory / TRAINING_STATE / "trainer", {"ledger": self._kept})

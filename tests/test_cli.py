@@ -158,7 +158,7 @@ class TestTrain:
     ) -> None:
         seen: dict[str, Any] = {}
 
-        def train(config: RunConfig, directory: Path, console: Any, wanted: Any) -> dict[str, Any]:
+        def train(config: RunConfig, directory: Path, console: Any, *_: Any) -> dict[str, Any]:
             seen.update(config=config, directory=directory)
             return {"success_before": 0.25, "success_after": 0.75, "wall_s": 3.0}
 
@@ -173,7 +173,7 @@ class TestTrain:
     def test_a_refused_run_leaves_no_folder(
         self, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        def train(config: RunConfig, directory: Path, console: Any, wanted: Any) -> dict[str, Any]:
+        def train(config: RunConfig, directory: Path, console: Any, *_: Any) -> dict[str, Any]:
             (directory / "config.yaml").write_text("seed: 0\n")
             raise InputError("MUJOCO_GL", "", "install it")
 
@@ -184,7 +184,7 @@ class TestTrain:
     def test_but_work_that_was_done_is_kept(
         self, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        def train(config: RunConfig, directory: Path, console: Any, wanted: Any) -> dict[str, Any]:
+        def train(config: RunConfig, directory: Path, console: Any, *_: Any) -> dict[str, Any]:
             (directory / "demos").mkdir()
             raise InputError("sft.lr", 1.0, "lower it")
 
@@ -292,5 +292,5 @@ def test_bench_without_a_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert (
         capsys.readouterr().err
         == "accerl: bench='': name what is measured: world, policy, throughput, scaling, async-vs-sync, "
-        "transport, weights, batching, replay, timeline, lag, dream, efficiency, faults, ranking\n"
+        "transport, weights, batching, replay, timeline, lag, dream, efficiency, faults, soak, ranking\n"
     )

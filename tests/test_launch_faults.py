@@ -32,19 +32,28 @@ import ray
 
 from accerl_lerobot import launch, seats
 from accerl_lerobot.config import LaunchConfig
-from accerl_lerobot.engine import Progress
+from accerl_lerobot.engine import Progress, WorkerError
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.launch import RayEngine
 from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.rollout import worker as rollout_worker
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.trainer import worker as trainer_worker
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.transport.endpoint import Transport
 from accerl_lerobot.transport.shared_memory import Address, this_node
-from tests.light_workers import FULL, NO_WEIGHTS, LightInference, LightTrainer, light_ray
+from tests.light_workers import (
+    FULL,
+    HANGS,
+    NO_WEIGHTS,
+    FalteringRollout,
+    LightInference,
+    LightTrainer,
+    light_ray,
+)
 from tests.runs import collect, drive, polls, tiny_run
 
 __all__ = ["light_ray"]
@@ -268,6 +277,18 @@ def lose_inference(one: RayEngine, how: Callable[[str], object], name: str = "in
     return away
 
 
+def test_a_rollout_worker_that_fails_to_report_is_replaced(engine, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(rollout_worker, "RolloutWorker", FalteringRollout)
+    one = engine(rollout=TWO, trainer=ENDLESS)
+    one.plan(evaluation_plans(("match",), 12, "before"))
+    assert sorted(r.plan.index for r in collect(one, "before", 12)) == list(range(12))
+    one.train()
+    for progress in polls(one):
+        if progress.rollout["restarts"] >= 1 and progress.version >= 3:
+            break
+    assert progress.rollout["restarts"] == 1 and progress.replay["duplicates"] == 0
+
+
 def hit(one: RayEngine, number: signal.Signals) -> Callable[[str], None]:
     return lambda name: os.kill(one.pids()[name], number)
 
@@ -340,6 +361,15 @@ def test_a_worker_that_does_not_find_inference_is_replaced(engine, monkeypatch):
         if restarts:
             break
     assert restarts == 1.0 and one.pids()["rollout 1"] != before
+
+
+def test_a_trainer_that_hangs_while_it_is_saved_is_found_as_soon_as_any(engine, tmp_path: Path):
+    one = engine(trainer=ENDLESS, launch=LaunchConfig(stall_s=5.0))
+    until_training(one)
+    began = time.monotonic()
+    with pytest.raises(WorkerError, match="trainer worker has not answered for 5 s, in write"):
+        one.save(tmp_path / HANGS)
+    assert time.monotonic() - began < 30, "and not after the minutes that large files may take"
 
 
 def test_a_world_that_does_not_return_is_no_reason_to_wait_for_ever(engine):

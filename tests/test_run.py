@@ -257,7 +257,7 @@ def losing(monkeypatch: pytest.MonkeyPatch, config: RunConfig, lost_at: list[int
     """Engines that lose a worker after so many updates, one after the other."""
     made: list[Scripted] = []
 
-    def make(config: RunConfig, tasks: Any, history: int, state: Path | None) -> Scripted:
+    def make(config: RunConfig, tasks: Any, history: int, state: Path | None, *_: Any) -> Scripted:
         engine = Scripted(config)
         engine.version = 0 if state is None else saved_version(state)
         engine.training = False

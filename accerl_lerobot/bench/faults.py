@@ -11,48 +11,49 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What a run survives: workers killed and stopped while it learns, and what that costs.
+"""What a run survives: faults of each of its processes, at named points and at any moment, and at what cost.
 
-    accerl bench faults --repeats=5
+    accerl bench faults                                          # a run made of time: seconds each
+    accerl bench faults --recipe=recipes/quickstart.yaml --faults=kill --targets=driver --repeats=5
 
-A cell is one run in which one kind of process is hit again and again, at random moments, by one signal. Each
-hit is proved to have happened; the run has recovered when another process has its place and, but for a
-rollout worker, an update has been made that had not been made before. At the end the run is asked to stop,
-and its books are looked at: every update logged once, none missing, every segment of replay accounted for.
+One run for each target, in which things go wrong again and again (`hits.py`), in an order drawn from the
+seed; each is proved to have happened. A cell is target × fault. After each the run's log is looked at, and at
+the end, when it has been asked to stop, its segments (`audit.py`) and what it has left behind.
 """
 
 from __future__ import annotations
 
 import json
 import random
-import signal
 import statistics
 import subprocess
 import time
-from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import yaml
 from rich.table import Table
 
-from accerl_lerobot.bench.study import as_markdown, as_table, last_words
-from accerl_lerobot.bench.victims import CLASSES, Victim, alive, await_hit, hit
-from accerl_lerobot.checkpoint import CHECKPOINTS, LAST, PRETRAINED, newest_whole
-from accerl_lerobot.config import RunConfig, parse
+from accerl_lerobot.bench.audit import audit_segments, audit_updates
+from accerl_lerobot.bench.hits import FAULTS, START_S, TIDY_S, places, strike
+from accerl_lerobot.bench.host import host
+from accerl_lerobot.bench.light_run import light_config
+from accerl_lerobot.bench.study import as_markdown, as_table, last_words, write
+from accerl_lerobot.bench.victims import CLASSES, DRIVER, EVERYTHING, LIGHT, TRAIN, Victim, alive
+from accerl_lerobot.checkpoint import CHECKPOINTS, LAST, PRETRAINED, SUMMARY
+from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, check_absent
+from accerl_lerobot.evaluation.pictures import drawing
+from accerl_lerobot.evaluation.stats import Rate
 
-SIGNALS = {"kill": signal.SIGKILL, "stop": signal.SIGSTOP}
-"""Fault → what is sent."""
-START_S = 300.0
-"""How long a run may take to its first update."""
+IMAGINING = ("dream", "world learning")
+"""Targets that are there where anything is imagined."""
+TARGETS = (*CLASSES, DRIVER, EVERYTHING)
 GRACE_S = 60.0
-"""How long it may take to stop when it is asked to."""
-SPARE = 5
-"""Updates beyond the last that was logged before a hit, by which a run has recovered."""
-TIDY_S = 10.0
-"""How long what it has started may outlive it."""
+"""How long a run may take to stop when it is asked to."""
 ENDLESS = 1_000_000
 
 
@@ -60,212 +61,308 @@ ENDLESS = 1_000_000
 class BenchFaultsConfig:
     """What is done, and to whom."""
 
-    recipe: str = "recipes/quickstart.yaml"
-    """The run. Its demonstrations and SFT are cut short, unless it has a policy: they do not matter here."""
+    recipe: str | None = None
+    """The run. Its demonstrations and SFT are cut short, unless it has a policy: they do not matter here.
+    None: one with worlds and a policy made of time, in which all else is real."""
     output_dir: str = "outputs/faults"
-    """Folder of the runs and of faults.json and faults.md; must not exist."""
-    targets: tuple[str, ...] = ("rollout", "inference", "replay", "trainer", "driver")
-    """Of these, and, where anything is imagined, dream and world learning. The driver is the process of the
-    run itself: after its end the run is gone on with by its command line."""
-    faults: tuple[str, ...] = ("kill", "stop")
-    """kill: SIGKILL. stop: SIGSTOP, so that it hangs; not of the driver, which nobody watches."""
+    """Folder of the runs and of faults.json, .md and .png; must not exist."""
+    targets: tuple[str, ...] = (
+        "rollout",
+        "inference",
+        "replay",
+        "trainer",
+        "trainer rank",
+        "driver",
+        "everything",
+    )
+    """Of these, and, where anything is imagined, dream and world learning. driver: the process of the run
+    itself, which is gone on with by its command line. everything: it and all below it, at once."""
+    faults: tuple[str, ...] = FAULTS
+    """kill, stop: SIGKILL and SIGSTOP, at a point or at any moment. exception, exit (with code 0), hang (of
+    one thread), nan, nans (in as many updates in a row as end the trainer), full (the disk), torn (a file of
+    a checkpoint): at the points of `fault_points` where they can happen."""
     repeats: int = 5
     """Hits of each cell."""
     stall_s: float = 10.0
     """``launch.stall_s`` of the runs: how long a process that hangs is waited for."""
+    updates: int = 0
+    """When what was to befall everything has, that run goes on to so many updates and ends by itself, and so
+    does one that was left alone, to compare what they have learnt; 0: it is asked to stop like others."""
     seed: int = 0
-    """Of the moments, and of which worker is hit."""
+    """Of the order, the places and the moments."""
 
     def __post_init__(self) -> None:
-        known = {"targets": [*CLASSES, "driver"], "faults": list(SIGNALS)}
-        for name, names in known.items():
+        for name, names in (("targets", TARGETS), ("faults", FAULTS)):
             given = getattr(self, name)
             if not given or len(set(given)) < len(given) or not set(given) <= set(names):
                 raise InputError(name, given, f"use some of {', '.join(names)}, none twice")
+        if self.updates < 0:
+            raise InputError("updates", self.updates, "use 0 (none) or more")
         if self.repeats < 1:
             raise InputError("repeats", self.repeats, "use at least 1")
         if not self.stall_s >= 5:
             remedy = "use 5 s or more, or a busy worker is taken for one that hangs"
             raise InputError("stall_s", self.stall_s, remedy)
+        if not any(self.of(target) for target in self.targets):
+            remedy = f"none of them can befall {', '.join(self.targets)}; add kill"
+            raise InputError("faults", self.faults, remedy)
+
+    def of(self, target: str) -> list[str]:
+        """The faults that can befall it."""
+        return [fault for fault in self.faults if places(target, fault)]
 
 
 def bench_faults(config: BenchFaultsConfig) -> dict[str, Any]:
-    """Does it all.
+    """Does it all; what is known is written after each target.
 
     Returns:
-        ``cells``, of each ``target``, ``fault``, ``fired``, ``recovered``, ``seconds`` of each recovery,
-        ``updates``, ``lost``, ``doubled``, ``books`` (whether replay's add up), ``exit`` (its code at the
-        end), ``left_behind`` (processes), and ``error`` if the run did not survive.
+        ``hits``, see `hits.Hit`; ``runs``, of each ``target``, what `audit` finds, ``exit`` (its code at the
+        end), ``left_behind`` (processes) and ``skipped_updates``; ``config`` and ``host``.
 
     Raises:
-        InputError: the folder exists, or the recipe is wrong.
+        InputError: the folder exists, or the recipe is wrong or has no such target.
         RuntimeError: no policy could be made to begin with.
     """
     root, console = Path(config.output_dir).expanduser().resolve(), Console()
-    recipe: RunConfig = parse(RunConfig, [f"--config_path={config.recipe}"])
-    for target in ("dream", "world learning"):
-        if target in config.targets and not recipe.imagination.share:
-            raise InputError("targets", target, "nothing is imagined in this recipe")
+    recipe = recipe_of(config)
     check_absent(root)
     root.mkdir(parents=True)
-    start = _policy(config, recipe, root, console)
-    cells = []
+    start = Start(config.recipe, recipe, config.stall_s, root, console)
+    result: dict[str, Any] = {"config": asdict(config), "host": host(), "hits": [], "runs": []}
     for target in config.targets:
-        for fault in config.faults:
-            if (target, fault) == ("driver", "stop"):
-                continue
-            with console.stage(f"{fault} {target}"):
-                cells.append(
-                    _cell(config, start, root / f"{fault}-{target.replace(' ', '_')}", target, fault)
-                )
-            console.say(_told(cells[-1]))
-    result = {"config": asdict(config), "cells": cells}
-    (root / "faults.json").write_text(json.dumps(result, indent=2) + "\n")
-    (root / "faults.md").write_text(markdown(result))
+        drawn = [fault for fault in config.of(target) for _ in range(config.repeats)]
+        random.Random(f"{config.seed} {target}").shuffle(drawn)
+        with console.stage(target, total=len(drawn)) as stage:
+            _target(config, start, target, drawn, result, stage.update)
+        result["host_after"] = host()
+        write(root, "faults", result, markdown(result), _draw)
     return result
 
 
-def _policy(config: BenchFaultsConfig, recipe: RunConfig, root: Path, console: Console) -> list[str]:
-    """The arguments of all runs, after one that has made their policy."""
-    arguments = [f"--config_path={config.recipe}", f"--launch.stall_s={config.stall_s}"]
-    if recipe.policy.path is not None:
-        return arguments
-    short = ["--sft.steps=5", "--trainer.updates=0", "--evaluation.before=false", "--evaluation.episodes=1"]
-    if recipe.dataset.repo_id is None:
-        short.append("--demos.episodes=2")
-    with console.stage("a policy to begin with"):
-        made = Victim(root / "start", [*arguments, *short, "--evaluation.videos=0"], root / "start.log")
-        if code := made.process.wait():
-            raise RuntimeError(f"its run ended with code {code}:\n{last_words(root / 'start.log')}")
-    return [
-        *arguments,
-        "--sft.steps=0",
-        f"--policy.path={root / 'start' / CHECKPOINTS / LAST / PRETRAINED}",
-    ]
+def recipe_of(config: BenchFaultsConfig) -> RunConfig:
+    """The run.
+
+    Raises:
+        InputError: the recipe is wrong or has no such target.
+    """
+    if config.recipe is None:
+        recipe = light_config(updates=ENDLESS, stall_s=config.stall_s)
+    else:
+        recipe = parse(RunConfig, [f"--config_path={config.recipe}"])
+    for target in IMAGINING:
+        if target in config.targets and not recipe.imagination.share:
+            raise InputError("targets", target, "nothing is imagined in this recipe")
+    if "trainer rank" in config.targets and config.recipe is not None and recipe.trainer.ranks < 2:
+        raise InputError("targets", "trainer rank", "the trainer of this recipe is one process")
+    return recipe
 
 
-def _cell(
-    config: BenchFaultsConfig, start: list[str], folder: Path, target: str, fault: str
-) -> dict[str, Any]:
-    """One run and all its hits."""
-    number, rng = SIGNALS[fault], random.Random(f"{config.seed} {target} {fault}")
-    arguments = [
-        *start,
-        f"--trainer.updates={ENDLESS}",
-        "--trainer.schedule=constant",
-        "--rollout.workers=2",
-        "--rollout.max_restarts=1000",
-        "--evaluation.before=false",
-        "--evaluation.every_updates=0",
-        "--evaluation.videos=0",
-        "--save_every_updates=5",
-    ]
-    victim = Victim(folder, arguments, folder.with_suffix(".log"))
-    found: dict[str, Any] = {"target": target, "fault": fault, "fired": 0, "recovered": 0, "seconds": []}
-    left: list[int] = []
+class Start:
+    """How runs to be done harm to are begun: all of one recipe, and of one policy.
+
+    Args:
+        path: of the recipe; None: the one made of time.
+        recipe: what is in it.
+        stall_s: of the runs.
+        root: folder for them.
+        console: progress for people.
+
+    Raises:
+        RuntimeError: no policy could be made to begin with.
+    """
+
+    def __init__(
+        self, path: str | None, recipe: RunConfig, stall_s: float, root: Path, console: Console
+    ) -> None:
+        self._root, self._module, self.recipe = root, TRAIN if path is not None else LIGHT, recipe
+        self._stall_s = stall_s
+        self._arguments = [f"--config_path={path}", f"--launch.stall_s={stall_s}"]
+        if path is None:
+            light = root / "light.yaml"
+            light.write_text(yaml.safe_dump(encode(recipe), sort_keys=False))
+            self._arguments = [f"--config_path={light}"]
+        else:
+            self._arguments += ["--rollout.workers=2", "--rollout.max_restarts=1000"]
+        if recipe.policy.path is None:
+            self._arguments += self._policy(console)
+
+    def run(self, name: str, *changes: str, orders: Path | None = None) -> Victim:
+        """Begins one.
+
+        Args:
+            name: of its folder.
+            changes: of its command line.
+            orders: folder of them, see `fault_points`.
+        """
+        chosen = [
+            f"--trainer.updates={ENDLESS}",
+            "--trainer.schedule=constant",
+            "--evaluation.before=false",
+            "--evaluation.every_updates=0",
+            "--evaluation.videos=0",
+        ]
+        if self._module is TRAIN:
+            chosen.append("--save_every_updates=5")
+        folder = self._root / name
+        arguments = [*self._arguments, *chosen, *changes]
+        return Victim(folder, arguments, folder.with_suffix(".log"), self._module, orders)
+
+    def ranks(self) -> list[str]:
+        """Changes that give the trainer another rank, where it has none."""
+        if self._module is TRAIN:
+            return []
+        wait = f"--trainer.rank_timeout_s={self._stall_s}"
+        return ["--trainer.ranks=2", "--trainer.sharding=ddp", wait]
+
+    def _policy(self, console: Console) -> list[str]:
+        """Arguments that name it, after a run that has made it."""
+        short = [
+            "--sft.steps=5",
+            "--trainer.updates=0",
+            "--evaluation.before=false",
+            "--evaluation.episodes=1",
+        ]
+        if self.recipe.dataset.repo_id is None:
+            short.append("--demos.episodes=2")
+        log = self._root / "start.log"
+        with console.stage("a policy to begin with"):
+            made = Victim(self._root / "start", [*self._arguments, *short, "--evaluation.videos=0"], log)
+            if code := made.process.wait():
+                raise RuntimeError(f"its run ended with code {code}:\n{last_words(log)}")
+        checkpoint = self._root / "start" / CHECKPOINTS / LAST / PRETRAINED
+        return ["--sft.steps=0", f"--policy.path={checkpoint}"]
+
+
+def _target(
+    config: BenchFaultsConfig,
+    start: Start,
+    target: str,
+    drawn: list[str],
+    result: dict[str, Any],
+    on_progress: Any,
+) -> None:
+    """All hits of one target, in one run unless it is lost."""
+    rng, done = random.Random(f"{config.seed} {target} where"), 0
+    changes = start.ranks() if target == "trainer rank" else []
+    while done < len(drawn):
+        name = f"{target.replace(' ', '_')}-{len(result['runs'])}"
+        orders = Path(config.output_dir).expanduser().resolve() / f"{name}.orders"
+        victim = start.run(name, *changes, orders=orders)
+        found: dict[str, Any] = {"target": target, "run": name}
+        try:
+            victim.await_update(20 if config.recipe is None else 7, START_S)
+            while done < len(drawn):
+                in_a_row = start.recipe.trainer.max_nonfinite
+                struck = strike(victim, orders, str(done), target, drawn[done], rng, in_a_row)
+                result["hits"].append(asdict(struck))
+                done += 1
+                on_progress(done, f"{struck.fault} at {struck.place}: {struck.outcome}")
+                if struck.outcome == "lost":
+                    break
+            found |= end_run(victim)
+            if target == EVERYTHING and config.updates:
+                found["success"] = _finish(victim, start, config.updates)
+        except (RuntimeError, subprocess.TimeoutExpired) as error:
+            found["error"] = str(error)
+            if not any(hit["target"] == target for hit in result["hits"]):
+                done = len(drawn)  # it did not even begin
+        finally:
+            victim.kill()
+        result["runs"].append(found | audit_updates(victim.records()) | audit_segments(victim.folder))
+
+
+def end_run(victim: Victim) -> dict[str, Any]:
+    """Asks the run to stop: its ``exit`` code, processes ``left_behind``, and ``skipped_updates``.
+
+    Raises:
+        subprocess.TimeoutExpired: it does not.
+    """
+    code, below = victim.end(GRACE_S)
+    deadline = time.monotonic() + TIDY_S
+    while time.monotonic() < deadline and any(alive(pid) for pid in below):
+        time.sleep(0.1)
+    skipped = [record["skipped"] for record in victim.records() if "skipped" in record]
+    left = sum(alive(pid) for pid in below)
+    return {"exit": code, "left_behind": left, "skipped_updates": (skipped or [0])[-1]}
+
+
+def _finish(victim: Victim, start: Start, updates: int) -> dict[str, Any]:
+    """Success at the end of a run that things were done to, and of one that was left alone."""
+    alone = start.run("alone", f"--trainer.updates={updates}")
+    found = {}
     try:
-        victim.await_update(7, START_S)
-        for _ in range(config.repeats):
-            time.sleep(rng.uniform(0.5, 3.0))
-            _hit_once(victim, found, target, number, rng)
-        found["exit"], left = victim.end(GRACE_S)
-    except (RuntimeError, subprocess.TimeoutExpired) as error:
-        found["error"] = str(error)
+        victim.go_on(f"--trainer.updates={updates}")
+        for name, one in (("struck", victim), ("alone", alone)):
+            if code := one.process.wait():
+                raise RuntimeError(f"{name}: it ended with code {code}:\n{last_words(one.log)}")
+            summary = json.loads((one.folder / SUMMARY).read_text())
+            rate = Rate(successes=round(summary["success_after"] * summary["n"]), n=summary["n"])
+            found[name] = str(rate)
     finally:
-        deadline = time.monotonic() + TIDY_S
-        while time.monotonic() < deadline and any(alive(pid) for pid in left):
-            time.sleep(0.1)
-        found["left_behind"] = sum(alive(pid) for pid in left)
-        victim.kill()
-    return found | audit(victim)
-
-
-def _hit_once(victim: Victim, found: dict[str, Any], target: str, number: int, rng: random.Random) -> None:
-    pids = victim.pids(target)
-    if not pids:
-        raise RuntimeError(f"there is no process of {target} to be hit")
-    pid, last = rng.choice(pids), max(victim.updates())
-    started = time.monotonic()
-    if not (hit(pid, number) and await_hit(pid, number)):
-        raise RuntimeError(f"{target} {pid} took no notice of signal {number}")
-    found["fired"] += 1
-    if target == "driver":
-        victim.process.wait()
-        last = max(victim.updates())
-        victim.go_on()
-    victim.await_successors(target, pid, len(pids), START_S)
-    if target != "rollout":
-        # With some to spare: a few may have been on their way when it was hit.
-        victim.await_update(last + SPARE, START_S)
-    found["recovered"] += 1
-    found["seconds"].append(round(time.monotonic() - started, 2))
-
-
-def audit(victim: Victim) -> dict[str, Any]:
-    """What a run's own files say of it: updates lost and doubled, and whether replay's books add up."""
-    counts = Counter(victim.updates())
-    newest = max(counts, default=0)
-    rollout = [record for record in victim.records() if record["kind"] == "rollout"]
-    books = None
-    if rollout:
-        held = {
-            name: rollout[-1].get(f"replay_{name}_segments", 0) for name in ("stored", "evicted", "retired")
-        }
-        books = rollout[-1]["replay_inserted_segments"] == sum(held.values())
-    try:
-        saved = newest_whole(victim.folder / CHECKPOINTS)[0].name
-    except InputError as error:
-        saved = str(error)
-    return {
-        "updates": newest,
-        "lost": newest - len(counts),
-        "doubled": sum(counts.values()) - len(counts),
-        "books": books,
-        "saved": saved,
-    }
+        alone.kill()
+    return found
 
 
 def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
-    return as_table("what a run survives", _COLUMNS, [_row(cell) for cell in result["cells"]])
+    return as_table("what a run survives", _COLUMNS, _rows(result))
 
 
 def markdown(result: dict[str, Any]) -> str:
-    """`table` for the docs."""
-    return as_markdown(_COLUMNS, [_row(cell) for cell in result["cells"]])
+    """`table` for the docs, and what was found at the end of each run."""
+    text = as_markdown(_COLUMNS, _rows(result))
+    return f"{text}\n{as_markdown(_RUN_COLUMNS, [_run_row(run) for run in result['runs']])}"
 
 
-_COLUMNS = [
-    "hit",
-    "times",
-    "recovered",
-    "seconds: median, most",
-    "updates",
-    "lost",
-    "doubled",
-    "books",
-    "end",
-]
+_COLUMNS = ("hit", "times", "survived", "stopped", "lost", "seconds: median, p95, most", "where")
+_RUN_COLUMNS = ("run", "updates", "lost", "doubled", "segments", "lost", "doubled", "books", "end")
 
 
-def _row(cell: dict[str, Any]) -> list[str]:
-    seconds = cell["seconds"]
-    took = f"{statistics.median(seconds):.1f}, {max(seconds):.1f}" if seconds else "–"
-    ended = cell["error"].splitlines()[0] if "error" in cell else f"exit {cell['exit']}"
-    if cell["left_behind"]:
-        ended += f", {cell['left_behind']} processes left behind"
-    books = {True: "add up", False: "DO NOT", None: "–"}[cell["books"]]
-    numbers = [str(cell[name]) for name in ("updates", "lost", "doubled")]
-    return [
-        f"{cell['fault']} {cell['target']}",
-        str(cell["fired"]),
-        str(cell["recovered"]),
-        took,
-        *numbers,
-        books,
-        ended,
-    ]
+def cells(result: dict[str, Any]) -> dict[tuple[str, str], list[dict[str, Any]]]:
+    """Hits by target and fault, in the order of the config."""
+    found: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for hit in result["hits"]:
+        found.setdefault((hit["target"], hit["fault"]), []).append(hit)
+    targets, faults = result["config"]["targets"], result["config"]["faults"]
+    order = sorted(found, key=lambda cell: (targets.index(cell[0]), faults.index(cell[1])))
+    return {cell: found[cell] for cell in order}
 
 
-def _told(cell: dict[str, Any]) -> str:
-    return ", ".join(f"{name} {text}" for name, text in zip(_COLUMNS, _row(cell), strict=True))
+def _rows(result: dict[str, Any]) -> list[list[str]]:
+    rows = []
+    for (target, fault), hits in cells(result).items():
+        outcomes = [str(sum(h["outcome"] == o for h in hits)) for o in ("survived", "stopped", "lost")]
+        seconds = [h["seconds"] for h in hits if h["seconds"] is not None]
+        took = "–"
+        if seconds:
+            took = f"{statistics.median(seconds):.1f}, {np.percentile(seconds, 95):.1f}, {max(seconds):.1f}"
+        where = sorted({h["place"].split(".")[-1] for h in hits})
+        fired = str(sum(h["fired"] for h in hits))
+        rows.append([f"{fault} {target}", fired, *outcomes, took, ", ".join(where)])
+    return rows
+
+
+def _run_row(run: dict[str, Any]) -> list[str]:
+    ended = run["error"].splitlines()[0] if "error" in run else f"exit {run['exit']}"
+    if run.get("left_behind"):
+        ended += f", {run['left_behind']} processes left behind"
+    if "success" in run:
+        ended += f"; in the end {run['success']['struck']}, left alone {run['success']['alone']}"
+    books = {True: "add up", False: "DO NOT", None: "–"}[run["books"]]
+    names = ("updates", "lost", "doubled", "segments", "segments_lost", "segments_doubled")
+    return [run["target"], *(str(run.get(name, "–")) for name in names), books, ended]
+
+
+def _draw(path: Path, result: dict[str, Any]) -> None:
+    """Seconds to recover, a dot for each hit."""
+    with drawing(path) as axes:
+        names: list[str] = []
+        for (target, fault), hits in cells(result).items():
+            seconds = [h["seconds"] for h in hits if h["seconds"] is not None]
+            if seconds:
+                x = [len(names)] * len(seconds)
+                axes.scatter(x, seconds, s=14, alpha=0.5, color=f"C{TARGETS.index(target)}", linewidths=0)
+                names.append(f"{fault} {target}")
+        axes.set_xticks(range(len(names)), names, rotation=90, fontsize=6)
+        axes.set(ylabel="seconds to recover", title="faults, one dot each")
+        axes.set_ylim(bottom=0)

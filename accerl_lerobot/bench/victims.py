@@ -31,6 +31,7 @@ from typing import Any
 
 from accerl_lerobot.bench.study import last_words
 from accerl_lerobot.checkpoint import CONFIG
+from accerl_lerobot.fault_points import VARIABLE
 from accerl_lerobot.metrics import METRICS
 
 CLASSES = {
@@ -38,10 +39,16 @@ CLASSES = {
     "inference": "InferenceWorker",
     "replay": "ReplayWorker",
     "trainer": "TrainerWorker",
+    "trainer rank": "TrainerRank",
     "dream": "DreamWorker",
     "world learning": "WorldLearningWorker",
 }
-"""Target → how Ray calls its processes; ``driver`` is the run's own process."""
+"""Target → how Ray calls its processes."""
+DRIVER, EVERYTHING = "driver", "everything"
+"""The run's own process; it and all below it."""
+TRAIN = ("accerl_lerobot.cli", "train")
+LIGHT = ("accerl_lerobot.bench.light_run",)
+"""Modules that run, and their first arguments."""
 LOOK_S = 0.05
 
 
@@ -52,25 +59,37 @@ class Victim:
         folder: of the run.
         arguments: of ``accerl train``, without its folder.
         log: file for what it says.
+        module: what runs, `TRAIN` or `LIGHT`.
+        orders: folder of orders, see `fault_points`; None: no point of it looks for any.
     """
 
-    def __init__(self, folder: Path, arguments: list[str], log: Path) -> None:
-        self.folder, self._log = folder, log
+    def __init__(
+        self,
+        folder: Path,
+        arguments: list[str],
+        log: Path,
+        module: tuple[str, ...] = TRAIN,
+        orders: Path | None = None,
+    ) -> None:
+        self.folder, self.log, self._module = folder, log, module
+        self._environment = dict(os.environ) if orders is None else os.environ | {VARIABLE: str(orders)}
         self._start([*arguments, f"--output_dir={folder}"])
 
-    def go_on(self) -> None:
-        """Starts it again, after its process has ended."""
-        self._start(["--resume=true", f"--config_path={self.folder / CONFIG}"])
+    def go_on(self, *changes: str) -> None:
+        """Starts it again, after its process has ended, with these changes of its command line."""
+        self._start(["--resume=true", f"--config_path={self.folder / CONFIG}", *changes])
 
     def _start(self, arguments: list[str]) -> None:
-        command = [sys.executable, "-m", "accerl_lerobot.cli", "train", *arguments]
-        with self._log.open("ab") as out:
+        command = [sys.executable, "-m", *self._module, *arguments]
+        with self.log.open("ab") as out:
             # Of a session of its own: what it leaves behind is found by that.
-            self.process = subprocess.Popen(command, stdout=out, stderr=out, start_new_session=True)
+            self.process = subprocess.Popen(
+                command, stdout=out, stderr=out, env=self._environment, start_new_session=True
+            )
 
     def pids(self, target: str) -> list[int]:
         """Processes of a target, as they are now."""
-        if target == "driver":
+        if target in (DRIVER, EVERYTHING):
             return [self.process.pid] if self.process.poll() is None else []
         name = f"ray::{CLASSES[target]}"
         found = {pid for pid in descendants(self.process.pid) if title(pid).startswith(name)}
@@ -93,7 +112,7 @@ class Victim:
         Raises:
             RuntimeError: it ended before, or did not get there in time.
         """
-        self._await(lambda: self.updates()[-1:] >= [number], timeout, f"update {number} was not reached")
+        self.wait(lambda: self.updates()[-1:] >= [number], timeout, f"update {number} was not reached")
 
     def await_successors(self, target: str, gone: int, count: int, timeout: float) -> None:
         """Waits until a target has as many processes as before, none of them `gone`.
@@ -106,7 +125,7 @@ class Victim:
             pids = self.pids(target)
             return len(pids) >= count and gone not in pids
 
-        self._await(there, timeout, f"no successor of {target} {gone}")
+        self.wait(there, timeout, f"no successor of {target} {gone}")
 
     def end(self, grace: float) -> tuple[int, list[int]]:
         """Asks it to stop; its exit code, and the processes that were below it.
@@ -118,13 +137,25 @@ class Victim:
         self.process.send_signal(signal.SIGTERM)
         return self.process.wait(grace), below
 
-    def kill(self) -> None:
-        """Ends it and all below it, whatever they do."""
-        for pid in [*descendants(self.process.pid), self.process.pid]:
+    def kill(self) -> list[int]:
+        """Ends it and all below it, whatever they do; who they were."""
+        everyone = [self.process.pid, *descendants(self.process.pid)]
+        for pid in everyone:
             hit(pid, signal.SIGKILL)
         self.process.wait()
+        return everyone
 
-    def _await(self, there: Callable[[], bool], timeout: float, otherwise: str) -> None:
+    def wait(self, there: Callable[[], bool], timeout: float, otherwise: str) -> None:
+        """Looks again and again, until what is waited for is there.
+
+        Args:
+            there: whether it is.
+            timeout: seconds.
+            otherwise: how the error begins.
+
+        Raises:
+            RuntimeError: the run ended before, or it did not come in time.
+        """
         deadline = time.monotonic() + timeout
         while not there():
             code = self.process.poll()
@@ -132,7 +163,7 @@ class Victim:
                 time.sleep(LOOK_S)
                 continue
             ended = f"it ended with code {code}" if code is not None else f"in {timeout:.0f} s"
-            raise RuntimeError(f"{otherwise}: {ended}; {self._log}:\n{last_words(self._log)}")
+            raise RuntimeError(f"{otherwise}: {ended}; {self.log}:\n{last_words(self.log)}")
 
 
 def hit(pid: int, number: int) -> bool:

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import ray
 
-from accerl_lerobot.launch import start_ray
+from accerl_lerobot.private_ray import start_ray
 from accerl_lerobot.weights.channel import Tensors
 from accerl_lerobot.weights.reader import Received, SharedMemoryReader
 

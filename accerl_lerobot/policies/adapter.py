@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from torch import Tensor, nn
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Decision, Request
 from accerl_lerobot.policies.base import Evaluation, PolicyAdapter, stack_observations
+from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Encoded, Family, Model
 from accerl_lerobot.policies.processing import Processing, example_observations
 from accerl_lerobot.policies.value_head import Value, ValueHead
@@ -133,6 +135,18 @@ class LeRobotAdapter(PolicyAdapter):
         latents = [decision.latent for decision in self.decide(requests, 0)]
         stacked = {k: torch.from_numpy(np.stack([latent[k] for latent in latents])) for k in latents[0]}
         return observations, tasks, stacked
+
+    def copy_weights(self) -> Any:
+        """See the base class."""
+        from accerl_lerobot.policies.loading import copy_weights
+
+        return copy_weights(self)
+
+    def save(self, directory: Path, config: PolicyConfig, weights: Any) -> None:
+        """See the base class; stock LeRobot loads it."""
+        from accerl_lerobot.policies.loading import save_pretrained
+
+        save_pretrained(self, directory, config, weights)
 
     @torch.no_grad()
     def self_check(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> float:

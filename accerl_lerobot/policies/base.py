@@ -22,6 +22,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -35,6 +36,7 @@ from accerl_lerobot.tensors import in_parts, part_of, whole
 
 if TYPE_CHECKING:
     from accerl_lerobot.envs.base import WorldSpec
+    from accerl_lerobot.policies.config import PolicyConfig
 
 OBS_STATE = "observation.state"
 
@@ -103,6 +105,20 @@ class PolicyAdapter(nn.Module, ABC):
     @abstractmethod
     def trainable(self) -> dict[str, nn.Parameter]:
         """What the trainer updates and publishes, by name; the critic's begin with ``value_head.``"""
+
+    @abstractmethod
+    def copy_weights(self) -> Any:
+        """A copy of what `save` writes, which may go on being learnt."""
+
+    @abstractmethod
+    def save(self, directory: Path, config: PolicyConfig, weights: Any) -> None:
+        """Writes ``pretrained_model``.
+
+        Args:
+            directory: created if it is missing.
+            config: what the adapter was loaded by.
+            weights: from `copy_weights`.
+        """
 
     def load_trainable(
         self, tensors: dict[str, np.ndarray], changed: dict[str, np.ndarray] | None = None

@@ -23,11 +23,13 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from accerl_lerobot import snapshot
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.policies.base import OBS_STATE, Evaluation, PolicyAdapter
@@ -125,6 +127,12 @@ class SimulatedAdapter(PolicyAdapter):
 
     def trainable(self) -> dict[str, nn.Parameter]:
         return dict(self.named_parameters())
+
+    def copy_weights(self) -> dict[str, np.ndarray]:
+        return self.export_trainable()
+
+    def save(self, directory: Path, config: PolicyConfig, weights: dict[str, np.ndarray]) -> None:
+        snapshot.save(directory / "simulated", weights)
 
     def _value(self, rows: int) -> Tensor:
         return self.value_head(torch.zeros(rows, 1))[:, 0]

@@ -27,6 +27,8 @@ import copy
 import os
 import time
 from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,11 +36,13 @@ import numpy as np
 
 from accerl_lerobot import snapshot
 from accerl_lerobot.experience import REAL, Segment
+from accerl_lerobot.fault_points import reach
 from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.replay.mixed import MixedReplay
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.replay.turns import Schedule, Turns
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
+from accerl_lerobot.transport.contract import stopped
 from accerl_lerobot.transport.on_loop import serve_on_loop
 from accerl_lerobot.transport.shared_memory import Address
 
@@ -94,6 +98,7 @@ class ReplayWorker:
         self._turns = Turns()
         self._batch = 0  # decisions the trainer asked for last
         self._closed = False
+        self._failure: Exception | None = None
         self._insert_wait_s = self._sample_wait_s = 0.0
         self._episodes: list[dict[str, float]] = []
         if state is not None:
@@ -114,15 +119,24 @@ class ReplayWorker:
         return serve_on_loop(self.insert).address
 
     async def run(self) -> None:
-        """Lasts until `close`; that it ends earlier is how the conductor learns of this process's death."""
+        """Lasts until `close`; that it ends earlier is how the conductor learns of this process's death.
+
+        Raises:
+            Exception: what has gone wrong while something was stored or drawn.
+        """
         async with self._changed:
-            await self._changed.wait_for(lambda: self._closed)
+            await self._changed.wait_for(lambda: self._closed or self._failure is not None)
+            if self._failure is not None:
+                raise self._failure
 
     async def insert(self, segments: list[Segment]) -> bool:
         """Stores segments of one source once the pace allows it; returns when more may be collected.
 
         Returns:
             False when the run is over and they were not stored.
+
+        Raises:
+            ServiceStoppedError: storing has failed, now or before; `run` says why.
         """
         source = segments[0].source
         started = time.monotonic()
@@ -133,12 +147,9 @@ class ReplayWorker:
             if self._closed:
                 return False
             self._clock.enter(COMPUTE)
-            for segment in segments:
-                if self._replay.insert(segment) and source == REAL:
-                    self._real.append(segment)
-                    self._real_count += 1
-                    if segment.episode:
-                        self._episodes.append(segment.episode)
+            with self._failing():
+                for segment in segments:
+                    self._insert(segment)
             self._clock.enter(WAIT_IN)
             self._changed.notify_all()
             kept = time.monotonic()
@@ -163,7 +174,9 @@ class ReplayWorker:
                 if self._closed or self._replay.exhausted(num_decisions):
                     return []
                 self._clock.enter(COMPUTE)
-                segments = self._replay.sample(num_decisions, trainer_version, self._rng)
+                with self._failing():
+                    reach("replay.sample")
+                    segments = self._replay.sample(num_decisions, trainer_version, self._rng)
                 self._clock.enter(WAIT_IN)
                 self._changed.notify_all()
                 if segments:
@@ -210,6 +223,7 @@ class ReplayWorker:
     async def save(self, directory: Path, version: int) -> None:
         """Writes its part of ``training_state``, as it was when the trainer had made `version` updates."""
         self._clock.enter(CHECKPOINT)
+        reach("replay.save")
         state = {
             "replay": self._replay.state(version),
             "rng": copy.deepcopy(self._rng),
@@ -217,6 +231,26 @@ class ReplayWorker:
         }
         self._clock.enter(WAIT_IN)
         await asyncio.to_thread(snapshot.save, directory / "replay", state)
+
+    def _insert(self, segment: Segment) -> None:
+        reach("replay.insert")
+        if self._replay.insert(segment) and segment.source == REAL:
+            self._real.append(segment)
+            self._real_count += 1
+            if segment.episode:
+                self._episodes.append(segment.episode)
+
+    @contextmanager
+    def _failing(self) -> Iterator[None]:
+        """What goes wrong inside is this worker's failure, and not that of whoever has asked."""
+        if self._failure is not None:
+            raise stopped(self._failure)
+        try:
+            yield
+        except Exception as error:
+            self._failure = error
+            self._changed.notify_all()
+            raise stopped(error) from error
 
     @property
     def _ready(self) -> bool:

@@ -34,8 +34,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.experience import Decision, Request, Segment
+from accerl_lerobot.fault_points import reach
 from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig, RolloutRunner
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, open_clock
@@ -63,6 +66,8 @@ class Report:
     """Since this process began."""
     in_world_s: float
     """How long the world has been at what it does now, in seconds; 0 while none is stepped."""
+    stuck_s: float = 0.0
+    """How long ago the thread that steps worlds last did anything, in seconds; 0 while one is stepped."""
     spent: bool = False
     """Every exploring episode that was paid for has been played, and replay has it."""
     away_s: float = 0.0
@@ -115,6 +120,7 @@ class RolloutWorker:
         self._results: deque[EpisodeResult] = deque()
         self._training = threading.Event()
         self._entered: float | None = None
+        self._moved: float | None = None
         self._outbox: list[Segment] = []
         self._deciding = LastingCaller("inference")
         worlds = [make_world(env, history) for _ in range(config.worlds)]
@@ -157,11 +163,12 @@ class RolloutWorker:
         self._at_the_door = 1 if in_turn else AT_THE_DOOR
         (self._training.set if training else self._training.clear)()
         episodes = [self._results.popleft() for _ in range(len(self._results))]
-        entered = self._entered
+        entered, moved, now = self._entered, self._moved, time.monotonic()
         return Report(
             episodes=episodes,
             counters={k: float(v) for k, v in vars(self._runner.counters).items()},
-            in_world_s=0.0 if entered is None else time.monotonic() - entered,
+            in_world_s=0.0 if entered is None else now - entered,
+            stuck_s=0.0 if moved is None or entered is not None else now - moved,
             spent=self._spent,
             away_s=self._deciding.away_s,
             away_why=self._deciding.why,
@@ -178,6 +185,7 @@ class RolloutWorker:
         size = max(1, len(self._runner) // PARTS)
         patience = 0.0
         while True:
+            self._moved = time.monotonic()
             at_the_door -= {ticket for ticket, _ in door.done(patience)}
             self._bring(door, at_the_door, size)
             self._spent = self._plans.spent and not self._runner.exploring and not at_the_door
@@ -199,6 +207,8 @@ class RolloutWorker:
         """Brings segments to replay; those of a whole group may come at once, and its pace is for a few."""
         while self._outbox and len(at_the_door) < QUEUE:
             self._clock.enter(TRANSPORT)
+            if reach("rollout.send"):
+                self._outbox[0].reward = self._outbox[0].reward * np.float32(np.nan)
             at_the_door.add(door.send(self._outbox[:size]))
             del self._outbox[:size]
 
@@ -217,7 +227,9 @@ class RolloutWorker:
 
     def _advance(self, slot: int, decision: Decision, due: dict[int, Request], idle: list[int]) -> None:
         self._clock.enter(COMPUTE)
+        reach("rollout.decided")
         with self._in_world():
+            reach("rollout.step")
             request = self._runner.advance(slot, decision)
         if request is None:
             idle.append(slot)
@@ -238,7 +250,7 @@ class RolloutWorker:
         """Lets `report` tell a world that hangs from a worker that waits."""
         self._entered = time.monotonic()
         yield
-        self._entered = None
+        self._moved, self._entered = time.monotonic(), None
 
     def _ended(self, result: EpisodeResult) -> None:
         self._plans.report(result)

@@ -36,7 +36,8 @@ from typing import NamedTuple
 import numpy as np
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.timeline.states import RECOVERY, STATES
+from accerl_lerobot.fault_points import reach
+from accerl_lerobot.timeline.states import RECOVERY, STATES, role_of
 
 FORMAT = 1
 BITS = 4
@@ -83,6 +84,7 @@ class Parts:
         self._folder, self._part_bytes = folder, part_bytes
         self._head = {"timeline": FORMAT, "worker": worker, "pid": os.getpid(), **begins._asdict()}
         self._slug = worker.replace(" ", "-")
+        self._point = f"{role_of(worker).split()[-1]}.timeline"
         self._part = 0
         folder.mkdir(parents=True, exist_ok=True)
         before = [
@@ -100,6 +102,7 @@ class Parts:
             state: that it has entered.
             totals: nanoseconds in each state up to then.
         """
+        reach(self._point)
         if sys.byteorder == "big":
             entries.byteswap()
         self._file.write(entries.tobytes())

@@ -37,6 +37,7 @@ from accerl_lerobot import snapshot
 from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.checkpoint import WEIGHTS
 from accerl_lerobot.experience import Segment
+from accerl_lerobot.fault_points import reach
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.trainer.config import TrainerConfig
 
@@ -134,6 +135,7 @@ class TrainerRank:
 
     def step(self, segments: Sequence[Segment]) -> None:
         """Its part of an update."""
+        reach("rank.step")
         self._update.step(segments)
 
     def lend_weights(self) -> None:
@@ -142,9 +144,7 @@ class TrainerRank:
 
     def lend_state(self) -> None:
         """Its part of all that is saved, in the order in which the first rank asks for it."""
-        from accerl_lerobot.policies.loading import copy_weights
-
-        copy_weights(self._learner.adapter)
+        self._learner.adapter.copy_weights()
         self.lend_weights()
         self._update.state()
 

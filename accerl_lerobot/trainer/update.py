@@ -27,6 +27,7 @@ Shapes: S segments, T decisions of the longest one, N decisions in all.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -40,19 +41,17 @@ from accerl_lerobot.algorithms.gae import decision_mask, gae
 from accerl_lerobot.algorithms.normalise import moments, normalise
 from accerl_lerobot.algorithms.ratio import present
 from accerl_lerobot.experience import Segment
+from accerl_lerobot.fault_points import reach
 from accerl_lerobot.optimizers import optimizer_state, restore_optimizer
 from accerl_lerobot.policies.base import PolicyAdapter
 from accerl_lerobot.tensors import whole
 from accerl_lerobot.trainer.anchors import CRITIC, Anchors
 from accerl_lerobot.trainer.batch import Batch, Part, collate, pick, turns
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.nonfinite import NonFiniteError
 from accerl_lerobot.trainer.probe import Probe
 from accerl_lerobot.trainer.ranks import Ranks
 from accerl_lerobot.trainer.sharding import arrange, synchronise
-
-
-class NonFiniteError(RuntimeError):
-    """Too many updates in a row had a non-finite loss or gradient."""
 
 
 class Update:
@@ -106,7 +105,8 @@ class Update:
         """Applies one optimiser step and returns its metrics; the version rises by one.
 
         Raises:
-            NonFiniteError: `TrainerConfig.max_nonfinite` updates in a row were not finite.
+            NonFiniteError: `TrainerConfig.max_nonfinite` updates in a row were not finite; this one changes
+                nothing.
         """
         batch = collate(segments)
         mismatch = self._probe.read(batch)
@@ -119,6 +119,7 @@ class Update:
         critic_group["lr"] = self.config.value_lr * share
         self.optimizer.zero_grad(set_to_none=True)
         metrics = self._backward(batch)
+        reach("trainer.backward")
         if critic_only:
             # Before the norm is taken: noise in the policy's gradient must not scale the critic's.
             for parameter in self._policy_parameters:
@@ -128,7 +129,7 @@ class Update:
             self.optimizer.step()
             self._skipped_in_a_row = 0
         else:
-            self._skip()
+            self._skip(metrics["loss"], float(norm))
         lag = lag_metrics(torch.from_numpy(batch.version), self.version)
         self.version += 1
         self._probe.renew(self.version)
@@ -166,13 +167,13 @@ class Update:
         every = self.algorithm.proximal_updates
         return every > 0 and self.version % every == 0
 
-    def _skip(self) -> None:
+    def _skip(self, loss: float, norm: float) -> None:
         self.skipped += 1
         self._skipped_in_a_row += 1
         if self._skipped_in_a_row >= self.config.max_nonfinite:
             raise NonFiniteError(
-                f"{self._skipped_in_a_row} updates in a row had a non-finite loss or gradient; "
-                "lower trainer.lr"
+                f"{self._skipped_in_a_row} updates in a row had a non-finite loss or gradient (the last one: "
+                f"loss {loss:g}, norm of the gradient {norm:g}); lower trainer.lr"
             )
 
     def _backward(self, batch: Batch) -> dict[str, float]:
@@ -215,7 +216,8 @@ class Update:
             output = compute_loss(inputs, self.algorithm)
             share = len(rows) / len(batch) if turn.own else 0.0
             synchronise(self.adapter, number == len(parts))
-            (output.loss * share * self.ranks.size).backward()  # a gradient is the mean over ranks
+            loss = output.loss * share * self.ranks.size  # a gradient is the mean over ranks
+            (loss * math.nan if reach("trainer.loss") else loss).backward()
             said = {k: float(v) if turn.own else 0.0 for k, v in output.metrics.items()}
             _merge(total, said, share)
         if self.config.sharding == "ddp":

@@ -35,10 +35,12 @@ import ray
 from accerl_lerobot import snapshot
 from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.checkpoint import PRETRAINED, TRAINING_STATE, WEIGHTS
+from accerl_lerobot.fault_points import reach
 from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.nonfinite import keeping
 from accerl_lerobot.trainer.peers import Learner, Peers
 from accerl_lerobot.weights.held_back import HeldBack
 from accerl_lerobot.weights.publisher import Publisher
@@ -57,6 +59,7 @@ class TrainerWorker:
         load: makes the adapter; None: of LeRobot's checkpoint.
         timeline: folder of the timeline; None: none is kept.
         peers: handles of the other ranks.
+        directory: of the run, for batches that nothing could be learnt from; None: they are not kept.
     """
 
     def __init__(
@@ -69,9 +72,10 @@ class TrainerWorker:
         load: Load | None = None,
         timeline: Path | None = None,
         peers: Sequence[Any] = (),
+        directory: Path | None = None,
     ) -> None:
         self._clock = open_clock(timeline, "trainer")
-        self._policy, self._config = policy, config
+        self._policy, self._config, self._directory = policy, config, directory
         self._peers = Peers(peers, config)
         self._update = self._peers.begin(Learner(policy, algorithm, config, seed, state, load))
         self._lock = threading.Lock()
@@ -154,7 +158,8 @@ class TrainerWorker:
             with self._lock:
                 self._clock.enter(COMPUTE)
                 started = time.monotonic()
-                with self._peers.joining("step", batch):
+                reach("trainer.update")
+                with self._peers.joining("step", batch), keeping(self._directory, self._update, segments):
                     metrics = self._update.step(segments)
                 updated = time.monotonic()
                 self._clock.enter(WEIGHT_SYNC)
@@ -186,6 +191,7 @@ class TrainerWorker:
             self._hand_over(publisher, *due)
 
     def _hand_over(self, publisher: Publisher, version: int, tensors: dict[str, Any]) -> None:
+        reach("trainer.publish")
         publisher.publish(version, tensors)
         self._handed_over = version
 
@@ -204,20 +210,17 @@ class TrainerWorker:
         Returns:
             Its version, and the records up to it that `metrics` has not given.
         """
-        from accerl_lerobot.policies.loading import copy_weights
-
         with self._lock:
             with self._peers.lending("lend_state"):
                 adapter = self._update.adapter
-                self._kept = copy_weights(adapter), adapter.export_trainable(), self._update.state()
+                self._kept = adapter.copy_weights(), adapter.export_trainable(), self._update.state()
             return self._update.version, self.metrics()
 
     def write(self, directory: Path) -> None:
         """Writes what is kept: ``pretrained_model`` and its part of ``training_state``."""
-        from accerl_lerobot.policies.loading import save_pretrained
-
         (weights, trained, state), self._kept = self._kept, None
-        save_pretrained(self._update.adapter, directory / PRETRAINED, self._policy, weights)
+        reach("trainer.write")
+        self._update.adapter.save(directory / PRETRAINED, self._policy, weights)
         snapshot.save(directory / TRAINING_STATE / WEIGHTS, trained)
         snapshot.save(directory / TRAINING_STATE / "trainer", state)
 

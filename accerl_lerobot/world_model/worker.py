@@ -38,6 +38,7 @@ import ray
 from accerl_lerobot import snapshot
 from accerl_lerobot.checkpoint import TRAINING_STATE, WORLD_MODEL
 from accerl_lerobot.experience import Segment
+from accerl_lerobot.fault_points import reach
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.transport.lasting import LastingCaller
@@ -160,6 +161,7 @@ class DreamWorker:
             self._clock.enter(CHECKPOINT)
             with self._dreaming:
                 self._clock.enter(COMPUTE)
+                reach("dream.step")
                 self._dreams.advance([decision for answer in answers for decision in answer])
                 self._clock.enter(TRANSPORT)
                 if self._outbox:
@@ -242,6 +244,7 @@ class WorldLearningWorker:
                 self._clock.enter(CHECKPOINT)
                 with self._learning:
                     self._clock.enter(COMPUTE)
+                    reach("learning.step")
                     learner.step()
             elif learner.due(last):
                 self._clock.enter(COMPUTE)

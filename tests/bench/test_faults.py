@@ -25,10 +25,18 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot.bench import faults as bench
-from accerl_lerobot.bench.faults import BenchFaultsConfig, audit, markdown
-from accerl_lerobot.bench.victims import Victim, await_hit, descendants, hit, title
+from accerl_lerobot import snapshot
+from accerl_lerobot.bench.audit import audit_segments, audit_updates
+from accerl_lerobot.bench.faults import BenchFaultsConfig, bench_faults, markdown
+from accerl_lerobot.bench.hits import ANYWHERE, FAULTS, places
+from accerl_lerobot.bench.soak import BenchSoakConfig, compare
+from accerl_lerobot.bench.victims import CLASSES, Victim, await_hit, descendants, hit, title
+from accerl_lerobot.checkpoint import CHECKPOINTS, TRAINING_STATE, save_checkpoint
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.fault_points import POINTS
+from accerl_lerobot.replay import MixedReplay, ReplayConfig
+from accerl_lerobot.replay.journal import EPISODES, Journal
+from tests.replay.segments import make_segment
 
 SLEEPS = """
 import subprocess, sys, time
@@ -80,36 +88,121 @@ def logged(folder: Path, updates: list[int], inserted: int) -> Victim:
 
 
 def test_books_that_add_up(tmp_path: Path):
-    found = audit(logged(tmp_path / "run", [1, 2, 3, 4], 9))
-    assert (found["updates"], found["lost"], found["doubled"], found["books"]) == (4, 0, 0, True)
-    assert "there is none" in found["saved"]
+    victim = logged(tmp_path / "run", [1, 2, 3, 4], 9)
+    found = audit_updates(victim.records())
+    assert found == {"updates": 4, "lost": 0, "doubled": 0, "books": True}
+    assert "there is none" in audit_segments(victim.folder)["saved"]
 
 
 def test_what_is_lost_or_doubled_is_found(tmp_path: Path):
-    found = audit(logged(tmp_path / "run", [1, 2, 2, 5, 5, 5], 8))
-    assert (found["updates"], found["lost"], found["doubled"], found["books"]) == (5, 2, 3, False)
+    found = audit_updates(logged(tmp_path / "run", [1, 2, 2, 5, 5, 5], 8).records())
+    assert found == {"updates": 5, "lost": 2, "doubled": 3, "books": False}
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> Path:
+    """A run's folder, with four segments in a checkpoint's replay and one that came later."""
+    run = tmp_path / "run"
+    run.mkdir()
+    journal = Journal(run / EPISODES)
+    sizes = ReplayConfig(capacity=12, min_decisions=4, ahead=4)
+    replay = MixedReplay(sizes, sizes, 0.0, journal=journal)
+    for key in "abcd":  # the first has left when the last comes
+        replay.insert(make_segment(key))
+
+    def write(folder: Path) -> int:
+        snapshot.save(folder / TRAINING_STATE / "replay", {"replay": replay.state()})
+        snapshot.save(folder / TRAINING_STATE / "run", {})
+        (folder / "pretrained_model").mkdir()
+        return 3
+
+    save_checkpoint(run / CHECKPOINTS, write)
+    replay.insert(make_segment("e"))
+    return run
+
+
+def test_segments_that_counted_are_in_the_journal_once(kept: Path):
+    found = audit_segments(kept)
+    assert found == {"saved": "000003", "segments": 4, "segments_lost": 0, "segments_doubled": 0}
+    assert not list(kept.glob(".*")), "nothing is left there"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "lost", "doubled"),
+    [
+        (lambda lines: [lines[0], *lines[2:4], *lines[4:]], 0, 0),  # the last one moves into the place of b
+        (lambda lines: lines[:3], 1, 0),
+        (lambda lines: [lines[0], lines[0], *lines[2:]], 1, 1),
+    ],
+)
+def test_segments_that_are_missing_or_there_twice_are_found(kept: Path, spoil: Any, lost: int, doubled: int):
+    lines = (kept / EPISODES).read_bytes().splitlines(keepends=True)
+    (kept / EPISODES).write_bytes(b"".join(spoil(lines)))
+    found = audit_segments(kept)
+    lost = lost or 1  # b is stored and not in the journal
+    assert (found["segments_lost"], found["segments_doubled"]) == (lost, doubled)
+
+
+def test_every_point_is_somewhere_that_a_target_can_be_hit():
+    targets = [*CLASSES, "driver", "everything"]
+    found = {place for target in targets for fault in FAULTS for place in places(target, fault)}
+    assert found == {ANYWHERE, *POINTS}
+    assert places("everything", "kill") == [ANYWHERE] and places("everything", "exit") == []
+    assert places("trainer rank", "hang") == ["rank.step"]
+    assert places("trainer", "nans") == places("trainer", "nan") == ["trainer.loss"]
+    assert ANYWHERE not in places("driver", "kill")[1:] and places("driver", "stop") == []
+
+
+def told(
+    target: str, fault: str, outcome: str, seconds: float | None, place: str = ANYWHERE
+) -> dict[str, Any]:
+    return {
+        "target": target, "fault": fault, "place": place, "fired": outcome != "lost", "outcome": outcome,
+        "seconds": seconds,
+    }  # fmt: skip
 
 
 def test_the_table_says_all_of_it():
-    cell = {
-        "target": "trainer", "fault": "kill", "fired": 3, "recovered": 2, "seconds": [4.0, 8.0],
-        "updates": 40, "lost": 1, "doubled": 0, "books": False, "left_behind": 2, "exit": 143,
+    run = {
+        "target": "trainer", "updates": 40, "lost": 1, "doubled": 0, "segments": 9, "segments_lost": 0,
+        "segments_doubled": 2, "books": False, "left_behind": 2, "exit": 143, "saved": "000040",
     }  # fmt: skip
-    died = cell | {"error": "no successor of trainer 7: it ended\nmore", "seconds": [], "left_behind": 0}
-    del died["exit"]
-    rows = markdown({"cells": [cell, died]}).splitlines()
-    assert rows[2] == (
-        "| kill trainer | 3 | 2 | 6.0, 8.0 | 40 | 1 | 0 | DO NOT | exit 143, 2 processes left behind |"
-    )
-    assert rows[3].endswith("| – | 40 | 1 | 0 | DO NOT | no successor of trainer 7: it ended |")
+    died = {
+        "target": "driver",
+        "updates": 4,
+        "lost": 0,
+        "doubled": 0,
+        "books": None,
+        "error": "it ended\nmore",
+    }
+    hits = [
+        told("driver", "torn", "stopped", 9.0, "driver.renamed"),
+        told("trainer", "kill", "survived", 4.0),
+        told("trainer", "nan", "survived", None, "trainer.loss"),
+        told("trainer", "kill", "survived", 8.0, "trainer.write"),
+        told("trainer", "kill", "lost", None),
+    ]
+    config = {"targets": ["trainer", "driver"], "faults": list(FAULTS)}
+    rows = markdown({"config": config, "hits": hits, "runs": [run, died]}).splitlines()
+    assert rows[2:5] == [
+        "| kill trainer | 2 | 2 | 0 | 1 | 6.0, 7.8, 8.0 | anywhere, write |",
+        "| nan trainer | 1 | 1 | 0 | 0 | – | loss |",
+        "| torn driver | 1 | 0 | 1 | 0 | 9.0, 9.0, 9.0 | renamed |",
+    ]
+    assert rows[-2] == "| trainer | 40 | 1 | 0 | 9 | 0 | 2 | DO NOT | exit 143, 2 processes left behind |"
+    assert rows[-1] == "| driver | 4 | 0 | 0 | – | – | – | – | it ended |"
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"targets": ("everything",)}, r"targets=\('everything',\): use some of rollout, inference"),
+        ({"targets": ("everyone",)}, r"targets=\('everyone',\): use some of rollout, inference"),
         ({"targets": ()}, "use some of"),
         ({"faults": ("kill", "kill")}, "none twice"),
+        (
+            {"targets": ("everything",), "faults": ("nan", "torn")},
+            "none of them can befall everything",
+        ),
         ({"repeats": 0}, "use at least 1"),
         ({"stall_s": 1.0}, "use 5 s or more"),
     ],
@@ -121,7 +214,53 @@ def test_what_cannot_be_done_is_refused(options: dict[str, Any], message: str):
 
 def test_nothing_is_begun_where_something_is(tmp_path: Path):
     with pytest.raises(InputError, match="the folder exists"):
-        bench.bench_faults(BenchFaultsConfig(output_dir=str(tmp_path)))
+        bench_faults(BenchFaultsConfig(output_dir=str(tmp_path)))
+    new = str(tmp_path / "new")
     with pytest.raises(InputError, match="nothing is imagined in this recipe"):
-        bench.bench_faults(BenchFaultsConfig(output_dir=str(tmp_path / "new"), targets=("dream",)))
+        bench_faults(BenchFaultsConfig(output_dir=new, targets=("dream",)))
+    recipe = str(Path(__file__).parents[2] / "recipes" / "quickstart.yaml")
+    with pytest.raises(InputError, match="the trainer of this recipe is one process"):
+        bench_faults(BenchFaultsConfig(output_dir=new, targets=("trainer rank",), recipe=recipe))
     assert not (tmp_path / "new").exists()
+
+
+def test_a_run_of_time_survives_what_is_done_to_it(tmp_path: Path):
+    """Everything real: a run, Ray, a rollout worker that raises where it was told to, and its successor."""
+    root = tmp_path / "faults"
+    targets, faults = ("rollout",), ("exception", "nan")
+    result = bench_faults(BenchFaultsConfig(output_dir=str(root), targets=targets, faults=faults, repeats=1))
+    assert sorted(one["fault"] for one in result["hits"]) == ["exception", "nan"]
+    for one in result["hits"]:
+        assert one["fired"] and one["outcome"] == "survived" and one["books"], one
+        assert (one["seconds"] is None) == (one["fault"] == "nan")
+    (run,) = result["runs"]
+    assert (run["exit"], run["left_behind"], run["skipped_updates"]) == (143, 0, 0)
+    assert run["lost"] == run["doubled"] == run["segments_lost"] == run["segments_doubled"] == 0
+    assert run["books"] and run["segments"] > 0
+    written = json.loads((root / "faults.json").read_text())
+    assert written["hits"] == result["hits"] and (root / "faults.png").stat().st_size > 1000
+
+
+def test_a_soak_compares_each_block_with_its_neighbour():
+    rates = {"quiet": [10.0, 12.0], "struck": [9.0, 6.0]}
+    blocks = [
+        {"kind": kind, "updates": rates[kind][i], "decisions": 16 * rates[kind][i]}
+        for kind, i in (("quiet", 0), ("struck", 0), ("struck", 1), ("quiet", 1))
+    ]
+    found = compare(blocks)
+    assert found["left"]["updates"]["blocks"] == [0.9, 0.5]
+    assert found["rates"]["decisions"]["quiet"]["median"] == 16 * 11.0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"minutes": 3.0}, "minutes=3.0: use at least 4"),
+        ({"block_s": 5.0}, "use 20 or more"),
+        ({"targets": ("driver",)}, "leave out driver"),
+        ({"targets": ("rollout", "replay"), "faults": ("nan",)}, "add kill"),
+    ],
+)
+def test_a_soak_that_says_nothing_is_refused(options: dict[str, Any], message: str):
+    with pytest.raises(InputError, match=message):
+        BenchSoakConfig(**options)

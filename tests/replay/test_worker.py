@@ -19,8 +19,12 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Any
 
+import pytest
+
+from accerl_lerobot.experience import IMAGINED, Segment
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.replay.worker import ReplayWorker
+from accerl_lerobot.transport.contract import ServiceStoppedError
 from tests.replay.segments import make_segment
 
 CONFIG = ReplayConfig(capacity=64, min_decisions=8, ahead=8, samples_per_insert=1.0)
@@ -41,6 +45,11 @@ async def waits(task: asyncio.Task[Any]) -> bool:
     for _ in range(20):
         await asyncio.sleep(0)
     return not task.done()
+
+
+def make_imagined(key: str) -> Segment:
+    """One that finds the door open."""
+    return make_segment(key, 8, source=IMAGINED)
 
 
 def start(call: Awaitable[Any]) -> asyncio.Task[Any]:
@@ -109,6 +118,29 @@ def test_sample_that_finds_everything_too_old_lets_rollouts_in_and_waits_on():
         assert (await worker.metrics())["retired_segments"] == 1
 
     play(scene, ReplayConfig(capacity=64, min_decisions=8, ahead=8, max_lag=3))
+
+
+@pytest.mark.parametrize("broken", ["insert", "sample"])
+def test_what_breaks_in_here_ends_this_worker_and_blames_nobody_else(broken: str):
+    """A full disk, say, which whoever brings a segment can do nothing about."""
+
+    async def scene(worker: ReplayWorker) -> None:
+        def fall_over(*_: Any) -> None:
+            raise OSError("no space left on the device")
+
+        running = start(worker.run())
+        await worker.insert([make_segment("a", 8)])
+        late = start(worker.insert([make_segment("b", 8)]))
+        assert await waits(late)
+        setattr(worker._replay, broken, fall_over)
+        with pytest.raises(ServiceStoppedError, match="no space left"):
+            await (worker.sample(BATCH, 0) if broken == "sample" else worker.insert([make_imagined("c")]))
+        with pytest.raises(OSError, match="no space left"):
+            await running
+        with pytest.raises(ServiceStoppedError, match="no space left"):
+            await worker.insert([make_imagined("d")])
+
+    play(scene)
 
 
 def test_close_releases_everyone_and_stores_nothing_more():

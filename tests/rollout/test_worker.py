@@ -29,6 +29,7 @@ import pytest
 
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.experience import Decision, Request, Segment
+from accerl_lerobot.replay.buffer import is_finite
 from accerl_lerobot.rollout import worker as module
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
 from accerl_lerobot.rollout.worker import AT_THE_DOOR, RolloutWorker
@@ -301,6 +302,33 @@ def test_a_world_that_hangs_shows_in_the_report(stage, monkeypatch: pytest.Monke
     release.set()
     one.until(lambda: len(one.episodes) >= 2)
     assert one.order(True).in_world_s < 0.2
+
+
+def test_a_thread_that_hangs_outside_of_a_world_shows_in_the_report(stage, monkeypatch: pytest.MonkeyPatch):
+    release = threading.Event()
+    hangs = iter([True])
+
+    def reach(point: str) -> bool:
+        if point == "rollout.send" and next(hangs, False):
+            release.wait(20)
+        return False
+
+    monkeypatch.setattr(module, "reach", reach)
+    one = stage(lambda segments: True)
+    one.until(lambda: one.order(True).stuck_s > 0.4)
+    assert one.order(True).in_world_s == 0
+    release.set()
+    one.until(lambda: len(one.episodes) >= 2 and one.order(True).stuck_s < 0.4)
+
+
+def test_what_is_not_finite_is_sent_where_it_is_ordered(stage, monkeypatch: pytest.MonkeyPatch):
+    """Replay refuses and counts it."""
+    visits = iter([True])
+    monkeypatch.setattr(module, "reach", lambda point: point == "rollout.send" and next(visits, False))
+    inserted: list[Segment] = []
+    one = stage(lambda segments: inserted.extend(segments) or True)
+    one.until(lambda: len(inserted) >= 4)
+    assert [is_finite(segment) for segment in inserted[:4]] == [False, True, True, True]
 
 
 def test_the_process_needs_no_torch():

@@ -16,14 +16,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from accerl_lerobot import snapshot
 from accerl_lerobot.experience import Decision, Origin, Request, Segment
 from accerl_lerobot.policies.base import Evaluation, PolicyAdapter
+from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.value_head import Value
 
 STATE = "observation.state"
@@ -81,6 +84,12 @@ class LinearAdapter(PolicyAdapter):
     def copy(self) -> dict[str, Tensor]:
         """The weights as they are now."""
         return {k: p.detach().clone() for k, p in self.trainable().items()}
+
+    def copy_weights(self) -> dict[str, Tensor]:
+        return self.copy()
+
+    def save(self, directory: Path, config: PolicyConfig, weights: dict[str, Tensor]) -> None:
+        snapshot.save(directory / "linear", weights)
 
 
 def decided_by(adapter: LinearAdapter, segments: Sequence[Segment], version: int) -> list[Segment]:

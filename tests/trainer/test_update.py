@@ -29,7 +29,8 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.trainer.batch import collate
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.update import NonFiniteError, Update
+from accerl_lerobot.trainer.nonfinite import NonFiniteError
+from accerl_lerobot.trainer.update import Update
 from tests.trainer.linear import STATE, STD, LinearAdapter, make_segments
 
 PLAIN = TrainerConfig(

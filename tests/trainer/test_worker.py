@@ -24,12 +24,13 @@ import pytest
 
 from accerl_lerobot import snapshot
 from accerl_lerobot.algorithms import GIPOConfig
-from accerl_lerobot.checkpoint import TRAINING_STATE
+from accerl_lerobot.checkpoint import PRETRAINED, TRAINING_STATE
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.trainer import worker as module
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.nonfinite import NonFiniteError
 from accerl_lerobot.trainer.worker import TrainerWorker
 from accerl_lerobot.weights import ray_channel
 from tests.local_ray import Handle, Local
@@ -52,7 +53,7 @@ class Prompt(ray_channel.RayPublisher):
 class Stage:
     """A trainer, a replay that counts what it is asked for, and a reader that keeps what it is sent."""
 
-    def __init__(self, batches: int = 1000, **config: Any) -> None:
+    def __init__(self, batches: int = 1000, directory: Path | None = None, **config: Any) -> None:
         self.asked: list[tuple[int, int]] = []
         self.received: list[tuple[int, dict[str, np.ndarray]]] = []
         self.replay = Handle(sample=self._sample, learnt=lambda: None)
@@ -62,7 +63,11 @@ class Stage:
         self._batches = batches
         defaults = {"updates": 6, "batch_decisions": 7, "warmup_updates": 0, "value_warmup_updates": 0}
         self.worker = TrainerWorker(
-            PolicyConfig(path="nowhere"), GIPOConfig(), TrainerConfig(**{**defaults, **config}), seed=0
+            PolicyConfig(path="nowhere"),
+            GIPOConfig(),
+            TrainerConfig(**{**defaults, **config}),
+            seed=0,
+            directory=directory,
         )
 
     def run(self) -> int:
@@ -144,6 +149,26 @@ def test_weights_held_back_are_published_late_and_the_last_at_once():
         assert all(np.array_equal(tensors[k], weights[version - 1][k]) for k in tensors)
 
 
+def test_a_batch_that_nothing_can_be_learnt_from_is_kept(tmp_path: Path):
+    stage = Stage(updates=6, max_nonfinite=2, directory=tmp_path)
+    good = stage._sample
+
+    def sample(decisions: int, version: int) -> list[Segment]:
+        segments = good(decisions, version)
+        for segment in segments if version >= 2 else []:
+            segment.reward[0] = np.nan
+        return segments
+
+    stage.replay = Handle(sample=sample, learnt=lambda: None)
+    with pytest.raises(NonFiniteError, match=r"2 updates in a row.*its batch is in .*nonfinite-000004\.json"):
+        stage.run()
+    kept = snapshot.load(tmp_path / "nonfinite-000004")
+    assert kept["update"] == 4 and "loss nan" in kept["said"]
+    assert [segment.key for segment in kept["segments"]] == ["4.0", "4.1"]
+    assert np.isnan(kept["segments"][0].reward[0])
+    assert [record["update"] for record in stage.worker.metrics()] == [1, 2, 3]
+
+
 def test_a_closed_replay_ends_it_early():
     stage = Stage(batches=2, updates=6)
     assert stage.run() == 2 and len(stage.worker.metrics()) == 2
@@ -162,12 +187,7 @@ def test_what_is_saved_is_a_whole_version(monkeypatch: pytest.MonkeyPatch, tmp_p
         seen.append((version, stage.worker._update.version))
         return before
 
-    def save(adapter: LinearAdapter, directory: Path, policy: PolicyConfig, weights: dict[str, Any]) -> None:
-        files.append(weights)
-
-    files: list[dict[str, Any]] = []
-    monkeypatch.setattr(loading, "copy_weights", copy_weights)
-    monkeypatch.setattr(loading, "save_pretrained", save)
+    monkeypatch.setattr(LinearAdapter, "copy_weights", copy_weights)
     runner = threading.Thread(target=stage.run)
     runner.start()
     while stage.worker._update.version < 3:
@@ -185,7 +205,9 @@ def test_what_is_saved_is_a_whole_version(monkeypatch: pytest.MonkeyPatch, tmp_p
         state = tmp_path / str(i) / TRAINING_STATE
         assert snapshot.load(state / "trainer")["version"] == version
         weights = snapshot.load(state / "weights")
-        assert all(np.array_equal(weights[k], files[i][k]) for k in files[i])
+        written = snapshot.load(tmp_path / str(i) / PRETRAINED / "linear")
+        assert written.keys() == weights.keys()
+        assert all(np.array_equal(weights[k], written[k].numpy()) for k in written)
 
 
 @pytest.mark.parametrize("settings", [{"hold_back": 2}, {"publish_every": 4}, {}])

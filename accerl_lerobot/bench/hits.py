@@ -1,0 +1,203 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""One thing that goes wrong in a run: where, the proof that it did, what became of the run, and how soon.
+
+survived    the run's process went on: the loss was made good below it, or nobody was lost
+stopped     it ended, by the fault or with an error of its own, and was gone on with by `--resume`
+lost        neither
+"""
+
+from __future__ import annotations
+
+import random
+import signal
+import subprocess
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from accerl_lerobot.bench.audit import audit_updates
+from accerl_lerobot.bench.study import last_words
+from accerl_lerobot.bench.victims import DRIVER, EVERYTHING, Victim, alive, await_hit, hit
+from accerl_lerobot.fault_points import FULL, NAN, POINTS, TORN, order, proof, withdraw
+
+SIGNALS = {"kill": signal.SIGKILL, "stop": signal.SIGSTOP}
+"""Fault → what is sent from outside, at any moment."""
+NANS = "nans"
+"""``nan`` in as many updates in a row as end the trainer."""
+FAULTS = ("kill", "stop", "exception", "exit", "hang", NAN, NANS, FULL, TORN)
+ANYWHERE = "anywhere"
+"""Place of a fault that comes from outside."""
+PREFIX = {"trainer rank": "rank", "world learning": "learning"}
+"""Target → what its points' names begin with, where that is not its own name."""
+VISITS = 3
+"""A fault happens at one of so many visits of its point."""
+AWAIT_S = 90.0
+"""How long a point may take to be reached."""
+START_S = 300.0
+"""How long a run may take to recover, or to its first update."""
+SPARE = 20
+"""Updates after a fault that loses nobody: some of them were made before it, and were told of late."""
+TIDY_S = 10.0
+"""How long what was killed may take to be gone."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hit:
+    """What came of one."""
+
+    target: str
+    fault: str
+    place: str
+    """One of `POINTS`, or `ANYWHERE`."""
+    fired: bool
+    """Whether there is a proof that it happened."""
+    outcome: str
+    """See above."""
+    seconds: float | None = None
+    """From the fault to an update that had not been made before; for a rollout worker, to its successor;
+    where it loses nobody: None."""
+    lost: int = 0
+    """Updates missing from the log."""
+    doubled: int = 0
+    """Updates in it twice."""
+    books: bool | None = None
+    """Whether replay's add up."""
+    said: str = ""
+    """Why it was lost, or what the run ended with."""
+
+
+def places(target: str, fault: str) -> list[str]:
+    """Where this can befall a target; none: it cannot."""
+    if target == EVERYTHING:
+        return [ANYWHERE] if fault == "kill" else []
+    prefix = PREFIX.get(target, target)
+    what = NAN if fault == NANS else fault
+    found = [p for p, faults in POINTS.items() if p.split(".")[0] == prefix and what in faults]
+    if fault in SIGNALS and (target, fault) != (DRIVER, "stop"):
+        found.insert(0, ANYWHERE)
+    return found
+
+
+def strike(
+    victim: Victim, orders: Path, name: str, target: str, fault: str, rng: random.Random, in_a_row: int
+) -> Hit:
+    """Does it once, and waits until the run has recovered, or has not.
+
+    Args:
+        victim: the run, which learns.
+        orders: its folder of them.
+        name: of this one.
+        target: whom it befalls.
+        fault: one of `FAULTS`.
+        rng: of the place and the moment.
+        in_a_row: updates that end the trainer if nothing can be learnt from any of them.
+    """
+    place, count = rng.choice(places(target, fault)), len(victim.pids(target))
+    try:
+        began, pid = _befall(victim, orders, name, target, fault, place, rng, in_a_row)
+    except RuntimeError as error:
+        found = audit_updates(victim.records())
+        return Hit(
+            target=target, fault=fault, place=place, fired=False, outcome="lost", said=str(error),
+            lost=found["lost"], doubled=found["doubled"], books=found["books"],
+        )  # fmt: skip
+    outcome, said, seconds = "survived", "", None
+    try:
+        try:
+            _recover(victim, target, fault, pid, count)
+        except RuntimeError as error:
+            if victim.process.poll() is None:
+                raise
+            outcome, said = "stopped", _reason(victim, error)
+            # What has ended may have left workers behind, which end with it, if not at once.
+            last = max(victim.updates(), default=0)
+            victim.go_on()
+            victim.await_update(last + 1, START_S)
+        seconds = None if fault == NAN else round(time.monotonic() - began, 2)
+    except RuntimeError as error:
+        outcome, said = "lost", str(error)
+    found = audit_updates(victim.records())
+    return Hit(
+        target=target, fault=fault, place=place, fired=True, outcome=outcome, seconds=seconds, said=said,
+        lost=found["lost"], doubled=found["doubled"], books=found["books"],
+    )  # fmt: skip
+
+
+def _befall(
+    victim: Victim,
+    orders: Path,
+    name: str,
+    target: str,
+    fault: str,
+    place: str,
+    rng: random.Random,
+    in_a_row: int,
+) -> tuple[float, int]:
+    """Makes it happen; when it did, by the monotonic clock, and to which process."""
+    if place != ANYWHERE:
+        times = in_a_row if fault == NANS else 1
+        what = NAN if fault == NANS else fault
+        taken = order(orders, name, place, what, at=rng.randint(1, VISITS), times=times)
+        deadline = time.monotonic() + AWAIT_S
+        while (said := proof(taken)) is None:
+            if time.monotonic() > deadline or (victim.process.poll() is not None and not taken.is_file()):
+                withdraw(orders, place)
+                raise RuntimeError(f"{place} was not reached; {victim.log}:\n{last_words(victim.log)}")
+            time.sleep(0.01)
+        return float(said["monotonic"]), int(said["pid"])
+    time.sleep(rng.uniform(0.2, 2.0))
+    pids = victim.pids(target)
+    if not pids:
+        raise RuntimeError(f"there is no process of {target} to be hit")
+    pid, began = rng.choice(pids), time.monotonic()
+    if target == EVERYTHING:
+        killed = victim.kill()
+        while (left := [p for p in killed if alive(p)]) and time.monotonic() - began < TIDY_S:
+            time.sleep(0.02)
+        if left:
+            raise RuntimeError(f"{len(left)} processes outlived SIGKILL")
+    elif not (hit(pid, SIGNALS[fault]) and await_hit(pid, SIGNALS[fault])):
+        raise RuntimeError(f"{target} {pid} took no notice of {fault}")
+    return began, pid
+
+
+def _recover(victim: Victim, target: str, fault: str, pid: int, count: int) -> None:
+    """Waits until the run has, with as many processes of the target as before.
+
+    Raises:
+        RuntimeError: its process has ended, or it has not in time.
+    """
+    last = max(victim.updates(), default=0)
+    if fault == NAN:
+        victim.await_update(last + SPARE, START_S)
+    elif target in (DRIVER, EVERYTHING):
+        try:
+            code = victim.process.wait(START_S)
+        except subprocess.TimeoutExpired as error:
+            raise RuntimeError("the run's process did not end") from error
+        raise RuntimeError(f"the run's process ended with code {code}")
+    else:
+        victim.wait(lambda: pid not in victim.pids(target), START_S, f"{target} {pid} was left as it is")
+        victim.await_successors(target, pid, count, START_S)
+        if target != "rollout":
+            # Who is there now was started from a checkpoint, long after what was made before was told.
+            victim.await_update(max(last, *victim.updates()) + 1, START_S)
+
+
+def _reason(victim: Victim, error: RuntimeError) -> str:
+    """What the run said last."""
+    lines = [line.strip() for line in last_words(victim.log).splitlines() if line.strip()]
+    errors = [line for line in lines if "Error" in line]
+    return f"{str(error).splitlines()[0]}; {(errors or lines or ['no word'])[-1][:200]}"

@@ -1,0 +1,97 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A run in which all is real but what takes long: `accerl train` with worlds and a policy made of time.
+
+    python -m accerl_lerobot.bench.light_run --config_path=light.yaml --output_dir=RUN
+
+Its processes, checkpoints, journal, recoveries and `--resume` are those of any run; no process of it imports
+LeRobot or a simulator, so it starts in seconds. That is what faults are tried on, again and again.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import os
+import sys
+
+from accerl_lerobot.config import LaunchConfig, RunConfig
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.config import EvaluationConfig
+from accerl_lerobot.policies.config import Load, PolicyConfig
+from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.trainer.config import TrainerConfig
+
+BATCH = 16
+"""Decisions of an update."""
+
+
+def light_config(
+    *, updates: int, ranks: int = 1, stall_s: float = 10.0, save_every_s: float = 2.0
+) -> RunConfig:
+    """Some ten updates a second, most of which is slept.
+
+    Args:
+        updates: of the run.
+        ranks: of the trainer.
+        stall_s: see `LaunchConfig`.
+        save_every_s: see `RunConfig`.
+    """
+    return RunConfig(
+        job_name="light",
+        env=SimulatedConfig(max_steps=32, frame_ms=40.0, latency="lognormal", latency_cv=0.5),
+        policy=PolicyConfig(path="made of time", device="cpu"),
+        rollout=RolloutConfig(workers=2, worlds=4, segment_length=4, max_restarts=1_000_000),
+        replay=ReplayConfig(capacity=512, min_decisions=32, ahead=64, samples_per_insert=1.0),
+        trainer=TrainerConfig(
+            updates=updates,
+            batch_decisions=BATCH,
+            lr=0.02,
+            value_lr=0.02,
+            warmup_updates=5,
+            value_warmup_updates=2,
+            ranks=ranks,
+            sharding="ddp" if ranks > 1 else "none",
+            rank_timeout_s=stall_s,
+        ),
+        evaluation=EvaluationConfig(episodes=100, before=False, videos=0),
+        launch=LaunchConfig(stall_s=stall_s),
+        save_every_s=save_every_s,
+    )
+
+
+def light_policy() -> Load:
+    """What stands for LeRobot's policy."""
+    from accerl_lerobot.policies.simulated import SimulatedPolicyConfig, load_simulated
+
+    return functools.partial(load_simulated, SimulatedPolicyConfig(decide_ms=2.0, update_ms=60.0))
+
+
+def main(arguments: list[str]) -> int:
+    """As ``accerl train``; returns the exit code."""
+    from accerl_lerobot.verbs import train
+
+    level = os.environ.get("ACCERL_LOG", "WARNING")
+    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s")
+    try:
+        return train(arguments, light_policy())
+    except InputError as error:
+        sys.stderr.write(f"light_run: {error}\n")
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,242 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""How a run bears up: a fault in every other minute, and what of its throughput is left in that minute.
+
+    accerl bench soak --minutes=10
+
+Blocks without a fault and blocks with one take turns, forth and back, in one run, so that whatever else
+changes befalls both alike. What counts is what counts in the end: an update that is lost with a worker and
+made again is one. At the end: whether the run's process has grown, and what its log and checkpoints cost.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import tempfile
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+from rich.console import Group
+
+from accerl_lerobot.bench.audit import audit_segments, audit_updates
+from accerl_lerobot.bench.faults import BenchFaultsConfig, Start, end_run, recipe_of
+from accerl_lerobot.bench.hits import START_S, strike
+from accerl_lerobot.bench.host import host, ranged, spread
+from accerl_lerobot.bench.study import as_markdown, as_table, write
+from accerl_lerobot.bench.victims import DRIVER, EVERYTHING, Victim
+from accerl_lerobot.console import Console
+from accerl_lerobot.errors import InputError, check_absent
+from accerl_lerobot.metrics import METRICS, MetricsLog, WandBConfig
+from accerl_lerobot.replay.journal import EPISODES
+from accerl_lerobot.timeline.read import shares
+
+QUIET, STRUCK = "quiet", "struck"
+ORDER = (QUIET, STRUCK, STRUCK, QUIET)
+"""Of blocks, again and again."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchSoakConfig:
+    """How long, how often, and what."""
+
+    recipe: str | None = None
+    """See ``bench faults``."""
+    output_dir: str = "outputs/soak"
+    """Folder of the run and of soak.json and .md; must not exist."""
+    minutes: float = 8.0
+    """In all, beside the start; at least four blocks."""
+    block_s: float = 60.0
+    """Seconds of a block; in every other one there is one fault. At least 20."""
+    targets: tuple[str, ...] = ("rollout", "inference", "replay", "trainer")
+    """See ``bench faults``; not of the run's own process, which is not gone on with by itself."""
+    faults: tuple[str, ...] = ("kill", "exception", "exit")
+    """See ``bench faults``."""
+    stall_s: float = 10.0
+    """See ``bench faults``."""
+    seed: int = 0
+    """Of faults, places and moments."""
+
+    def __post_init__(self) -> None:
+        if not self.block_s >= 20:
+            raise InputError("block_s", self.block_s, "use 20 or more, in which a run can recover")
+        if not self.blocks >= len(ORDER):
+            least = len(ORDER) * self.block_s / 60
+            raise InputError("minutes", self.minutes, f"use at least {least:g}: both kinds, forth and back")
+        if {DRIVER, EVERYTHING} & set(self.targets):
+            raise InputError("targets", self.targets, "leave out driver and everything")
+        if not all(self.of.of(target) for target in self.targets):
+            raise InputError("faults", self.faults, "add kill, which can befall any target")
+
+    @property
+    def blocks(self) -> int:
+        """Of them, in whole turns."""
+        whole = int(self.minutes * 60 / self.block_s)
+        return whole // len(ORDER) * len(ORDER)
+
+    @property
+    def of(self) -> BenchFaultsConfig:
+        """The same of ``bench faults``."""
+        return BenchFaultsConfig(
+            recipe=self.recipe, targets=self.targets, faults=self.faults, stall_s=self.stall_s, seed=self.seed
+        )
+
+
+def bench_soak(config: BenchSoakConfig) -> dict[str, Any]:
+    """Measures one run.
+
+    Returns:
+        ``blocks``, of each ``kind``, ``seconds``, ``updates`` and ``decisions`` learned from a second, what
+        the run's process holds (``rss_mb``, ``files``), and the ``hit``; ``rates`` of either kind; ``left``,
+        the share of them that was left, pair by pair; ``costs``; what `audit` finds; ``config``, ``host``.
+
+    Raises:
+        InputError: the folder exists, or the recipe is wrong.
+        RuntimeError: the run did not begin, or was lost.
+    """
+    root, console = Path(config.output_dir).expanduser().resolve(), Console()
+    recipe = recipe_of(config.of)
+    check_absent(root)
+    root.mkdir(parents=True)
+    start = Start(config.recipe, recipe, config.stall_s, root, console)
+    rng, orders = random.Random(config.seed), root / "run.orders"
+    result: dict[str, Any] = {"config": asdict(config), "host": host(), "blocks": []}
+    victim = start.run("run", orders=orders)
+    try:
+        victim.await_update(20, START_S)
+        with console.stage("blocks", total=config.blocks) as stage:
+            for number in range(config.blocks):
+                kind = ORDER[number % len(ORDER)]
+                block = _block(config, victim, orders, str(number), kind, rng, recipe.trainer.max_nonfinite)
+                result["blocks"].append(block)
+                stage.update(number + 1, f"{kind}: {block['updates']:.1f} updates/s")
+        result |= compare(result["blocks"])
+        result |= end_run(victim)
+    finally:
+        victim.kill()
+    result |= audit_updates(victim.records()) | audit_segments(victim.folder)
+    result |= {"costs": costs(victim.folder), "host_after": host()}
+    write(root, "soak", result, markdown(result))
+    return result
+
+
+def _block(
+    config: BenchSoakConfig,
+    victim: Victim,
+    orders: Path,
+    name: str,
+    kind: str,
+    rng: random.Random,
+    in_a_row: int,
+) -> dict[str, Any]:
+    """Some seconds of the run; the fault, if any, is early enough that the block bears all of it."""
+    before, began, struck = _made(victim), time.monotonic(), None
+    if kind == STRUCK:
+        target = rng.choice(config.targets)
+        fault = rng.choice(config.of.of(target))
+        time.sleep(rng.uniform(0.0, config.block_s / 10))
+        struck = asdict(strike(victim, orders, name, target, fault, rng, in_a_row))
+        if struck["outcome"] == "lost":
+            raise RuntimeError(f"{fault} of {target}: {struck['said']}")
+    time.sleep(max(0.0, began + config.block_s - time.monotonic()))
+    seconds, after = time.monotonic() - began, _made(victim)
+    process = psutil.Process(victim.process.pid)
+    return {
+        "kind": kind,
+        "seconds": seconds,
+        "updates": (after[0] - before[0]) / seconds,
+        "decisions": (after[1] - before[1]) / seconds,
+        "rss_mb": process.memory_info().rss / 1e6,
+        "files": process.num_fds(),
+        "hit": struck,
+    }
+
+
+def _made(victim: Victim) -> tuple[int, float]:
+    """Updates, and decisions learned from, that are in the log."""
+    train = [record for record in victim.records() if record["kind"] == "train"]
+    return len(train), sum(record["decisions"] for record in train)
+
+
+def compare(blocks: list[dict[str, Any]]) -> dict[str, Any]:
+    """Of blocks in `ORDER`: ``rates`` of either kind, and what is ``left`` of them, pair by pair."""
+    rates, left = {}, {}
+    for name in ("updates", "decisions"):
+        of = {kind: [b[name] for b in blocks if b["kind"] == kind] for kind in (QUIET, STRUCK)}
+        rates[name] = {kind: spread(values) for kind, values in of.items()}
+        left[name] = spread([b / a for a, b in zip(of[QUIET], of[STRUCK], strict=True)])
+    return {"rates": rates, "left": left}
+
+
+def costs(run: Path) -> dict[str, float]:
+    """Shares of a run's time: the trainer's and replay's in which they were saved, the driver's in which it
+    saved, and of one process what writing its log once more takes.
+    """
+    spent = shares(run, training=True)
+    roles = ("trainer", "replay", "driver")
+    found = {f"checkpoint_{role}": spent.get(role, {}).get("checkpoint", 0.0) for role in roles}
+    lines = (run / METRICS).read_text().splitlines()
+    records = [json.loads(line) for line in lines]
+    journal = (run / EPISODES).read_bytes().splitlines(keepends=True)
+    with tempfile.TemporaryDirectory(dir=run) as scratch:
+        began = time.perf_counter()
+        log = MetricsLog(Path(scratch), WandBConfig(), {})
+        for record in records:
+            values = {k: v for k, v in record.items() if k not in ("kind", "wall_s", "update")}
+            log.write(record["kind"], record["update"], values)
+        log.close()
+        metrics_s = time.perf_counter() - began
+        began = time.perf_counter()
+        with (Path(scratch) / EPISODES).open("wb") as file:
+            for line in journal:
+                file.write(line)
+                file.flush()
+        journal_s = time.perf_counter() - began
+    wall = records[-1]["wall_s"]
+    return found | {"metrics": metrics_s / wall, "journal": journal_s / wall}
+
+
+def table(result: dict[str, Any]) -> Group:
+    """`result` for people."""
+    rates = as_table("a fault in every other block", _COLUMNS, _rows(result))
+    return Group(rates, as_table("shares of the time", _COST_COLUMNS, _cost_rows(result)))
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """`table` for the docs."""
+    return f"{as_markdown(_COLUMNS, _rows(result))}\n{as_markdown(_COST_COLUMNS, _cost_rows(result))}"
+
+
+_COLUMNS = ("a second", "without a fault", "with one", "left")
+_COST_COLUMNS = ("what", "of the time")
+
+
+def _rows(result: dict[str, Any]) -> list[list[str]]:
+    rows = []
+    for name in ("updates", "decisions"):
+        rates = result["rates"][name]
+        cells = [ranged(rates[kind], ".1f") for kind in (QUIET, STRUCK)]
+        rows.append([name, *cells, ranged(result["left"][name], ".0%")])
+    return rows
+
+
+def _cost_rows(result: dict[str, Any]) -> list[list[str]]:
+    rows = [[name.replace("_", ", "), f"{share:.2%}"] for name, share in result["costs"].items()]
+    first, last = result["blocks"][0], result["blocks"][-1]
+    rows.append(["memory of the run's process, MB", f"{first['rss_mb']:.0f} → {last['rss_mb']:.0f}"])
+    rows.append(["its open files", f"{first['files']} → {last['files']}"])
+    return rows

@@ -1,0 +1,82 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A run's own Ray, kept while workers come and go: after a loss they are started again, and not Ray."""
+
+from __future__ import annotations
+
+import logging
+
+import ray
+from ray.exceptions import GetTimeoutError, RayError
+
+from accerl_lerobot.stopping import Stopping
+
+logger = logging.getLogger(__name__)
+
+RESPONDS_S = 20.0
+"""How long Ray may take to start a process, or it is taken for broken."""
+
+
+def start_ray() -> None:
+    """A private Ray on this machine, without a dashboard; `ray_environment` says what keeps it private."""
+    with Stopping.kept():
+        ray.init(
+            address="local",
+            include_dashboard=False,
+            _node_ip_address="127.0.0.1",
+            log_to_driver=False,
+            configure_logging=False,
+        )
+
+
+class PrivateRay:
+    """Ray, for as long as it is not closed; one that was there before is used and left running.
+
+    Example:
+        >>> own = PrivateRay()
+        >>> own.start()     # for the first workers
+        >>> own.start()     # for their successors: looks whether it still does what it is asked to
+        >>> own.close()
+    """
+
+    def __init__(self) -> None:
+        self._started = False
+
+    def start(self) -> None:
+        """Starts it unless it is there, or if it does not respond any more."""
+        if ray.is_initialized():
+            if not self._started or _responds():
+                return
+            logger.warning("Ray does not respond any more and is started again")
+            ray.shutdown()
+        self._started = True
+        start_ray()
+
+    def close(self) -> None:
+        """Ends it, if it was started here. Safe to call twice."""
+        if self._started and ray.is_initialized():
+            ray.shutdown()
+        self._started = False
+
+
+def _responds() -> bool:
+    """Whether a process can still be had."""
+    try:
+        return bool(ray.get(ray.remote(_there).options(num_cpus=0).remote(), timeout=RESPONDS_S))
+    except (RayError, GetTimeoutError):
+        return False
+
+
+def _there() -> bool:
+    return True

@@ -1,0 +1,139 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Named points: nothing happens unless it is ordered, and then once, by whoever is there first."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import accerl_lerobot
+from accerl_lerobot import fault_points
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.fault_points import CRASHES, POINTS, VARIABLE, FaultError, order, proof, reach, withdraw
+
+COMES_BY = """
+import sys
+from pathlib import Path
+from accerl_lerobot.fault_points import reach
+for _ in range(int(sys.argv[2])):
+    reach(sys.argv[1], Path(sys.argv[3]))
+print("went on")
+"""
+
+
+@pytest.fixture
+def orders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """This process looks for orders here."""
+    monkeypatch.setattr(fault_points, "_orders", fault_points._Orders(tmp_path))
+    return tmp_path
+
+
+def comes_by(folder: Path, point: str, times: int = 1, path: str = "") -> subprocess.CompletedProcess[str]:
+    """A process of its own that reaches a point."""
+    command = [sys.executable, "-c", COMES_BY, point, str(times), path]
+    environment = os.environ | {VARIABLE: str(folder)}
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_without_an_order_nothing_happens(orders: Path):
+    assert not reach("trainer.loss") and list(orders.iterdir()) == []
+    taken = order(orders, "1", "trainer.backward", "exception")
+    assert not reach("trainer.update") and proof(taken) is None
+    assert withdraw(orders, "trainer.backward") and not withdraw(orders, "trainer.backward")
+    reach("trainer.backward")
+
+
+def test_a_process_that_was_not_told_of_orders_looks_for_none(tmp_path: Path):
+    assert fault_points._orders is None
+    taken = order(tmp_path, "1", "trainer.loss", "nan")
+    assert not reach("trainer.loss") and proof(taken) is None
+
+
+def test_it_happens_at_the_visit_that_was_ordered_and_once(orders: Path):
+    taken = order(orders, "1", "replay.insert", "exception", at=3)
+    reach("replay.insert")
+    reach("replay.insert")
+    assert proof(taken) is None
+    with pytest.raises(FaultError, match=r"replay\.insert"):
+        reach("replay.insert")
+    said = proof(taken)
+    assert said is not None and said["pid"] == os.getpid() and said["point"] == "replay.insert"
+    reach("replay.insert")
+    order(orders, "2", "replay.insert", "exception")
+    with pytest.raises(FaultError):  # visits are counted from the order on
+        reach("replay.insert")
+
+
+def test_what_is_not_finite_may_last(orders: Path):
+    order(orders, "1", "trainer.loss", "nan", at=2, times=3)
+    assert [reach("trainer.loss") for _ in range(6)] == [False, True, True, True, False, False]
+
+
+def test_a_full_disk_is_an_error_of_the_system(orders: Path):
+    order(orders, "1", "replay.journal", "full")
+    with pytest.raises(OSError, match="No space left") as caught:
+        reach("replay.journal")
+    assert caught.value.errno == errno.ENOSPC
+
+
+def test_a_process_that_is_started_anew_does_not_take_it_again(tmp_path: Path):
+    taken = order(tmp_path, "1", "rollout.step", "exit", at=2)
+    assert comes_by(tmp_path, "rollout.step").stdout == "went on\n" and proof(taken) is None
+    first = comes_by(tmp_path, "rollout.step", times=2)
+    assert (first.returncode, first.stdout) == (0, "") and proof(taken) is not None
+    assert comes_by(tmp_path, "rollout.step", times=9).stdout == "went on\n"
+
+
+def test_a_torn_file_has_lost_its_end_and_its_writer_is_gone(tmp_path: Path):
+    files = tmp_path / "000001"
+    files.mkdir()
+    (files / "large").write_bytes(bytes(1000))
+    (files / "small").write_bytes(bytes(10))
+    order(tmp_path / "orders", "1", "driver.renamed", "torn")
+    done = comes_by(tmp_path / "orders", "driver.renamed", path=str(files))
+    assert done.returncode == -signal.SIGKILL
+    assert ((files / "large").stat().st_size, (files / "small").stat().st_size) == (500, 10)
+
+
+@pytest.mark.parametrize(
+    ("point", "fault", "at", "message"),
+    [
+        ("trainer.nap", "nan", 1, r"point='trainer\.nap': use one of rollout\.step"),
+        ("trainer.loss", "exception", 1, r"fault='exception': at trainer\.loss, use one of nan"),
+        ("trainer.loss", "nan", 0, "use at least 1"),
+    ],
+)
+def test_what_cannot_happen_is_refused(tmp_path: Path, point: str, fault: str, at: int, message: str):
+    with pytest.raises(InputError, match=message):
+        order(tmp_path, "1", point, fault, at=at)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_every_point_is_in_the_code_once_and_no_other_is():
+    found = [
+        point
+        for path in Path(accerl_lerobot.__file__).parent.rglob("*.py")
+        for point in re.findall(r'\breach\("([a-z.]+)"', path.read_text())
+    ]
+    # Every worker's timeline is written by the same line.
+    assert sorted(found) == sorted(point for point in POINTS if not point.endswith(".timeline"))
+    assert all(set(faults) <= {*CRASHES, "nan", "full", "torn"} for faults in POINTS.values())
