@@ -65,6 +65,8 @@ class Report:
     """How long the world has been at what it does now, in seconds; 0 while none is stepped."""
     spent: bool = False
     """Every exploring episode that was paid for has been played, and replay has it."""
+    starts: int = 0
+    """See `EpisodePlans.starts`."""
     away_s: float = 0.0
     """For how long inference has not been where it was last said to be, in seconds."""
     away_why: str = ""
@@ -163,6 +165,7 @@ class RolloutWorker:
             counters={k: float(v) for k, v in vars(self._runner.counters).items()},
             in_world_s=0.0 if entered is None else time.monotonic() - entered,
             spent=self._spent,
+            starts=self._plans.starts,
             away_s=self._deciding.away_s,
             away_why=self._deciding.why,
         )
