@@ -32,7 +32,7 @@ CHANGEABLE = (
     "resume", "output_dir", "evaluation", "launch", "wandb", "save_every_updates", "save_every_s",
     "save_keep", "trainer.updates", "trainer.num_threads", "trainer.ranks", "trainer.sharding",
     "trainer.cpu_offload", "trainer.activation_checkpointing", "trainer.rank_timeout_s",
-    "rollout.max_restarts", "inference",
+    "rollout.max_restarts", "inference", "imagination.record",
 )  # fmt: skip
 """Fields, and rooms, that may be other than before: what is learnt, and from what, is the same."""
 

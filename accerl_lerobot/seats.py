@@ -33,7 +33,7 @@ from accerl_lerobot.config import RunConfig, timeline_folder
 from accerl_lerobot.engine import WorkerError, check_new, episode_key
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.ray_environment import TOKENLESS
-from accerl_lerobot.rollout.plans import budgets, whole_groups
+from accerl_lerobot.rollout.plans import budgets, incarnation_after, whole_groups
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.watched import Watched
@@ -54,7 +54,9 @@ class Seat:
 
     index: int
     incarnation: int = 0
-    """Processes that have sat here before."""
+    """Grows with every process that sits here; part of its seeds and keys."""
+    starts: int = 0
+    """Where it is in the worker's seeds."""
     restarts: int = 0
     """Of them, since the run was begun or gone on with."""
     outstanding: dict[tuple[str, int], EpisodePlan] = field(default_factory=dict)
@@ -161,9 +163,14 @@ class Seats:
                 continue
             if report is None:
                 continue
+<<<<<<< HEAD
             seat.counters, seat.spent = report.counters, report.spent
             seat.in_world_s, seat.stuck_s = report.in_world_s, report.stuck_s
             seat.away = report.away_s, report.away_why
+=======
+            seat.counters, seat.in_world_s, seat.spent = report.counters, report.in_world_s, report.spent
+            seat.away, seat.starts = (report.away_s, report.away_why), report.starts
+>>>>>>> e82
             if seat.budget is not None:
                 seat.budget -= sum(e.plan.explore for e in report.episodes)
             for episode in report.episodes:
@@ -235,8 +242,12 @@ class Seats:
     def save(self, directory: Path) -> None:
         """Writes their part of ``training_state``."""
         seats = [
-            {"incarnation": s.incarnation, "budget": s.budget, "outstanding": list(s.outstanding.values())}
-            for s in self._seats
+            {
+                "incarnation": incarnation_after(seat.incarnation, seat.starts) - 1,
+                "budget": seat.budget,
+                "outstanding": list(seat.outstanding.values()),
+            }
+            for seat in self._seats
         ]
         snapshot.save(directory / ROLLOUT, {"past": self.counters(), "seats": seats})
 
@@ -283,9 +294,14 @@ class Seats:
         self._past["restarts"] += 1
         for key, value in seat.counters.items():
             self._past[key] = self._past.get(key, 0.0) + value
+<<<<<<< HEAD
         seat.counters, seat.in_world_s, seat.stuck_s = {}, 0.0, 0.0
         seat.away, seat.moved = (0.0, ""), None
         seat.incarnation += 1
+=======
+        seat.counters, seat.in_world_s, seat.away, seat.moved = {}, 0.0, (0.0, ""), None
+        seat.incarnation = incarnation_after(seat.incarnation, seat.starts)
+>>>>>>> e82
         seat.restarts += 1
         if seat.budget is not None:
             seat.budget = whole_groups(seat.budget, self._config.rollout)

@@ -31,6 +31,7 @@ import pytest
 from accerl_lerobot import snapshot
 from accerl_lerobot.checkpoint import TRAINING_STATE
 from accerl_lerobot.experience import Decision, Request
+from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.rollout.worker import Report, RolloutWorker
 from accerl_lerobot.transport.on_loop import serve_on_loop
 from accerl_lerobot.transport.shared_memory import Address
@@ -89,7 +90,8 @@ class LightInference:
         return version
 
     async def metrics(self) -> dict[str, float]:
-        return {"version": float(self._version)}
+        others = dict.fromkeys(("busy_share", "swap_s", "publish_to_served_s"), 0.0)
+        return BatcherStats().metrics() | others | {"version": float(self._version)}
 
 
 def _decision(request: Request, version: int) -> Decision:

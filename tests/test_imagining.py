@@ -26,7 +26,10 @@ import pytest
 import torch
 
 from accerl_lerobot import cli
-from accerl_lerobot.config import RunConfig
+from accerl_lerobot.config import DatasetConfig, RunConfig
+from accerl_lerobot.console import Console
+from accerl_lerobot.demos.export_dreams import write_dreams
+from accerl_lerobot.demos.windows import check_dataset
 from accerl_lerobot.engine import Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
@@ -41,6 +44,8 @@ from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, T
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig, OnlineLearnConfig
 from accerl_lerobot.world_model.offline import world_spec
 from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.recorded import DREAMS as DREAMT
+from accerl_lerobot.world_model.recorded import read_dreams
 from accerl_lerobot.world_model.store import save_world_model
 from accerl_lerobot.world_model.success import new_success_model
 from tests.runs import drive, polls, tiny_run
@@ -230,7 +235,7 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
     from accerl_lerobot.launch import RayEngine
 
     learn = OnlineLearnConfig(steps_per_episode=1.0, try_every=2, held_out=0.4, trial=LOOSE, batch=4)
-    config = dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12)
+    config = dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12, record=3)
     config = replace(config, rollout=replace(config.rollout, workers=2))
     engine = RayEngine(replace(config, output_dir=str(tmp_path)), ("match",))
     try:
@@ -260,6 +265,13 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
     spent = shares(tmp_path)
     assert {"recovery", "compute", "transport", "wait_in"} <= spent["dream"].keys()
     assert {"recovery", "compute", "transport", "wait_in"} <= spent["world learning"].keys()
+    kept = list(read_dreams(tmp_path / DREAMT))
+    assert len(kept) == 3 and kept[-1].number > 3, "the newest"
+    assert all(dream.observations.keys() == kept[0].observations.keys() for dream in kept)
+    assert all(dream.decisions_per_s == 80 / 4 and 1 <= len(dream) <= 2 for dream in kept)
+    write_dreams(kept, tmp_path / "set", "some/dreams", "simulated", Console())
+    with pytest.raises(InputError, match=r"action has shape \(8,\) here and \(2,\) in the world"):
+        check_dataset(DatasetConfig(repo_id="some/dreams", root=str(tmp_path / "set")), ENV, {})
 
 
 def test_asynchronously_a_run_ends_when_its_episodes_are_used_up(tiny_checkpoint: Path):

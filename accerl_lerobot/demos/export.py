@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""The real episodes of a run as a LeRobotDataset.
+"""The episodes of a run as a LeRobotDataset: real ones, or what it dreamt, for which see `export_dreams`.
 
     accerl export --path=RUN --root=outputs/rollouts
 
@@ -23,7 +23,8 @@ gone, by its rewards and its outcome, is left out and counted.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ from accerl_lerobot.checkpoint import CONFIG
 from accerl_lerobot.config import RunConfig, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.expert import Episode
+from accerl_lerobot.demos.export_dreams import write_dreams
 from accerl_lerobot.demos.record import features, frames
 from accerl_lerobot.demos.writing import (
     appearing,
@@ -47,7 +49,9 @@ from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import World
 from accerl_lerobot.envs.config import EnvConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import IMAGINED, REAL
 from accerl_lerobot.replay.journal import EPISODES, Done, read_journal, whole_episodes
+from accerl_lerobot.world_model.recorded import DREAMS, read_dreams
 
 SIDECAR = Path("meta") / "accerl_rollouts.json"
 """Inside the dataset: where it is from, and what came of it."""
@@ -56,6 +60,7 @@ VERSION = "policy_version"
 TOLERANCE = 1e-4
 """By which the rewards of a decision may differ, which are summed in another order."""
 PICKS = ("all", "successes", "failures")
+SOURCES = (REAL, IMAGINED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +69,10 @@ class ExportConfig:
 
     path: str | None = None
     """Folder of an ``accerl train`` run."""
+    source: str = REAL
+    """real: exploring episodes, with a picture at every env step. imagined: dreams, where
+    ``imagination.record`` has kept any, with a picture at every decision. Never both: what is done between
+    two frames is not the same in them."""
     root: str = "outputs/rollouts"
     """Folder to create; must not exist."""
     repo_id: str = "accerl/rollouts"
@@ -78,6 +87,8 @@ class ExportConfig:
     def __post_init__(self) -> None:
         if self.path is None:
             raise InputError("path", None, "name the folder of an accerl train run")
+        if self.source not in SOURCES:
+            raise InputError("source", self.source, f"use {' or '.join(SOURCES)}")
         if self.pick not in PICKS:
             raise InputError("pick", self.pick, f"use {', '.join(PICKS)}")
         if self.last < 0:
@@ -98,7 +109,9 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
     if not (run / CONFIG).is_file():
         raise InputError("path", str(run), f"no run in it: there is no {CONFIG}")
     settings: RunConfig = parse(RunConfig, [f"--config_path={run / CONFIG}"])
-    chosen = _chosen(run / EPISODES, config)
+    if config.source == IMAGINED:
+        return _export_dreams(settings, config, run, root, console)
+    chosen = _picked(whole_episodes(read_journal(run / EPISODES)), lambda parts: parts[-1].success, config)
     if not chosen:
         raise InputError(
             "path", str(run), f"no whole episode in its {EPISODES} of those asked for ({config.pick})"
@@ -108,18 +121,34 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
         if not tally["episodes"]:
             remedy = "none of its episodes repeats itself: this world does not show the same again"
             raise InputError("path", str(run), remedy)
-        about = {"export": asdict(config) | {"path": run.name}, "seed": settings.seed, **tally}
-        (partial / SIDECAR).write_text(json.dumps(about, indent=2) + "\n")
+        _say_what_it_is(config, run, settings, tally, partial)
     return tally
 
 
-def _chosen(journal: Path, config: ExportConfig) -> list[list[Done]]:
-    picked = [
-        episode
-        for episode in whole_episodes(read_journal(journal))
-        if config.pick == "all" or episode[-1].success is (config.pick == "successes")
-    ]
-    return picked[-config.last :] if config.last else picked
+def _export_dreams(
+    settings: RunConfig, config: ExportConfig, run: Path, root: Path, console: Console
+) -> dict[str, Any]:
+    chosen = _picked(read_dreams(run / DREAMS), lambda dream: dream.success, config)
+    if not chosen:
+        raise InputError("path", str(run), f"no dream in its {DREAMS}/ of those asked for ({config.pick})")
+    with appearing(root) as partial:
+        tally = write_dreams(chosen, partial, config.repo_id, settings.env.type, console)
+        _say_what_it_is(config, run, settings, tally, partial)
+    return tally
+
+
+def _say_what_it_is(
+    config: ExportConfig, run: Path, settings: RunConfig, tally: dict[str, Any], root: Path
+) -> None:
+    about = {"export": asdict(config) | {"path": run.name}, "seed": settings.seed, **tally}
+    (root / SIDECAR).write_text(json.dumps(about, indent=2) + "\n")
+
+
+def _picked[Item](
+    items: Iterable[Item], succeeded: Callable[[Item], bool], config: ExportConfig
+) -> list[Item]:
+    picked = (i for i in items if config.pick == "all" or succeeded(i) is (config.pick == "successes"))
+    return list(deque(picked, maxlen=config.last or None))
 
 
 def _write(
@@ -136,7 +165,7 @@ def _write(
         simulators(config.processes, _start, settings.env, cost) as pool,
     ):
         repeated = in_order(pool, _repeat, chosen, ahead=2 * config.processes)
-        with new_dataset(root, config.repo_id, spec, settings.env.type, table) as dataset:
+        with new_dataset(root, config.repo_id, spec.fps, settings.env.type, table) as dataset:
             for number, (episode, parts) in enumerate(zip(repeated, chosen, strict=True), start=1):
                 stage.update(number, f"{tally['successes']} successes")
                 if episode is None:

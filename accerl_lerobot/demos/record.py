@@ -143,7 +143,7 @@ def _write(env_config: EnvConfig, config: DemosConfig, spec: WorldSpec, root: Pa
     ):
         # The first episodes are already being simulated while LeRobot is imported.
         episodes = in_order(pool, _record_one, range(config.episodes), ahead=2 * config.processes)
-        with new_dataset(root, config.repo_id, spec, env_config.type, features(spec)) as dataset:
+        with new_dataset(root, config.repo_id, spec.fps, env_config.type, features(spec)) as dataset:
             bar = progress.add_task("recording", total=config.episodes)
             for episode, discarded in episodes:
                 for frame in frames(episode):

@@ -24,7 +24,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.errors import InputError
 
 
@@ -106,7 +105,7 @@ def _drained[Item, Result](
 
 @contextmanager
 def new_dataset(
-    root: Path, repo_id: str, spec: WorldSpec, robot_type: str, features: dict[str, Any]
+    root: Path, repo_id: str, fps: int, robot_type: str, features: dict[str, Any]
 ) -> Iterator[Any]:
     """A LeRobotDataset to be filled; complete when the context has been left."""
     from datasets.utils.logging import disable_progress_bar
@@ -115,7 +114,7 @@ def new_dataset(
     disable_progress_bar()  # one per episode would bury ours
     dataset = LeRobotDataset.create(
         repo_id,
-        fps=spec.fps,
+        fps=fps,
         features=features,
         root=root,
         robot_type=robot_type,

@@ -48,6 +48,16 @@ def whole_groups(episodes: int, config: RolloutConfig) -> int:
     return size * math.ceil(episodes / size)
 
 
+def incarnation_after(incarnation: int, starts: int) -> int:
+    """Of the process that takes a worker's place, such that it meets none of its seeds again.
+
+    Args:
+        incarnation: of the one before.
+        starts: where that one was in its seeds when it last said so; it may have gone on since.
+    """
+    return max(incarnation, (starts + STARTS_PER_INCARNATION // 2) // STARTS_PER_INCARNATION) + 1
+
+
 class EpisodePlans:
     """The episodes of one worker, in order.
 
@@ -112,6 +122,11 @@ class EpisodePlans:
         if plan is not None and self._budget is not None:
             self._budget -= 1
         return plan
+
+    @property
+    def starts(self) -> int:
+        """Where it is in the worker's seeds."""
+        return self._starts
 
     @property
     def spent(self) -> bool:

@@ -70,6 +70,8 @@ class Report:
     """How long ago the thread that steps worlds last did anything, in seconds; 0 while one is stepped."""
     spent: bool = False
     """Every exploring episode that was paid for has been played, and replay has it."""
+    starts: int = 0
+    """See `EpisodePlans.starts`."""
     away_s: float = 0.0
     """For how long inference has not been where it was last said to be, in seconds."""
     away_why: str = ""
@@ -170,6 +172,7 @@ class RolloutWorker:
             in_world_s=0.0 if entered is None else now - entered,
             stuck_s=0.0 if moved is None or entered is not None else now - moved,
             spent=self._spent,
+            starts=self._plans.starts,
             away_s=self._deciding.away_s,
             away_why=self._deciding.why,
         )

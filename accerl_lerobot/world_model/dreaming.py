@@ -21,6 +21,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from accerl_lerobot.config import journal_folder
 from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import WorldSpec
@@ -37,6 +38,7 @@ from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 from accerl_lerobot.world_model.imagine import Dreamer, Imagination
 from accerl_lerobot.world_model.online import OnlineLearner
 from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.recorded import DREAMS, DreamRecorder
 from accerl_lerobot.world_model.store import load_source
 from accerl_lerobot.world_model.zoo import make_dreamer
 
@@ -57,6 +59,10 @@ def make_imagination(config: RunConfig, name: str, on_segment: Callable[[Segment
     """
     spec = _spec(config)
     dreamer = load_dreamer(config, spec)
+    folder = journal_folder(config)
+    if config.imagination.record and folder is not None:
+        pace = spec.fps / dreamer.model.spec.chunk
+        on_segment = _recorded(DreamRecorder(folder / DREAMS, config.imagination.record, pace), on_segment)
     return Imagination(
         dreamer.model,
         dreamer.success,
@@ -68,6 +74,16 @@ def make_imagination(config: RunConfig, name: str, on_segment: Callable[[Segment
         name=name,
         on_segment=on_segment,
     )
+
+
+def _recorded(
+    recorder: DreamRecorder, on_segment: Callable[[Segment], object]
+) -> Callable[[Segment], object]:
+    def record(segment: Segment) -> None:
+        recorder.write(segment)
+        on_segment(segment)
+
+    return record
 
 
 def load_dreamer(config: RunConfig, world: WorldSpec) -> Dreamer:

@@ -20,7 +20,13 @@ import itertools
 import pytest
 
 from accerl_lerobot.rollout.groups import Outcome, Place
-from accerl_lerobot.rollout.plans import STARTS_PER_INCARNATION, EpisodePlans, budgets, whole_groups
+from accerl_lerobot.rollout.plans import (
+    STARTS_PER_INCARNATION,
+    EpisodePlans,
+    budgets,
+    incarnation_after,
+    whole_groups,
+)
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
 from accerl_lerobot.seeds import train_seed
 from tests.rollout.worlds import evaluate
@@ -95,6 +101,20 @@ def test_another_incarnation_repeats_no_seed(group_size):
         seeds.append({p.seed for p in take(plans, 400)})
         assert min(seeds[-1]) == train_seed(3, 0, incarnation * STARTS_PER_INCARNATION)
     assert not set.intersection(*seeds) and len(set.union(*seeds)) == 3 * (100 if group_size else 400)
+
+
+def test_not_even_where_the_one_before_has_played_thousands():
+    incarnation, seen = 0, set()
+    for count in (1, 400, 990, 1010, 0, 1499):
+        plans = make(incarnation=incarnation)
+        said = count - 30  # the last episodes were begun after it had been asked
+        seeds = {plan.seed for plan in take(plans, max(0, said))}
+        starts = plans.starts
+        seeds |= {plan.seed for plan in take(plans, min(count, 30))}
+        assert len(seeds) == count and not seeds & seen
+        seen |= seeds
+        incarnation = incarnation_after(incarnation, starts)
+    assert incarnation == 9
 
 
 @pytest.mark.parametrize("group_size", [0, 2])
