@@ -57,6 +57,10 @@ def _is_gates(value: Any) -> bool:
     )
 
 
+def _is_trial(value: Any) -> bool:
+    return isinstance(value, dict) and "name" in value and not _lacking(value, TRIAL_NEEDS)
+
+
 Needs = dict[str, Callable[[Any], bool]]
 """What a page cannot do without, and what it has to be."""
 
@@ -75,6 +79,9 @@ TRIAL_NEEDS: Needs = {
     "trials": _is_number,
     "gates": _is_gates,
     "depths": _is_list,
+    "sources": lambda value: (
+        value is None or (isinstance(value, dict) and all(map(_is_trial, value.values())))
+    ),
 }
 EVALUATION_NEEDS: Needs = {
     "success": _is_number,

@@ -62,6 +62,14 @@ FILMS = {
         "Top to bottom: what happened; what the world model dreamt with the same actions; and with those of "
         "another episode.",
     ),
+    "preview_online.mp4": (
+        "Dreams of a policy's episodes",
+        "The same of episodes that a policy lived through.",
+    ),
+    "preview_perturbed.mp4": (
+        "Dreams of perturbed episodes",
+        "The same of episodes that were played again with noise on their actions.",
+    ),
 }
 """Title and caption of the videos that runs make."""
 

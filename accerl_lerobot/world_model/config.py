@@ -218,6 +218,47 @@ class TrialConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class InverseConfig:
+    """How the probe is learnt that reads actions off frames, see `inverse.py`."""
+
+    steps: int = 400
+    """Gradient steps; 0: there is no probe."""
+    batch: int = 64
+    """Pairs of frames in each, at least 2."""
+    lr: float = 2e-3
+    """Falls to 0 by a cosine."""
+    episodes: int = 40
+    """Episodes that it learns from at most, at least 1: such as the world model has learnt from, or, of a
+    dataset that it does not know, half of all. On those it is not read."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("steps", 0), ("batch", 2), ("episodes", 1)):
+            if getattr(self, name) < least:
+                raise InputError(f"inverse.{name}", getattr(self, name), f"use at least {least}")
+        if not 0 < self.lr < 1:
+            raise InputError("inverse.lr", self.lr, "use a value in (0, 1), e.g. 2e-3")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PerturbedConfig:
+    """Episodes that are played again with other actions, see `perturbed.py`."""
+
+    episodes: int = 0
+    """How many of the dataset's that are tried, at most; 0: none."""
+    noise: float = 0.4
+    """Standard deviation of what is added to each action, in halves of its range; > 0."""
+    hold: int = 10
+    """Env steps for which it stays the same, at least 1."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("episodes", 0), ("hold", 1)):
+            if getattr(self, name) < least:
+                raise InputError(f"perturbed.{name}", getattr(self, name), f"use at least {least}")
+        if not self.noise > 0:
+            raise InputError("perturbed.noise", self.noise, "use a positive number, e.g. 0.4")
+
+
+@dataclass(frozen=True, kw_only=True)
 class WorldModelConfig:
     """A world model with its success model."""
 
