@@ -26,7 +26,13 @@ from accerl_lerobot.evaluation.config import EvaluationConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.world_model.config import InverseConfig, PerturbedConfig, TrialConfig, WorldModelConfig
+from accerl_lerobot.world_model.config import (
+    InverseConfig,
+    PerturbedConfig,
+    StandInConfig,
+    TrialConfig,
+    WorldModelConfig,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,6 +121,8 @@ class WorldModelEvalRun:
     """Episodes of `dataset`, played again in `env` with other actions."""
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     """The world that `dataset` was recorded in; only where it is played again."""
+    success: StandInConfig = field(default_factory=StandInConfig)
+    """A reward model that tells successes in place of the one beside the world model."""
     trial: TrialConfig = field(default_factory=TrialConfig)
     inverse: InverseConfig = field(default_factory=InverseConfig)
 

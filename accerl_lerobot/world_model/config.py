@@ -259,6 +259,28 @@ class PerturbedConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class StandInConfig:
+    """A reward model of LeRobot that tells successes, see `stand_in.py`."""
+
+    path: str | None = None
+    """A folder, or an id on the Hub. None: the success model beside the world model."""
+    revision: str | None = None
+    """Hub revision."""
+    threshold: float | None = None
+    """P above which a frame counts as a success, in [0, 1]. None: ``accerl world-model-eval`` sets it on the
+    episodes, a run refuses."""
+    discover_packages_path: str | None = None
+    """Package to import that registers the model's type with LeRobot, where that is not LeRobot's own."""
+
+    def __post_init__(self) -> None:
+        if self.threshold is not None and not 0 <= self.threshold <= 1:
+            raise InputError("success.threshold", self.threshold, "use a value in [0, 1]")
+        if self.path is None and self.threshold is not None:
+            remedy = "it is of the model in success.path; the one beside the world model has its own"
+            raise InputError("success.threshold", self.threshold, remedy)
+
+
+@dataclass(frozen=True, kw_only=True)
 class WorldModelConfig:
     """A world model with its success model."""
 

@@ -45,6 +45,7 @@ from accerl_lerobot.world_model.films import film
 from accerl_lerobot.world_model.inverse import InverseProbe, learn_probe
 from accerl_lerobot.world_model.perturbed import SOURCE as PERTURBED
 from accerl_lerobot.world_model.perturbed import check_world, perturbed_episodes
+from accerl_lerobot.world_model.stand_in import SuccessModel, load_stand_in
 from accerl_lerobot.world_model.store import Source, load_source, load_world_model
 from accerl_lerobot.world_model.trial import try_out
 
@@ -77,7 +78,11 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
         InputError: no world model there, a dataset or a world of another kind, or nothing was held out.
     """
     path = Path(str(config.path)).expanduser()
+    success: SuccessModel | None
     model, success = load_world_model(path)
+    given = config.success.threshold is not None
+    if config.success.path is not None:
+        success = load_stand_in(config.success, model.spec, "success")
     spec, source = model.spec, load_source(path)
     part = _part(config.dataset, source, spec)
     with _named("online"):
@@ -109,8 +114,8 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
     for name, episodes in sources.items():
         with console.stage(f"trial, {name}"):
             # Its threshold was set on the very episodes that were held out: here it is set on some of them
-            # and tried on others. On other sources it is what it is.
-            fresh = name == HELD_OUT
+            # and tried on others. On other sources it is what it is; one that stands in has none yet.
+            fresh = name == (HELD_OUT if config.success.path is None else first) and not given
             told = try_out(model, episodes, config.trial, success, config.seed, fresh, probe)
             found[name] = {"name": name} | told | {"tried": amount(episodes)}
             video = "preview.mp4" if name == first else f"preview_{name}.mp4"

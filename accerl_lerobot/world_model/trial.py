@@ -41,8 +41,8 @@ from accerl_lerobot.world_model.inverse import InverseProbe
 from accerl_lerobot.world_model.outcomes import judged, scores, spaced, threshold
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.replayed import Dreams, cut_alike, dream
+from accerl_lerobot.world_model.stand_in import SuccessModel
 from accerl_lerobot.world_model.success import Examples, probabilities
-from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
 ARMS = ("true", "shuffled", "zero", "opposite", "failed")
 """Which actions are dreamt with."""
@@ -94,7 +94,7 @@ def try_out(
     model: WorldModel,
     episodes: Sequence[Episode],
     config: TrialConfig,
-    success: SuccessPairsRewardModel | None = None,
+    success: SuccessModel | None = None,
     seed: int = 0,
     fresh: bool = False,
     probe: InverseProbe | None = None,
@@ -224,7 +224,7 @@ def _legible(
 
 
 def _judged(
-    success: SuccessPairsRewardModel,
+    success: SuccessModel,
     arms: dict[str, Dreams],
     windows: Windows,
     failed: np.ndarray,
@@ -250,7 +250,7 @@ def _judged(
 
 
 def _auroc_real(
-    success: SuccessPairsRewardModel,
+    success: SuccessModel,
     episodes: Sequence[Episode],
     model: WorldModel,
     rng: np.random.Generator,
