@@ -33,6 +33,7 @@ from accerl_lerobot.world_model.config import (
     TrialConfig,
     WorldModelConfig,
 )
+from accerl_lerobot.world_model.sizes import TinyConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +95,7 @@ class WorldModelRun:
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     """The world it is to be a model of: its cameras, sizes and rate."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
+    world_model: WorldModelConfig = field(default_factory=TinyConfig)
 
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 100:

@@ -22,6 +22,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
+import draccus
+
 from accerl_lerobot.errors import InputError
 
 Objective = Literal["refiner", "edm", "flow"]
@@ -281,8 +283,8 @@ class StandInConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorldModelConfig:
-    """A world model with its success model."""
+class WorldModelConfig(draccus.ChoiceRegistry):
+    """A world model with its success model; `sizes.py` has those that can be named."""
 
     model: PixelModelConfig = field(default_factory=PixelModelConfig)
     learn: LearnConfig = field(default_factory=LearnConfig)
@@ -296,6 +298,11 @@ class WorldModelConfig:
     """Env steps it goes at a time: the actions a policy executes per decision."""
     shuffle_actions: bool = False
     """Learn with the actions of other windows: a placebo, which must fail the trial."""
+
+    @property
+    def type(self) -> str:
+        """The registered name."""
+        return str(self.get_choice_name(self.__class__))
 
     def __post_init__(self) -> None:
         if not 0 < self.held_out < 1:
