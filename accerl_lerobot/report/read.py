@@ -31,6 +31,7 @@ import yaml
 from accerl_lerobot.checkpoint import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.metrics import METRICS
+from accerl_lerobot.world_model.imagination_config import FILMS
 
 Record = dict[str, Any]
 
@@ -115,6 +116,8 @@ class Run:
     written: float
     """When something was last written, in seconds since 1970."""
     videos: tuple[Path, ...]
+    dreams: tuple[Path, ...]
+    """Of held-out episodes beside their dreams, in the order of the trials that they were made after."""
     checkpoint: Path | None
     """The newest policy, a LeRobot checkpoint."""
 
@@ -165,6 +168,7 @@ def read_run(path: Path) -> Run:
         sessions=sessions,
         written=max(file.stat().st_mtime for file in path.iterdir() if file.suffix != ".html"),
         videos=tuple(sorted(path.glob("*.mp4"))),
+        dreams=tuple(sorted(path.glob(f"{FILMS}/[0-9]*.mp4"))),
         checkpoint=newest if newest.is_dir() else None,
     )
 

@@ -41,7 +41,7 @@ from accerl_lerobot.report.blocks import (
 )
 from accerl_lerobot.report.charts import WHOLE, Chart, Series, line
 from accerl_lerobot.report.commands import commands
-from accerl_lerobot.report.dreams import dream_blocks
+from accerl_lerobot.report.dreams import dream_blocks, dream_films
 from accerl_lerobot.report.learning import lag_chart, learning_charts
 from accerl_lerobot.report.notes import notes, status
 from accerl_lerobot.report.read import Record, Run, column, newest
@@ -98,7 +98,9 @@ def run_page(run: Run, config_class: type[Any], now: float) -> Page:
         sections=[
             *section("success", "Success", figures(success_chart(run)), _tasks(run)),
             *films(run),
-            *section("dreams", "Dreams", dream_blocks(rollout, run.room("imagination"))),
+            *section(
+                "dreams", "Dreams", dream_blocks(rollout, run.room("imagination")), dream_films(run.dreams)
+            ),
             *section("lag", "Staleness", figures(lag_chart(train, bound)) if train else []),
             *section(
                 "speed",

@@ -25,6 +25,8 @@ from accerl_lerobot.world_model.config import StandInConfig, TrialConfig
 
 Kind = Literal["learned", "shuffled", "copy", "oracle"]
 Reward = Literal["potential", "success"]
+FILMS = "dreams"
+"""Folder of a run with `OnlineLearnConfig.films`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,11 +70,15 @@ class OnlineLearnConfig:
     dozen held-out episodes tell little; beyond that, `gap` watches."""
     memory: int = 400
     """Real episodes kept to learn from, at least 2."""
+    films: int = 1
+    """A video after every so many trials, in the run's folder ``dreams``: the newest held-out episode beside
+    what is dreamt of it with the same actions. 0: none."""
 
     def __post_init__(self) -> None:
         where = "imagination.learn"
         for name, least in (
             ("steps_per_episode", 0), ("batch", 2), ("try_every", 1), ("last_tries", 1), ("memory", 2),
+            ("films", 0),
         ):  # fmt: skip
             if not getattr(self, name) >= least:
                 raise InputError(f"{where}.{name}", getattr(self, name), f"use at least {least}")
