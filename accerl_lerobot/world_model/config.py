@@ -25,6 +25,7 @@ from typing import Literal, get_args
 import draccus
 
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.safety import check_remote_code
 
 Objective = Literal["refiner", "edm", "flow"]
 
@@ -268,6 +269,11 @@ class StandInConfig:
     """A folder, or an id on the Hub. None: the success model beside the world model."""
     revision: str | None = None
     """Hub revision."""
+    trust_remote_code: bool = False
+    """Whether Python code from a Hub repository that the model names, such as the backbone's of LeRobot's
+    classifier, is run with your rights. It needs `code_revision`."""
+    code_revision: str | None = None
+    """Commit of that repository, 40 hexadecimal digits: the one whose code you have read. No other is run."""
     threshold: float | None = None
     """P above which a frame counts as a success, in [0, 1]. None: ``accerl world-model-eval`` sets it on the
     episodes, a run refuses."""
@@ -275,6 +281,7 @@ class StandInConfig:
     """Package to import that registers the model's type with LeRobot, where that is not LeRobot's own."""
 
     def __post_init__(self) -> None:
+        check_remote_code(self.trust_remote_code, self.code_revision, "success")
         if self.threshold is not None and not 0 <= self.threshold <= 1:
             raise InputError("success.threshold", self.threshold, "use a value in [0, 1]")
         if self.path is None and self.threshold is not None:

@@ -31,7 +31,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.files import check_policy_config, check_processor
+from accerl_lerobot.policies.files import check_origin, check_policy_config, check_processor
 from accerl_lerobot.policies.guard import Budget, guarded, input_error
 from accerl_lerobot.safety import (
     Origin,
@@ -53,6 +53,8 @@ FILES = ("*.json", "*.safetensors")
 """What is fetched of a reward model on the Hub."""
 PREPROCESSOR = "*_preprocessor.json"
 IMAGES = "observation.image"
+BACKBONE = "model_name"
+"""Key of a classifier's config that names another model."""
 TEXT = "task_key"
 """Attribute of the configs of models that read the task's text."""
 BLANK = 2
@@ -140,8 +142,10 @@ def load_stand_in(
     if config.discover_packages_path is not None:
         _register(config.discover_packages_path, room)
     folder = _folder(config, origin)
+    fetched = not Path(str(config.path)).expanduser().exists()
     content = read_json(safe_join(folder, CONFIG, origin), origin)
     check_policy_config(content, origin)
+    check_origin(content.get(BACKBONE), None, f"{CONFIG}: {BACKBONE}", origin, fetched)
     importlib.import_module("lerobot.rewards.factory")  # registers LeRobot's own
     known = sorted(RewardModelConfig.get_known_choices())
     if content.get("type") not in known:
@@ -155,8 +159,10 @@ def load_stand_in(
         raise origin.refuse(CONFIG, f"not one of this LeRobot's reward models ({brief(error)})") from error
     settings.device = str(device or "cpu")
     cameras, pairs = _cameras(settings, spec, origin), _pairs(settings, spec, origin)
-    made = _load(settings, folder, origin)
-    stand_in = StandIn(made, _preprocessor(settings, folder, origin), cameras, pairs, config.threshold or 0.5)
+    made = _load(settings, folder, origin, config.code_revision)
+    stand_in = StandIn(
+        made, _preprocessor(settings, folder, origin, fetched), cameras, pairs, config.threshold or 0.5
+    )
     _try(stand_in.eval().requires_grad_(False), spec, origin)
     return stand_in
 
@@ -213,7 +219,7 @@ def _pairs(settings: Any, spec: WorldModelSpec, origin: Origin) -> bool:
     return True
 
 
-def _load(settings: Any, folder: Path, origin: Origin) -> Any:
+def _load(settings: Any, folder: Path, origin: Origin, code_revision: str | None) -> Any:
     from lerobot.rewards.factory import get_reward_model_class
 
     check_not_pickled(folder, WEIGHTS, origin)
@@ -221,7 +227,7 @@ def _load(settings: Any, folder: Path, origin: Origin) -> Any:
     stored = check_safetensors(weights, origin)
     try:
         with (
-            guarded(origin.field.removesuffix(".path")),
+            guarded(origin.field.removesuffix(".path"), code_revision),
             Budget(file_size(weights, origin), origin.field, origin.value),
         ):
             made = get_reward_model_class(settings.type).from_pretrained(folder, config=settings)
@@ -241,7 +247,7 @@ def _load(settings: Any, folder: Path, origin: Origin) -> Any:
     return made.to(settings.device)
 
 
-def _preprocessor(settings: Any, folder: Path, origin: Origin) -> Any:
+def _preprocessor(settings: Any, folder: Path, origin: Origin, fetched: bool) -> Any:
     """What lerobot-train has saved beside the weights, with the statistics it normalises by."""
     from lerobot.processor import PolicyProcessorPipeline
     from lerobot.rewards.factory import make_reward_pre_post_processors
@@ -252,7 +258,7 @@ def _preprocessor(settings: Any, folder: Path, origin: Origin) -> Any:
             return make_reward_pre_post_processors(settings)[0]
         if len(found) != 1:
             raise origin.refuse(PREPROCESSOR, f"{len(found)} there, and lerobot-train saves one; give that")
-        check_processor(folder, found[0].name, origin)
+        check_processor(folder, found[0].name, origin, fetched=fetched)
         device = {"device_processor": {"device": settings.device}}
         return PolicyProcessorPipeline.from_pretrained(folder, found[0].name, overrides=device)
     except InputError:

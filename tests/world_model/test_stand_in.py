@@ -157,6 +157,7 @@ def test_models_of_language_are_refused_by_what_they_read(kind: str, tmp_path: P
     [
         ("type", "'unheard_of'; use one of .*tiny_brightness.*or name its package"),
         ("weights", "model.safetensors: is missing"),
+        ("elsewhere", "config.json: model_name: 'a b' is neither a Hub id nor an absolute path"),
         ("fewer", "they are not those of its config: weight is in one of them only"),
         ("pickle", "a pickle"),
         ("package", "success.discover_packages_path='no.such.package': cannot be imported"),
@@ -168,6 +169,8 @@ def test_what_cannot_be_loaded(harm: str, why: str, tmp_path: Path):
     given = saved(folder)
     if harm == "type":
         (folder / "config.json").write_text(json.dumps({"type": "unheard_of"}))
+    if harm == "elsewhere":
+        (folder / "config.json").write_text(json.dumps({"type": "reward_classifier", "model_name": "a b"}))
     if harm in ("weights", "pickle"):
         (folder / "model.safetensors").unlink()
     if harm == "pickle":
