@@ -34,7 +34,7 @@ VERBS = {
     "sft": ("verbs:sft", "fine-tune on a LeRobotDataset with LeRobot's own trainer"),
     "eval": ("verbs:evaluate", "success of a checkpoint, with its confidence interval"),
     "world-model": ("verbs:world_model", "learn to dream a world from a LeRobotDataset, and be tried on it"),
-    "world-model-eval": ("verbs:world_model_eval", "try a world model on another dataset"),
+    "world-model-eval": ("verbs:world_model_eval", "try a world model on episodes of one or several sources"),
     "push": ("verbs:push", "a policy, world model, dataset or run to the Hub, as one commit"),
     "pull": ("verbs:pull", "what was pushed into a new folder, pinned and checked"),
     "report": ("verbs:report", "one HTML page of a run, or of several beside each other, to look at"),

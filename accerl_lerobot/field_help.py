@@ -75,23 +75,26 @@ def docstrings(cls: type[Any]) -> dict[str, str]:
     return found
 
 
-def _fields(cls: type[Any], prefix: str) -> list[str]:
+def _fields(cls: type[Any], prefix: str, usual: Any = None) -> list[str]:
+    """Lines of its fields with their defaults: those of `usual`, which is one of it, or its own."""
     hints, docs = typing.get_type_hints(cls), docstrings(cls)
     lines: list[str] = []
     rooms: list[str] = []
     for field in dataclasses.fields(cls):
         name, room = f"{prefix}{field.name}", room_of(hints[field.name])
         if room is None:
-            lines += _entry(f"--{name}={_shown(_default(field))}", docs[field.name])
+            lines += _entry(f"--{name}={_shown(_default(field, usual))}", docs[field.name])
             continue
-        choices, default = choices_of(room), _default(field)
+        choices, default = choices_of(room), _default(field, usual)
         if not choices:
             note = "" if default is not None else " (off unless given)"
-            rooms += ["", f"{name}{note}: {_summary(room)}", *_fields(room, f"{name}.")]
+            rooms += ["", f"{name}{note}: {_summary(room)}", *_fields(room, f"{name}.", default)]
             continue
         for kind, subclass in choices.items():
-            note = " (default)" if getattr(default, TYPE, None) == kind else ""
-            rooms += ["", f"{name}.{TYPE}={kind}{note}: {_summary(subclass)}", *_fields(subclass, f"{name}.")]
+            chosen = default if getattr(default, TYPE, None) == kind else None
+            note = "" if chosen is None else " (default)"
+            rooms += ["", f"{name}.{TYPE}={kind}{note}: {_summary(subclass)}"]
+            rooms += _fields(subclass, f"{name}.", chosen)
     return lines + rooms
 
 
@@ -104,7 +107,9 @@ def _entry(flag: str, text: str) -> list[str]:
     return [start, *textwrap.wrap(text, WIDTH, initial_indent=" " * COLUMN, subsequent_indent=" " * COLUMN)]
 
 
-def _default(field: Any) -> Any:
+def _default(field: Any, usual: Any = None) -> Any:
+    if usual is not None:
+        return getattr(usual, field.name)
     if field.default is not dataclasses.MISSING:
         return field.default
     return None if field.default_factory is dataclasses.MISSING else field.default_factory()

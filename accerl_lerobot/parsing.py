@@ -28,7 +28,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-import types
 import typing
 from collections.abc import Iterator
 from pathlib import Path
@@ -38,6 +37,7 @@ import draccus
 import yaml
 
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.hints import is_optional, is_union, wanted
 
 TYPE = "type"
 """The key that picks one config of several, as in ``env.type``."""
@@ -150,7 +150,7 @@ def read_recipe(path: Path) -> dict[str, Any]:
 
 def room_of(hint: Any) -> type[Any] | None:
     """The config class behind a field's annotation, ``X`` or ``X | None``; None for a plain value."""
-    options = [a for a in typing.get_args(hint) if a is not type(None)] if _is_union(hint) else [hint]
+    options = [a for a in typing.get_args(hint) if a is not type(None)] if is_union(hint) else [hint]
     if len(options) == 1 and isinstance(options[0], type) and dataclasses.is_dataclass(options[0]):
         return options[0]
     return None
@@ -244,7 +244,7 @@ def _checked(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...], whole:
             out[key] = value = _as_list(hint, value)
             _check_leaf(hint, value, here)
         elif value is None:
-            if _is_optional(hint):
+            if is_optional(hint):
                 out[key] = None  # otherwise an empty room: all defaults
         elif not isinstance(value, dict):
             raise InputError(".".join(here), value, f"a room, not a value; use --{here[-1]}.field=value")
@@ -258,7 +258,7 @@ def _checked_room(
 ) -> dict[str, Any]:
     choices = choices_of(room)
     if not choices:
-        return _checked(room, value, here, whole)
+        return _checked(room, _merged(_apart(field, room), value), here, whole)
     kind = value.get(TYPE, _default_type(field))
     if kind not in choices:
         near = difflib.get_close_matches(str(kind), choices, n=1)
@@ -266,6 +266,17 @@ def _checked_room(
         raise InputError(".".join((*here, TYPE)), kind, f"{hint}use one of {', '.join(sorted(choices))}")
     rest = {k: v for k, v in value.items() if k != TYPE}
     return {TYPE: kind} | _checked(choices[kind], rest, here, whole)
+
+
+def _apart(field: Any, room: type[Any]) -> dict[str, Any]:
+    """What a field's default says of a room where it is not what the room's own class would say.
+
+    draccus takes the class's word for all that is not given, so one field given would change the others.
+    """
+    default = None if field.default_factory is dataclasses.MISSING else field.default_factory()
+    if default is None or default == room():
+        return {}
+    return encode(default)
 
 
 def _as_list(hint: Any, value: Any) -> Any:
@@ -280,14 +291,14 @@ def _as_list(hint: Any, value: Any) -> Any:
 
 
 def _kinds(hint: Any) -> set[Any]:
-    return set(typing.get_args(hint)) if _is_union(hint) else {hint}
+    return set(typing.get_args(hint)) if is_union(hint) else {hint}
 
 
 def _check_leaf(hint: Any, value: Any, here: tuple[str, ...]) -> None:
     """Refuses what draccus would quietly turn into something else."""
     kinds = _kinds(hint)
     wrong = (
-        (value is None and hint is not Any and not _is_optional(hint))
+        (value is None and hint is not Any and not is_optional(hint))
         or (isinstance(value, bool) and not kinds & {bool, Any})
         or (isinstance(value, (list, dict)) and kinds <= {str, int, float, bool, type(None)})
     )
@@ -297,26 +308,6 @@ def _check_leaf(hint: Any, value: Any, here: tuple[str, ...]) -> None:
         wrong = wrong or any(isinstance(v, bool) and entry not in (bool, Any) for v in value)
     if wrong:
         raise InputError(".".join(here), value, f"use {wanted(hint)}")
-
-
-def wanted(hint: Any) -> str:
-    """An annotation in words, for people."""
-    if _is_union(hint):
-        parts = [wanted(a) for a in typing.get_args(hint) if a is not type(None)]
-        return " or ".join(parts + (["null"] if _is_optional(hint) else []))
-    plain = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
-    if hint in plain:
-        return plain[hint]
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin is typing.Literal:
-        return f"one of {', '.join(map(str, arguments))}"
-    if origin is tuple and Ellipsis not in arguments:
-        return f"a list of {len(arguments)}, each {wanted(arguments[0])}"
-    if origin in (list, tuple):
-        return f"a list such as [a, b], each {wanted(arguments[0])}"
-    if origin is dict:
-        return "a mapping such as {key: value}"
-    return getattr(hint, "__name__", str(hint))
 
 
 def dotted_fields(cls: type[Any], path: tuple[str, ...] = ()) -> Iterator[str]:
@@ -389,11 +380,3 @@ def _default_type(field: Any) -> str | None:
         return None
     kind: str | None = getattr(field.default_factory(), TYPE, None)
     return kind
-
-
-def _is_union(hint: Any) -> bool:
-    return typing.get_origin(hint) in (typing.Union, types.UnionType)
-
-
-def _is_optional(hint: Any) -> bool:
-    return _is_union(hint) and type(None) in typing.get_args(hint)

@@ -163,14 +163,9 @@ class Seats:
                 continue
             if report is None:
                 continue
-<<<<<<< HEAD
-            seat.counters, seat.spent = report.counters, report.spent
+            seat.counters, seat.spent, seat.starts = report.counters, report.spent, report.starts
             seat.in_world_s, seat.stuck_s = report.in_world_s, report.stuck_s
             seat.away = report.away_s, report.away_why
-=======
-            seat.counters, seat.in_world_s, seat.spent = report.counters, report.in_world_s, report.spent
-            seat.away, seat.starts = (report.away_s, report.away_why), report.starts
->>>>>>> e82
             if seat.budget is not None:
                 seat.budget -= sum(e.plan.explore for e in report.episodes)
             for episode in report.episodes:
@@ -294,14 +289,9 @@ class Seats:
         self._past["restarts"] += 1
         for key, value in seat.counters.items():
             self._past[key] = self._past.get(key, 0.0) + value
-<<<<<<< HEAD
         seat.counters, seat.in_world_s, seat.stuck_s = {}, 0.0, 0.0
         seat.away, seat.moved = (0.0, ""), None
-        seat.incarnation += 1
-=======
-        seat.counters, seat.in_world_s, seat.away, seat.moved = {}, 0.0, (0.0, ""), None
         seat.incarnation = incarnation_after(seat.incarnation, seat.starts)
->>>>>>> e82
         seat.restarts += 1
         if seat.budget is not None:
             seat.budget = whole_groups(seat.budget, self._config.rollout)

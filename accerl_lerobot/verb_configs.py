@@ -26,7 +26,14 @@ from accerl_lerobot.evaluation.config import EvaluationConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.world_model.config import TrialConfig, WorldModelConfig
+from accerl_lerobot.world_model.config import (
+    InverseConfig,
+    PerturbedConfig,
+    StandInConfig,
+    TrialConfig,
+    WorldModelConfig,
+)
+from accerl_lerobot.world_model.sizes import TinyConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +95,7 @@ class WorldModelRun:
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     """The world it is to be a model of: its cameras, sizes and rate."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
+    world_model: WorldModelConfig = field(default_factory=TinyConfig)
 
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 100:
@@ -97,7 +104,7 @@ class WorldModelRun:
 
 @dataclass(frozen=True, kw_only=True)
 class WorldModelEvalRun:
-    """``accerl world-model-eval``: a saved world model on another dataset."""
+    """``accerl world-model-eval``: a saved world model on episodes of one or several sources."""
 
     path: str | None = None
     """The folder named world_model that ``accerl world-model`` wrote."""
@@ -108,8 +115,17 @@ class WorldModelEvalRun:
     job_name: str = "world_model_eval"
     """Last part of the folder's name."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    """Episodes it has not learnt from."""
+    """Episodes it has not learnt from; of the dataset that it has, those that were held out are taken."""
+    online: DatasetConfig = field(default_factory=DatasetConfig)
+    """Episodes of a policy, as ``accerl export`` writes them; without a name there are none."""
+    perturbed: PerturbedConfig = field(default_factory=PerturbedConfig)
+    """Episodes of `dataset`, played again in `env` with other actions."""
+    env: EnvConfig = field(default_factory=MetaWorldConfig)
+    """The world that `dataset` was recorded in; only where it is played again."""
+    success: StandInConfig = field(default_factory=StandInConfig)
+    """A reward model that tells successes in place of the one beside the world model."""
     trial: TrialConfig = field(default_factory=TrialConfig)
+    inverse: InverseConfig = field(default_factory=InverseConfig)
 
     def __post_init__(self) -> None:
         if self.path is None:

@@ -200,21 +200,15 @@ def world_model(arguments: list[str]) -> int:
 def world_model_eval(arguments: list[str]) -> int:
     """``accerl world-model-eval``; 1 if it fails its trial."""
     config: WorldModelEvalRun = parse(WorldModelEvalRun, arguments, recipe_class=RunConfig)
-    from accerl_lerobot.world_model.offline import try_on_dataset
+    from accerl_lerobot.world_model.evaluate import evaluate
 
-    path = Path(str(config.path)).expanduser()
-    return _tried(
-        config,
-        lambda directory, console: try_on_dataset(
-            path, config.dataset, config.trial, directory, config.seed, console
-        ),
-    )
+    return _tried(config, lambda directory, console: evaluate(config, directory, console))
 
 
 def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Console], dict[str, Any]]) -> int:
     """Does the work in a new folder and shows the trial it ends with."""
     from accerl_lerobot.run import make_output_dir
-    from accerl_lerobot.world_model.offline import gates, table
+    from accerl_lerobot.world_model.show import gates, sources_table, table
 
     directory = make_output_dir(config)
     (directory / CONFIG).write_text(yaml.safe_dump(encode(config), sort_keys=False))
@@ -227,6 +221,8 @@ def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Cons
         _discard_unused(directory)
         raise
     console.rich.print(table(found))
+    if found.get("sources"):
+        console.rich.print(sources_table(found))
     for line in gates(found):
         console.say(line)
     console.say(f"{'passed' if found['passed'] else 'FAILED'}; see {directory / 'preview.mp4'}")

@@ -16,6 +16,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,6 +29,7 @@ from accerl_lerobot.config import DatasetConfig, RunConfig, check_chunk, encode,
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.envs import LeRobotEnvConfig, MetaWorldConfig, SimulatedConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.field_help import help_text
 from accerl_lerobot.policies.backbone import BackboneConfig
 from accerl_lerobot.preflight import check_sft_policy, check_start
 from accerl_lerobot.verb_configs import DemosRun, EvalRun, SFTRun
@@ -62,6 +64,16 @@ class TestOverrides:
         config = parse(RunConfig, ["--env.task=door-open-v3", "--algorithm.sigma=0.2"])
         assert config.env == MetaWorldConfig(task="door-open-v3")
         assert config.algorithm == GIPOConfig(sigma=0.2)
+
+    def test_the_other_fields_of_a_room_keep_the_values_that_help_shows(self) -> None:
+        """Of a room whose default in this place is not that of its class, too."""
+        usual = RunConfig().imagination
+        config = parse(RunConfig, ["--imagination.replay.ahead=100", "--imagination.learn.trial.most=7"])
+        assert config.imagination.replay == replace(usual.replay, ahead=100)
+        assert config.imagination.learn.trial == replace(usual.learn.trial, most=7)
+        text = help_text("train", RunConfig, "train")
+        assert f"--imagination.replay.capacity={usual.replay.capacity} " in text
+        assert f"--imagination.learn.trial.auroc={usual.learn.trial.auroc} " in text
 
     @pytest.mark.parametrize("form", ["--config_path={}", "--config_path {}", "{}"])
     def test_forms_of_naming_a_recipe(self, recipe: str, form: str) -> None:

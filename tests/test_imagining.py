@@ -262,6 +262,9 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
     explained = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
     for name in last.imagination:
         assert f"`imagination_{name}`" in explained or name.startswith("gate_"), name
+    films = sorted(p.name for p in (tmp_path / "dreams").iterdir())
+    tried = int(last.imagination["promoted"] + last.imagination["refused"])
+    assert films[0].startswith("0001_") and tried - 1 <= len(films) <= tried + 1
     spent = shares(tmp_path)
     assert {"recovery", "compute", "transport", "wait_in"} <= spent["dream"].keys()
     assert {"recovery", "compute", "transport", "wait_in"} <= spent["world learning"].keys()

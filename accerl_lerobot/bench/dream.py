@@ -28,13 +28,14 @@ from rich.table import Table
 from accerl_lerobot.bench.measure import Memory, device_name, timed
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import WorldModelConfig
+from accerl_lerobot.world_model.sizes import TinyConfig
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchDreamConfig:
     """What is measured."""
 
-    world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
+    world_model: WorldModelConfig = field(default_factory=TinyConfig)
     cameras: int = 1
     """Pictures in an observation."""
     state_dim: int = 4

@@ -37,6 +37,7 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.demos.expert import Episode
 from accerl_lerobot.demos.export_dreams import write_dreams
 from accerl_lerobot.demos.record import features, frames
+from accerl_lerobot.demos.starts import Start, write_starts
 from accerl_lerobot.demos.writing import (
     appearing,
     check_free,
@@ -160,6 +161,7 @@ def _write(
     tally = {"episodes": 0, "frames": 0, "successes": 0, "unlike": 0}
     table = features(spec) | {VERSION: {"dtype": "int64", "shape": (1,), "names": None}}
     cost = settings.rollout.decision_cost
+    starts: list[Start] = []
     with (
         console.stage("doing it again", total=len(chosen)) as stage,
         simulators(config.processes, _start, settings.env, cost) as pool,
@@ -174,9 +176,11 @@ def _write(
                 for frame in _versioned(episode, parts):
                     dataset.add_frame(frame)
                 dataset.save_episode()
+                starts.append((parts[0].origin.task, parts[0].origin.seed))
                 tally["episodes"] += 1
                 tally["frames"] += len(episode)
                 tally["successes"] += episode.success
+    write_starts(root, starts)
     if tally["unlike"]:
         console.say(
             f"{tally['unlike']} of {len(chosen)} episodes did not go as they had gone, and are left out"

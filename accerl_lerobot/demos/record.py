@@ -35,6 +35,7 @@ import numpy as np
 from rich.progress import Progress
 
 from accerl_lerobot.demos.expert import Episode, make_expert, play
+from accerl_lerobot.demos.starts import Start, write_starts
 from accerl_lerobot.demos.writing import (
     appearing,
     check_free,
@@ -137,6 +138,7 @@ def record_demos(env_config: EnvConfig, config: DemosConfig) -> Path:
 
 def _write(env_config: EnvConfig, config: DemosConfig, spec: WorldSpec, root: Path) -> dict[str, Any]:
     tally = {"episodes": 0, "frames": 0, "successes": 0, "discarded": 0}
+    starts: list[Start] = []
     with (
         simulators(config.processes, _start, env_config, config) as pool,
         Progress(transient=True) as progress,
@@ -149,11 +151,13 @@ def _write(env_config: EnvConfig, config: DemosConfig, spec: WorldSpec, root: Pa
                 for frame in frames(episode):
                     dataset.add_frame(frame)
                 dataset.save_episode()
+                starts.append((spec.tasks[len(starts) % len(spec.tasks)], episode.seed))
                 tally["episodes"] += 1
                 tally["frames"] += len(episode)
                 tally["successes"] += episode.success
                 tally["discarded"] += discarded
                 progress.advance(bar)
+    write_starts(root, starts)
     return tally
 
 

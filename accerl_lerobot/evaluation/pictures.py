@@ -128,24 +128,27 @@ def before_after(
     both = sorted(filmed[0].keys() & filmed[1].keys())
     if both:
         names = ("before", "after")
-        rows = [[_captioned(row[i], name) for i in both] for row, name in zip(filmed, names, strict=True)]
+        rows = [
+            [captioned(row[i].frames, name, row[i].success) for i in both]
+            for row, name in zip(filmed, names, strict=True)
+        ]
         write_video(path, rows, fps)
 
 
-def _captioned(result: EpisodeResult, name: str) -> list[np.ndarray]:
-    """An episode's frames under its name, and one more that tells how it ended by the colour of its frame."""
+def captioned(frames: Sequence[np.ndarray], name: str, success: bool) -> list[np.ndarray]:
+    """Frames uint8 (H, W, 3) under a name, and one more that tells the end by the colour of its frame."""
     from PIL import Image, ImageDraw
 
-    captioned = []
-    for i in range(len(result.frames) + 1):
-        image = Image.fromarray(result.frames[min(i, len(result.frames) - 1)])
+    told = []
+    for i in range(len(frames) + 1):
+        image = Image.fromarray(frames[min(i, len(frames) - 1)])
         draw = ImageDraw.Draw(image)
         draw.text((6, 4), name, fill=(255, 255, 255), stroke_width=1, stroke_fill=(0, 0, 0))
-        if i == len(result.frames):
-            colour = (40, 160, 60) if result.success else (200, 40, 40)
+        if i == len(frames):
+            colour = (40, 160, 60) if success else (200, 40, 40)
             draw.rectangle((0, 0, image.width - 1, image.height - 1), outline=colour, width=BORDER)
-        captioned.append(np.asarray(image))
-    return captioned
+        told.append(np.asarray(image))
+    return told
 
 
 def _joined(pictures: Sequence[np.ndarray], axis: int) -> np.ndarray:

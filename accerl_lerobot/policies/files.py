@@ -103,8 +103,8 @@ def check_checkpoint(folder: Path, origin: Origin, *, fetched: bool = False) -> 
     config = read_json(safe_join(folder, CONFIG, origin), origin)
     check_policy_config(config, origin)
     for key, own in CONFIG_FOLDERS.items():
-        _check_origin(config.get(key), folder / own, f"{CONFIG}: {key}", origin, fetched)
-    _check_origin(config.get("vision_encoder_name"), None, f"{CONFIG}: vision_encoder_name", origin, fetched)
+        check_origin(config.get(key), folder / own, f"{CONFIG}: {key}", origin, fetched)
+    check_origin(config.get("vision_encoder_name"), None, f"{CONFIG}: vision_encoder_name", origin, fetched)
     for name in PROCESSORS:
         if safe_join(folder, name, origin).exists():
             check_processor(folder, name, origin, fetched=fetched)
@@ -167,7 +167,7 @@ def check_processor(folder: Path, name: str, origin: Origin, *, fetched: bool = 
         if kind in STEP_FOLDERS:
             option, own = STEP_FOLDERS[kind]
             named = step.get("config", {}).get(option)
-            _check_origin(named, folder / own, f"{name}: {option}", origin, fetched)
+            check_origin(named, folder / own, f"{name}: {option}", origin, fetched)
 
 
 def check_ours(ours: dict[str, Any], origin: Origin) -> None:
@@ -181,8 +181,19 @@ def check_ours(ours: dict[str, Any], origin: Origin) -> None:
             raise origin.refuse(f"{OURS}: {key}", "a mapping is wanted; remove the file to start without it")
 
 
-def _check_origin(name: Any, own: Path | None, what: str, origin: Origin, fetched: bool) -> None:
-    """A backbone or tokeniser is the checkpoint's own, the Hub's, or, of a local checkpoint, at a path."""
+def check_origin(name: Any, own: Path | None, what: str, origin: Origin, fetched: bool) -> None:
+    """A backbone or tokeniser is the checkpoint's own, the Hub's, or, of a local checkpoint, at a path.
+
+    Args:
+        name: what its config says.
+        own: the checkpoint's own folder of it, where it may have one.
+        what: file and key that say so, for the error.
+        origin: what named the checkpoint.
+        fetched: it is from the Hub, and folders of this machine are none of its business.
+
+    Raises:
+        InputError: it is something else.
+    """
     if name is None:
         return
     if not isinstance(name, str) or len(name) > 1024 or "\x00" in name:

@@ -16,11 +16,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.report.blocks import Block, Cell, Table, Words, figures
+from accerl_lerobot.report.blocks import Block, Cell, Film, Table, Words, figures
 from accerl_lerobot.report.charts import WHOLE, Chart, line
 from accerl_lerobot.report.read import Record, column, has, newest
 from accerl_lerobot.report.words import count, number, percent
@@ -55,6 +56,20 @@ def dream_blocks(rollout: Sequence[Record], imagination: Mapping[str, Any]) -> l
     if not imagination.get("share") or not has(rollout, "imagination_dreams"):
         return []
     return [Words(text=_amount(rollout)), *figures(*_charts(rollout)), *_trial(rollout, imagination)]
+
+
+def dream_films(paths: Sequence[Path]) -> list[Block]:
+    """The first and the newest; a page does not hold all of a long run's."""
+    found: list[Block] = []
+    for path in dict.fromkeys([*paths[:1], *paths[-1:]]):
+        trial, _, outcome = path.stem.partition("_")
+        caption = (
+            f"Trial {trial.lstrip('0')}, {outcome}: an episode that was held out, above, and what the world "
+            "model dreamt with the same actions, below. The frame at the end is green for a success, red for "
+            "a failure."
+        )
+        found.append(Film(path=path, caption=caption))
+    return found
 
 
 def gate_table(caption: str, rows: Sequence[tuple[str, float | None, str, bool]]) -> Table:

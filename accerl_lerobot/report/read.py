@@ -31,6 +31,7 @@ import yaml
 from accerl_lerobot.checkpoint import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.metrics import METRICS
+from accerl_lerobot.world_model.imagination_config import FILMS
 
 Record = dict[str, Any]
 
@@ -57,6 +58,10 @@ def _is_gates(value: Any) -> bool:
     )
 
 
+def _is_trial(value: Any) -> bool:
+    return isinstance(value, dict) and "name" in value and not _lacking(value, TRIAL_NEEDS)
+
+
 Needs = dict[str, Callable[[Any], bool]]
 """What a page cannot do without, and what it has to be."""
 
@@ -75,6 +80,9 @@ TRIAL_NEEDS: Needs = {
     "trials": _is_number,
     "gates": _is_gates,
     "depths": _is_list,
+    "sources": lambda value: (
+        value is None or (isinstance(value, dict) and all(map(_is_trial, value.values())))
+    ),
 }
 EVALUATION_NEEDS: Needs = {
     "success": _is_number,
@@ -108,6 +116,8 @@ class Run:
     written: float
     """When something was last written, in seconds since 1970."""
     videos: tuple[Path, ...]
+    dreams: tuple[Path, ...]
+    """Of held-out episodes beside their dreams, in the order of the trials that they were made after."""
     checkpoint: Path | None
     """The newest policy, a LeRobot checkpoint."""
 
@@ -158,6 +168,7 @@ def read_run(path: Path) -> Run:
         sessions=sessions,
         written=max(file.stat().st_mtime for file in path.iterdir() if file.suffix != ".html"),
         videos=tuple(sorted(path.glob("*.mp4"))),
+        dreams=tuple(sorted(path.glob(f"{FILMS}/[0-9]*.mp4"))),
         checkpoint=newest if newest.is_dir() else None,
     )
 

@@ -41,7 +41,7 @@ from accerl_lerobot.report.blocks import (
 )
 from accerl_lerobot.report.charts import WHOLE, Chart, Series, line
 from accerl_lerobot.report.commands import commands
-from accerl_lerobot.report.dreams import dream_blocks
+from accerl_lerobot.report.dreams import dream_blocks, dream_films
 from accerl_lerobot.report.learning import lag_chart, learning_charts
 from accerl_lerobot.report.notes import notes, status
 from accerl_lerobot.report.read import Record, Run, column, newest
@@ -61,6 +61,14 @@ FILMS = {
         "Dreams beside reality",
         "Top to bottom: what happened; what the world model dreamt with the same actions; and with those of "
         "another episode.",
+    ),
+    "preview_online.mp4": (
+        "Dreams of a policy's episodes",
+        "The same of episodes that a policy lived through.",
+    ),
+    "preview_perturbed.mp4": (
+        "Dreams of perturbed episodes",
+        "The same of episodes that were played again with noise on their actions.",
     ),
 }
 """Title and caption of the videos that runs make."""
@@ -90,7 +98,9 @@ def run_page(run: Run, config_class: type[Any], now: float) -> Page:
         sections=[
             *section("success", "Success", figures(success_chart(run)), _tasks(run)),
             *films(run),
-            *section("dreams", "Dreams", dream_blocks(rollout, run.room("imagination"))),
+            *section(
+                "dreams", "Dreams", dream_blocks(rollout, run.room("imagination")), dream_films(run.dreams)
+            ),
             *section("lag", "Staleness", figures(lag_chart(train, bound)) if train else []),
             *section(
                 "speed",

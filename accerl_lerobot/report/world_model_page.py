@@ -20,14 +20,15 @@ from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.report.blocks import Block, Commands, Page, Tile, figures, section
+from accerl_lerobot.report.blocks import Block, Cell, Commands, Page, Table, Tile, figures, section
 from accerl_lerobot.report.charts import Chart, Series, line
 from accerl_lerobot.report.commands import commands
 from accerl_lerobot.report.dreams import gate_table
 from accerl_lerobot.report.notes import notes, status
 from accerl_lerobot.report.read import Record, Run, column, has
 from accerl_lerobot.report.run_page import films, recipe_blocks
-from accerl_lerobot.report.words import count, duration, number
+from accerl_lerobot.report.words import ABSENT, count, duration, number
+from accerl_lerobot.world_model.by_source import source_rows
 
 DEPTH = "depth of the dream in chunks"
 ARMS = {
@@ -38,6 +39,13 @@ ARMS = {
     "failed": "a failed episode's",
 }
 """Which actions were dreamt with."""
+BY_SOURCE: tuple[tuple[str, str, tuple[float | None, float | None]], ...] = (
+    ("Skill where pixels changed", "skill_changed", (None, 1.0)),
+    ("Sensitivity to another episode's actions", "sensitivity_shuffled", (0.0, None)),
+    ("Another episode's actions, read off the dreams", "legible_shuffled", (None, 1.0)),
+    ("AUROC of the chunk", "auroc_dreamt", (None, 1.0)),
+)
+"""Title, measure and limits of a chart with a line per source."""
 
 
 def world_model_page(run: Run, config_class: type[Any], now: float) -> Page:
@@ -64,6 +72,7 @@ def world_model_page(run: Run, config_class: type[Any], now: float) -> Page:
             *section("trial", "Trial", _gates(found)),
             *films(run),
             *section("depth", "The deeper the dream", figures(*depth_charts(found.get("depths", [])))),
+            *section("sources", "By source", *source_blocks(found)),
             *section("learning", "Learning", figures(*_learning(run))),
             *section("recipe", "Recipe", recipe_blocks(run, config_class)),
             *section("next", "What to do next", [Commands(commands=commands(run))]),
@@ -110,6 +119,22 @@ def depth_charts(depths: Sequence[Record]) -> list[Chart]:
             ),
         ),
         Chart(
+            title="Actions read off the frames",
+            unit="R²",
+            x_label=DEPTH,
+            limits=(None, 1.0),
+            note="By a probe that has learnt on real frames. With another episode's actions a model that "
+            "ignores them has 0 or less.",
+            series=tuple(
+                estimates(depths, f"legible_{of}", called, colour)
+                for of, called, colour in (
+                    ("real", "off reality", 7),
+                    ("true", "off dreams with its own actions", 0),
+                    ("shuffled", "off dreams with another episode's", 1),
+                )
+            ),
+        ),
+        Chart(
             title="Error of the state",
             x_label=DEPTH,
             limits=(0.0, None),
@@ -130,6 +155,35 @@ def depth_charts(depths: Sequence[Record]) -> list[Chart]:
             ),
         ),
     ]
+
+
+def source_blocks(found: Record) -> list[list[Block]]:
+    """A table and charts of the trials on several sources; nothing where there was one."""
+    if not found.get("sources"):
+        return []
+    every = [found, *found["sources"].values()]
+    names = [str(one.get("name")) for one in every]
+    table = Table(
+        caption="The same measures on episodes from each source",
+        columns=("", *names),
+        rows=[
+            (Cell(text=name), *(Cell(text=text or ABSENT, number=True) for text in cells))
+            for name, cells in source_rows(every)
+        ],
+    )
+    charts = [
+        Chart(
+            title=title,
+            x_label=DEPTH,
+            limits=limits,
+            series=tuple(
+                estimates(one["depths"], key, name, i)
+                for i, (one, name) in enumerate(zip(every, names, strict=True))
+            ),
+        )
+        for title, key, limits in BY_SOURCE
+    ]
+    return [[table], figures(*charts)]
 
 
 def _headline(run: Run) -> str:

@@ -22,7 +22,10 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
+import draccus
+
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.safety import check_remote_code
 
 Objective = Literal["refiner", "edm", "flow"]
 
@@ -218,8 +221,77 @@ class TrialConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorldModelConfig:
-    """A world model with its success model."""
+class InverseConfig:
+    """How the probe is learnt that reads actions off frames, see `inverse.py`."""
+
+    steps: int = 400
+    """Gradient steps; 0: there is no probe."""
+    batch: int = 64
+    """Pairs of frames in each, at least 2."""
+    lr: float = 2e-3
+    """Falls to 0 by a cosine."""
+    episodes: int = 40
+    """Episodes that it learns from at most, at least 1: such as the world model has learnt from, or, of a
+    dataset that it does not know, half of all. On those it is not read."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("steps", 0), ("batch", 2), ("episodes", 1)):
+            if getattr(self, name) < least:
+                raise InputError(f"inverse.{name}", getattr(self, name), f"use at least {least}")
+        if not 0 < self.lr < 1:
+            raise InputError("inverse.lr", self.lr, "use a value in (0, 1), e.g. 2e-3")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PerturbedConfig:
+    """Episodes that are played again with other actions, see `perturbed.py`."""
+
+    episodes: int = 0
+    """How many of the dataset's that are tried, at most; 0: none."""
+    noise: float = 0.4
+    """Standard deviation of what is added to each action, in halves of its range; > 0."""
+    hold: int = 10
+    """Env steps for which it stays the same, at least 1."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("episodes", 0), ("hold", 1)):
+            if getattr(self, name) < least:
+                raise InputError(f"perturbed.{name}", getattr(self, name), f"use at least {least}")
+        if not self.noise > 0:
+            raise InputError("perturbed.noise", self.noise, "use a positive number, e.g. 0.4")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StandInConfig:
+    """A reward model of LeRobot that tells successes, see `stand_in.py`."""
+
+    path: str | None = None
+    """A folder, or an id on the Hub. None: the success model beside the world model."""
+    revision: str | None = None
+    """Hub revision."""
+    trust_remote_code: bool = False
+    """Whether Python code from a Hub repository that the model names, such as the backbone's of LeRobot's
+    classifier, is run with your rights. It needs `code_revision`."""
+    code_revision: str | None = None
+    """Commit of that repository, 40 hexadecimal digits: the one whose code you have read. No other is run."""
+    threshold: float | None = None
+    """P above which a frame counts as a success, in [0, 1]. None: ``accerl world-model-eval`` sets it on the
+    episodes, a run refuses."""
+    discover_packages_path: str | None = None
+    """Package to import that registers the model's type with LeRobot, where that is not LeRobot's own."""
+
+    def __post_init__(self) -> None:
+        check_remote_code(self.trust_remote_code, self.code_revision, "success")
+        if self.threshold is not None and not 0 <= self.threshold <= 1:
+            raise InputError("success.threshold", self.threshold, "use a value in [0, 1]")
+        if self.path is None and self.threshold is not None:
+            remedy = "it is of the model in success.path; the one beside the world model has its own"
+            raise InputError("success.threshold", self.threshold, remedy)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldModelConfig(draccus.ChoiceRegistry):
+    """A world model with its success model; `sizes.py` has those that can be named."""
 
     model: PixelModelConfig = field(default_factory=PixelModelConfig)
     learn: LearnConfig = field(default_factory=LearnConfig)
@@ -233,6 +305,11 @@ class WorldModelConfig:
     """Env steps it goes at a time: the actions a policy executes per decision."""
     shuffle_actions: bool = False
     """Learn with the actions of other windows: a placebo, which must fail the trial."""
+
+    @property
+    def type(self) -> str:
+        """The registered name."""
+        return str(self.get_choice_name(self.__class__))
 
     def __post_init__(self) -> None:
         if not 0 < self.held_out < 1:

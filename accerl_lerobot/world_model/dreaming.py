@@ -19,9 +19,8 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from accerl_lerobot.config import journal_folder
+from accerl_lerobot.config import RunConfig, journal_folder
 from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import WorldSpec
@@ -33,17 +32,15 @@ from accerl_lerobot.world_model.baselines import ShuffledModel
 from accerl_lerobot.world_model.config import TrialConfig
 from accerl_lerobot.world_model.dataset import check_metadata, fingerprint, load_episodes
 from accerl_lerobot.world_model.episodes import Episode
+from accerl_lerobot.world_model.films import TrialFilms
 from accerl_lerobot.world_model.fit import check_fit
-from accerl_lerobot.world_model.imagination_config import ImaginationConfig
+from accerl_lerobot.world_model.imagination_config import FILMS, ImaginationConfig
 from accerl_lerobot.world_model.imagine import Dreamer, Imagination
 from accerl_lerobot.world_model.online import OnlineLearner
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.recorded import DREAMS, DreamRecorder
 from accerl_lerobot.world_model.store import load_source
 from accerl_lerobot.world_model.zoo import make_dreamer
-
-if TYPE_CHECKING:
-    from accerl_lerobot.config import RunConfig
 
 
 def make_imagination(config: RunConfig, name: str, on_segment: Callable[[Segment], object]) -> Imagination:
@@ -128,6 +125,7 @@ def make_learner(config: RunConfig, dreamer: Dreamer | None = None) -> OnlineLea
         held_out=held_out,
         longest=longest,
         seed=config.seed,
+        on_trial=_films(config),
     )
 
 
@@ -148,6 +146,12 @@ def check_imagination(config: RunConfig) -> None:
     learn = config.imagination.learn
     if config.imagination.learns and learn.dataset.repo_id is not None:
         check_metadata(open_metadata(learn.dataset), learn.dataset.repo_id, dreamer.model.spec)
+
+
+def _films(config: RunConfig) -> TrialFilms | None:
+    """Where the folder of the run is known, and films are wanted."""
+    folder, every = journal_folder(config), config.imagination.learn.films
+    return None if folder is None or not every else TrialFilms(folder / FILMS, every)
 
 
 def _trial(config: ImaginationConfig, longest: int) -> TrialConfig:

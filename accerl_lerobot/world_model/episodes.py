@@ -236,6 +236,11 @@ def _window(
     }
 
 
+def amount(episodes: Sequence[Episode]) -> dict[str, int]:
+    """How many, and of how many env steps."""
+    return {"episodes": len(episodes), "env_steps": sum(map(len, episodes))}
+
+
 def split(episodes: Sequence[Episode], share: float, rng: np.random.Generator) -> tuple[list[int], list[int]]:
     """Episodes to learn from and episodes to be judged on, as indices; each kind of outcome is split alike.
 

@@ -21,10 +21,12 @@ from typing import Literal, get_args
 from accerl_lerobot.dataset_config import DatasetConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.pacing import ReplayConfig
-from accerl_lerobot.world_model.config import TrialConfig
+from accerl_lerobot.world_model.config import StandInConfig, TrialConfig
 
 Kind = Literal["learned", "shuffled", "copy", "oracle"]
 Reward = Literal["potential", "success"]
+FILMS = "dreams"
+"""Folder of a run with `OnlineLearnConfig.films`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,11 +70,15 @@ class OnlineLearnConfig:
     dozen held-out episodes tell little; beyond that, `gap` watches."""
     memory: int = 400
     """Real episodes kept to learn from, at least 2."""
+    films: int = 1
+    """A video after every so many trials, in the run's folder ``dreams``: the newest held-out episode beside
+    what is dreamt of it with the same actions. 0: none."""
 
     def __post_init__(self) -> None:
         where = "imagination.learn"
         for name, least in (
             ("steps_per_episode", 0), ("batch", 2), ("try_every", 1), ("last_tries", 1), ("memory", 2),
+            ("films", 0),
         ):  # fmt: skip
             if not getattr(self, name) >= least:
                 raise InputError(f"{where}.{name}", getattr(self, name), f"use at least {least}")
@@ -98,6 +104,9 @@ class ImaginationConfig:
     path: str | None = None
     """The folder ``world_model`` that ``accerl world-model`` has written; oracle needs none, copy one for its
     success model."""
+    success: StandInConfig = field(default_factory=StandInConfig)
+    """A reward model that tells successes in place of the one in `path`; it stays as it is, and so does the
+    world model."""
     dreams: int = 32
     """Dreams at a time, decided and dreamt as one batch."""
     horizon: int | None = None
@@ -171,6 +180,16 @@ class ImaginationConfig:
         if self.share and self.path is None and self.model != "oracle":
             remedy = "give the folder world_model that accerl world-model has written"
             raise InputError("imagination.path", None, remedy)
+        if self.share and self.success.path is not None:
+            if self.success.threshold is None:
+                remedy = "say what counts as a success; accerl world-model-eval --success.path=… finds it"
+                raise InputError("imagination.success.threshold", None, remedy)
+            if self.model == "oracle":
+                remedy = "leave it out: the oracle knows what has succeeded"
+                raise InputError("imagination.success.path", self.success.path, remedy)
+            if self.learns:
+                remedy = "use 0 with imagination.success.path: a model that stands in does not learn"
+                raise InputError("imagination.learn.steps_per_episode", self.learn.steps_per_episode, remedy)
 
     @property
     def learns(self) -> bool:

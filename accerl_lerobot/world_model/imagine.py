@@ -43,10 +43,10 @@ from accerl_lerobot.world_model.frames import observed
 from accerl_lerobot.world_model.guard import KillSwitch
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.stand_in import SuccessModel, device_of
 from accerl_lerobot.world_model.starts import Start, StartPool
 from accerl_lerobot.world_model.store import save_world_model
 from accerl_lerobot.world_model.success import probabilities
-from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
 if TYPE_CHECKING:
     from accerl_lerobot.world_model.online import Promotion
@@ -82,7 +82,7 @@ class Dreamer(NamedTuple):
     """What dreams, and what tells successes, where that is another."""
 
     model: WorldModel
-    success: SuccessPairsRewardModel | None
+    success: SuccessModel | None
 
 
 class Imagination:
@@ -108,7 +108,7 @@ class Imagination:
     def __init__(
         self,
         model: WorldModel,
-        success: SuccessPairsRewardModel | None,
+        success: SuccessModel | None,
         world: WorldSpec,
         config: ImaginationConfig,
         *,
@@ -164,7 +164,7 @@ class Imagination:
         self._rows, self._state = [None] * len(self._rows), None
         self._doubted_in_a_row = 0
         assert self._success is not None  # or there would be nothing to promote
-        device = self._success.out.weight.device
+        device = device_of(self._success)
         model: WorldModel = promotion.model.to(device)
         self._model = ShuffledModel(model) if isinstance(self._model, ShuffledModel) else model
         self._success = promotion.success.to(device)
@@ -205,7 +205,7 @@ class Imagination:
         if isinstance(self._model, OracleModel):
             self._model.tasks = state["tasks"]
         if state["dreams"] is not None:
-            device = "cpu" if self._success is None else self._success.out.weight.device
+            device = "cpu" if self._success is None else device_of(self._success)
             self._state = {name: tensor.to(device) for name, tensor in state["dreams"].items()}
         for i, row in enumerate(state["rows"]):
             if row is not None:

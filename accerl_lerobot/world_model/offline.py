@@ -23,7 +23,6 @@
 from __future__ import annotations
 
 import json
-import math
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,36 +30,25 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.table import Table
 
 from accerl_lerobot.config import DatasetConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.pictures import write_video
-from accerl_lerobot.world_model.config import TrialConfig, WorldModelConfig
-from accerl_lerobot.world_model.contract import WorldModel, WorldModelSpec
+from accerl_lerobot.world_model.config import WorldModelConfig
+from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.dataset import fingerprint, load_episodes
-from accerl_lerobot.world_model.episodes import Episode, split
+from accerl_lerobot.world_model.episodes import Episode, amount, split
+from accerl_lerobot.world_model.films import film
 from accerl_lerobot.world_model.learn import pretrain
 from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.replayed import dream
-from accerl_lerobot.world_model.store import SUCCESS, Source, load_source, load_world_model, save_world_model
+from accerl_lerobot.world_model.store import SUCCESS, Source, save_world_model
 from accerl_lerobot.world_model.success import Examples, SuccessLearner, new_success_model
-from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
-from accerl_lerobot.world_model.trial import (
-    NEVER,
-    calibrate,
-    trial_windows,
-    try_out,
-    wrong_actions,
-)
+from accerl_lerobot.world_model.trial import calibrate, try_out
 
 EVERY = 20
 """Steps between two lines of metrics."""
-FILMED, SCALE = 4, 3
-"""Trials in the preview, and how much larger than life."""
 
 
 def world_spec(config: WorldModelConfig, env: EnvConfig) -> WorldModelSpec:
@@ -140,105 +128,13 @@ def learn_from_dataset(
         held_out=tuple(held_out),
     )
     save_world_model(directory / "world_model", serving, None, source)
-    amounts = {"seconds": seconds, "learnt": _amount(learn), "held_out": _amount(held)}
-    found = _trial(serving, success, held, config.trial, directory, seed, console, amounts, fresh=True)
+    amounts = {"seconds": seconds, "learnt": amount(learn), "held_out": amount(held)}
+    with console.stage("trial"):
+        found = try_out(serving, held, config.trial, success, seed, fresh=True) | amounts
+        film(directory / "preview.mp4", serving, held, config.trial, seed)
+    (directory / "trial.json").write_text(json.dumps(found, indent=2) + "\n")
     success.save_pretrained(directory / "world_model" / SUCCESS)  # with its threshold
     return found
-
-
-def try_on_dataset(
-    path: Path, dataset: DatasetConfig, trial: TrialConfig, directory: Path, seed: int, console: Console
-) -> dict[str, Any]:
-    """Tries a saved world model on a dataset; of the one it has learnt from, on what was held out.
-
-    Returns:
-        What `try_out` found; also in ``trial.json``, beside ``preview.mp4``.
-
-    Raises:
-        InputError: no world model there, a dataset of another world, or nothing of it was held out.
-    """
-    model, success = load_world_model(path)
-    source, only = load_source(path), None
-    if source is not None and source.fingerprint == fingerprint(open_metadata(dataset)):
-        only = source.held_out
-        if not only:
-            remedy = "the world model has learnt from every episode of it; give another dataset"
-            raise InputError("dataset.repo_id", dataset.repo_id, remedy)
-        console.say(f"it has learnt from this dataset: tried on the {len(only)} episodes that were held out")
-    with console.stage("episodes"):
-        episodes = load_episodes(dataset, model.spec, both=success is not None, only=only)
-    amounts = {"tried": _amount(episodes)}
-    # Its threshold was set on these very episodes: here it is set on some of them and tried on others.
-    fresh = only is not None
-    return _trial(model, success, episodes, trial, directory, seed, console, amounts, fresh)
-
-
-def _trial(
-    model: PixelWorldModel,
-    success: SuccessPairsRewardModel | None,
-    episodes: Sequence[Episode],
-    trial: TrialConfig,
-    directory: Path,
-    seed: int,
-    console: Console,
-    amounts: dict[str, Any],
-    fresh: bool = False,
-) -> dict[str, Any]:
-    """Tries, films and writes down."""
-    with console.stage("trial"):
-        found = try_out(model, episodes, trial, success, seed, fresh) | amounts
-        film(directory / "preview.mp4", model, episodes, trial, seed)
-    (directory / "trial.json").write_text(json.dumps(found, indent=2) + "\n")
-    return found
-
-
-def _amount(episodes: Sequence[Episode]) -> dict[str, int]:
-    return {"episodes": len(episodes), "env_steps": sum(map(len, episodes))}
-
-
-def film(path: Path, model: WorldModel, episodes: Sequence[Episode], config: TrialConfig, seed: int) -> None:
-    """Real, dreamt, and dreamt with another episode's actions, one row each."""
-    windows = trial_windows(episodes, model, config, seed)
-    rng = np.random.default_rng((seed, 3))
-    rows = sorted(rng.choice(len(windows), min(FILMED, len(windows)), replace=False).tolist())
-    filmed, context = windows.rows(rows), model.spec.context
-    lines = [filmed.frames[:, context - 1 :]]
-    for arm in ("true", "shuffled"):
-        dreamt = dream(model, filmed, wrong_actions(windows, arm, rng)[rows]).frames
-        lines.append(np.concatenate([filmed.frames[:, context - 1 : context], dreamt], 1))
-    write_video(path, [[list(_large(clip)) for clip in line] for line in lines], fps=4)
-
-
-def table(found: dict[str, Any]) -> Table:
-    """A trial for people."""
-    outcome = "passed" if found["passed"] else "FAILED"
-    shown = Table(title=f"{found['trials']} trials: {outcome}")
-    columns = (
-        "depth", "trials", "skill, changed pixels", "sensitivity", "PSNR", "AUROC", "false success: true",
-        "none",
-    )  # fmt: skip
-    for column in columns:
-        shown.add_column(column, justify="right")
-    for row in found["depths"]:
-        shown.add_row(
-            str(row["depth"]),
-            str(row["trials"]),
-            _estimate(row.get("skill_changed")),
-            _estimate(row.get("sensitivity_shuffled")),
-            _number(row.get("psnr"), 1),
-            _estimate(row.get("auroc_dreamt")),
-            *(_number(row.get(f"false_success_{arm}"), 2) for arm in NEVER),
-        )
-    return shown
-
-
-def gates(found: dict[str, Any]) -> list[str]:
-    """Each gate of a trial in a line."""
-    return [
-        f"{'holds' if gate['holds'] else 'FAILS'}  {name} = {_number(gate['value'], 2) or 'unknown'}, "
-        f"{gate['wanted']} wanted"
-        for name, gate in found["gates"].items()
-    ]
 
 
 def _check_held_out(
@@ -259,19 +155,3 @@ def _check_held_out(
 
 def _rng(seed: int) -> np.random.Generator:
     return np.random.default_rng((seed, 0))
-
-
-def _large(frames: np.ndarray) -> np.ndarray:
-    """(D, V, H, W, 3) as (D, SCALE·H, V·SCALE·W, 3): cameras beside each other."""
-    beside = np.concatenate(list(frames.transpose(1, 0, 2, 3, 4)), axis=2)
-    return beside.repeat(SCALE, 1).repeat(SCALE, 2)
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "" if value is None or math.isnan(value) else f"{value:.{digits}f}"
-
-
-def _estimate(estimate: dict[str, float] | None) -> str:
-    if estimate is None:
-        return ""
-    return f"{estimate['value']:.2f} [{estimate['low']:.2f}, {estimate['high']:.2f}]"

@@ -25,7 +25,7 @@ import contextlib
 import copy
 import time
 from collections import OrderedDict, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,6 +48,10 @@ LONGEST_TRIAL_S = 3600.0
 _STATE = ("owed", "promoted", "refused", "found", "_ended", "_since", "_last_tries")
 ENDLESS = 10**9
 """Steps of a learning rate that never falls."""
+
+
+OnTrial = Callable[[PixelWorldModel, SuccessPairsRewardModel, Episode, int, bool], object]
+"""Model, success model, the newest episode that was held out, the trial's number, and whether it passed."""
 
 
 def episode_of(segments: Sequence[Segment], spec: WorldModelSpec) -> Episode:
@@ -128,6 +132,7 @@ class OnlineLearner:
         held_out: others, which it is tried on beside the policy's.
         longest: chunks of a dream at most.
         seed: of everything random.
+        on_trial: shown what was tried.
     """
 
     def __init__(
@@ -141,8 +146,10 @@ class OnlineLearner:
         held_out: Sequence[Episode] = (),
         longest: int = 15,
         seed: int = 0,
+        on_trial: OnTrial | None = None,
     ) -> None:
         self.config, self.trial = config, trial
+        self._on_trial = on_trial
         self.owed = 0.0
         """Gradient steps that are due."""
         self.promoted = self.refused = 0
@@ -256,6 +263,8 @@ class OnlineLearner:
         learnt = self._scored(model, success, list(self._learnt)[-self.trial.most :])
         self._set_threshold(success, learnt)
         found = self.found = try_out(model, held, self.trial, success, self._seed)
+        if self._on_trial is not None:
+            self._on_trial(model, success, held[-1], self.promoted + self.refused + 1, found["passed"])
         if not found["passed"]:
             self.refused += 1
             if last and self._last_tries < self.config.last_tries:

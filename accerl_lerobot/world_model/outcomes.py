@@ -32,8 +32,8 @@ from accerl_lerobot.world_model.config import TrialConfig
 from accerl_lerobot.world_model.contract import WorldModel
 from accerl_lerobot.world_model.episodes import Episode, Place
 from accerl_lerobot.world_model.replayed import dream, replay
+from accerl_lerobot.world_model.stand_in import SuccessModel
 from accerl_lerobot.world_model.success import probabilities
-from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
 FOLDS = 4
 """Parts of the episodes, see `judged`."""
@@ -56,7 +56,7 @@ class Scores(NamedTuple):
 
 def scores(
     model: WorldModel,
-    success: SuccessPairsRewardModel,
+    success: SuccessModel,
     episodes: Sequence[Episode],
     config: TrialConfig,
     seed: int,

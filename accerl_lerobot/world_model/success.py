@@ -35,6 +35,7 @@ from accerl_lerobot.world_model.config import SuccessLearnConfig
 from accerl_lerobot.world_model.contract import WorldModel
 from accerl_lerobot.world_model.episodes import Episode, Place
 from accerl_lerobot.world_model.replayed import replay
+from accerl_lerobot.world_model.stand_in import SuccessModel, device_of
 from accerl_lerobot.world_model.success_plugin import SuccessPairsConfig
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
@@ -246,18 +247,13 @@ def as_floats(frames: np.ndarray, device: torch.device) -> torch.Tensor:
     return torch.from_numpy(frames).movedim(-1, 2).to(device).float() / 255
 
 
-@torch.no_grad()
 def probabilities(
-    success: SuccessPairsRewardModel, before: np.ndarray, after: np.ndarray, batch: int = 64
+    success: SuccessModel, before: np.ndarray, after: np.ndarray, batch: int = 64
 ) -> np.ndarray:
     """float32 (M,): P that the second frames show a success; frames uint8 (M, V, H, W, 3)."""
-    device = success.out.weight.device
+    device = device_of(success)
     parts = [
-        torch.sigmoid(
-            success.logits(as_floats(before[i : i + batch], device), as_floats(after[i : i + batch], device))[
-                0
-            ]
-        )
+        success.said(as_floats(before[i : i + batch], device), as_floats(after[i : i + batch], device))
         for i in range(0, len(before), batch)
     ]
     return torch.cat(parts).cpu().numpy() if parts else np.zeros(0, np.float32)

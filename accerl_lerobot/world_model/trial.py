@@ -37,16 +37,19 @@ from accerl_lerobot.world_model import judge
 from accerl_lerobot.world_model.config import TrialConfig
 from accerl_lerobot.world_model.contract import WorldModel
 from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, held
+from accerl_lerobot.world_model.inverse import InverseProbe
 from accerl_lerobot.world_model.outcomes import judged, scores, spaced, threshold
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.replayed import Dreams, cut_alike, dream
+from accerl_lerobot.world_model.stand_in import SuccessModel
 from accerl_lerobot.world_model.success import Examples, probabilities
-from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
 ARMS = ("true", "shuffled", "zero", "opposite", "failed")
 """Which actions are dreamt with."""
 PAIRS = 400
 """Real pairs of frames that the success model is tried on, half of them successes."""
+LEGIBLE = ("true", "shuffled")
+"""Arms whose actions are read off the dreams."""
 NEVER = ("true", "zero")
 """Arms that cannot succeed, the first one from failures. Actions of other episodes may well do so."""
 
@@ -91,9 +94,10 @@ def try_out(
     model: WorldModel,
     episodes: Sequence[Episode],
     config: TrialConfig,
-    success: SuccessPairsRewardModel | None = None,
+    success: SuccessModel | None = None,
     seed: int = 0,
     fresh: bool = False,
+    probe: InverseProbe | None = None,
 ) -> dict[str, Any]:
     """Tries a model on episodes it has not learnt from.
 
@@ -104,13 +108,15 @@ def try_out(
         success: what tells successes, if anything does.
         seed: of what is drawn.
         fresh: whether the success model has just been learnt: its threshold is set, on these episodes.
+        probe: what reads actions off frames, if anything does.
 
     Returns:
-        ``depths``: a row per depth with `judge`'s estimates of skill and sensitivity, errors in pixels, state
-        and, with a success model, AUROC on the chunk dreamt there and the share of them taken for a success
-        under each arm's actions; ``auroc_real``, of the success model on real pairs, its ``threshold``, and
-        ``outcomes``, see `outcomes.judged`; ``gates``: each with its value and whether it holds; ``passed``;
-        ``trials``, of so many ``episodes``.
+        ``depths``: a row per depth with `judge`'s estimates of skill and sensitivity, errors in pixels and
+        state, with a probe ``legible_real`` and ``legible_<arm>``, how well the actions can be read off the
+        frames, and with a success model AUROC on the chunk dreamt there and the share of them taken for a
+        success under each arm's actions; ``auroc_real``, of the success model on real pairs, its
+        ``threshold``, and ``outcomes``, see `outcomes.judged`; ``gates``: each with its value and whether it
+        holds; ``passed``; ``trials``, of so many ``episodes``.
     """
     rng = np.random.default_rng((seed, 1))
     ended: dict[str, Any] = {}
@@ -129,10 +135,9 @@ def try_out(
     online = np.array([episodes[e].source == "online" for e in windows.episode])
     theirs = failed & online if (failed & online).any() else failed
     ends = held(windows.actions, cut_alike(windows.steps, windows.success, rng))
+    given = {arm: wrong_actions(windows, arm, rng, failed) for arm in ARMS if arm != "failed" or failed.any()}
     arms = {
-        arm: dream(model, windows, wrong_actions(windows, arm, rng, failed), ends if arm == "true" else None)
-        for arm in ARMS
-        if arm != "failed" or failed.any()
+        arm: dream(model, windows, actions, ends if arm == "true" else None) for arm, actions in given.items()
     }
     context = model.spec.context
     newest = windows.frames[:, context - 1]
@@ -150,6 +155,8 @@ def try_out(
                 row["state_error"] = float(np.abs(robots - there).mean())
                 row["state_error_copy"] = float(np.abs(windows.state[fits, context - 1] - there).mean())
             row["uncertainty"] = float(arms["true"].uncertainty[fits, d].mean())
+        if probe is not None:
+            row |= _legible(probe, arms, given, windows, fits, d)
         if success is not None:
             row |= _judged(success, arms, windows, theirs, newest, d)
         rows.append(row)
@@ -190,8 +197,34 @@ def _pixels(
     }
 
 
+def _legible(
+    probe: InverseProbe,
+    arms: dict[str, Dreams],
+    given: dict[str, np.ndarray],
+    windows: Windows,
+    fits: np.ndarray,
+    d: int,
+) -> dict[str, Any]:
+    """How well the actions of the chunk at this depth can be read off real frames, and off dreams."""
+    new = np.array([e not in probe.known for e in windows.episode])
+    rows, groups = fits & new, windows.episode[fits & new]
+    if len(groups) < 2:
+        return {}
+    real, context = windows.frames[rows], windows.context
+
+    def read(before: np.ndarray, after: np.ndarray, actions: np.ndarray) -> dict[str, float]:
+        return probe.legibility(probe.read(before, after), actions[rows, d].mean(1), groups)._asdict()
+
+    found = {"legible_real": read(real[:, context - 1 + d], real[:, context + d], windows.actions)}
+    for arm in LEGIBLE:
+        dreamt = arms[arm].frames[rows]
+        before = real[:, context - 1] if d == 0 else dreamt[:, d - 1]
+        found[f"legible_{arm}"] = read(before, dreamt[:, d], given[arm])
+    return found
+
+
 def _judged(
-    success: SuccessPairsRewardModel,
+    success: SuccessModel,
     arms: dict[str, Dreams],
     windows: Windows,
     failed: np.ndarray,
@@ -217,7 +250,7 @@ def _judged(
 
 
 def _auroc_real(
-    success: SuccessPairsRewardModel,
+    success: SuccessModel,
     episodes: Sequence[Episode],
     model: WorldModel,
     rng: np.random.Generator,

@@ -26,6 +26,7 @@ from accerl_lerobot.world_model.contract import WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 from accerl_lerobot.world_model.imagine import Dreamer
 from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.stand_in import load_stand_in
 from accerl_lerobot.world_model.store import load_world_model
 
 
@@ -49,11 +50,12 @@ def make_dreamer(
         return _oracle(config, env, world, executed)
     assert config.path is not None  # ImaginationConfig has seen to that
     model, success = load_world_model(Path(config.path), "imagination.path")
+    dreams = _LEARNED[config.model](model.eval().to(where))
+    if config.success.path is not None:
+        return Dreamer(dreams, load_stand_in(config.success, model.spec, "imagination.success", where))
     if success is not None:
         success.config.device = str(where)
-    return Dreamer(
-        _LEARNED[config.model](model.eval().to(where)), None if success is None else success.to(where)
-    )
+    return Dreamer(dreams, None if success is None else success.to(where))
 
 
 def _oracle(config: ImaginationConfig, env: EnvConfig, world: WorldSpec, executed: int) -> Dreamer:

@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import re
@@ -285,6 +286,19 @@ def test_dreams(tmp_path: Path) -> None:
     off = page_of(write_run(tmp_path / "off", config=dreaming(), rollout=dreams(on=0.0))).text
     assert "Dreams were switched off in the end: 70 % of them succeeded, and 40 % of real episodes." in off
     assert "dreams of" not in page_of(write_run(tmp_path / "none")).text
+
+
+def test_films_of_dreams(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", config=dreaming(), rollout=dreams())
+    (folder / "dreams").mkdir()
+    for name in ("0001_failed", "0002_failed", "0013_passed", ".0014_failed"):
+        (folder / "dreams" / f"{name}.mp4").write_bytes(name.encode())
+    text = page_of(folder).text
+    assert "Trial 1, failed: an episode that was held out" in text and "Trial 13, passed: " in text
+    assert "Trial 2," not in text and "Trial 14" not in text
+    html = (folder / "report.html").read_text()
+    for name, there in (("0001_failed", True), ("0002_failed", False), ("0013_passed", True)):
+        assert (base64.b64encode(name.encode()).decode() in html) is there
 
 
 def test_a_world_model(tmp_path: Path) -> None:

@@ -212,15 +212,3 @@ def test_what_cannot_be_loaded(tmp_path: Path, harm: str, why: str):
 def test_bad_values_name_their_field(name: str, value: float):
     with pytest.raises(InputError, match=f"^world_model.{name}="):
         WorldModelConfig(**{name: value})
-
-
-def test_the_tiny_one_is_tiny():
-    from accerl_lerobot.world_model.contract import WorldModelSpec
-    from accerl_lerobot.world_model.pixels import PixelWorldModel
-
-    spec = WorldModelSpec(
-        cameras=("observation.images.corner2",), image_size=(64, 64), state_dim=4, action_dim=4, chunk=10,
-        context=2, fps=80, provides=frozenset({"pixels"}),
-    )  # fmt: skip
-    size = sum(p.numel() for p in PixelWorldModel(spec, WorldModelConfig().model).parameters())
-    assert 1.5e6 < size < 2.5e6

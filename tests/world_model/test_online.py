@@ -181,6 +181,21 @@ def test_what_passes_is_promoted_and_what_does_not_is_not(monkeypatch: pytest.Mo
     assert made.owed == 0
 
 
+def test_what_was_tried_is_shown(monkeypatch: pytest.MonkeyPatch):
+    shown: list[tuple[Any, ...]] = []
+    passes(monkeypatch, False, True)
+    made = learner(try_every=4)
+    made._on_trial = lambda *tried: shown.append(tried)
+    for segment in episodes(*[False] * 8):
+        made.add(segment)
+        made.owed = 0
+        made._learner.count = 1
+        if made.due(last=False):
+            made.promote(last=False)
+    assert [(number, passed) for *_, number, passed in shown] == [(1, False), (2, True)]
+    assert all(any(episode is held for held in made._held) for _, _, episode, _, _ in shown)
+
+
 def test_after_the_last_episode_it_learns_on_until_it_passes_or_is_given_up(monkeypatch: pytest.MonkeyPatch):
     made = learner(last_tries=3)
     passes(monkeypatch, False, False, False)

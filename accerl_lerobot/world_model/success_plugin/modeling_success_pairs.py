@@ -67,6 +67,11 @@ class SuccessPairsRewardModel(PreTrainedRewardModel):
         success, progress = self.out(features).unbind(1)
         return success, progress
 
+    @torch.no_grad()
+    def said(self, before: Tensor, after: Tensor) -> Tensor:
+        """P(success), (B,), of frames (B, V, 3, H, W) in [0, 1]."""
+        return torch.sigmoid(self.logits(before, after)[0])
+
     def loss(
         self,
         before: Tensor,

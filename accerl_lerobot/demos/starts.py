@@ -1,0 +1,61 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""How each episode of a dataset began, so that it can be played again: task and seed of `World.reset`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from accerl_lerobot.safety import Origin, read_json, safe_join
+from accerl_lerobot.seeds import EVAL_SEEDS
+
+Start = tuple[str, int]
+"""Task and seed."""
+
+STARTS = Path("meta") / "accerl_starts.json"
+"""Inside a dataset of ``accerl demos`` or ``accerl export``."""
+
+
+def write_starts(root: Path, starts: Sequence[Start]) -> None:
+    """Puts them beside the dataset's own metadata, in the order of its episodes."""
+    (root / STARTS).write_text(json.dumps({"starts": starts}) + "\n")
+
+
+def read_starts(root: Path, episodes: int, origin: Origin) -> list[Start]:
+    """What `write_starts` wrote.
+
+    Args:
+        root: of the dataset.
+        episodes: that it has.
+        origin: what named it, for the error.
+
+    Raises:
+        InputError: the dataset does not say how its episodes began, or not of each.
+    """
+    path = safe_join(root, STARTS.as_posix(), origin)
+    if not path.is_file():
+        remedy = "is missing: nobody knows how its episodes began; record it with accerl demos or export"
+        raise origin.refuse(STARTS.as_posix(), remedy)
+    starts = read_json(path, origin).get("starts")
+    if not isinstance(starts, list) or len(starts) != episodes or not all(map(_is_start, starts)):
+        raise origin.refuse(STARTS.as_posix(), f"{episodes} pairs of a task and a seed are wanted")
+    return [(task, seed) for task, seed in starts]
+
+
+def _is_start(value: object) -> bool:
+    if not isinstance(value, list) or len(value) != 2 or not isinstance(value[0], str):
+        return False
+    return type(value[1]) is int and 0 <= value[1] < EVAL_SEEDS.stop

@@ -1,0 +1,61 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Trials of one world model on several sources, beside each other. Free of torch: a report shows them too."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+
+def source_rows(every: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
+    """What is told of each source: a name, and a text for each of them."""
+    rows = [("episodes", [str((one.get("tried") or {}).get("episodes", "")) for one in every])]
+    rows += [("gates that hold", [_holding(one["gates"]) for one in every])]
+    ends = [one.get("outcomes") or {} for one in every]
+    for name, depth, key in (
+        ("skill, changed pixels, first chunk", 0, "skill_changed"),
+        ("last chunk", -1, "skill_changed"),
+        ("sensitivity, other actions", 0, "sensitivity_shuffled"),
+        ("actions read off reality", 0, "legible_real"),
+        ("off dreams with the same", 0, "legible_true"),
+        ("off dreams with others", 0, "legible_shuffled"),
+    ):
+        rows.append((name, [estimate((one["depths"] or [{}])[depth].get(key)) for one in every]))
+    rows.append(("successes, failures dreamt", [_ended(o) for o in ends]))
+    rows.append(("AUROC of how they end", [estimate(o.get("auroc")) for o in ends]))
+    for name, key in (("false success", "false_success"), ("recall", "recall")):
+        rows.append((name, [number(o.get(key), 2) for o in ends]))
+    return [(name, cells) for name, cells in rows if any(cells)]
+
+
+def _holding(gates: dict[str, Any]) -> str:
+    return f"{sum(gate['holds'] for gate in gates.values())} of {len(gates)}"
+
+
+def _ended(outcomes: dict[str, Any]) -> str:
+    return f"{outcomes['successes']}, {outcomes['failures']}" if outcomes else ""
+
+
+def number(value: float | None, digits: int) -> str:
+    """Empty where there is none."""
+    return "" if value is None or math.isnan(value) else f"{value:.{digits}f}"
+
+
+def estimate(found: dict[str, float] | None) -> str:
+    """With its interval; empty where there is none."""
+    if found is None or math.isnan(found["value"]):
+        return ""
+    return f"{found['value']:.2f} [{found['low']:.2f}, {found['high']:.2f}]"

@@ -1,0 +1,65 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""World models of three sizes: ``--world_model.type=tiny`` (the default), ``small`` or ``serious``.
+
+A size is a config, not another model: any of its fields can be given beside it. ``tiny`` is what all numbers
+in the documents are of. The others have their place on a GPU; what they begin with is chosen by their size,
+and no run has tuned it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from accerl_lerobot.world_model.config import LearnConfig, NetworkConfig, PixelModelConfig, WorldModelConfig
+
+
+@WorldModelConfig.register_subclass("tiny")
+@dataclass(frozen=True, kw_only=True)
+class TinyConfig(WorldModelConfig):
+    """64 pixels, 1.8 million weights: learns in minutes on two CPU cores."""
+
+
+@WorldModelConfig.register_subclass("small")
+@dataclass(frozen=True, kw_only=True)
+class SmallConfig(WorldModelConfig):
+    """128 pixels, 19 million weights: for one consumer GPU."""
+
+    model: PixelModelConfig = field(
+        default_factory=lambda: PixelModelConfig(
+            network=NetworkConfig(channels=(96, 192, 288), blocks=2, condition=256)
+        )
+    )
+    learn: LearnConfig = field(
+        default_factory=lambda: LearnConfig(steps=20_000, batch=32, lr=3e-4, warmup=500, average=0.999)
+    )
+    image_size: int = 128
+    """Height and width in pixels of the frames it dreams."""
+
+
+@WorldModelConfig.register_subclass("serious")
+@dataclass(frozen=True, kw_only=True)
+class SeriousConfig(WorldModelConfig):
+    """224 pixels, 85 million weights: for a GPU of 80 GB."""
+
+    model: PixelModelConfig = field(
+        default_factory=lambda: PixelModelConfig(
+            network=NetworkConfig(channels=(128, 256, 512, 512), blocks=2, condition=512, planes=16)
+        )
+    )
+    learn: LearnConfig = field(
+        default_factory=lambda: LearnConfig(steps=50_000, batch=64, lr=1e-4, warmup=1000, average=0.9995)
+    )
+    image_size: int = 224
+    """Height and width in pixels of the frames it dreams."""

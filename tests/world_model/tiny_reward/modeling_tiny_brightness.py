@@ -1,0 +1,42 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The network."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from lerobot.rewards.pretrained import PreTrainedRewardModel
+from torch import Tensor, nn
+
+from tests.world_model.tiny_reward.configuration_tiny_brightness import TinyBrightnessConfig
+
+
+class TinyBrightnessRewardModel(PreTrainedRewardModel):
+    """P = weight · (mean of the last frame), less that of the first one if there are two."""
+
+    config_class = TinyBrightnessConfig
+    name = "tiny_brightness"
+
+    def __init__(self, config: TinyBrightnessConfig, **unused: Any) -> None:
+        super().__init__(config)
+        self.weight = nn.Parameter(torch.ones(()))
+
+    def compute_reward(self, batch: dict[str, Tensor]) -> Tensor:
+        [image] = [batch[name] for name in self.config.input_features]
+        if self.config.frames == 1:
+            return self.config.scale * self.weight * image.mean((1, 2, 3))
+        first, *_, last = image.unbind(1)
+        return self.config.scale * self.weight * (0.5 + last.mean((1, 2, 3)) - first.mean((1, 2, 3)))
