@@ -30,6 +30,7 @@ import pytest
 import ray
 
 from accerl_lerobot import launch
+from accerl_lerobot.bench.victims import alive
 from accerl_lerobot.config import LaunchConfig
 from accerl_lerobot.engine import WorkerError
 from accerl_lerobot.envs import SimulatedConfig
@@ -220,7 +221,7 @@ def test_a_rollout_worker_that_hangs_is_replaced_and_an_inference_that_hangs_end
     os.kill(pid, signal.SIGSTOP)
     assert "inference worker has not answered for" in until_failure(one)
     one.close()
-    assert gone(pid)
+    assert not alive(pid), "one that was stopped does not hear that it is to go"
 
 
 def test_a_rollout_worker_that_fails_to_report_is_replaced(engine, monkeypatch: pytest.MonkeyPatch):
