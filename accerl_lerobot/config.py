@@ -63,12 +63,13 @@ class LaunchConfig:
     stall_s: float = 300.0
     """How long, in seconds, a worker may owe an answer or a world a step, and a run stand still; > 0.
 
-    A rollout worker is started again then; with any other, and where nothing moves, all are.
+    A rollout worker or an inference service is started again then; with any other, and where nothing moves,
+    all are.
     """
     max_recoveries: int = 3
     """How often in a row, no later checkpoint having been reached in between, all workers are started again
-    from the last checkpoint because one of them was lost that is not a rollout worker; once more ends the run
-    with its error."""
+    from the last checkpoint because one of them was lost that is not started again alone; once more ends the
+    run with its error."""
     timeline: bool = True
     """Whether every worker records what it does when, for ``accerl timeline``: up to 8 MB each time one is
     started."""

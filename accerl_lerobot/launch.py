@@ -24,10 +24,10 @@
        └────── world models that have passed ◄── world learning ◄──real──┘
 
 The trainer is the clock: when it has made its updates the run is over. Another worker that ends is an event:
-a rollout worker is started again, a few times (with it go its unfinished segments and groups, nothing else);
-any other ends this engine with its own traceback, and `run` makes another one that goes on from the last
-checkpoint. The same goes for one that hangs: nothing here waits for an answer without a limit. Workers get
-handles and never hold the conductor.
+a rollout worker is started again, a few times (with it go its unfinished segments and groups, nothing else),
+and so is an inference service (with it goes nothing); any other ends this engine with its own traceback, and
+`run` makes another one that goes on from the last checkpoint. The same goes for one that hangs: nothing here
+waits for an answer without a limit. Workers get handles and never hold the conductor.
 """
 
 from __future__ import annotations
@@ -45,16 +45,15 @@ from accerl_lerobot.checkpoint import TRAINING_STATE, saved_version
 from accerl_lerobot.config import RunConfig, journal_folder, timeline_folder
 from accerl_lerobot.engine import Engine, Progress, Saved, WorkerError
 from accerl_lerobot.inference.batcher import BatcherStats
-from accerl_lerobot.inference.pool import added, dealt, together
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.private_ray import PrivateRay
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seats import START_S, Seats
+from accerl_lerobot.services import Services
 from accerl_lerobot.transport.contract import ServiceStoppedError
-from accerl_lerobot.transport.endpoint import listens
+from accerl_lerobot.transport.endpoint import Endpoint, listens
 from accerl_lerobot.watched import Watched, end
-from accerl_lerobot.weights.publisher import ReaderLostError
 
 logger = logging.getLogger(__name__)
 
@@ -90,11 +89,12 @@ class RayEngine(Engine):
     ) -> None:
         listens(config.launch.transport)
         self._config, self._state, self._load = config, state, load
-        self._services: list[Watched] = []
+        self._others: list[Watched] = []
+        """All but inference services and rollout workers."""
         self._seats = Seats(config, tasks, history, state)
         self._updates: list[dict[str, float]] = []
         self._replay_metrics: dict[str, float] = {}
-        self._of_services: dict[str, dict[str, float]] = {}
+        self._inference_metrics: dict[str, float] = {}
         self._imagination_metrics: dict[str, float] = {}
         self._dreamer: Watched | None = None
         self._learner: Watched | None = None
@@ -104,6 +104,7 @@ class RayEngine(Engine):
         self._schedule: Schedule = ASYNCHRONOUS
         self._training = self._done = self._closed = False
         self._version = 0 if state is None else saved_version(state)
+        self._inference = Services(config, self._version, state, load)
         self._last_change = time.monotonic()
         self._last_state: tuple[object, ...] = ()
         self._ray = PrivateRay() if own is None else own
@@ -122,7 +123,7 @@ class RayEngine(Engine):
     def train(self) -> None:
         self._training, self._last_change = True, time.monotonic()
         self.follow(self._config.launch.schedule)
-        readers = [service.actor for service in self._inference]
+        readers = self._inference.publishing(self._trainer.actor)
         self._trainer.work = self._trainer.actor.run.remote(
             self._replay.actor, readers, self._config.launch.transport
         )
@@ -136,19 +137,17 @@ class RayEngine(Engine):
         if schedule == self._schedule:
             return
         in_turn = schedule != ASYNCHRONOUS
-        rollout = self._config.rollout
         self._seats.in_turn, self._schedule = in_turn, schedule
         # The trainer first: who takes turns waits for it to hand over its weights.
         for worker in (self._trainer, self._replay):
             worker.call("follow", schedule, timeout=self._limit)
-        for service, workers in zip(
-            self._inference, dealt(rollout.workers, len(self._inference)), strict=True
-        ):
-            service.call("lock_step", workers * rollout.worlds if in_turn else 0, timeout=self._limit)
+        self._inference.lock_step(in_turn)
 
     def poll(self) -> Progress:
         self._ask()
         self._await_end()
+        for number, endpoint in self._inference.advance():
+            self._move(number, endpoint)
         episodes = self._listen()
         self._check_hung()
         updates, self._updates = self._updates, []
@@ -161,7 +160,7 @@ class RayEngine(Engine):
             episodes=episodes,
             rollout=self._seats.counters(),
             replay=self._replay_metrics,
-            inference=together([m for m in self._of_services.values() if m]),
+            inference=self._inference_metrics,
             imagination=self._imagination_metrics,
         )
         self._check_moving(progress)
@@ -204,7 +203,7 @@ class RayEngine(Engine):
 
     def batching(self) -> BatcherStats:
         """What the inference services have batched so far."""
-        return added([service.call("batching", timeout=self._limit) for service in self._inference])
+        return self._inference.batching()
 
     @property
     def _limit(self) -> float:
@@ -212,11 +211,11 @@ class RayEngine(Engine):
 
     def _everyone(self) -> Iterator[Watched]:
         """Those that others depend on first."""
-        yield from self._services
+        yield from self._inference.workers()
+        yield from self._others
         yield from self._seats.workers()
 
     def _start(self) -> None:
-        from accerl_lerobot.inference.worker import InferenceWorker
         from accerl_lerobot.replay.worker import ReplayWorker
         from accerl_lerobot.trainer.peers import TrainerRank
         from accerl_lerobot.trainer.worker import TrainerWorker
@@ -233,54 +232,57 @@ class RayEngine(Engine):
         threads = {"num_cpus": 0, "num_gpus": share, "max_concurrency": 4}
         first = ray.remote(TrainerWorker).options(**threads | {"num_gpus": of_rank})
         trainer = first.remote(*learner, timeline, ranks, journal_folder(c))
-        inference = ray.remote(InferenceWorker).options(num_cpus=0, num_gpus=share, max_concurrency=1000)
-        serves = (c.policy, c.inference, self._version, self._state, self._load, timeline)
-        several = c.inference.workers > 1
-        names = [f"inference {i}" if several else "inference" for i in range(c.inference.workers)]
-        self._inference = [self._service(name, inference.remote(*serves, name)) for name in names]
+        self._inference.start(share)
         replay = ray.remote(ReplayWorker).options(num_cpus=0, num_gpus=0, max_concurrency=1000)
         imagined, counted = imagination.replay if imagination.share else None, c.rollout.episodes > 0
-        self._replay = self._service(
+        self._replay = self._other(
             "replay",
             replay.remote(c.replay, c.seed, imagined, counted, self._state, journal_folder(c), timeline),
         )
-        self._ranks = [self._service(f"trainer rank {i}", rank) for i, rank in enumerate(ranks, start=1)]
-        self._trainer = self._service("trainer", trainer)
+        self._ranks = [self._other(f"trainer rank {i}", rank) for i, rank in enumerate(ranks, start=1)]
+        self._trainer = self._other("trainer", trainer)
         if imagination.share:
             from accerl_lerobot.world_model.worker import DreamWorker, WorldLearningWorker
 
-            self._dreamer = self._service(
+            self._dreamer = self._other(
                 "dream", ray.remote(DreamWorker).options(**threads).remote(c, self._state, timeline)
             )
             if imagination.learns:
                 dreamt = ray.remote(WorldLearningWorker).options(**threads)
-                self._learner = self._service("world learning", dreamt.remote(c, self._state, timeline))
+                self._learner = self._other("world learning", dreamt.remote(c, self._state, timeline))
         self._seats.start()
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
         for worker, reference in ready:
             worker.await_start(reference, max(START_S, self._limit))
         way = c.launch.transport, self._limit
-        deciding = [service.endpoint("decide", *way) for service in self._inference]
-        inserting = self._replay.endpoint("insert", *way)
+        deciding, inserting = self._inference.open(), self._replay.endpoint("insert", *way)
         self._dreams_ask = deciding[-1], inserting  # those that get one rollout worker more come first
-        for service in self._inference:
-            service.work = service.actor.serve.remote()
         self._replay.work = self._replay.actor.run.remote()
         self._seats.set_to_work(deciding, inserting)
 
-    def _service(self, name: str, actor: Any) -> Watched:
-        self._services.append(Watched(name, actor))
-        return self._services[-1]
+    def _other(self, name: str, actor: Any) -> Watched:
+        self._others.append(Watched(name, actor))
+        return self._others[-1]
+
+    def _move(self, number: int, inference: Endpoint) -> None:
+        """Tells those who ask an inference service where it is now."""
+        self._seats.move(number, inference)
+        if number == self._config.inference.workers - 1:
+            self._dreams_ask = inference, self._dreams_ask[1]
+            if self._dreamer is not None:
+                self._dreamer.call("move", inference, timeout=self._limit)
 
     def _ask(self) -> None:
-        for worker in self._services:
+        self._inference.ask()
+        for worker in self._others:
             worker.ask("metrics")
         self._seats.ask(self._training and not self._done)
 
     def _await_end(self) -> None:
         """Waits a little, and deals with every worker whose long call has ended."""
         works = {worker.work: worker for worker in self._everyone() if worker.work is not None}
-        if not ray.wait(list(works), num_returns=1, timeout=POLL_S)[0]:
+        awaited = [*works, *self._inference.awaited()]
+        if not ray.wait(awaited, num_returns=1, timeout=POLL_S)[0]:
             return
         ended = set(ray.wait(list(works), num_returns=len(works), timeout=0)[0])
         for reference, worker in works.items():
@@ -293,10 +295,10 @@ class RayEngine(Engine):
         try:
             result = ray.get(reference)
         except RayError as error:
-            innocent = RayError | ServiceStoppedError | ReaderLostError
+            innocent = RayError | ServiceStoppedError
             if isinstance(error, RayTaskError) and isinstance(error.cause, innocent):
                 self._blame()
-            if self._seats.restart_worker(worker, error):
+            if self._inference.restart_worker(worker, error) or self._seats.restart_worker(worker, error):
                 return
             raise WorkerError(f"{worker.name} worker failed for good:\n{error}") from error
         if worker is self._trainer:
@@ -306,7 +308,7 @@ class RayEngine(Engine):
 
     def _blame(self) -> None:
         """A worker failed because of another one: ends the run with that one's failure, if it is found."""
-        works = {w.work: w for w in self._services if w is not self._trainer and w.work is not None}
+        works = {w.work: w for w in self._others if w is not self._trainer and w.work is not None}
         if works:
             for reference in ray.wait(list(works), num_returns=1, timeout=BLAME_S)[0]:
                 self._ended(works[reference])
@@ -325,8 +327,7 @@ class RayEngine(Engine):
         """Picks up the answers that have come; returns the episodes among them."""
         self._updates += self._hear(self._trainer) or []
         self._replay_metrics = self._hear(self._replay) or self._replay_metrics
-        for service in self._inference:
-            self._of_services[service.name] = self._hear(service) or self._of_services.get(service.name, {})
+        self._inference_metrics = self._inference.listen()
         for rank in self._ranks:
             self._hear(rank)
         for imaginer in (self._dreamer, self._learner):
@@ -345,15 +346,16 @@ class RayEngine(Engine):
             raise WorkerError(f"{worker.name} worker failed for good:\n{error}") from error
 
     def _check_hung(self) -> None:
-        """Starts a rollout worker again that does not answer or whose world does not return.
+        """Starts a rollout worker or inference service again that does not answer, or does not get on.
 
         Raises:
             WorkerError: another worker does not answer.
         """
-        for worker in self._services:
+        for worker in self._others:
             if worker.silent_s() > self._limit:
                 raise WorkerError(f"{worker.name} worker has not answered for {worker.silent_s():.0f} s")
-        self._seats.check_hung()
+        self._inference.check_hung()
+        self._seats.check_hung(self._inference.up)
 
     def _check_moving(self, progress: Progress) -> None:
         """Ends a run in which everybody answers and nothing moves.
@@ -368,7 +370,8 @@ class RayEngine(Engine):
         # Where one worker is to blame, `_check_hung` comes to it a moment later.
         silent = max(worker.silent_s() for worker in self._everyone())
         suspect = max(silent, self._seats.stuck_s) > self._limit / 2
-        if state != self._last_state or not waiting:
+        # A service that is to come has a limit of its own.
+        if state != self._last_state or not waiting or not all(self._inference.up):
             self._last_state, self._last_change = state, now
         elif now - self._last_change > self._limit and not suspect:
             raise WorkerError(

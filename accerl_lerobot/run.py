@@ -54,9 +54,11 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.engine import Engine, WorkerError
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError, check_absent
+from accerl_lerobot.hub.portable import AWAY
 from accerl_lerobot.loop import Loop, Times, heed_stop
 from accerl_lerobot.metrics import METRICS, MetricsLog
 from accerl_lerobot.policies.config import Load
+from accerl_lerobot.preflight import check_start
 from accerl_lerobot.replay.journal import EPISODES
 from accerl_lerobot.stopping import Stopping
 from accerl_lerobot.timeline import RECOVERY, open_clock
@@ -66,6 +68,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+BASE = "base"
+"""Folder of a run: the policy that it began from, where that had to be computed back."""
 FIRST_PAUSE_S = 1.0
 """Before all workers are started again the first time; twice as long each time."""
 WARM_START = "warm_start.json"
@@ -184,18 +188,20 @@ def train(
     """
     started = time.monotonic()
     checkpoint = None if wanted is None else _checkpoint(directory, wanted, console)
+    if wanted is not None and checkpoint is None and load is None:
+        check_start(config)
     text = yaml.safe_dump(encode(replace(config, resume=False)), sort_keys=False)
     write_atomically(directory / CONFIG, text)
     tasks = check_world(config)
-    if config.imagination.share:
-        from accerl_lerobot.world_model.dreaming import check_imagination
-
-        check_imagination(config)
     if checkpoint is None:
+        _check_imagination(config)
         config = _warm_started(config, directory, console)
     else:
         go_back_to(checkpoint)
-        config = _going_on(config, directory, checkpoint)
+        config = _going_on(config, directory, checkpoint, console)
+        if load is None:
+            check_start(config)
+        _check_imagination(config)
         console.say(f"going on from {checkpoint}")
     before_s = 0.0 if checkpoint is None else None
     config = replace(config, output_dir=str(directory))
@@ -215,7 +221,7 @@ def train(
                 checkpoint = recovery.next(directory / CHECKPOINTS, console, error)
                 heed_stop(stop, directory)
                 go_back_to(checkpoint)
-                config = _going_on(config, directory, checkpoint)
+                config = _going_on(config, directory, checkpoint, console)
 
 
 def _own_ray() -> PrivateRay:
@@ -308,15 +314,46 @@ def _warm_started(config: RunConfig, directory: Path, console: Console) -> RunCo
     return _improving(config, path)
 
 
-def _going_on(config: RunConfig, directory: Path, checkpoint: Path) -> RunConfig:
-    """The run from its checkpoint on."""
+def _going_on(config: RunConfig, directory: Path, checkpoint: Path, console: Console) -> RunConfig:
+    """The run from its checkpoint on, which holds all that it takes, whatever has become of its start."""
     if config.policy.tuning.mode != "lora":
         return _improving(config, checkpoint / PRETRAINED)
     # A checkpoint has low-rank adapters merged; apart from what they adapt they are in the training state.
-    return _warm_started(config, directory, Console())
+    start = _start(config, directory)
+    if start is None:
+        start = str(directory / BASE)
+        if not Path(start).is_dir():
+            from accerl_lerobot.policies.computed_back import compute_back
+
+            with console.stage("the policy it began from is not here: computing it back, to rounding"):
+                compute_back(config.policy, checkpoint, directory / BASE)
+    return _improving(config, start)
 
 
-def _improving(config: RunConfig, path: Path) -> RunConfig:
+def _start(config: RunConfig, directory: Path) -> str | None:
+    """The policy that a run began from, in a folder or on the Hub; None if it is not here any more."""
+    path, note = config.policy.path, directory / WARM_START
+    if path is None:
+        made = directory / json.loads(note.read_text())["policy"] if note.is_file() else None
+        return str(made) if made is not None and made.is_dir() else None
+    on_the_hub = not path.startswith((".", "/", "~", f"{AWAY}/")) and path.count("/") <= 1
+    return path if on_the_hub or Path(path).expanduser().is_dir() else None
+
+
+def _check_imagination(config: RunConfig) -> None:
+    if config.imagination.share:
+        from accerl_lerobot.world_model.dreaming import check_imagination
+
+        path = config.imagination.path
+        if path is not None and not Path(path).expanduser().is_dir():
+            remedy = (
+                "no such folder; what a run begins to dream with is not in its checkpoints: put a copy there"
+            )
+            raise InputError("imagination.path", path, remedy)
+        check_imagination(config)
+
+
+def _improving(config: RunConfig, path: Path | str) -> RunConfig:
     """The run as one that improves a checkpoint."""
     return replace(config, policy=replace(config.policy, path=str(path)), sft=replace(config.sft, steps=0))
 

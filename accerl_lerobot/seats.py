@@ -42,6 +42,8 @@ logger = logging.getLogger(__name__)
 
 START_S = 600.0
 """How long a worker may take to start; `LaunchConfig.stall_s` counts from its first answer."""
+AWAY_S = 10.0
+"""How long a worker may do without an inference service that is there, before it counts as lost."""
 ROLLOUT = "rollout"
 """Name of their state."""
 
@@ -61,6 +63,10 @@ class Seat:
     counters: dict[str, float] = field(default_factory=dict)
     in_world_s: float = 0.0
     stuck_s: float = 0.0
+    away: tuple[float, str] = (0.0, "")
+    """For how long it has not found inference where it was told, in seconds, and why."""
+    moved: Endpoint | None = None
+    """Where inference is now, until it has been told."""
     budget: int | None = None
     """Exploring episodes that are still to be played; None: no end."""
     spent: bool = False
@@ -107,6 +113,19 @@ class Seats:
         for seat in self._seats:
             self._set_to_work(seat)
 
+    def move(self, service: int, inference: Endpoint) -> None:
+        """Tells those who ask an inference service where it is now.
+
+        Args:
+            service: its number.
+            inference: where.
+        """
+        assert self._peers is not None
+        services, _ = self._peers
+        services[service] = inference
+        for seat in self._seats[service :: len(services)]:
+            seat.moved = inference
+
     def workers(self) -> Iterator[Watched]:
         """Those that have been started."""
         return (seat.worker for seat in self._seats if hasattr(seat, "worker"))
@@ -120,7 +139,9 @@ class Seats:
     def ask(self, training: bool) -> None:
         """Has each report, unless it owes a report already."""
         for seat in self._seats:
-            if seat.worker.ask("report", training, seat.unsent, self.in_turn):
+            if seat.worker.ask("report", training, seat.unsent, self.in_turn, seat.moved):
+                if seat.moved is not None:  # what it said before has been dealt with
+                    seat.moved, seat.away = None, (0.0, "")
                 seat.unsent = []
 
     def listen(self) -> list[EpisodeResult]:
@@ -142,6 +163,7 @@ class Seats:
                 continue
             seat.counters, seat.spent = report.counters, report.spent
             seat.in_world_s, seat.stuck_s = report.in_world_s, report.stuck_s
+            seat.away = report.away_s, report.away_why
             if seat.budget is not None:
                 seat.budget -= sum(e.plan.explore for e in report.episodes)
             for episode in report.episodes:
@@ -185,14 +207,19 @@ class Seats:
                 return True
         return False
 
-    def check_hung(self) -> None:
-        """Starts those again that do not answer, do nothing, or whose world does not return.
+    def check_hung(self, served: list[bool]) -> None:
+        """Starts those again that do not answer, do nothing, whose world does not return, or who do not find
+        inference.
+
+        Args:
+            served: of each inference service, whether it is there.
 
         Raises:
             WorkerError: see `restart_worker`.
         """
         limit = self._config.launch.stall_s
         for seat in self._seats:
+            away_s, why = seat.away
             silent = seat.worker.silent_s()
             if silent > (limit if seat.worker.answered else max(START_S, limit)):
                 self._restart(seat, RuntimeError(f"no answer for {silent:.0f} s"))
@@ -200,6 +227,10 @@ class Seats:
                 self._restart(seat, RuntimeError(f"its world has not returned for {seat.in_world_s:.0f} s"))
             elif seat.stuck_s > limit:
                 self._restart(seat, RuntimeError(f"it has done nothing for {seat.stuck_s:.0f} s"))
+            elif away_s > AWAY_S and seat.moved is None and served[seat.index % len(served)]:
+                self._restart(
+                    seat, RuntimeError(f"without inference, which is there, for {away_s:.0f} s: {why}")
+                )
 
     def save(self, directory: Path) -> None:
         """Writes their part of ``training_state``."""
@@ -253,6 +284,7 @@ class Seats:
         for key, value in seat.counters.items():
             self._past[key] = self._past.get(key, 0.0) + value
         seat.counters, seat.in_world_s, seat.stuck_s = {}, 0.0, 0.0
+        seat.away, seat.moved = (0.0, ""), None
         seat.incarnation += 1
         seat.restarts += 1
         if seat.budget is not None:

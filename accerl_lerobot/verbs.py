@@ -74,8 +74,8 @@ def train(arguments: list[str], load: Load | None = None) -> int:
     from accerl_lerobot.stopping import StoppedError
 
     begun = begun_run(read_arguments(arguments)[0], config) if config.resume else None
-    if load is None:
-        check_start(config)
+    if begun is None and load is None:
+        check_start(config)  # before there is a folder
     console = Console()
     directory = run.make_output_dir(config) if begun is None else begun.directory
     console.say(f"run {directory}")

@@ -128,6 +128,7 @@ class LightTrainer:
         self._lock = threading.Lock()
         self._failure: str | None = None
         self._idle = False
+        self._publishing = threading.Event()
         self._ledger: list[dict[str, int]] = []
         """Of each update, the keys of its segments, and their decisions."""
         if state is not None:
@@ -145,6 +146,11 @@ class LightTrainer:
     def run(self, replay: Any, readers: list[Any], transport: str) -> int:
         import ray
 
+        from accerl_lerobot.weights.ray_channel import make_publisher
+
+        self._publisher = publisher = make_publisher(readers, "ray")
+        publisher.publish(len(self._ledger), {})
+        self._publishing.set()
         n = self._config.batch_decisions
         upcoming = replay.sample.remote(n, len(self._ledger))
         while len(self._ledger) < self._config.updates:
@@ -159,8 +165,18 @@ class LightTrainer:
                 self._ledger.append({segment.key: len(segment) for segment in segments})
                 version = len(self._ledger)
                 self._records.append({"update": float(version)})
-            ray.get([reader.receive_weights.remote(version, {}) for reader in readers])
+            publisher.publish(version, {})
+            publisher.flush()
         return self._config.updates
+
+    def join(self, reader: Any) -> int:
+        from accerl_lerobot.weights.ray_channel import join
+
+        assert self._publishing.wait(60)
+        newest = self._publisher._version
+        assert newest is not None
+        join(self._publisher, reader)
+        return newest
 
     def metrics(self) -> list[dict[str, float]]:
         with self._lock:

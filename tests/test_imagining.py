@@ -15,6 +15,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,7 +43,7 @@ from accerl_lerobot.world_model.offline import world_spec
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.store import save_world_model
 from accerl_lerobot.world_model.success import new_success_model
-from tests.runs import drive, tiny_run
+from tests.runs import drive, polls, tiny_run
 
 # About half of all episodes succeed when it is acted at random.
 ENV = SimulatedConfig(max_steps=16, hold=8, tolerance=0.45)
@@ -232,12 +234,20 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
     config = replace(config, rollout=replace(config.rollout, workers=2))
     engine = RayEngine(replace(config, output_dir=str(tmp_path)), ("match",))
     try:
-        assert {"dream", "world learning"} < set(engine.pids())
+        pids = engine.pids()
+        assert {"dream", "world learning"} < set(pids)
         engine.train()
-        history = drive(engine)
+        history: list[Progress] = []
+        for progress in polls(engine):
+            history.append(progress)
+            if progress.imagination.get("dreams", 0) > 0:
+                os.kill(pids["inference"], signal.SIGKILL)  # dreams find the next one, too
+                history += drive(engine)
+                break
     finally:
         engine.close()
     last = history[-1]
+    assert last.inference["restarts"] == 1.0
     assert last.version == 12 == len([u for p in history for u in p.updates])
     assert sum(e.plan.explore for p in history for e in p.episodes) == 12
     assert last.imagination["promoted"] >= 1 and last.imagination["dreams"] > 0

@@ -23,25 +23,29 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import ray
 
-from accerl_lerobot import launch
+from accerl_lerobot import launch, seats
 from accerl_lerobot.bench.victims import alive
 from accerl_lerobot.config import LaunchConfig
-from accerl_lerobot.engine import WorkerError
+from accerl_lerobot.engine import Progress, WorkerError
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
+from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.launch import RayEngine
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout import worker as rollout_worker
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.trainer import worker as trainer_worker
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.transport.endpoint import Transport
+from accerl_lerobot.transport.shared_memory import Address, this_node
 from tests.light_workers import (
     FULL,
     HANGS,
@@ -214,12 +218,12 @@ def test_a_rollout_worker_that_is_killed_is_replaced_and_a_replay_that_is_killed
     assert until_failure(one).startswith("replay worker failed for good:")
 
 
-def test_a_rollout_worker_that_hangs_is_replaced_and_an_inference_that_hangs_ends_the_run(engine):
+def test_a_rollout_worker_that_hangs_is_replaced_and_a_replay_that_hangs_ends_the_run(engine):
     one = engine(env=HARD, rollout=TWO, trainer=ENDLESS, launch=LaunchConfig(stall_s=7.0))
     lose_a_rollout_worker(one, signal.SIGSTOP)
-    pid = one.pids()["inference"]
+    pid = one.pids()["replay"]
     os.kill(pid, signal.SIGSTOP)
-    assert "inference worker has not answered for" in until_failure(one)
+    assert "replay worker has not answered for" in until_failure(one)
     one.close()
     assert not alive(pid), "one that was stopped does not hear that it is to go"
 
@@ -236,19 +240,82 @@ def test_a_rollout_worker_that_fails_to_report_is_replaced(engine, monkeypatch: 
     assert progress.rollout["restarts"] == 1 and progress.replay["duplicates"] == 0
 
 
-def test_an_inference_that_is_killed_ends_the_run_and_not_those_who_relied_on_it(engine):
-    one = engine(trainer=ENDLESS)
-    until_training(one)
-    os.kill(one.pids()["inference"], signal.SIGKILL)
-    assert until_failure(one).startswith("inference worker failed for good:")
+def lose_inference(one: RayEngine, how: Callable[[str], object], name: str = "inference") -> list[Progress]:
+    """Nothing is lost or doubled, nobody else is to blame, and no version is older than one before.
+
+    Args:
+        one: an engine that nobody has asked for anything yet.
+        how: what is done to the service.
+        name: of the service.
+
+    Returns:
+        What was reported while it was away.
+    """
+    one.train()
+    updates: list[float] = []
+    results: list[EpisodeResult] = []
+    history: list[Progress] = []
+    away: list[Progress] = []
+    died = back = None
+    for progress in polls(one):
+        history.append(progress)
+        updates += [update["update"] for update in progress.updates]
+        results += progress.episodes
+        if died is None and progress.version >= 2:
+            pid = one.pids()[name]
+            one.plan(evaluation_plans(("match",), 24, "during"))
+            how(name)
+            died = progress.version
+        elif died is not None and not all(one._inference.up):
+            away.append(progress)
+        elif back is None and progress.inference["restarts"]:
+            back = progress.version
+            one.plan(evaluation_plans(("match",), 8, "later"))
+        elif back is not None and sum(r.plan.group == "later" for r in results) == 8:
+            break
+    assert back is not None and died is not None
+    assert updates == [float(i + 1) for i in range(len(updates))]
+    versions = [progress.version for progress in history]
+    assert versions == sorted(versions) and versions[-1] > back
+    for group, count in (("during", 24), ("later", 8)):
+        assert sorted(r.plan.index for r in results if r.plan.group == group) == list(range(count))
+    later = [r.versions for r in results if r.plan.group == "later"]
+    assert min(old for old, _ in later) >= died, "it came back with weights of its time"
+    assert all(r.versions[0] <= r.versions[1] for r in results)
+    explored = [r.plan.seed for r in results if r.plan.explore]
+    assert len(set(explored)) == len(explored)
+    assert progress.replay["duplicates"] == 0 and progress.rollout["restarts"] == 0.0
+    assert progress.inference["restarts"] == 1.0
+    assert one.pids()[name] != pid and gone(pid)
+    return away
 
 
-def test_an_exception_in_the_inference_service_is_reported_as_its_own(engine):
-    one = engine(trainer=ENDLESS)
-    until_training(one)
-    ray.get(one._inference[0].actor.fail.remote())
+def hit(one: RayEngine, number: signal.Signals) -> Callable[[str], None]:
+    return lambda name: os.kill(one.pids()[name], number)
+
+
+@pytest.mark.parametrize("transport", ["ray", "shared_memory"])
+def test_an_inference_that_is_killed_is_replaced_alone(engine, transport: Transport):
+    launched = LaunchConfig(stall_s=120.0, transport=transport)
+    one = engine(env=HARD, rollout=TWO, trainer=ENDLESS, launch=launched)
+    lose_inference(one, hit(one, signal.SIGKILL))
+
+
+def test_while_one_of_two_hangs_the_other_goes_on(engine):
+    one = engine(
+        env=HARD, rollout=TWO, trainer=ENDLESS, launch=LaunchConfig(stall_s=7.0),
+        inference=InferenceConfig(workers=2),
+    )  # fmt: skip
+    away = lose_inference(one, hit(one, signal.SIGSTOP), "inference 1")
+    assert away[-1].rollout["decisions"] > away[0].rollout["decisions"]
+
+
+def test_an_exception_in_the_inference_service_is_survived_as_often_as_it_may_be_and_then_its_own(engine):
+    one = engine(env=HARD, rollout=TWO, trainer=ENDLESS, inference=InferenceConfig(max_restarts=1))
+    lose_inference(one, lambda name: ray.get(next(one._inference.workers()).actor.fail.remote()))
+    ray.get(next(one._inference.workers()).actor.fail.remote())
     text = until_failure(one)
-    assert text.startswith("inference worker failed for good:")
+    assert text.startswith("inference worker failed for good after 1 restarts:")
     assert "the forward pass fell over" in text and "serve" in text
 
 
@@ -259,6 +326,51 @@ def test_a_trainer_that_hangs_while_it_is_saved_is_found_as_soon_as_any(engine, 
     with pytest.raises(WorkerError, match="trainer worker has not answered for 5 s, in write"):
         one.save(tmp_path / HANGS)
     assert time.monotonic() - began < 30, "and not after the minutes that large files may take"
+
+
+class NoRoom(LightInference):
+    """Has no memory to start in."""
+
+    def __init__(self, *_: Any) -> None:
+        raise MemoryError("no room for the policy")
+
+
+def test_an_inference_that_does_not_start_again_ends_the_run(engine, monkeypatch):
+    one = engine(trainer=ENDLESS, inference=InferenceConfig(max_restarts=2))
+    until_training(one)
+    monkeypatch.setattr(inference_worker, "InferenceWorker", NoRoom)
+    os.kill(one.pids()["inference"], signal.SIGKILL)
+    text = until_failure(one)
+    assert text.startswith("inference worker failed for good after 2 restarts:")
+    assert "no room for the policy" in text
+
+
+def test_an_inference_is_replaced_before_there_are_weights_and_after_the_last_ones(engine):
+    one = engine(rollout=TWO)
+    one.plan(evaluation_plans(("match",), 4, "before"))
+    os.kill(one.pids()["inference"], signal.SIGKILL)
+    assert {r.versions for r in collect(one, "before", 4)} == {(0, 0)}
+    one.train()
+    assert drive(one)[-1].version == 12
+    os.kill(one.pids()["inference"], signal.SIGKILL)
+    one.plan(evaluation_plans(("match",), 4, "after"))
+    assert {r.versions for r in collect(one, "after", 4)} == {(12, 12)}
+    assert one.poll().inference["restarts"] == 2.0
+
+
+def test_a_worker_that_does_not_find_inference_is_replaced(engine, monkeypatch):
+    monkeypatch.setattr(seats, "AWAY_S", 1.0)
+    one = engine(env=HARD, rollout=TWO, trainer=ENDLESS)
+    until_training(one)
+    there = one._dreams_ask[0]
+    one._seats._seats[1].moved = replace(there, address=Address(this_node(), "accerl-nobody"))
+    before = one.pids()["rollout 1"]
+    restarts = 0.0
+    for progress in polls(one):
+        restarts = progress.rollout["restarts"]
+        if restarts:
+            break
+    assert restarts == 1.0 and one.pids()["rollout 1"] != before
 
 
 def test_a_world_that_does_not_return_is_no_reason_to_wait_for_ever(engine):

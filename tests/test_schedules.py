@@ -17,6 +17,8 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import os
+import signal
 from collections import Counter
 from dataclasses import replace
 from typing import Any
@@ -25,6 +27,7 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.config import LaunchConfig, RunConfig
+from accerl_lerobot.engine import Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import evaluation_plans
@@ -39,7 +42,7 @@ from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 from tests.light_workers import light_ray
 from tests.replay.segments import make_segment
 from tests.replay.test_worker import BATCH, play, start, waits
-from tests.runs import collect, drive
+from tests.runs import collect, drive, polls
 
 __all__ = ["light_ray"]
 
@@ -156,6 +159,34 @@ def test_a_run_in_turn(light_ray: None, schedule: Any):
         # Nothing is lost on the way from the worlds to the trainer.
         assert end.replay["trained_decisions"] == 6 * 16
         assert np.isfinite([u["loss"] for u in updates]).all()
+    finally:
+        engine.close()
+
+
+@pytest.mark.parametrize("schedule", [SYNCHRONOUS, OVERLAP])
+def test_in_turn_a_service_that_is_lost_is_waited_for_and_the_round_is_finished(
+    light_ray: None, schedule: Any
+):
+    from accerl_lerobot.launch import RayEngine
+
+    load = functools.partial(load_simulated, SimulatedPolicyConfig(decide_ms=1.0, update_ms=5.0))
+    engine = RayEngine(run_of(schedule, updates=30), ("match",), load=load)
+    try:
+        engine.train()
+        history: list[Progress] = []
+        for progress in polls(engine):
+            history.append(progress)
+            if progress.version >= 3 and not progress.inference["restarts"]:
+                os.kill(engine.pids()["inference"], signal.SIGKILL)
+                history += drive(engine)
+                break
+        updates = [update for progress in history for update in progress.updates]
+        assert [u["update"] for u in updates] == [float(i + 1) for i in range(30)]
+        assert history[-1].inference["restarts"] == 1.0 and history[-1].rollout["restarts"] == 0.0
+        assert max(u["lag_max"] for u in updates) <= (0.0 if schedule == SYNCHRONOUS else 1.0)
+        # The one that came later decides for all four together, too.
+        sizes = Counter(engine.batching().batch_sizes)
+        assert sizes[3] + sizes[1] > 0.9 * sizes.total()
     finally:
         engine.close()
 

@@ -18,7 +18,8 @@
     waits for   a full batch, or for the oldest request to have waited `max_wait_s`
     weights     are swapped between batches: no batch ever sees two versions
 
-    ends        with the process; an exception fails every caller that waits or comes later, and ends the run
+    ends        with the process; an exception fails every caller that waits or comes later
+    restarted   it has no state but weights, which the trainer gives it: `launch` starts another in its place
 
 One thread does all of it: it waits for callers and for the batcher's clock at once, runs the forward pass and
 replies; what is sent meanwhile lies in shared memory. Ray's calls come in on the event loop beside it, which
@@ -65,11 +66,16 @@ class InferenceConfig:
     """How long the oldest request waits for others, seconds."""
     num_threads: int = 1
     """CPU threads of the forward pass."""
+    max_restarts: int = 3
+    """How often in a row each of them is started again alone after it died or hung, half a minute of service
+    making up for what was before; after that all workers are, from the last checkpoint."""
 
     def __post_init__(self) -> None:
         for name in ("workers", "max_batch", "num_threads"):
             if getattr(self, name) < 1:
                 raise InputError(f"inference.{name}", getattr(self, name), "use at least 1")
+        if self.max_restarts < 0:
+            raise InputError("inference.max_restarts", self.max_restarts, "use 0 or more")
         if not 0 <= self.max_wait_s < 10:
             raise InputError("inference.max_wait_s", self.max_wait_s, "use seconds in [0, 10)")
 
@@ -175,7 +181,7 @@ class InferenceWorker:
         self._server.wake()
 
     async def serve(self) -> None:
-        """Serves until the process ends; an exception here ends the run."""
+        """Serves until the process ends, or an exception ends it."""
         loop = asyncio.get_running_loop()
         ended: asyncio.Future[None] = loop.create_future()
 

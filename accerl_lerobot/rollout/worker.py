@@ -18,6 +18,7 @@
     waits for   a decision, only when every world has an observation under way
     pauses      exploring worlds while replay keeps segments at the door; evaluation goes on
     ends        never unasked: a world that raises ends the process's `run`, and `launch` starts another
+    outlives    inference: its successor is asked again what has not been answered
 
 Imports neither torch nor LeRobot (unless its world does).
 """
@@ -43,6 +44,7 @@ from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutCon
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, open_clock
 from accerl_lerobot.transport.contract import Caller
 from accerl_lerobot.transport.endpoint import Endpoint
+from accerl_lerobot.transport.lasting import LastingCaller
 
 PARTS = 2
 """A worker's worlds are asked for in so many parts: one is stepped while the other's decisions are made."""
@@ -68,6 +70,9 @@ class Report:
     """How long ago the thread that steps worlds last did anything, in seconds; 0 while one is stepped."""
     spent: bool = False
     """Every exploring episode that was paid for has been played, and replay has it."""
+    away_s: float = 0.0
+    """For how long inference has not been where it was last said to be, in seconds."""
+    away_why: str = ""
 
 
 class RolloutWorker:
@@ -117,6 +122,7 @@ class RolloutWorker:
         self._entered: float | None = None
         self._moved: float | None = None
         self._outbox: list[Segment] = []
+        self._deciding = LastingCaller("inference")
         worlds = [make_world(env, history) for _ in range(config.worlds)]
         name = f"rollout{index}.{incarnation}"
         self._runner = RolloutRunner(
@@ -135,15 +141,24 @@ class RolloutWorker:
         """Answers once the worlds exist; returns this process's id."""
         return os.getpid()
 
-    def report(self, training: bool, plans: list[EpisodePlan], in_turn: bool = False) -> Report:
+    def report(
+        self,
+        training: bool,
+        plans: list[EpisodePlan],
+        in_turn: bool = False,
+        inference: Endpoint | None = None,
+    ) -> Report:
         """Takes orders and reports. One call at a time, so that orders cannot overtake each other.
 
         Args:
             training: whether training episodes are run between planned ones, from now on.
             plans: evaluation episodes to queue; they are taken before any training episode.
             in_turn: exploring worlds pause until replay lets them go on after each segment, from now on.
+            inference: where it is from now on; None: where it was.
         """
         self._clock.beat()
+        if inference is not None:
+            self._deciding.move(inference)
         self._plans.queue(plans)
         self._at_the_door = 1 if in_turn else AT_THE_DOOR
         (self._training.set if training else self._training.clear)()
@@ -155,11 +170,14 @@ class RolloutWorker:
             in_world_s=0.0 if entered is None else now - entered,
             stuck_s=0.0 if moved is None or entered is not None else now - moved,
             spent=self._spent,
+            away_s=self._deciding.away_s,
+            away_why=self._deciding.why,
         )
 
     def run(self, inference: Endpoint, replay: Endpoint) -> None:
         """Steps worlds until the process ends."""
-        deciding, door = inference.connect(), replay.connect()
+        deciding, door = self._deciding, replay.connect()
+        deciding.move(inference)
         idle = list(range(len(self._runner)))
         due: dict[int, Request] = {}
         under_way: dict[int, list[int]] = {}

@@ -14,7 +14,8 @@
 """The trainer process: the run's clock.
 
 consumes    batches of segments from replay, the next one drawn while the current one is learned from
-produces    weights, published every `publish_every` updates without waiting for more than a copy of them
+produces    weights, published every `publish_every` updates without waiting for more than a copy of them;
+            to readers that come later as well, even after the last update
 waits for   a batch
 ends        after `updates` updates, or when replay is closed
 """
@@ -43,7 +44,7 @@ from accerl_lerobot.trainer.nonfinite import keeping
 from accerl_lerobot.trainer.peers import Learner, Peers
 from accerl_lerobot.weights.held_back import HeldBack
 from accerl_lerobot.weights.publisher import Publisher
-from accerl_lerobot.weights.ray_channel import make_publisher
+from accerl_lerobot.weights.ray_channel import CONNECT_S, join, make_publisher
 
 
 class TrainerWorker:
@@ -80,6 +81,9 @@ class TrainerWorker:
         self._lock = threading.Lock()
         self._kept: Any = None
         self._in_turn = False
+        self._publisher: Publisher | None = None
+        self._publishing = threading.Event()
+        """Set once the first weights have been published."""
         self._handed_over = -1
         """Version of the weights that were published last."""
         self._history: deque[dict[str, float]] = deque()  # filled on one thread, emptied on another
@@ -103,13 +107,36 @@ class TrainerWorker:
             # A checkpoint need not hold a critic: all start from this one.
             with self._lock:
                 self._hand_over(publisher, self._update.version, self._view())
+            self._publisher = publisher
+            self._publishing.set()
             self._train(replay, publisher)
             self._clock.enter(WEIGHT_SYNC)
             publisher.flush()
-        finally:
+        except BaseException:
             publisher.close()
+            raise
+        finally:
             self._clock.enter(WAIT_IN)
         return self._update.version
+
+    def join(self, reader: Any) -> int:
+        """Has another reader receive the weights, once `run` publishes any.
+
+        Args:
+            reader: actor handle.
+
+        Returns:
+            The newest version that has been published: it gets no older one.
+
+        Raises:
+            TimeoutError: none has been.
+        """
+        if not self._publishing.wait(2 * CONNECT_S):
+            raise TimeoutError(f"the trainer has published no weights for {2 * CONNECT_S:g} s")
+        assert self._publisher is not None
+        newest = self._handed_over
+        join(self._publisher, reader)
+        return newest
 
     def _train(self, replay: Any, publisher: Publisher) -> None:
         """Makes the updates."""

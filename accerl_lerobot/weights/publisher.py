@@ -16,6 +16,7 @@
     publish    copies the tensors into a slab that nobody uses, and returns; it waits for nobody
     thread     hashes, sends, hears who has what; takes the newest set and never one before it
     flush      waits until all readers have the newest set
+    readers    that die are let go of, and others may come at any time: they get the newest set
     failures   of the thread are raised by the next `publish` or `flush`
 
 At most one set per reader is under way, so a slow one skips versions.
@@ -37,10 +38,6 @@ from accerl_lerobot.weights.slab import Layout, Slab
 FLUSH_S = 300.0
 """How long all readers together may take for the last set: a forward pass and a copy of the weights."""
 _CLOSE_S = 10.0
-
-
-class ReaderLostError(RuntimeError):
-    """A reader of the weights has gone; nobody here did anything wrong."""
 
 
 @dataclass(eq=False)
@@ -87,7 +84,7 @@ class Publisher(ABC):
 
         Raises:
             ValueError: `version` does not grow; nothing is changed then.
-            ReaderLostError: see there, or what else has ended the thread.
+            BaseException: what has ended the thread.
         """
         self._check()
         check_grows(version, self._version)
@@ -107,7 +104,7 @@ class Publisher(ABC):
 
         Raises:
             TimeoutError: names those that do not, after `timeout_s` seconds.
-            ReaderLostError: see there, or what else has ended the thread.
+            BaseException: what has ended the thread.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._failure is not None or not self._owed(), timeout_s)

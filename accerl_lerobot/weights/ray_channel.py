@@ -15,15 +15,18 @@
 
 One copy is put into the store, each reader gets a reference, and at most one set per reader is under way: a
 reader that is slow skips versions instead of queueing them. The trainer waits for its own copy and neither
-for the store nor for a reader.
+for the store nor for a reader. One that dies is let go of, and one that comes later gets the newest set.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, get_args
 
 import ray
+from ray.exceptions import RayActorError
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.transport.endpoint import FIELD, Transport
@@ -31,6 +34,8 @@ from accerl_lerobot.transport.nameless import available
 from accerl_lerobot.weights.publisher import Publisher
 from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
 from accerl_lerobot.weights.slab import Slab
+
+logger = logging.getLogger(__name__)
 
 CONNECT_S = 60.0
 """How long readers may take to say whether they can map the trainer's memory."""
@@ -71,11 +76,42 @@ def make_publisher(readers: Sequence[Any], transport: str = "auto", *, changes: 
     return RayPublisher(readers)
 
 
+def join(publisher: Publisher, reader: Any) -> None:
+    """Has another reader receive what is published, from the newest set on.
+
+    Args:
+        publisher: of `make_publisher`.
+        reader: actor handle, see there.
+
+    Raises:
+        InputError: the trainer's memory is what is shared, and it cannot be reached from there.
+        ray.exceptions.RayError: the reader has died.
+    """
+    if isinstance(publisher, RayPublisher):
+        publisher.add(reader)
+    elif isinstance(publisher, SharedMemoryPublisher) and not _answered(
+        reader.open_weights.remote(publisher.address)
+    ):
+        raise InputError(FIELD, "shared_memory", "a worker that was started anew is elsewhere; use ray")
+
+
 def _answered(answer: Any) -> bool:
     try:
         return bool(ray.get(answer, timeout=CONNECT_S))
     except ray.exceptions.GetTimeoutError as error:
         raise TimeoutError(f"a reader has not answered `open_weights` within {CONNECT_S:g} s") from error
+
+
+@dataclass(eq=False)
+class _Reader:
+    """One of them as the publisher sees it."""
+
+    number: int
+    handle: Any
+    under_way: Any = None
+    """Reference of the call that brings it a set."""
+    sent: int | None = None
+    """Version of the last one."""
 
 
 class RayPublisher(Publisher):
@@ -87,11 +123,17 @@ class RayPublisher(Publisher):
 
     def __init__(self, readers: Sequence[Any]) -> None:
         super().__init__(2, Slab)  # one is put into the store while the next is written
-        self._readers = list(readers)
-        self._under_way: list[Any] = [None] * len(self._readers)
-        self._sent: list[int | None] = [None] * len(self._readers)
+        self._readers = [_Reader(number, handle) for number, handle in enumerate(readers)]
+        self._came = len(self._readers)
         self._stored: tuple[int, Any, float] | None = None
         self._thread.start()
+
+    def add(self, reader: Any) -> None:
+        """Has another one receive what is published, from the newest set on."""
+        with self._changed:
+            self._readers.append(_Reader(self._came, reader))
+            self._came += 1
+            self._wake()
 
     def _serve(self) -> None:
         while True:
@@ -106,39 +148,55 @@ class RayPublisher(Publisher):
                 self._spare()
                 with self._changed:
                     self._current = None  # the store has a copy
-            waiting = [reference for reference in self._under_way if reference is not None]
+            waiting = [reader.under_way for reader in self._readers if reader.under_way is not None]
             if waiting and shipment is None:
                 ray.wait(waiting, timeout=_POLL_S)
-            for index in range(len(self._readers)):
-                self._advance(index)
+            for reader in list(self._readers):
+                try:
+                    self._advance(reader)
+                except RayActorError:
+                    self._let_go(reader)
 
-    def _advance(self, index: int) -> None:
-        """Hears from a reader, and sends it the newest set if it is free and has another one."""
-        reference = self._under_way[index]
-        if reference is not None:
-            done, _ = ray.wait([reference], timeout=0)
+    def _advance(self, reader: _Reader) -> None:
+        """Hears from a reader, and sends it the newest set if it is free and has another one.
+
+        Raises:
+            RayActorError: it has died.
+        """
+        if reader.under_way is not None:
+            done, _ = ray.wait([reader.under_way], timeout=0)
             if not done:
                 return
-            ray.get(done[0])  # a dead reader raises here
-        assert self._stored is not None
+            ray.get(done[0])
+        if self._stored is None:
+            return
         version, stored, published_s = self._stored
         sent = None
-        if self._sent[index] != version:
-            sent = self._readers[index].receive_weights.remote(version, stored, published_s)
+        if reader.sent != version:
+            sent = reader.handle.receive_weights.remote(version, stored, published_s)
         with self._changed:
-            self._under_way[index], self._sent[index] = sent, version
+            reader.under_way, reader.sent = sent, version
             self._changed.notify_all()
 
+    def _let_go(self, reader: _Reader) -> None:
+        with self._changed:
+            self._readers.remove(reader)
+            self._changed.notify_all()
+        logger.warning("reader %d of the weights has gone", reader.number)
+
     def _busy(self) -> bool:
-        return any(reference is not None for reference in self._under_way)
+        """Whether a reader has been sent something, or has come and is owed the newest set."""
+        return any(r.under_way is not None for r in self._readers) or (
+            self._stored is not None and any(r.sent is None for r in self._readers)
+        )
 
     def _wake(self) -> None:
         self._changed.notify_all()
 
     def _owed(self) -> str:
         late = [
-            str(i)
-            for i, (version, reference) in enumerate(zip(self._sent, self._under_way, strict=True))
-            if self._version is not None and (version != self._version or reference is not None)
+            str(reader.number)
+            for reader in self._readers
+            if self._version is not None and (reader.sent != self._version or reader.under_way is not None)
         ]
         return f"not received by readers {', '.join(late)}" if late else ""

@@ -20,25 +20,27 @@
 Socket and slabs are in no file system, see `transport.nameless`: nothing is left behind whoever is killed,
 and both sides talk to processes of the same user only. A slab that a reader holds is never written to: with R
 readers there are R for them, one that is being sent, one to write to, and one to compare with if only changes
-are sent.
+are sent. A reader that has gone is let go of: whoever watches it knows why. One that comes later gets the
+newest set, whole.
 """
 
 from __future__ import annotations
 
-import contextlib
+import logging
 import os
 import selectors
 import socket
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from accerl_lerobot.transport.nameless import aligned, listening, new_name, same_user
 from accerl_lerobot.weights import changes as changed_words
 from accerl_lerobot.weights.changes import LIMIT, Changes
-from accerl_lerobot.weights.publisher import Publisher, ReaderLostError, Shipment
+from accerl_lerobot.weights.publisher import Publisher, Shipment
 from accerl_lerobot.weights.slab import Layout, Slab, digest
+
+logger = logging.getLogger(__name__)
 
 NOT_ONLY_CHANGES = -1
 TALK_S = 10.0
@@ -83,6 +85,8 @@ APPLIED = struct.Struct("<q")
 class _Reader:
     """One of them as the publisher sees it."""
 
+    number: int
+    """In the order in which they came."""
     connection: socket.socket
     known: dict[int, Slab] = field(default_factory=dict)
     """Slot → slab that it has mapped."""
@@ -94,14 +98,15 @@ class SharedMemoryPublisher(Publisher):
     """The trainer's end; `SharedMemoryReader` is the other one.
 
     Args:
-        readers: how many there will be.
+        readers: how many there will be to begin with.
         changes: send only the words that changed, where these are few and the reader has the set before.
     """
 
     def __init__(self, readers: int, *, changes: bool = False) -> None:
         super().__init__(readers + 2 + changes, Slab.shared)
-        self._expected, self._changes = readers, changes
+        self._awaited, self._changes = readers, changes
         self._readers: list[_Reader] = []
+        self._came = 0
         self._base: Shipment | None = None
         self._difference: Changes | None = None
         self.address = new_name()
@@ -142,10 +147,22 @@ class SharedMemoryPublisher(Publisher):
             connection.close()
             return
         connection.settimeout(TALK_S)
-        reader = _Reader(connection)
-        self._selector.register(connection, selectors.EVENT_READ, reader)
         with self._changed:
+            reader = _Reader(self._came, connection)
+            self._came, self._awaited = self._came + 1, max(0, self._awaited - 1)
             self._readers.append(reader)
+            # One that takes the place of another may be here before that one is seen to have gone.
+            self._limit = max(self._limit, len(self._readers) + 2 + self._changes)
+        self._selector.register(connection, selectors.EVENT_READ, reader)
+
+    def _let_go(self, reader: _Reader) -> None:
+        """Forgets a reader that has gone, and what it held."""
+        self._selector.unregister(reader.connection)
+        with self._changed:
+            self._readers.remove(reader)
+            self._changed.notify_all()
+        reader.connection.close()
+        logger.warning("reader %d of the weights has gone", reader.number)
 
     def _begin(self) -> None:
         """Makes the newest set ready to be sent."""
@@ -160,7 +177,7 @@ class SharedMemoryPublisher(Publisher):
         self._send_newest()  # readers reckon the digest while it is reckoned here
         data = shipment.slab.memory[: shipment.layout.size]
         shipment.digest = digest(shipment.version, shipment.layout, data)
-        for reader in self._readers:
+        for reader in list(self._readers):
             if reader.holds is shipment:
                 self._confirm(reader, shipment)
         self._spare()
@@ -184,13 +201,14 @@ class SharedMemoryPublisher(Publisher):
         shipment = self._current
         if shipment is None:
             return
-        for reader in self._readers:
+        for reader in list(self._readers):
             if reader.holds is None and reader.applied != shipment.version:
-                self._announce(reader, shipment)
-                if shipment.digest:
+                there = self._announce(reader, shipment)
+                if there and shipment.digest:
                     self._confirm(reader, shipment)
 
-    def _announce(self, reader: _Reader, shipment: Shipment) -> None:
+    def _announce(self, reader: _Reader, shipment: Shipment) -> bool:
+        """Tells a reader of a set; False if it has gone."""
         slab, layout = shipment.slab, shipment.layout
         base = -1 if self._base is None else self._base.version
         found = self._difference if reader.applied == base else None
@@ -208,19 +226,30 @@ class SharedMemoryPublisher(Publisher):
             base=base,
         )
         fds = [] if slab.fd is None or reader.known.get(slot) is slab else [slab.fd]
-        with _lost():
+        try:
             socket.send_fds(reader.connection, [message.pack()], fds)
+        except OSError:
+            self._let_go(reader)
+            return False
         reader.known[slot] = slab
+        return True
 
     def _confirm(self, reader: _Reader, shipment: Shipment) -> None:
-        with _lost():
+        try:
             reader.connection.send(CONFIRMED.pack(shipment.version, shipment.digest))
+        except OSError:
+            self._let_go(reader)
 
     def _hear(self, reader: _Reader) -> None:
-        with _lost():
+        if reader not in self._readers:
+            return  # let go of since the selector spoke of it
+        try:
             data = reader.connection.recv(APPLIED.size)
-            if not data:
-                raise ConnectionResetError("it has ended")
+        except OSError:
+            data = b""
+        if not data:
+            self._let_go(reader)
+            return
         with self._changed:
             (reader.applied,) = APPLIED.unpack(data)
             reader.holds = None
@@ -243,17 +272,7 @@ class SharedMemoryPublisher(Publisher):
     def _owed(self) -> str:
         if self._version is None:
             return ""
-        missing = self._expected - len(self._readers)
-        late = [str(i) for i, reader in enumerate(self._readers) if reader.applied != self._version]
-        parts = [f"{missing} readers have not connected"] if missing else []
+        late = [str(reader.number) for reader in self._readers if reader.applied != self._version]
+        parts = [f"{self._awaited} readers have not connected"] if self._awaited else []
         parts += [f"not applied by readers {', '.join(late)}"] if late else []
         return "; ".join(parts)
-
-
-@contextlib.contextmanager
-def _lost() -> Iterator[None]:
-    """Says what it means that the socket does not work any more."""
-    try:
-        yield
-    except OSError as error:
-        raise ReaderLostError(f"a reader of the weights has gone: {error}") from error

@@ -16,6 +16,7 @@
     Dreaming      consumes    decisions from inference, real segments from replay, promoted models
                   produces    imagined segments for replay
                   waits for   decisions; and replay, while what it imagined stands at the door
+                  outlives    inference: its successor is asked again what has not been answered
     WorldLearning consumes    real segments from replay
                   produces    world models that have passed their trial, for the dreamer
                   waits for   real experience
@@ -40,6 +41,7 @@ from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import reach
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.endpoint import Endpoint
+from accerl_lerobot.transport.lasting import LastingCaller
 from accerl_lerobot.world_model.dreaming import make_imagination, make_learner
 from accerl_lerobot.world_model.online import Promotion
 
@@ -80,6 +82,7 @@ class DreamWorker:
         self._lock = threading.Lock()
         self._dreaming = threading.Lock()
         """Held while dreams change; outside, nothing stands in the outbox."""
+        self._deciding = LastingCaller("inference")
         self._promoted: Promotion | None = None
         self._promising = config.imagination.learns
         self._cursor = 0
@@ -103,6 +106,10 @@ class DreamWorker:
         with self._lock:
             self._promising = promising
 
+    def move(self, inference: Endpoint) -> None:
+        """From now on inference is there."""
+        self._deciding.move(inference)
+
     def metrics(self) -> dict[str, float]:
         """See `Imagination.metrics`."""
         self._clock.beat()
@@ -121,7 +128,8 @@ class DreamWorker:
     def run(self, inference: Endpoint, inserting: Endpoint, replay: Any) -> None:
         """Dreams until replay is closed."""
         news, told = _News(replay, self._cursor), None
-        deciding, door = inference.connect(), inserting.connect()
+        deciding, door = self._deciding, inserting.connect()
+        deciding.move(inference)
         at_the_door: set[int] = set()
         while not news.closed:
             self._clock.enter(CHECKPOINT)

@@ -27,6 +27,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from safetensors.torch import load_file
 
 from accerl_lerobot import cli
 from accerl_lerobot.checkpoint import defect, save_checkpoint
@@ -34,7 +35,7 @@ from accerl_lerobot.config import LaunchConfig, encode
 from accerl_lerobot.demos.sft import SFTConfig, sft_command
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
-from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, save_pretrained
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.hub.folders import SUMMARY, write_json
@@ -142,11 +143,18 @@ def test_a_policy_from_the_hub_can_be_improved_and_pushed_again(hub: HubServer, 
     assert {n: first[n] for n in names} == {n: second[n] for n in names}
 
 
-def test_a_run_that_was_pulled_can_be_gone_on_with(hub: HubServer, tiny_checkpoint: Path, tmp_path: Path):
-    trainer = TrainerConfig(updates=3, batch_decisions=16)
+@pytest.mark.parametrize("start", ["hub", "folder", "folder, low rank"])
+def test_a_run_that_was_pulled_can_be_gone_on_with(
+    hub: HubServer, tiny_checkpoint: Path, tmp_path: Path, start: str
+):
+    """Whether or not what it began from can be had."""
+    trainer = TrainerConfig(updates=3, batch_decisions=16, lr=1e-2, warmup_updates=0, value_warmup_updates=0)
     launch, evaluation = LaunchConfig(engine="local"), EvaluationConfig(episodes=2, videos=0)
     accerl("push", f"--path={tiny_checkpoint}", "--repo_id=alice/start")
-    policy = PolicyConfig(path="alice/start", device="cpu")
+    began = shutil.copytree(tiny_checkpoint, tmp_path / "began" / "pretrained_model")
+    tuning = TuningConfig(mode="lora", rank=2) if start == "folder, low rank" else TuningConfig()
+    path = "alice/start" if start == "hub" else str(began)
+    policy = PolicyConfig(path=path, device="cpu", tuning=tuning)
     config = tiny_run(tiny_checkpoint, policy=policy, trainer=trainer, launch=launch, evaluation=evaluation)
     (tmp_path / "recipe.yaml").write_text(yaml.safe_dump(encode(config)))
     accerl("train", f"--config_path={tmp_path / 'recipe.yaml'}", f"--output_dir={tmp_path / 'run'}")
@@ -154,6 +162,7 @@ def test_a_run_that_was_pulled_can_be_gone_on_with(hub: HubServer, tiny_checkpoi
     uploaded = hub.files("alice/run")
     assert [n for n, data in uploaded.items() if str(tmp_path).encode() in data] == []
     shutil.rmtree(tmp_path / "run")
+    shutil.rmtree(tmp_path / "began")
     accerl("pull", "--repo_id=alice/run", f"--output_dir={tmp_path / 'pulled'}")
     assert defect(tmp_path / "pulled" / "checkpoints" / "000003") is None
     accerl(
@@ -164,6 +173,14 @@ def test_a_run_that_was_pulled_can_be_gone_on_with(hub: HubServer, tiny_checkpoi
     )
     assert os.readlink(tmp_path / "pulled" / "checkpoints" / "last") == "000005"
     assert json.loads((tmp_path / "pulled" / "summary.json").read_text())["updates"] == 5
+    base = tmp_path / "pulled" / "base"
+    assert base.exists() is (start == "folder, low rank")
+    if base.exists():
+        places = (tiny_checkpoint, base, tmp_path / "pulled" / LAST)
+        before, back, merged = (load_file(place / "model.safetensors") for place in places)
+        assert before.keys() == back.keys() == merged.keys()
+        assert max(float((before[name] - back[name]).abs().max()) for name in before) < 1e-6, "to rounding"
+        assert max(float((before[name] - merged[name]).abs().max()) for name in before) > 1e-4
     weights = tmp_path / "pulled" / LAST / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:-1] + b"x")
     assert cli.main(["push", f"--path={tmp_path / 'pulled'}", "--repo_id=alice/run"]) == 2

@@ -31,7 +31,6 @@ from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from accerl_lerobot.weights import shared_memory
-from accerl_lerobot.weights.publisher import ReaderLostError
 from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
 
 NAMES = ("a", "b", "c")
@@ -364,22 +363,21 @@ def test_a_torn_set_ends_the_service_and_is_never_served(play, monkeypatch: pyte
                 (decision,) = await worker.decide(requests(0))
                 assert decision.version == 0
         assert adapter.loaded == []
-        with pytest.raises(ReaderLostError):
-            await asyncio.to_thread(publisher.flush, 20)
+        await asyncio.to_thread(publisher.flush, 20)  # it is a reader no more
 
     play(scene, max_batch=1, max_wait_s=0.0)
     publisher.close()
 
 
-def test_a_service_that_fails_is_heard_of_by_the_trainer(play):
+def test_a_service_that_fails_is_let_go_of_by_the_trainer(play):
     publisher = SharedMemoryPublisher(1)
 
     async def scene(worker, adapter):
         assert await worker.open_weights(publisher.address)
         adapter.broken = ValueError("no such weights")
         publisher.publish(1, weights(1))
-        with pytest.raises(ReaderLostError):
-            await asyncio.to_thread(publisher.flush, 20)
+        await asyncio.to_thread(publisher.flush, 20)
+        assert publisher._readers == []
         with pytest.raises(ServiceStoppedError, match="no such weights"):
             await worker.decide(requests(0))
 

@@ -21,6 +21,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ from accerl_lerobot.replay.buffer import is_finite
 from accerl_lerobot.rollout import worker as module
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
 from accerl_lerobot.rollout.worker import AT_THE_DOOR, RolloutWorker
+from accerl_lerobot.transport.contract import ServiceStoppedError
 from tests.rollout.worlds import evaluate
 from tests.transport.played import played
 
@@ -56,6 +58,7 @@ class Stage:
         self.over = False
         self.held: list[tuple[Future[list[Decision]], int]] | None = None
         self.failure: BaseException | None = None
+        self.decision: Callable[[Request], Decision] = a_decision
         self._insert = insert
         self.thread = threading.Thread(target=self._run, daemon=True)
         self.thread.start()
@@ -85,7 +88,7 @@ class Stage:
         if self.held is not None and not requests[0].explore:
             self.held.append((Future(), len(requests)))
             return self.held[-1][0]
-        return [a_decision() for _ in requests]
+        return [self.decision(request) for request in requests]
 
     def hold(self) -> None:
         """Lets evaluation decisions wait until `release`."""
@@ -105,9 +108,15 @@ class Stage:
             self.failure = error
 
 
-def a_decision() -> Decision:
+def a_decision(request: Request | None = None) -> Decision:
     zeros = np.zeros((4, 2), np.float32)
     return Decision(chunk=zeros, latent={"x": zeros}, log_prob=np.zeros(4, np.float32), value=0.0, version=0)
+
+
+def drawn(request: Request) -> Decision:
+    """A decision that depends on its request alone."""
+    chunk = np.random.default_rng(request.noise_seed).uniform(-1, 1, (4, 2)).astype(np.float32)
+    return replace(a_decision(), chunk=chunk)
 
 
 @pytest.fixture
@@ -245,6 +254,33 @@ def test_an_insert_that_fails_ends_the_worker(stage):
     one.order(True)
     one.thread.join(timeout=10)
     assert isinstance(one.failure, OSError)
+
+
+def test_a_worker_outlives_its_inference_and_plays_what_it_would_have_played(stage):
+    """Decisions are of their requests alone; the service is lost with requests under way, and replaced."""
+
+    def broken(requests: list[Request]) -> list[Decision]:
+        raise ServiceStoppedError("the forward pass fell over")
+
+    played_out = []
+    for lost in (False, True):
+        one = stage(lambda segments: True)
+        one.decision = drawn
+        if lost:
+            one.hold()
+        one.order(False, planned(12))
+        if lost:
+            one.until(lambda one=one: len(one.held or []) >= 2, training=False)
+            one.worker._deciding.move(played(broken))  # on another thread than the one that asks
+            one.until(lambda one=one: "fell over" in one.order(False).away_why, training=False)
+            assert one.order(False).away_s > 0.0 and one.evaluated == []
+            one.held = None
+            one.worker.report(False, [], False, played(one._decide))
+        one.until(lambda one=one: len(one.evaluated) == 12, training=False)
+        assert one.order(False).away_s == 0.0
+        results = sorted(one.evaluated, key=lambda result: result.plan.index)
+        played_out.append([(r.plan, r.success, r.episode_return, r.decisions) for r in results])
+    assert played_out[0] == played_out[1]
 
 
 def test_a_restarted_worker_uses_other_keys_and_other_seeds():

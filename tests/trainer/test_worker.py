@@ -82,6 +82,7 @@ class Stage:
 def _without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "ray", Local)
     monkeypatch.setattr(module, "make_publisher", lambda readers, *_, **__: Prompt(readers))
+    monkeypatch.setattr(module, "CONNECT_S", 0.05)
     monkeypatch.setattr(ray_channel, "ray", Local)
     monkeypatch.setattr(loading, "load_adapter", lambda policy: LinearAdapter())
 
@@ -225,3 +226,17 @@ def test_in_turn_the_wait_for_a_batch_does_not_hold_that_for_the_readers(monkeyp
     stage.run()
     # Twice for each version, of which one in turn: before its record is complete.
     assert flushed == [0, 0, 0, 1, 1, 2, 2, 3]
+
+
+def test_a_reader_that_comes_later_gets_the_weights_of_now_even_after_the_last_update():
+    stage = Stage(updates=3)
+    with pytest.raises(TimeoutError, match="has published no weights"):
+        stage.worker.join(stage.reader)
+    stage.run()
+    received: list[int] = []
+    late = Handle(receive_weights=lambda version, tensors, _: received.append(version))
+    assert stage.worker.join(late) == 3
+    assert stage.worker._publisher is not None
+    stage.worker._publisher.flush(60)
+    assert received == [3]
+    stage.worker._publisher.close()

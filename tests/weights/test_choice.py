@@ -23,7 +23,7 @@ import ray as real_ray
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.weights import ray_channel
-from accerl_lerobot.weights.ray_channel import RayPublisher, make_publisher
+from accerl_lerobot.weights.ray_channel import RayPublisher, join, make_publisher
 from accerl_lerobot.weights.reader import Received, SharedMemoryReader
 from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
 from tests.local_ray import Handle, Local
@@ -85,6 +85,27 @@ def test_the_choice(here: tuple[bool, ...], transport: str, expected: type):
     publisher.flush(60)
     publisher.close()
     assert [worker.received for worker in workers] == [[(3, {3.0})]] * 2
+
+
+@pytest.mark.parametrize("transport", ["shared_memory", "ray"])
+def test_one_that_joins_is_reached_in_the_same_way(transport: str):
+    first, late = Inference(), Inference()
+    publisher = make_publisher([first.handle], transport)
+    publisher.publish(3, filled(3.0))
+    publisher.flush(60)
+    join(publisher, late.handle)
+    publisher.publish(4, filled(4.0))
+    while late.received[-1:] != [(4, {4.0})]:
+        publisher.flush(60)  # one that has just come may not have been let in
+    publisher.close()
+    assert first.received == [(3, {3.0}), (4, {4.0})] and late.received in (first.received, [(4, {4.0})])
+
+
+def test_one_that_cannot_be_reached_does_not_join():
+    publisher = make_publisher([Inference().handle])
+    with pytest.raises(InputError, match="a worker that was started anew is elsewhere"):
+        join(publisher, Inference(here=False).handle)
+    publisher.close()
 
 
 def test_without_memfd_there_is_ray(monkeypatch: pytest.MonkeyPatch):

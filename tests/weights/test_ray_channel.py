@@ -20,7 +20,6 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import numpy as np
 import pytest
 import ray
 
@@ -193,13 +192,33 @@ def test_flush_names_the_reader_it_waited_for(shelves: list[Any]):
         publisher.publish(5, filled(5.0))
 
 
-def test_a_dead_reader_is_an_error_at_the_next_publication(light_ray: None):
+def test_a_dead_reader_is_let_go_of_and_another_takes_its_place(light_ray: None, shelves: list[Any]):
     shelf = ray.remote(Shelf).options(num_cpus=0).remote()
-    publisher = RayPublisher([Reader(shelf)])
-    publisher.publish(0, {"a": np.zeros(1, np.float32)})
+    quick = Reader(shelves[0])
+    publisher = RayPublisher([Reader(shelf), quick])
+    publisher.publish(0, filled(0.0))
     publisher.flush()
     ray.kill(shelf)
-    with pytest.raises(ray.exceptions.RayActorError):
-        for version in range(1, 1000):
-            publisher.publish(version, {"a": np.zeros(1, np.float32)})
-            publisher.flush()
+    version = 0
+    while len(publisher._readers) > 1:
+        version += 1
+        publisher.publish(version, filled(float(version)))
+        publisher.flush(60)
+    assert quick.versions() == list(range(version + 1))
+    late = Reader(shelves[1])
+    publisher.add(late)
+    until(lambda: late.versions() == [version])
+    publisher.publish(version + 1, filled(version + 1.0))
+    publisher.flush(60)
+    assert late.versions() == [version, version + 1] and quick.versions()[-1] == version + 1
+    publisher.close()
+
+
+def test_a_reader_that_comes_before_anything_is_published_waits(shelves: list[Any]):
+    publisher, reader = RayPublisher([]), Reader(shelves[0])
+    publisher.add(reader)
+    publisher.flush(0.1)
+    publisher.publish(2, filled(2.0))
+    publisher.flush(60)
+    assert reader.versions() == [2]
+    publisher.close()
