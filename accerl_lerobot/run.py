@@ -188,7 +188,7 @@ def train(
     """
     started = time.monotonic()
     checkpoint = None if wanted is None else _checkpoint(directory, wanted, console)
-    if wanted is not None and checkpoint is None:
+    if wanted is not None and checkpoint is None and load is None:
         check_start(config)
     text = yaml.safe_dump(encode(replace(config, resume=False)), sort_keys=False)
     write_atomically(directory / CONFIG, text)
@@ -199,7 +199,8 @@ def train(
     else:
         go_back_to(checkpoint)
         config = _going_on(config, directory, checkpoint, console)
-        check_start(config)
+        if load is None:
+            check_start(config)
         _check_imagination(config)
         console.say(f"going on from {checkpoint}")
     before_s = 0.0 if checkpoint is None else None

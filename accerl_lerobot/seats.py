@@ -227,12 +227,12 @@ class Seats:
                 self._restart(seat, RuntimeError(f"no answer for {silent:.0f} s"))
             elif seat.in_world_s > limit:
                 self._restart(seat, RuntimeError(f"its world has not returned for {seat.in_world_s:.0f} s"))
+            elif seat.stuck_s > limit:
+                self._restart(seat, RuntimeError(f"it has done nothing for {seat.stuck_s:.0f} s"))
             elif away_s > AWAY_S and seat.moved is None and served[seat.index % len(served)]:
                 self._restart(
                     seat, RuntimeError(f"without inference, which is there, for {away_s:.0f} s: {why}")
                 )
-            elif seat.stuck_s > limit:
-                self._restart(seat, RuntimeError(f"it has done nothing for {seat.stuck_s:.0f} s"))
 
     def save(self, directory: Path) -> None:
         """Writes their part of ``training_state``."""

@@ -31,6 +31,7 @@ import pytest
 import ray
 
 from accerl_lerobot import launch, seats
+from accerl_lerobot.bench.victims import alive
 from accerl_lerobot.config import LaunchConfig
 from accerl_lerobot.engine import Progress, WorkerError
 from accerl_lerobot.envs import SimulatedConfig
@@ -224,7 +225,19 @@ def test_a_rollout_worker_that_hangs_is_replaced_and_a_replay_that_hangs_ends_th
     os.kill(pid, signal.SIGSTOP)
     assert "replay worker has not answered for" in until_failure(one)
     one.close()
-    assert gone(pid)
+    assert not alive(pid), "one that was stopped does not hear that it is to go"
+
+
+def test_a_rollout_worker_that_fails_to_report_is_replaced(engine, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(rollout_worker, "RolloutWorker", FalteringRollout)
+    one = engine(rollout=TWO, trainer=ENDLESS)
+    one.plan(evaluation_plans(("match",), 12, "before"))
+    assert sorted(r.plan.index for r in collect(one, "before", 12)) == list(range(12))
+    one.train()
+    for progress in polls(one):
+        if progress.rollout["restarts"] >= 1 and progress.version >= 3:
+            break
+    assert progress.rollout["restarts"] == 1 and progress.replay["duplicates"] == 0
 
 
 def lose_inference(one: RayEngine, how: Callable[[str], object], name: str = "inference") -> list[Progress]:
@@ -277,18 +290,6 @@ def lose_inference(one: RayEngine, how: Callable[[str], object], name: str = "in
     return away
 
 
-def test_a_rollout_worker_that_fails_to_report_is_replaced(engine, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(rollout_worker, "RolloutWorker", FalteringRollout)
-    one = engine(rollout=TWO, trainer=ENDLESS)
-    one.plan(evaluation_plans(("match",), 12, "before"))
-    assert sorted(r.plan.index for r in collect(one, "before", 12)) == list(range(12))
-    one.train()
-    for progress in polls(one):
-        if progress.rollout["restarts"] >= 1 and progress.version >= 3:
-            break
-    assert progress.rollout["restarts"] == 1 and progress.replay["duplicates"] == 0
-
-
 def hit(one: RayEngine, number: signal.Signals) -> Callable[[str], None]:
     return lambda name: os.kill(one.pids()[name], number)
 
@@ -316,6 +317,15 @@ def test_an_exception_in_the_inference_service_is_survived_as_often_as_it_may_be
     text = until_failure(one)
     assert text.startswith("inference worker failed for good after 1 restarts:")
     assert "the forward pass fell over" in text and "serve" in text
+
+
+def test_a_trainer_that_hangs_while_it_is_saved_is_found_as_soon_as_any(engine, tmp_path: Path):
+    one = engine(trainer=ENDLESS, launch=LaunchConfig(stall_s=5.0))
+    until_training(one)
+    began = time.monotonic()
+    with pytest.raises(WorkerError, match="trainer worker has not answered for 5 s, in write"):
+        one.save(tmp_path / HANGS)
+    assert time.monotonic() - began < 30, "and not after the minutes that large files may take"
 
 
 class NoRoom(LightInference):
@@ -361,15 +371,6 @@ def test_a_worker_that_does_not_find_inference_is_replaced(engine, monkeypatch):
         if restarts:
             break
     assert restarts == 1.0 and one.pids()["rollout 1"] != before
-
-
-def test_a_trainer_that_hangs_while_it_is_saved_is_found_as_soon_as_any(engine, tmp_path: Path):
-    one = engine(trainer=ENDLESS, launch=LaunchConfig(stall_s=5.0))
-    until_training(one)
-    began = time.monotonic()
-    with pytest.raises(WorkerError, match="trainer worker has not answered for 5 s, in write"):
-        one.save(tmp_path / HANGS)
-    assert time.monotonic() - began < 30, "and not after the minutes that large files may take"
 
 
 def test_a_world_that_does_not_return_is_no_reason_to_wait_for_ever(engine):

@@ -182,7 +182,8 @@ class Start:
             light.write_text(yaml.safe_dump(encode(recipe), sort_keys=False))
             self._arguments = [f"--config_path={light}"]
         else:
-            self._arguments += ["--rollout.workers=2", "--rollout.max_restarts=1000"]
+            more = [f"--{room}.max_restarts=1000" for room in ("rollout", "inference")]
+            self._arguments += ["--rollout.workers=2", *more]
         if recipe.policy.path is None:
             self._arguments += self._policy(console)
 

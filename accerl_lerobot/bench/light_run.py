@@ -30,6 +30,7 @@ from accerl_lerobot.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
+from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
@@ -55,6 +56,7 @@ def light_config(
         env=SimulatedConfig(max_steps=32, frame_ms=40.0, latency="lognormal", latency_cv=0.5),
         policy=PolicyConfig(path="made of time", device="cpu"),
         rollout=RolloutConfig(workers=2, worlds=4, segment_length=4, max_restarts=1_000_000),
+        inference=InferenceConfig(max_restarts=1_000_000),
         replay=ReplayConfig(capacity=512, min_decisions=32, ahead=64, samples_per_insert=1.0),
         trainer=TrainerConfig(
             updates=updates,
