@@ -39,7 +39,7 @@ class LastingCaller(Caller):
         >>> ticket = caller.send([request])
         >>> caller.done(timeout=0.5)   # nothing while the service is away
         []
-        >>> caller.away_s
+        >>> caller.away_s  # since it was lost
         0.5
 
     Args:
@@ -56,20 +56,19 @@ class LastingCaller(Caller):
         self._tickets: dict[int, int] = {}
         """The connection's ticket → ours."""
         self._sent = 0
-        self._away_since: float | None = time.monotonic()
-        self.why = "it has not been said where it is"
-        """There is no connection, while there is none."""
+        self._away_since: float | None = None
+        self.why = ""
+        """The connection was lost last, or was not to be had."""
 
     def move(self, endpoint: Endpoint) -> None:
         """From now on the service is there."""
         self._next.append(endpoint)
-        if self._away_since is not None:
-            self._away_since = time.monotonic()
+        self._away_since = None
         self._moved.set()
 
     @property
     def away_s(self) -> float:
-        """For how long there has been no connection where the service was last said to be, in seconds."""
+        """For how long it has not been found where it was last said to be, in seconds; 0 before it was tried."""
         since = self._away_since
         return 0.0 if since is None else time.monotonic() - since
 
@@ -118,7 +117,7 @@ class LastingCaller(Caller):
         except ServiceStoppedError as error:
             self._lose(error)
             return
-        self._away_since = None
+        self._away_since = None  # what was lost meanwhile was the one before
         for ticket in list(self._messages):
             if self._caller is not None:
                 self._pass_on(ticket)
@@ -132,12 +131,12 @@ class LastingCaller(Caller):
 
     def _lose(self, error: ServiceStoppedError) -> None:
         self.why = str(error)
+        if self._away_since is None:
+            self._away_since = time.monotonic()
         self._drop()
 
     def _drop(self) -> None:
         caller, self._caller = self._caller, None
         self._tickets.clear()
-        if self._away_since is None:
-            self._away_since = time.monotonic()
         if caller is not None:
             caller.close()

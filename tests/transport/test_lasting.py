@@ -97,6 +97,19 @@ def test_a_service_that_dies_while_it_is_asked_and_one_that_is_gone_when_it_is_c
     assert caller.done(5.0) == [(ticket, "last early")]
 
 
+def test_what_is_lost_after_it_was_said_where_the_next_one_is_was_the_one_before():
+    first, second = Service("first"), Service("second")
+    caller = connected(first)
+    ticket = caller.send("question")
+    caller._lose(ServiceStoppedError("seen late"))  # as if `move` had come in the middle of `done`
+    caller._next.append(second.endpoint)
+    assert caller.away_s > 0.0
+    caller.done(0.0)
+    assert caller.away_s == 0.0
+    second.answer()
+    assert caller.done(5.0) == [(ticket, "second question")]
+
+
 def test_what_is_forgotten_is_not_asked_again():
     first, second = Service("first"), Service("second")
     caller = connected(first)
@@ -117,12 +130,17 @@ def test_a_wait_ends_when_the_service_is_there_and_how_long_it_was_away_counts_f
     service = Service("only")
     caller = LastingCaller("inference")
     ticket = caller.send("question")
+    assert caller.done(0.01) == [] and caller.away_s == 0.0, "nobody has said where it is"
+    caller.move(Nowhere(name="nowhere", method=None))
+    time.sleep(0.05)
+    assert caller.away_s == 0.0, "nobody has looked"
+    caller.done(0.0)
     time.sleep(0.3)
     assert caller.away_s >= 0.3
     threading.Timer(0.1, caller.move, (service.endpoint,)).start()
     started = time.monotonic()
     assert caller.done(60.0) == []
-    assert time.monotonic() - started < 30.0 and caller.away_s < 0.3
+    assert time.monotonic() - started < 30.0 and caller.away_s == 0.0
     caller.done(0.0)
     service.answer()
     assert caller.done(5.0) == [(ticket, "only question")]
