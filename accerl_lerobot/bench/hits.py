@@ -106,6 +106,7 @@ def strike(
         in_a_row: updates that end the trainer if nothing can be learnt from any of them.
     """
     place, count = rng.choice(places(target, fault)), len(victim.pids(target))
+    said_before = victim.log.stat().st_size
     try:
         began, pid = _befall(victim, orders, name, target, fault, place, rng, in_a_row)
     except RuntimeError as error:
@@ -121,7 +122,7 @@ def strike(
         except RuntimeError as error:
             if victim.process.poll() is None:
                 raise
-            outcome, said = "stopped", _reason(victim, error)
+            outcome, said = "stopped", _reason(victim, error, said_before)
             # What has ended may have left workers behind, which end with it, if not at once.
             last = max(victim.updates(), default=0)
             victim.go_on()
@@ -200,8 +201,16 @@ def _recover(victim: Victim, target: str, fault: str, pid: int, count: int) -> N
             victim.await_update(newest + 1, START_S)
 
 
-def _reason(victim: Victim, error: RuntimeError) -> str:
-    """What the run said last."""
-    lines = [line.strip() for line in last_words(victim.log).splitlines() if line.strip()]
+def _reason(victim: Victim, error: RuntimeError, since: int) -> str:
+    """How its process ended, and what it said last.
+
+    Args:
+        victim: the run.
+        error: that says how it ended.
+        since: byte of its log after which it said that.
+    """
+    with victim.log.open("rb") as log:
+        log.seek(since)
+        lines = [line.strip() for line in log.read().decode(errors="replace").splitlines() if line.strip()]
     errors = [line for line in lines if "Error" in line]
-    return f"{str(error).splitlines()[0]}; {(errors or lines or ['no word'])[-1][:200]}"
+    return f"{str(error).splitlines()[0]}; {errors[-1][:200]}" if errors else str(error).splitlines()[0]
