@@ -42,37 +42,27 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from accerl_lerobot.checkpoint import TRAINING_STATE, saved_version
+from accerl_lerobot.cluster import on, placed, start_ray
 from accerl_lerobot.config import RunConfig, journal_folder, timeline_folder
 from accerl_lerobot.engine import Engine, Progress, Saved, WorkerError
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.inference.pool import added, dealt, together
+from accerl_lerobot.placement import numbered
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seats import START_S, Seats
-from accerl_lerobot.stopping import Stopping
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from accerl_lerobot.transport.endpoint import listens
 from accerl_lerobot.watched import Watched
 from accerl_lerobot.weights.publisher import ReaderLostError
+from accerl_lerobot.world_model.pool import together as dreamt_together
 
 logger = logging.getLogger(__name__)
 
 POLL_S = 0.5
 BLAME_S = 10.0
 """How long to wait for the failure that another failure is the consequence of."""
-
-
-def start_ray() -> None:
-    """A private Ray on this machine, without a dashboard; `ray_environment` says what keeps it private."""
-    with Stopping.kept():
-        ray.init(
-            address="local",
-            include_dashboard=False,
-            _node_ip_address="127.0.0.1",
-            log_to_driver=False,
-            configure_logging=False,
-        )
 
 
 class RayEngine(Engine):
@@ -105,8 +95,9 @@ class RayEngine(Engine):
         self._updates: list[dict[str, float]] = []
         self._replay_metrics: dict[str, float] = {}
         self._of_services: dict[str, dict[str, float]] = {}
-        self._imagination_metrics: dict[str, float] = {}
-        self._dreamer: Watched | None = None
+        self._of_dreamers: dict[str, dict[str, float]] = {}
+        self._of_learner: dict[str, float] = {}
+        self._dreamers: list[Watched] = []
         self._learner: Watched | None = None
         self._ranks: list[Watched] = []
         """The trainer's, but the first."""
@@ -119,7 +110,7 @@ class RayEngine(Engine):
         self._started_ray = not ray.is_initialized()
         try:
             if self._started_ray:
-                start_ray()
+                start_ray(config.launch)
             self._start()
         except BaseException:
             self.close()
@@ -136,10 +127,11 @@ class RayEngine(Engine):
         self._trainer.work = self._trainer.actor.run.remote(
             self._replay.actor, readers, self._config.launch.transport
         )
-        if self._dreamer is not None:
-            self._dreamer.work = self._dreamer.actor.run.remote(*self._dreams_ask, self._replay.actor)
-        if self._learner is not None and self._dreamer is not None:
-            self._learner.work = self._learner.actor.run.remote(self._dreamer.actor, self._replay.actor)
+        dreaming = [dreamer.actor for dreamer in self._dreamers]
+        for dreamer, (deciding, inserting) in zip(self._dreamers, self._dreams_ask, strict=True):
+            dreamer.work = dreamer.actor.run.remote(deciding, inserting, self._replay.actor)
+        if self._learner is not None:
+            self._learner.work = self._learner.actor.run.remote(dreaming, self._replay.actor)
 
     def follow(self, schedule: Schedule) -> None:
         """From now on, collecting and learning take turns like this, see `replay.turns`."""
@@ -172,7 +164,7 @@ class RayEngine(Engine):
             rollout=self._seats.counters(),
             replay=self._replay_metrics,
             inference=together([m for m in self._of_services.values() if m]),
-            imagination=self._imagination_metrics,
+            imagination=dreamt_together(list(self._of_dreamers.values())) | self._of_learner,
         )
         self._check_moving(progress)
         return progress
@@ -188,9 +180,8 @@ class RayEngine(Engine):
         # At once, so that little comes in that was decided by weights of later updates. Those who dream may
         # know of more than replay then; they are told anew of what comes after.
         self._replay.call("save", state, version, timeout=limit)
-        for imaginer in (self._learner, self._dreamer):
-            if imaginer is not None:
-                imaginer.call("save", directory, timeout=limit)
+        for imaginer in self._imaginers:
+            imaginer.call("save", directory, timeout=limit)
         self._trainer.call("write", directory, timeout=limit)
         self._seats.save(state)
         self._last_change = time.monotonic()
@@ -220,6 +211,11 @@ class RayEngine(Engine):
     def _limit(self) -> float:
         return self._config.launch.stall_s
 
+    @property
+    def _imaginers(self) -> list[Watched]:
+        """In the order in which they are saved: who learns, then who dreams of it."""
+        return [*([self._learner] if self._learner is not None else []), *self._dreamers]
+
     def _everyone(self) -> Iterator[Watched]:
         """Those that others depend on first."""
         yield from self._services
@@ -232,47 +228,44 @@ class RayEngine(Engine):
         from accerl_lerobot.trainer.worker import TrainerWorker
 
         c, timeline = self._config, timeline_folder(self._config)
-        gpus = ray.available_resources().get("GPU", 0)
-        imagination = c.imagination
-        users = c.inference.workers + (imagination.share > 0) + imagination.learns
-        of_rank, share = c.trainer.gpu_shares(0 if c.policy.device == "cpu" else gpus, users)
+        plan, imagination = placed(c), c.imagination
+
+        def make(name: str, kind: type, calls: int, *arguments: Any) -> Any:
+            options = on(plan.places[name]) | {"max_concurrency": calls}
+            return ray.remote(kind).options(**options).remote(*arguments)
+
         # The ranks first: Ray fills the GPU that is fullest, and each of them needs more than half of one.
         learner = (c.policy, c.algorithm, c.trainer, c.seed, self._state, self._load)
-        peer = ray.remote(TrainerRank).options(num_cpus=0, num_gpus=of_rank)
-        ranks = [peer.remote(rank, *learner) for rank in range(1, c.trainer.ranks)]
-        threads = {"num_cpus": 0, "num_gpus": share, "max_concurrency": 4}
-        first = ray.remote(TrainerWorker).options(**threads | {"num_gpus": of_rank})
-        trainer = first.remote(*learner, timeline, ranks)
-        inference = ray.remote(InferenceWorker).options(num_cpus=0, num_gpus=share, max_concurrency=1000)
+        peers = [f"trainer rank {rank}" for rank in range(1, c.trainer.ranks)]
+        ranks = [make(name, TrainerRank, 1, i, *learner) for i, name in enumerate(peers, start=1)]
+        trainer = make("trainer", TrainerWorker, 4, *learner, timeline, ranks)
         serves = (c.policy, c.inference, self._version, self._state, self._load, timeline)
-        several = c.inference.workers > 1
-        names = [f"inference {i}" if several else "inference" for i in range(c.inference.workers)]
-        self._inference = [self._service(name, inference.remote(*serves, name)) for name in names]
-        replay = ray.remote(ReplayWorker).options(num_cpus=0, num_gpus=0, max_concurrency=1000)
+        names = numbered("inference", c.inference.workers)
+        self._inference = [self._service(n, make(n, InferenceWorker, 1000, *serves, n)) for n in names]
         imagined, counted = imagination.replay if imagination.share else None, c.rollout.episodes > 0
-        self._replay = self._service(
-            "replay",
-            replay.remote(c.replay, c.seed, imagined, counted, self._state, journal_folder(c), timeline),
-        )
-        self._ranks = [self._service(f"trainer rank {i}", rank) for i, rank in enumerate(ranks, start=1)]
+        stores = (c.replay, c.seed, imagined, counted, self._state, journal_folder(c), timeline)
+        replay = make("replay", ReplayWorker, 1000, *stores, imagination.workers)
+        self._replay = self._service("replay", replay)
+        self._ranks = [self._service(*rank) for rank in zip(peers, ranks, strict=True)]
         self._trainer = self._service("trainer", trainer)
         if imagination.share:
             from accerl_lerobot.world_model.worker import DreamWorker, WorldLearningWorker
 
-            self._dreamer = self._service(
-                "dream", ray.remote(DreamWorker).options(**threads).remote(c, self._state, timeline)
-            )
+            for i, n in enumerate(numbered("dream", imagination.workers)):
+                dreams = make(n, DreamWorker, 4, c, self._state, timeline, i)
+                self._dreamers.append(self._service(n, dreams))
             if imagination.learns:
-                dreamt = ray.remote(WorldLearningWorker).options(**threads)
-                self._learner = self._service("world learning", dreamt.remote(c, self._state, timeline))
-        self._seats.start()
+                learns = make("world learning", WorldLearningWorker, 4, c, self._state, timeline)
+                self._learner = self._service("world learning", learns)
+        self._seats.start(plan)
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
         for worker, reference in ready:
             worker.result(reference, "ready", max(START_S, self._limit))
         way = c.launch.transport, self._limit
         deciding = [service.endpoint("decide", *way) for service in self._inference]
         inserting = self._replay.endpoint("insert", *way)
-        self._dreams_ask = deciding[-1], inserting  # those that get one rollout worker more come first
+        # Those that get one rollout worker more come first.
+        self._dreams_ask = [(deciding[-1 - i % len(deciding)], inserting) for i in range(len(self._dreamers))]
         for service in self._inference:
             service.work = service.actor.serve.remote()
         self._replay.work = self._replay.actor.run.remote()
@@ -311,7 +304,7 @@ class RayEngine(Engine):
             raise WorkerError(f"{worker.name} worker failed for good:\n{error}") from error
         if worker is self._trainer:
             self._finish(int(result))
-        elif not (self._done and worker in (self._replay, self._dreamer, self._learner)):
+        elif not (self._done and worker in (self._replay, *self._imaginers)):
             raise WorkerError(f"{worker.name} worker ended without being asked to")
 
     def _blame(self) -> None:
@@ -339,9 +332,10 @@ class RayEngine(Engine):
             self._of_services[service.name] = self._hear(service) or self._of_services.get(service.name, {})
         for rank in self._ranks:
             self._hear(rank)
-        for imaginer in (self._dreamer, self._learner):
-            if imaginer is not None:
-                self._imagination_metrics |= self._hear(imaginer) or {}
+        for dreamer in self._dreamers:
+            self._of_dreamers[dreamer.name] = self._hear(dreamer) or self._of_dreamers.get(dreamer.name, {})
+        if self._learner is not None:
+            self._of_learner = self._hear(self._learner) or self._of_learner
         episodes = self._seats.listen()
         if not self._real_ended and self._seats.spent:
             self._real_ended = True

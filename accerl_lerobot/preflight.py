@@ -43,7 +43,7 @@ def check_start(config: RunConfig) -> int:
     if config.policy.path is None and not config.sft.steps:
         remedy = "give a LeRobot checkpoint, or sft.steps > 0 to make one; recipes/quickstart.yaml does"
         raise InputError("policy.path", None, remedy)
-    if config.trainer.ranks > 1 and config.policy.device != "cpu":
+    if config.trainer.ranks > 1 and config.policy.device != "cpu" and config.launch.address is None:
         import torch
 
         config.trainer.gpu_shares(torch.cuda.device_count(), others=1)

@@ -109,7 +109,7 @@ def make_engine(config: RunConfig, tasks: tuple[str, ...], history: int, state: 
         from accerl_lerobot.local import LocalEngine
 
         return LocalEngine(config, tasks, history, state)
-    ray_environment.prepare()
+    ray_environment.prepare(joins=config.launch.address is not None)
     from accerl_lerobot.launch import RayEngine
 
     return RayEngine(config, tasks, history, state)

@@ -29,9 +29,11 @@ import ray
 from ray.exceptions import RayActorError, RayError
 
 from accerl_lerobot import snapshot
+from accerl_lerobot.cluster import alive, on
 from accerl_lerobot.config import RunConfig, timeline_folder
 from accerl_lerobot.engine import WorkerError, check_new, episode_key
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.placement import Plan
 from accerl_lerobot.ray_environment import TOKENLESS
 from accerl_lerobot.rollout.plans import budgets, whole_groups
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
@@ -95,8 +97,9 @@ class Seats:
         if state is not None:
             self._restore(state)
 
-    def start(self) -> None:
-        """Starts a process for each."""
+    def start(self, plan: Plan) -> None:
+        """Starts a process for each, where the plan says."""
+        self._plan = plan
         for seat in self._seats:
             seat.worker = self._new(seat)
 
@@ -225,16 +228,20 @@ class Seats:
 
         c = self._config
         film = (c.evaluation.video_size, c.evaluation.video_every)
-        actor = ray.remote(RolloutWorker).options(num_cpus=0, num_gpus=0, max_concurrency=4, **TOKENLESS)
-        place = (c.seed, seat.index, seat.incarnation)
-        rest = (film, self._history, seat.budget, timeline_folder(c))
-        made = actor.remote(c.env, c.rollout, self._tasks, *place, *rest)
-        return Watched(f"rollout {seat.index}", made)
+        name = f"rollout {seat.index}"
+        place = self._plan.places[name]
+        actor = ray.remote(RolloutWorker).options(**on(place), max_concurrency=4, **TOKENLESS)
+        who = (c.seed, seat.index, seat.incarnation)
+        # A node that does not see the run's folder would write a timeline that nobody finds.
+        rest = (film, self._history, seat.budget, None if place.node.unseen else timeline_folder(c))
+        made = actor.remote(c.env, c.rollout, self._tasks, *who, *rest)
+        return Watched(name, made)
 
     def _restart(self, seat: Seat, error: Exception) -> None:
         """Puts a new process into a seat."""
         name = seat.worker.name
-        if seat.restarts >= self._config.rollout.max_restarts:
+        moved = self._move(name)
+        if seat.restarts >= self._config.rollout.max_restarts and not moved:
             times = f" after {seat.restarts} restarts" if seat.restarts else ""
             raise WorkerError(f"{name} worker failed for good{times}:\n{error}") from error
         reason = str(error).strip().splitlines()[-1][:200]
@@ -245,12 +252,23 @@ class Seats:
             self._past[key] = self._past.get(key, 0.0) + value
         seat.counters, seat.in_world_s = {}, 0.0
         seat.incarnation += 1
-        seat.restarts += 1
+        seat.restarts += not moved  # that its node has left is no fault of its own
         if seat.budget is not None:
             seat.budget = whole_groups(seat.budget, self._config.rollout)
         seat.worker = self._new(seat)
         seat.unsent = list(seat.outstanding.values())
         self._set_to_work(seat)
+
+    def _move(self, name: str) -> bool:
+        """Plans another node for a worker whose own has left; False if that is still there."""
+        there, node = alive(), self._plan.places[name].node
+        if node.key in there:
+            return False
+        place = self._plan.instead(name, there)
+        self._plan = self._plan.moved(name, place)
+        self._past["moved"] = self._past.get("moved", 0.0) + 1
+        logger.warning("%s has left; its %s worker goes to %s", node, name, place.node)
+        return True
 
     def _set_to_work(self, seat: Seat) -> None:
         assert self._peers is not None

@@ -41,7 +41,7 @@ from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.peers import Learner, Peers
 from accerl_lerobot.weights.held_back import HeldBack
 from accerl_lerobot.weights.publisher import Publisher
-from accerl_lerobot.weights.ray_channel import make_publisher
+from accerl_lerobot.weights.ray_channel import Publishers, make_publisher
 
 
 class TrainerWorker:
@@ -107,7 +107,7 @@ class TrainerWorker:
             self._clock.enter(WAIT_IN)
         return self._update.version
 
-    def _train(self, replay: Any, publisher: Publisher) -> None:
+    def _train(self, replay: Any, publisher: Publisher | Publishers) -> None:
         """Makes the updates."""
         held = HeldBack(self._config.hold_back)
         n, config = self._config.batch_decisions, self._config
@@ -150,7 +150,7 @@ class TrainerWorker:
                 # It has ended early, and what is evaluated is to be what is saved.
                 self._publish(publisher, held, last=True)
 
-    def _publish(self, publisher: Publisher, held: HeldBack, last: bool) -> None:
+    def _publish(self, publisher: Publisher | Publishers, held: HeldBack, last: bool) -> None:
         """Hands the weights of now over, or those that are old enough."""
         if not held.updates:
             self._hand_over(publisher, self._update.version, self._view())
@@ -158,7 +158,7 @@ class TrainerWorker:
         for due in held.push(self._update.version, self._export(), last=last):
             self._hand_over(publisher, *due)
 
-    def _hand_over(self, publisher: Publisher, version: int, tensors: dict[str, Any]) -> None:
+    def _hand_over(self, publisher: Publisher | Publishers, version: int, tensors: dict[str, Any]) -> None:
         publisher.publish(version, tensors)
         self._handed_over = version
 

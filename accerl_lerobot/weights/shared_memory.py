@@ -113,6 +113,11 @@ class SharedMemoryPublisher(Publisher):
         self._selector.register(self._listener, selectors.EVENT_READ)
         self._thread.start()
 
+    def expect(self, readers: int) -> None:
+        """So many have connected, and no more will."""
+        with self._changed:
+            self._expected = readers
+
     def close(self) -> None:
         super().close()
         self._selector.close()

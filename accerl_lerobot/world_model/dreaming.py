@@ -37,6 +37,7 @@ from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 from accerl_lerobot.world_model.imagine import Dreamer, Imagination
 from accerl_lerobot.world_model.online import OnlineLearner
 from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.pool import part
 from accerl_lerobot.world_model.store import load_source
 from accerl_lerobot.world_model.zoo import make_dreamer
 
@@ -44,13 +45,16 @@ if TYPE_CHECKING:
     from accerl_lerobot.config import RunConfig
 
 
-def make_imagination(config: RunConfig, name: str, on_segment: Callable[[Segment], object]) -> Imagination:
-    """What dreams in a run.
+def make_imagination(
+    config: RunConfig, name: str, on_segment: Callable[[Segment], object], index: int = 0
+) -> Imagination:
+    """What dreams in a run, or a part of it.
 
     Args:
         config: the run; its ``policy.path`` must be set.
         name: prefix of the segments' keys.
         on_segment: see `Imagination`.
+        index: which of `ImaginationConfig.workers` dreams; each has its part of the dreams and its own draws.
 
     Raises:
         InputError: the world model cannot be loaded, or does not fit world and policy.
@@ -61,12 +65,13 @@ def make_imagination(config: RunConfig, name: str, on_segment: Callable[[Segment
         dreamer.model,
         dreamer.success,
         spec,
-        config.imagination,
+        part(config.imagination, index),
         decision_cost=config.rollout.decision_cost,
         fails=config.rollout.time_limit == "fail",
         seed=config.seed,
         name=name,
         on_segment=on_segment,
+        index=index,
     )
 
 

@@ -98,8 +98,11 @@ class ImaginationConfig:
     path: str | None = None
     """The folder ``world_model`` that ``accerl world-model`` has written; oracle needs none, copy one for its
     success model."""
+    workers: int = 1
+    """Processes that dream, each with a copy of the world model, its own draws, and its part of `dreams`;
+    they are dealt out over inference services as rollout workers are, from the last one on."""
     dreams: int = 32
-    """Dreams at a time, decided and dreamt as one batch."""
+    """Dreams at a time, of all workers; those of each are decided and dreamt as one batch."""
     horizon: int | None = None
     """None: dreams last until a success or the world's time limit. A number: they last so many decisions at
     most, and V of the last observation stands for the rest. Either way they end before what is too uncertain.
@@ -150,9 +153,12 @@ class ImaginationConfig:
                 raise InputError(
                     f"imagination.{name}", getattr(self, name), f"use {' or '.join(get_args(kinds))}"
                 )
-        for name in ("dreams", "memory", "window", "witnesses"):
+        for name in ("workers", "dreams", "memory", "window", "witnesses"):
             if getattr(self, name) < 1:
                 raise InputError(f"imagination.{name}", getattr(self, name), "use at least 1")
+        if self.workers > self.dreams:
+            remedy = f"use at most imagination.dreams, {self.dreams}: each worker needs one"
+            raise InputError("imagination.workers", self.workers, remedy)
         if self.horizon is not None and self.horizon < 1:
             remedy = "use at least 1, or leave it out for whole episodes"
             raise InputError("imagination.horizon", self.horizon, remedy)
