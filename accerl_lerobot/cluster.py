@@ -116,6 +116,19 @@ def placed(config: RunConfig) -> Plan:
     return plan
 
 
+def rehearse(config: RunConfig) -> list[str]:
+    """The plan as lines, of a run that joins a cluster; leaves it as it was.
+
+    Raises:
+        InputError: see `start_ray` and `placed`.
+    """
+    start_ray(config.launch)
+    try:
+        return list(placed(config).rows())
+    finally:
+        ray.shutdown()
+
+
 def on(place: Place) -> dict[str, Any]:
     """Options of an actor that is to be there."""
     strategy = NodeAffinitySchedulingStrategy(place.node.key, soft=False)

@@ -27,6 +27,7 @@ Knows no Ray: `cluster` looks at the nodes, and starts workers where the plan sa
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -134,6 +135,15 @@ class Plan:
     def moved(self, name: str, place: Place) -> Plan:
         """The plan with one worker somewhere else."""
         return replace(self, places=self.places | {name: place})
+
+
+def this_machine() -> Node:
+    """The only node of a private Ray."""
+    import torch
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    gpus = torch.cuda.device_count()
+    return Node(number=0, key="", name="this machine", cpus=float(cores), gpus=float(gpus))
 
 
 def asked(config: RunConfig) -> list[Asked]:

@@ -23,7 +23,8 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot import cli
+from accerl_lerobot import cli, snapshot
+from accerl_lerobot.checkpoint import TRAINING_STATE
 from accerl_lerobot.config import RunConfig
 from accerl_lerobot.engine import Progress
 from accerl_lerobot.envs import SimulatedConfig
@@ -224,17 +225,18 @@ def test_dreams_of_a_copy_are_known_for_what_they_are(tiny_checkpoint: Path, wor
         assert all(np.array_equal(f, frames[0]) for f in frames)
 
 
-def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_path: Path):
+def test_it_runs_asynchronously_with_two_who_dream(tiny_checkpoint: Path, world_model: Path, tmp_path: Path):
     from accerl_lerobot.launch import RayEngine
 
     learn = OnlineLearnConfig(steps_per_episode=1.0, try_every=2, held_out=0.4, trial=LOOSE, batch=4)
-    config = dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12)
+    config = dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12, workers=2)
     config = replace(config, rollout=replace(config.rollout, workers=2))
     engine = RayEngine(replace(config, output_dir=str(tmp_path)), ("match",))
     try:
-        assert {"dream", "world learning"} < set(engine.pids())
+        assert {"dream 0", "dream 1", "world learning"} < set(engine.pids())
         engine.train()
         history = drive(engine)
+        engine.save(tmp_path / "saved")
     finally:
         engine.close()
     last = history[-1]
@@ -248,7 +250,14 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
     for name in last.imagination:
         assert f"`imagination_{name}`" in explained or name.startswith("gate_"), name
     spent = shares(tmp_path)
-    assert {"recovery", "compute", "transport", "wait_in"} <= spent["dream"].keys()
+    for one in ("dream 0", "dream 1"):
+        assert {"recovery", "compute", "transport", "wait_in"} <= spent[one].keys()
+    saved = [
+        snapshot.load(tmp_path / "saved" / TRAINING_STATE / name)["dreams"] for name in ("dreams", "dreams1")
+    ]
+    assert [len(s["rows"]) for s in saved] == [2, 2] and len({s["version"] for s in saved}) == 1
+    assert sum(s["counters"].decisions for s in saved) >= last.imagination["decisions"]
+    assert all(s["counters"].dreams for s in saved) and saved[0]["rng"].random() != saved[1]["rng"].random()
     assert {"recovery", "compute", "transport", "wait_in"} <= spent["world learning"].keys()
 
 
