@@ -288,17 +288,10 @@ def dreams(config: RunConfig) -> Iterator[Check]:
 
 def placement(config: RunConfig) -> Iterator[Check]:
     """Which worker would be where; the cluster is asked if one is to be joined."""
-    from accerl_lerobot.placement import planned, this_machine
+    from accerl_lerobot.run import check_placement
 
-    if config.launch.engine == "local":
-        return
     try:
-        if config.launch.address is None:
-            rows = list(planned([this_machine()], config).rows())
-        else:
-            from accerl_lerobot.cluster import rehearse
-
-            rows = rehearse(config)
+        rows = check_placement(config)
     except InputError as error:
         yield Check(name="placement", status=FAIL, text=str(error))
     else:

@@ -167,6 +167,7 @@ def train(config: RunConfig, directory: Path, console: Console, wanted: str | No
     text = yaml.safe_dump(encode(replace(config, resume=False)), sort_keys=False)
     write_atomically(directory / CONFIG, text)
     tasks = check_world(config)
+    check_placement(replace(config, output_dir=str(directory)))
     if config.imagination.share:
         from accerl_lerobot.world_model.dreaming import check_imagination
 
@@ -303,6 +304,24 @@ def check_policy(config: RunConfig) -> int:
     finally:
         world.close()
     return int(policy.n_obs_steps)
+
+
+def check_placement(config: RunConfig) -> list[str]:
+    """Plans where the workers will be, so that what does not fit is refused before anything long; as lines.
+
+    Raises:
+        InputError: they do not fit, or the cluster that is to be joined is not as it has to be.
+    """
+    if config.launch.engine == "local":
+        return []
+    if config.launch.address is None:
+        from accerl_lerobot.placement import planned, this_machine
+
+        return list(planned([this_machine()], config).rows())
+    ray_environment.prepare(joins=True)
+    from accerl_lerobot.cluster import rehearse
+
+    return rehearse(config)
 
 
 def check_world(config: RunConfig) -> tuple[str, ...]:

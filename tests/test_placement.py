@@ -24,12 +24,14 @@ from typing import Any
 import pytest
 
 from accerl_lerobot.config import LaunchConfig, RunConfig
+from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.placement import Node, Plan, planned
 from accerl_lerobot.placement_config import PlacementConfig, RoleConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.run import train
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 from tests.runs import tiny_run
@@ -291,3 +293,13 @@ def test_whatever_is_planned_fits():
                 fullest = min((g for g in range(len(free)) if free[g] >= share - 1e-6), key=lambda g: free[g])
                 free[fullest] -= share
     assert made > 80
+
+
+def test_a_run_that_does_not_fit_does_not_begin(tmp_path: Path):
+    """Not even with what comes before its workers."""
+    config = tiny_run(Path("nowhere"), launch=LaunchConfig(placement=PlacementConfig(rollout=at(cpus=4096))))
+    with pytest.raises(
+        InputError, match=r"rollout\.cpus=4096: 1 × 4096 = 4096 CPUs .* node 0 \(this machine\)"
+    ):
+        train(config, tmp_path, Console())
+    assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
