@@ -21,12 +21,13 @@ are run by whoever sits there next. So it is when a run is gone on with.
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import ray
-from ray.exceptions import RayActorError, RayError
+from ray.exceptions import ActorUnavailableError, RayActorError, RayError
 
 from accerl_lerobot import snapshot
 from accerl_lerobot.cluster import alive, on
@@ -44,6 +45,9 @@ logger = logging.getLogger(__name__)
 
 START_S = 600.0
 """How long a worker may take to start; `LaunchConfig.stall_s` counts from its first answer."""
+MISSED_S = 60.0
+"""How long a process on another node may be out of reach before it is started again, unless its node is found
+to have left, of which Ray is certain after half of that."""
 ROLLOUT = "rollout"
 """Name of their state."""
 
@@ -66,6 +70,8 @@ class Seat:
     """Exploring episodes that are still to be played; None: no end."""
     spent: bool = False
     """Whether all of them are in replay."""
+    unreachable: tuple[float, Exception] | None = None
+    """Since when its process cannot be reached, on `time.monotonic`, and how that was found."""
     worker: Watched = field(init=False)
 
 
@@ -177,7 +183,10 @@ class Seats:
         """
         for seat in self._seats:
             if seat.worker is worker:
-                self._restart(seat, error)
+                if isinstance(error, ActorUnavailableError) and self._plan.places[worker.name].node.number:
+                    seat.unreachable = (time.monotonic(), error)  # `check_hung` finds out what it is
+                else:
+                    self._restart(seat, error)
                 return True
         return False
 
@@ -188,7 +197,14 @@ class Seats:
             WorkerError: see `restart_worker`.
         """
         limit = self._config.launch.stall_s
+        there = alive() if any(seat.unreachable for seat in self._seats) else frozenset()
         for seat in self._seats:
+            if seat.unreachable is not None:
+                since, error = seat.unreachable
+                left = self._plan.places[seat.worker.name].node.key not in there
+                if left or time.monotonic() - since > MISSED_S:
+                    self._restart(seat, error)
+                continue
             silent = seat.worker.silent_s()
             if silent > (limit if seat.worker.answered else max(START_S, limit)):
                 self._restart(seat, RuntimeError(f"no answer for {silent:.0f} s"))
@@ -250,7 +266,7 @@ class Seats:
         self._past["restarts"] += 1
         for key, value in seat.counters.items():
             self._past[key] = self._past.get(key, 0.0) + value
-        seat.counters, seat.in_world_s = {}, 0.0
+        seat.counters, seat.in_world_s, seat.unreachable = {}, 0.0, None
         seat.incarnation += 1
         seat.restarts += not moved  # that its node has left is no fault of its own
         if seat.budget is not None:
