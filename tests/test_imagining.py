@@ -250,8 +250,8 @@ def test_it_runs_asynchronously_with_two_who_dream(tiny_checkpoint: Path, world_
     for name in last.imagination:
         assert f"`imagination_{name}`" in explained or name.startswith("gate_"), name
     spent = shares(tmp_path)
-    for one in ("dream 0", "dream 1"):
-        assert {"recovery", "compute", "transport", "wait_in"} <= spent[one].keys()
+    assert {"recovery", "compute", "transport", "wait_in"} <= spent["dream"].keys()
+    assert len(list((tmp_path / "timeline").glob("dream*"))) == 2
     saved = [
         snapshot.load(tmp_path / "saved" / TRAINING_STATE / name)["dreams"] for name in ("dreams", "dreams1")
     ]
