@@ -97,9 +97,15 @@ def placed(config: RunConfig) -> Plan:
 
     Raises:
         InputError: they do not fit, or a node has other versions.
+        WorkerError: a node does not answer.
     """
-    deadline = time.monotonic() + FREED_S
-    seen = _seen(config)
+    deadline, known = time.monotonic() + FREED_S, alive()
+    try:
+        seen = _seen(config)
+    except WorkerError:
+        if known <= alive():
+            raise
+        seen = _seen(config)  # one has left, which Ray finds out when it is asked for something
     while True:
         nodes, whole = _nodes()
         nodes = [seen(node) for node in nodes]
@@ -122,6 +128,8 @@ def rehearse(config: RunConfig) -> list[str]:
     Raises:
         InputError: see `start_ray` and `placed`.
     """
+    if ray.is_initialized():
+        return list(placed(config).rows())
     start_ray(config.launch)
     try:
         return list(placed(config).rows())
