@@ -18,13 +18,17 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from accerl_lerobot import snapshot
+from accerl_lerobot.checkpoint import TRAINING_STATE
 from accerl_lerobot.config import RunConfig, parse
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 from accerl_lerobot.world_model.pool import DREAMS, check_workers, part, together
+from accerl_lerobot.world_model.worker import DreamWorker
+from tests.test_imagining import dreaming
 
 
 @pytest.mark.parametrize(
@@ -72,3 +76,23 @@ def test_going_on_with_another_number_is_refused(tmp_path: Path):
 def test_numbers_that_mean_nothing_are_refused(options: list[str], match: str):
     with pytest.raises(InputError, match=match):
         parse(RunConfig, options)
+
+
+def test_each_saves_its_own_and_goes_on_with_it(tiny_checkpoint: Path, tmp_path: Path):
+    config = dreaming(tiny_checkpoint, model="oracle", workers=2)
+    state = tmp_path / TRAINING_STATE
+    keys = set()
+    for index in range(2):
+        worker = DreamWorker(config, index=index)
+        keys.add(worker._dreams._name)
+        assert worker._dreams.config.dreams == 2
+        worker._cursor = 5 + index
+        worker.save(tmp_path)
+    assert keys == {"dream0", "dream1"}, "keys of segments tell them apart"
+    again = [DreamWorker(config, state, index=index) for index in range(2)]
+    assert [worker._cursor for worker in again] == [5, 6]
+    drawn = [worker._dreams._rng.integers(2**62, size=4).tolist() for worker in again]
+    alone = np.random.default_rng((config.seed, 3)).integers(2**62, size=4).tolist()
+    assert drawn[0] == alone != drawn[1]
+    with pytest.raises(InputError, match=r"imagination\.workers=1: this run has 2"):
+        DreamWorker(dreaming(tiny_checkpoint, model="oracle"), state)
