@@ -33,6 +33,7 @@ from accerl_lerobot.evaluation.config import EvaluationConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.metrics import WandBConfig
 from accerl_lerobot.parsing import decode, encode, parse
+from accerl_lerobot.placement_config import PlacementConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
@@ -51,6 +52,14 @@ class LaunchConfig:
 
     engine: str = "ray"
     """ray: asynchronous workers. local: the same parts in one process, deterministic, for tests."""
+    address: str | None = None
+    """HOST:PORT of a running Ray cluster that the workers join, or auto: the one that ``ray start`` has
+    started here. It must ask for a token, which is looked for where Ray does: RAY_AUTH_TOKEN,
+    RAY_AUTH_TOKEN_PATH, ``~/.ray/auth_token``. None: a private Ray on this machine."""
+    open_cluster: bool = False
+    """Join a cluster that asks for no token: whoever reaches it runs code in your workers."""
+    placement: PlacementConfig = field(default_factory=PlacementConfig)
+    """Which workers are on which of its nodes, and what each takes."""
     schedule: Schedule = ASYNCHRONOUS
     """asynchronous: nobody waits for anybody. synchronous: a batch is collected, by all worlds in lock step,
     then learned from. overlap: the next one is collected meanwhile. These two are for measuring what the
@@ -86,10 +95,27 @@ class LaunchConfig:
             raise InputError("launch.schedule", self.schedule, remedy)
         if self.transport not in get_args(Transport):
             raise InputError(FIELD, self.transport, f"use {' or '.join(get_args(Transport))}")
+        self._check_cluster()
         if not self.stall_s > 0:
             raise InputError("launch.stall_s", self.stall_s, "use a positive number of seconds")
         if self.max_recoveries < 0:
             raise InputError("launch.max_recoveries", self.max_recoveries, "use 0 or more")
+
+    def _check_cluster(self) -> None:
+        if self.engine == "local" and (self.address is not None or self.placement != PlacementConfig()):
+            name, value = ("address", self.address) if self.address is not None else ("placement", "…")
+            remedy = "launch.engine=local is one process, which is here; leave it out"
+            raise InputError(f"launch.{name}", value, remedy)
+        if self.address is not None and self.address != "auto":
+            host, _, port = self.address.rpartition(":")
+            if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+                remedy = "use HOST:PORT as ray start --head prints it, or auto"
+                raise InputError("launch.address", self.address, remedy)
+        if self.address is None and self.placement.elsewhere:
+            remedy = "a private Ray has one node; add --launch.address=auto, or leave the field out"
+            raise InputError("launch.placement", "…", remedy)
+        if self.address is None and self.open_cluster:
+            raise InputError("launch.open_cluster", True, "it is about the cluster of launch.address")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,6 +200,9 @@ class RunConfig:
         if self.inference.workers > 1 and self.launch.engine == "local":
             remedy = "launch.engine=local is one process; use launch.engine=ray, or 1"
             raise InputError("inference.workers", self.inference.workers, remedy)
+        if self.imagination.workers > 1 and self.launch.engine == "local":
+            remedy = "launch.engine=local is one process; use launch.engine=ray, or 1"
+            raise InputError("imagination.workers", self.imagination.workers, remedy)
         if self.inference.workers > self.rollout.workers:
             remedy = f"use at most rollout.workers, {self.rollout.workers}, or some have nobody to answer"
             raise InputError("inference.workers", self.inference.workers, remedy)

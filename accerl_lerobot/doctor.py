@@ -91,7 +91,7 @@ def main(arguments: list[str]) -> int:
         sys.stdout.write(yaml.safe_dump(encode(config), sort_keys=False, allow_unicode=True) + "\n")
     checks += list(machine(config, history))
     if config is not None:
-        checks += [*pace(config), *dreams(config)]
+        checks += [*pace(config), *dreams(config), *placement(config)]
     for check in checks:
         sys.stdout.write(f"{check.status:5} {check.name:10} {check.text}\n")
     failed = sum(check.status == FAIL for check in checks)
@@ -104,7 +104,7 @@ def machine(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
     yield python_version()
     yield packages()
     yield hugging_face_datasets()
-    yield ray_imports()
+    yield ray_imports(joins=config is not None and config.launch.address is not None)
     yield cuda(config)
     yield rendering(needed=config is None or config.env.type == "metaworld")
     yield from resources(config, history)
@@ -182,11 +182,11 @@ def hugging_face_datasets() -> Check:
     return Check(name="datasets", status=OK, text=f"Hugging Face datasets {version}")
 
 
-def ray_imports() -> Check:
+def ray_imports(joins: bool = False) -> Check:
     """Ray, with the environment a run would give it."""
     from accerl_lerobot import ray_environment
 
-    ray_environment.prepare()
+    ray_environment.prepare(joins)
     try:
         import ray
     except Exception as error:
@@ -284,6 +284,18 @@ def dreams(config: RunConfig) -> Iterator[Check]:
     else:
         kind, share = config.imagination.model, config.imagination.share
         yield Check(name="dreams", status=OK, text=f"{share:.0%} of every batch; what dreams: {kind}")
+
+
+def placement(config: RunConfig) -> Iterator[Check]:
+    """Which worker would be where; the cluster is asked if one is to be joined."""
+    from accerl_lerobot.preflight import check_placement
+
+    try:
+        rows = check_placement(config)
+    except InputError as error:
+        yield Check(name="placement", status=FAIL, text=str(error))
+    else:
+        yield from (Check(name="placement", status=OK, text=row) for row in rows)
 
 
 def memory_estimate_gib(config: RunConfig, history: int = 1) -> float:

@@ -42,11 +42,13 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from accerl_lerobot.checkpoint import TRAINING_STATE, saved_version
+from accerl_lerobot.cluster import on, placed
 from accerl_lerobot.config import RunConfig, journal_folder, timeline_folder
 from accerl_lerobot.engine import Engine, Progress, Saved, WorkerError
 from accerl_lerobot.inference.batcher import BatcherStats
+from accerl_lerobot.own_ray import OwnRay
+from accerl_lerobot.placement import numbered
 from accerl_lerobot.policies.config import Load
-from accerl_lerobot.private_ray import PrivateRay
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seats import START_S, Seats
@@ -54,6 +56,7 @@ from accerl_lerobot.services import Services
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from accerl_lerobot.transport.endpoint import Endpoint, listens
 from accerl_lerobot.watched import Watched, end
+from accerl_lerobot.world_model.pool import together as dreamt_together
 
 logger = logging.getLogger(__name__)
 
@@ -85,7 +88,7 @@ class RayEngine(Engine):
         history: int = 1,
         state: Path | None = None,
         load: Load | None = None,
-        own: PrivateRay | None = None,
+        own: OwnRay | None = None,
     ) -> None:
         listens(config.launch.transport)
         self._config, self._state, self._load = config, state, load
@@ -95,8 +98,9 @@ class RayEngine(Engine):
         self._updates: list[dict[str, float]] = []
         self._replay_metrics: dict[str, float] = {}
         self._inference_metrics: dict[str, float] = {}
-        self._imagination_metrics: dict[str, float] = {}
-        self._dreamer: Watched | None = None
+        self._of_dreamers: dict[str, dict[str, float]] = {}
+        self._of_learner: dict[str, float] = {}
+        self._dreamers: list[Watched] = []
         self._learner: Watched | None = None
         self._ranks: list[Watched] = []
         """The trainer's, but the first."""
@@ -107,7 +111,7 @@ class RayEngine(Engine):
         self._inference = Services(config, self._version, state, load)
         self._last_change = time.monotonic()
         self._last_state: tuple[object, ...] = ()
-        self._ray = PrivateRay() if own is None else own
+        self._ray = OwnRay(config.launch) if own is None else own
         self._lasting = own is not None
         try:
             self._ray.start()
@@ -127,10 +131,11 @@ class RayEngine(Engine):
         self._trainer.work = self._trainer.actor.run.remote(
             self._replay.actor, readers, self._config.launch.transport
         )
-        if self._dreamer is not None:
-            self._dreamer.work = self._dreamer.actor.run.remote(*self._dreams_ask, self._replay.actor)
-        if self._learner is not None and self._dreamer is not None:
-            self._learner.work = self._learner.actor.run.remote(self._dreamer.actor, self._replay.actor)
+        dreaming = [dreamer.actor for dreamer in self._dreamers]
+        for dreamer, (deciding, inserting) in zip(self._dreamers, self._dreams_ask, strict=True):
+            dreamer.work = dreamer.actor.run.remote(deciding, inserting, self._replay.actor)
+        if self._learner is not None:
+            self._learner.work = self._learner.actor.run.remote(dreaming, self._replay.actor)
 
     def follow(self, schedule: Schedule) -> None:
         """From now on, collecting and learning take turns like this, see `replay.turns`."""
@@ -161,7 +166,7 @@ class RayEngine(Engine):
             rollout=self._seats.counters(),
             replay=self._replay_metrics,
             inference=self._inference_metrics,
-            imagination=self._imagination_metrics,
+            imagination=dreamt_together(list(self._of_dreamers.values())) | self._of_learner,
         )
         self._check_moving(progress)
         return progress
@@ -178,9 +183,8 @@ class RayEngine(Engine):
         # At once, so that little comes in that was decided by weights of later updates. Those who dream may
         # know of more than replay then; they are told anew of what comes after.
         self._replay.call("save", state, version, **alive)
-        for imaginer in (self._learner, self._dreamer):
-            if imaginer is not None:
-                imaginer.call("save", directory, **alive)
+        for imaginer in self._imaginers:
+            imaginer.call("save", directory, **alive)
         self._trainer.call("write", directory, **alive)
         self._seats.save(state)
         self._last_change = time.monotonic()
@@ -209,6 +213,11 @@ class RayEngine(Engine):
     def _limit(self) -> float:
         return self._config.launch.stall_s
 
+    @property
+    def _imaginers(self) -> list[Watched]:
+        """In the order in which they are saved: who learns, then who dreams of it."""
+        return [*([self._learner] if self._learner is not None else []), *self._dreamers]
+
     def _everyone(self) -> Iterator[Watched]:
         """Those that others depend on first."""
         yield from self._inference.workers()
@@ -221,42 +230,40 @@ class RayEngine(Engine):
         from accerl_lerobot.trainer.worker import TrainerWorker
 
         c, timeline = self._config, timeline_folder(self._config)
-        gpus = ray.available_resources().get("GPU", 0)
-        imagination = c.imagination
-        users = c.inference.workers + (imagination.share > 0) + imagination.learns
-        of_rank, share = c.trainer.gpu_shares(0 if c.policy.device == "cpu" else gpus, users)
+        plan, imagination = placed(c), c.imagination
+
+        def make(name: str, kind: type, calls: int, *arguments: Any) -> Any:
+            options = on(plan.places[name]) | {"max_concurrency": calls}
+            return ray.remote(kind).options(**options).remote(*arguments)
+
         # The ranks first: Ray fills the GPU that is fullest, and each of them needs more than half of one.
         learner = (c.policy, c.algorithm, c.trainer, c.seed, self._state, self._load)
-        peer = ray.remote(TrainerRank).options(num_cpus=0, num_gpus=of_rank)
-        ranks = [peer.remote(rank, *learner) for rank in range(1, c.trainer.ranks)]
-        threads = {"num_cpus": 0, "num_gpus": share, "max_concurrency": 4}
-        first = ray.remote(TrainerWorker).options(**threads | {"num_gpus": of_rank})
-        trainer = first.remote(*learner, timeline, ranks, journal_folder(c))
-        self._inference.start(share)
-        replay = ray.remote(ReplayWorker).options(num_cpus=0, num_gpus=0, max_concurrency=1000)
+        peers = [f"trainer rank {rank}" for rank in range(1, c.trainer.ranks)]
+        ranks = [make(name, TrainerRank, 1, i, *learner) for i, name in enumerate(peers, start=1)]
+        trainer = make("trainer", TrainerWorker, 4, *learner, timeline, ranks, journal_folder(c))
+        self._inference.start(plan)
         imagined, counted = imagination.replay if imagination.share else None, c.rollout.episodes > 0
-        self._replay = self._other(
-            "replay",
-            replay.remote(c.replay, c.seed, imagined, counted, self._state, journal_folder(c), timeline),
-        )
-        self._ranks = [self._other(f"trainer rank {i}", rank) for i, rank in enumerate(ranks, start=1)]
+        stores = (c.replay, c.seed, imagined, counted, self._state, journal_folder(c), timeline)
+        self._replay = self._other("replay", make("replay", ReplayWorker, 1000, *stores, imagination.workers))
+        self._ranks = [self._other(*rank) for rank in zip(peers, ranks, strict=True)]
         self._trainer = self._other("trainer", trainer)
         if imagination.share:
             from accerl_lerobot.world_model.worker import DreamWorker, WorldLearningWorker
 
-            self._dreamer = self._other(
-                "dream", ray.remote(DreamWorker).options(**threads).remote(c, self._state, timeline)
-            )
+            for i, n in enumerate(numbered("dream", imagination.workers)):
+                dreams = make(n, DreamWorker, 4, c, self._state, timeline, i)
+                self._dreamers.append(self._other(n, dreams))
             if imagination.learns:
-                dreamt = ray.remote(WorldLearningWorker).options(**threads)
-                self._learner = self._other("world learning", dreamt.remote(c, self._state, timeline))
-        self._seats.start()
+                learns = make("world learning", WorldLearningWorker, 4, c, self._state, timeline)
+                self._learner = self._other("world learning", learns)
+        self._seats.start(plan)
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
         for worker, reference in ready:
             worker.await_start(reference, max(START_S, self._limit))
         way = c.launch.transport, self._limit
         deciding, inserting = self._inference.open(), self._replay.endpoint("insert", *way)
-        self._dreams_ask = deciding[-1], inserting  # those that get one rollout worker more come first
+        # Those that get one rollout worker more come first.
+        self._dreams_ask = [(deciding[-1 - i % len(deciding)], inserting) for i in range(len(self._dreamers))]
         self._replay.work = self._replay.actor.run.remote()
         self._seats.set_to_work(deciding, inserting)
 
@@ -267,10 +274,11 @@ class RayEngine(Engine):
     def _move(self, number: int, inference: Endpoint) -> None:
         """Tells those who ask an inference service where it is now."""
         self._seats.move(number, inference)
-        if number == self._config.inference.workers - 1:
-            self._dreams_ask = inference, self._dreams_ask[1]
-            if self._dreamer is not None:
-                self._dreamer.call("move", inference, timeout=self._limit)
+        services = self._config.inference.workers
+        for i, dreamer in enumerate(self._dreamers):
+            if services - 1 - i % services == number:
+                self._dreams_ask[i] = inference, self._dreams_ask[i][1]
+                dreamer.call("move", inference, timeout=self._limit)
 
     def _ask(self) -> None:
         self._inference.ask()
@@ -303,7 +311,7 @@ class RayEngine(Engine):
             raise WorkerError(f"{worker.name} worker failed for good:\n{error}") from error
         if worker is self._trainer:
             self._finish(int(result))
-        elif not (self._done and worker in (self._replay, self._dreamer, self._learner)):
+        elif not (self._done and worker in (self._replay, *self._imaginers)):
             raise WorkerError(f"{worker.name} worker ended without being asked to")
 
     def _blame(self) -> None:
@@ -330,9 +338,10 @@ class RayEngine(Engine):
         self._inference_metrics = self._inference.listen()
         for rank in self._ranks:
             self._hear(rank)
-        for imaginer in (self._dreamer, self._learner):
-            if imaginer is not None:
-                self._imagination_metrics |= self._hear(imaginer) or {}
+        for dreamer in self._dreamers:
+            self._of_dreamers[dreamer.name] = self._hear(dreamer) or self._of_dreamers.get(dreamer.name, {})
+        if self._learner is not None:
+            self._of_learner = self._hear(self._learner) or self._of_learner
         episodes = self._seats.listen()
         if not self._real_ended and self._seats.spent:
             self._real_ended = True

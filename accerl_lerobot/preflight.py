@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 import draccus
 
+from accerl_lerobot import ray_environment
 from accerl_lerobot.errors import InputError
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ def check_start(config: RunConfig) -> int:
     if config.policy.path is None and not config.sft.steps:
         remedy = "give a LeRobot checkpoint, or sft.steps > 0 to make one; recipes/quickstart.yaml does"
         raise InputError("policy.path", None, remedy)
-    if config.trainer.ranks > 1 and config.policy.device != "cpu":
+    if config.trainer.ranks > 1 and config.policy.device != "cpu" and config.launch.address is None:
         import torch
 
         config.trainer.gpu_shares(torch.cuda.device_count(), others=1)
@@ -110,3 +111,21 @@ def _as_input_error(error: BaseException, fields: dict[str, Any]) -> InputError:
         return InputError("sft.policy", fields, f"LeRobot says: {text}")
     key = located.key_path[0]  # type: ignore[attr-defined]
     return InputError(f"sft.policy.{key}", fields.get(key), f"LeRobot says: {text}")
+
+
+def check_placement(config: RunConfig) -> list[str]:
+    """Plans where the workers will be, so that what does not fit is refused before anything long; as lines.
+
+    Raises:
+        InputError: they do not fit, or the cluster that is to be joined is not as it has to be.
+    """
+    if config.launch.engine == "local":
+        return []
+    if config.launch.address is None:
+        from accerl_lerobot.placement import planned, this_machine
+
+        return list(planned([this_machine()], config).rows())
+    ray_environment.prepare(joins=True)
+    from accerl_lerobot.cluster import rehearse
+
+    return rehearse(config)

@@ -16,6 +16,8 @@
 Every run gets a Ray of its own, which nobody else can talk to: it listens on the loopback interface only, and
 asks for a token. That lies in a folder which only this user can enter, beside Ray's sockets and logs, and
 goes when this process ends. No process has it in its environment, which whatever is started would inherit.
+
+A run that joins a cluster (``launch.address``) takes the user's token and leaves the rest as it is there.
 """
 
 from __future__ import annotations
@@ -49,10 +51,23 @@ TOKENLESS = {"runtime_env": {"env_vars": _NO_TOKEN}}
 found by the client in it. No wall: what runs as the same user can read what that user can."""
 
 
-def prepare() -> None:
-    """Sets what is not set yet; a token only if none is configured and Ray has not been imported."""
+PASSED_ON = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
+"""What workers on other nodes are told besides `WORKERS`, where it is set here."""
+_AUTH = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
+
+
+def prepare(joins: bool = False) -> None:
+    """Sets what is not set yet; a token only if none is configured and Ray has not been imported.
+
+    Args:
+        joins: whether a cluster is joined; its token is the user's.
+    """
     for key, value in WORKERS.items():
         os.environ.setdefault(key, value)
+    if joins:
+        if "ray" not in sys.modules and has_token():
+            os.environ.setdefault("RAY_AUTH_MODE", "token")
+        return
     if not os.environ.get("RAY_TMPDIR"):
         # Sockets and logs: Ray's own choice is a folder that every user of the machine may write to.
         os.environ["RAY_TMPDIR"] = str(private_folder())
@@ -60,9 +75,31 @@ def prepare() -> None:
         return
     for key, value in PRIVATE.items():
         os.environ.setdefault(key, value)
-    if not any(os.environ.get(k) for k in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")):
+    if not any(os.environ.get(k) for k in _AUTH):
         os.environ["RAY_AUTH_MODE"] = "token"
         os.environ["RAY_AUTH_TOKEN_PATH"] = str(write_token())
+
+
+def has_token() -> bool:
+    """Whether there is a token of the user's where Ray looks for one."""
+    if os.environ.get("RAY_AUTH_TOKEN"):
+        return True
+    path = os.environ.get("RAY_AUTH_TOKEN_PATH") or Path.home() / ".ray" / "auth_token"
+    return Path(path).is_file()
+
+
+def without_token() -> dict[str, str]:
+    """This environment as somebody has it who knows no token."""
+    home = str(private_folder())  # or Ray would look into this user's
+    return {k: v for k, v in os.environ.items() if k not in _AUTH} | {
+        "RAY_AUTH_MODE": "disabled",
+        "HOME": home,
+    }
+
+
+def passed_on() -> dict[str, str]:
+    """What workers have in their environment on nodes that were not started from here."""
+    return {name: os.environ[name] for name in (*WORKERS, *PASSED_ON) if name in os.environ}
 
 
 def write_token() -> Path:

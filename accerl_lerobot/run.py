@@ -49,7 +49,7 @@ from accerl_lerobot.checkpoint import (
     newest_whole,
     write_atomically,
 )
-from accerl_lerobot.config import RunConfig, encode, timeline_folder
+from accerl_lerobot.config import LaunchConfig, RunConfig, encode, timeline_folder
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import Engine, WorkerError
 from accerl_lerobot.envs import make_world
@@ -58,13 +58,13 @@ from accerl_lerobot.hub.portable import AWAY
 from accerl_lerobot.loop import Loop, Times, heed_stop
 from accerl_lerobot.metrics import METRICS, MetricsLog
 from accerl_lerobot.policies.config import Load
-from accerl_lerobot.preflight import check_start
+from accerl_lerobot.preflight import check_placement, check_start
 from accerl_lerobot.replay.journal import EPISODES
 from accerl_lerobot.stopping import Stopping
 from accerl_lerobot.timeline import RECOVERY, open_clock
 
 if TYPE_CHECKING:
-    from accerl_lerobot.private_ray import PrivateRay
+    from accerl_lerobot.own_ray import OwnRay
 
 logger = logging.getLogger(__name__)
 
@@ -110,7 +110,7 @@ def make_engine(
     history: int,
     state: Path | None = None,
     load: Load | None = None,
-    own: PrivateRay | None = None,
+    own: OwnRay | None = None,
 ) -> Engine:
     """The engine that ``launch.engine`` names.
 
@@ -126,7 +126,7 @@ def make_engine(
         from accerl_lerobot.local import LocalEngine
 
         return LocalEngine(config, tasks, history, state, load)
-    ray_environment.prepare()
+    ray_environment.prepare(joins=config.launch.address is not None)
     from accerl_lerobot.launch import RayEngine
 
     return RayEngine(config, tasks, history, state, load, own)
@@ -193,6 +193,7 @@ def train(
     text = yaml.safe_dump(encode(replace(config, resume=False)), sort_keys=False)
     write_atomically(directory / CONFIG, text)
     tasks = check_world(config)
+    check_placement(replace(config, output_dir=str(directory)))
     if checkpoint is None:
         _check_imagination(config)
         config = _warm_started(config, directory, console)
@@ -210,7 +211,11 @@ def train(
         stop = stack.enter_context(Stopping())
         times.clock = stack.enter_context(contextlib.closing(open_clock(timeline_folder(config), "driver")))
         log = stack.enter_context(contextlib.closing(MetricsLog(directory, config.wandb, encode(config))))
-        own = None if config.launch.engine == "local" else stack.enter_context(contextlib.closing(_own_ray()))
+        own = (
+            None
+            if config.launch.engine == "local"
+            else stack.enter_context(contextlib.closing(_own_ray(config.launch)))
+        )
         recovery = Recovery(config.launch.max_recoveries)
         while True:
             try:
@@ -224,11 +229,11 @@ def train(
                 config = _going_on(config, directory, checkpoint, console)
 
 
-def _own_ray() -> PrivateRay:
-    ray_environment.prepare()
-    from accerl_lerobot.private_ray import PrivateRay
+def _own_ray(launch: LaunchConfig) -> OwnRay:
+    ray_environment.prepare(joins=launch.address is not None)
+    from accerl_lerobot.own_ray import OwnRay
 
-    return PrivateRay()
+    return OwnRay(launch)
 
 
 def _attempt(
@@ -241,7 +246,7 @@ def _attempt(
     times: Times,
     stop: Stopping,
     load: Load | None,
-    own: PrivateRay | None,
+    own: OwnRay | None,
 ) -> dict[str, Any]:
     """The run, or what is left of it, by one set of workers, which have ended when this returns or raises."""
     history = 1 if load is not None else check_policy(config)

@@ -21,17 +21,20 @@ are run by whoever sits there next. So it is when a run is gone on with.
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import ray
-from ray.exceptions import RayActorError, RayError
+from ray.exceptions import ActorUnavailableError, RayActorError, RayError
 
 from accerl_lerobot import snapshot
+from accerl_lerobot.cluster import alive, on
 from accerl_lerobot.config import RunConfig, timeline_folder
 from accerl_lerobot.engine import WorkerError, check_new, episode_key
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.placement import Plan
 from accerl_lerobot.ray_environment import TOKENLESS
 from accerl_lerobot.rollout.plans import budgets, incarnation_after, whole_groups
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
@@ -44,6 +47,9 @@ START_S = 600.0
 """How long a worker may take to start; `LaunchConfig.stall_s` counts from its first answer."""
 AWAY_S = 10.0
 """How long a worker may do without an inference service that is there, before it counts as lost."""
+MISSED_S = 60.0
+"""How long a process on another node may be out of reach before it is started again, unless its node is found
+to have left, of which Ray is certain after half of that."""
 ROLLOUT = "rollout"
 """Name of their state."""
 
@@ -73,6 +79,8 @@ class Seat:
     """Exploring episodes that are still to be played; None: no end."""
     spent: bool = False
     """Whether all of them are in replay."""
+    unreachable: tuple[float, Exception] | None = None
+    """Since when its process cannot be reached, on `time.monotonic`, and how that was found."""
     worker: Watched = field(init=False)
 
 
@@ -104,8 +112,9 @@ class Seats:
         if state is not None:
             self._restore(state)
 
-    def start(self) -> None:
-        """Starts a process for each."""
+    def start(self, plan: Plan) -> None:
+        """Starts a process for each, where the plan says."""
+        self._plan = plan
         for seat in self._seats:
             seat.worker = self._new(seat)
 
@@ -205,7 +214,10 @@ class Seats:
         """
         for seat in self._seats:
             if seat.worker is worker:
-                self._restart(seat, error)
+                if isinstance(error, ActorUnavailableError) and self._plan.places[worker.name].node.number:
+                    seat.unreachable = (time.monotonic(), error)  # `check_hung` finds out what it is
+                else:
+                    self._restart(seat, error)
                 return True
         return False
 
@@ -220,8 +232,15 @@ class Seats:
             WorkerError: see `restart_worker`.
         """
         limit = self._config.launch.stall_s
+        there = alive() if any(seat.unreachable for seat in self._seats) else frozenset()
         for seat in self._seats:
             away_s, why = seat.away
+            if seat.unreachable is not None:
+                since, error = seat.unreachable
+                left = self._plan.places[seat.worker.name].node.key not in there
+                if left or time.monotonic() - since > MISSED_S:
+                    self._restart(seat, error)
+                continue
             silent = seat.worker.silent_s()
             if silent > (limit if seat.worker.answered else max(START_S, limit)):
                 self._restart(seat, RuntimeError(f"no answer for {silent:.0f} s"))
@@ -271,16 +290,20 @@ class Seats:
 
         c = self._config
         film = (c.evaluation.video_size, c.evaluation.video_every)
-        actor = ray.remote(RolloutWorker).options(num_cpus=0, num_gpus=0, max_concurrency=4, **TOKENLESS)
-        place = (c.seed, seat.index, seat.incarnation)
-        rest = (film, self._history, seat.budget, timeline_folder(c))
-        made = actor.remote(c.env, c.rollout, self._tasks, *place, *rest)
-        return Watched(f"rollout {seat.index}", made)
+        name = f"rollout {seat.index}"
+        place = self._plan.places[name]
+        actor = ray.remote(RolloutWorker).options(**on(place), max_concurrency=4, **TOKENLESS)
+        who = (c.seed, seat.index, seat.incarnation)
+        # A node that does not see the run's folder would write a timeline that nobody finds.
+        rest = (film, self._history, seat.budget, None if place.node.unseen else timeline_folder(c))
+        made = actor.remote(c.env, c.rollout, self._tasks, *who, *rest)
+        return Watched(name, made)
 
     def _restart(self, seat: Seat, error: Exception) -> None:
         """Puts a new process into a seat."""
         name = seat.worker.name
-        if seat.restarts >= self._config.rollout.max_restarts:
+        moved = self._move(name)
+        if seat.restarts >= self._config.rollout.max_restarts and not moved:
             times = f" after {seat.restarts} restarts" if seat.restarts else ""
             raise WorkerError(f"{name} worker failed for good{times}:\n{error}") from error
         reason = str(error).strip().splitlines()[-1][:200]
@@ -290,14 +313,25 @@ class Seats:
         for key, value in seat.counters.items():
             self._past[key] = self._past.get(key, 0.0) + value
         seat.counters, seat.in_world_s, seat.stuck_s = {}, 0.0, 0.0
-        seat.away, seat.moved = (0.0, ""), None
+        seat.away, seat.moved, seat.unreachable = (0.0, ""), None, None
         seat.incarnation = incarnation_after(seat.incarnation, seat.starts)
-        seat.restarts += 1
+        seat.restarts += not moved  # that its node has left is no fault of its own
         if seat.budget is not None:
             seat.budget = whole_groups(seat.budget, self._config.rollout)
         seat.worker = self._new(seat)
         seat.unsent = list(seat.outstanding.values())
         self._set_to_work(seat)
+
+    def _move(self, name: str) -> bool:
+        """Plans another node for a worker whose own has left; False if that is still there."""
+        there, node = alive(), self._plan.places[name].node
+        if node.key in there:
+            return False
+        place = self._plan.instead(name, there)
+        self._plan = self._plan.moved(name, place)
+        self._past["moved"] = self._past.get("moved", 0.0) + 1
+        logger.warning("%s has left; its %s worker goes to %s", node, name, place.node)
+        return True
 
     def _set_to_work(self, seat: Seat) -> None:
         assert self._peers is not None

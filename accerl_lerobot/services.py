@@ -34,10 +34,12 @@ from typing import Any
 import ray
 from ray.exceptions import RayActorError, RayError
 
+from accerl_lerobot.cluster import alive, on
 from accerl_lerobot.config import RunConfig, timeline_folder
 from accerl_lerobot.engine import WorkerError
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.inference.pool import added, dealt, together
+from accerl_lerobot.placement import Plan
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.seats import START_S
 from accerl_lerobot.transport.endpoint import Endpoint, listens
@@ -96,15 +98,10 @@ class Services:
         several = config.inference.workers > 1
         names = [f"inference {i}" if several else "inference" for i in range(config.inference.workers)]
         self._services = [Service(index=index, name=name) for index, name in enumerate(names)]
-        self._share = 0.0
 
-    def start(self, share: float) -> None:
-        """Starts a process for each.
-
-        Args:
-            share: of a GPU, for each of them.
-        """
-        self._share = share
+    def start(self, plan: Plan) -> None:
+        """Starts a process for each, where the plan says."""
+        self._plan = plan
         for service in self._services:
             service.worker = self._new(service.name)
 
@@ -221,16 +218,22 @@ class Services:
     def _new(self, name: str) -> Watched:
         from accerl_lerobot.inference.worker import InferenceWorker
 
-        options = {"num_cpus": 0, "num_gpus": self._share, "max_concurrency": 1000}
-        return Watched(name, ray.remote(InferenceWorker).options(**options).remote(*self._serves, name))
+        actor = ray.remote(InferenceWorker).options(**on(self._plan.places[name]), max_concurrency=1000)
+        return Watched(name, actor.remote(*self._serves, name))
 
     def _restart(self, service: Service, error: Exception) -> None:
-        """Ends a process, and has another one take its place."""
+        """Ends a process, and has another one take its place.
+
+        Raises:
+            WorkerError: that has been done too often, or its node has left.
+        """
         if service.up and time.monotonic() - service.since > STEADY_S:
             service.restarts = 0
         if service.restarts >= self._config.inference.max_restarts:
             times = f" after {service.restarts} restarts" if service.restarts else ""
             raise WorkerError(f"{service.name} worker failed for good{times}:\n{error}") from error
+        if (node := self._plan.places[service.name].node).key not in alive():
+            raise WorkerError(f"{service.name} worker is lost: {node} has left:\n{error}") from error
         reason = str(error).strip().splitlines()[-1][:200]
         logger.warning("%s worker is started again: %s", service.name, reason)
         ray.kill(service.worker.actor)

@@ -42,7 +42,7 @@ def light_ray() -> Iterator[None]:
     """Ray for the rest of the test session; engines that find it leave it running."""
     import ray
 
-    from accerl_lerobot.private_ray import start_ray
+    from accerl_lerobot.cluster import start_ray
 
     if not ray.is_initialized():
         start_ray()

@@ -25,7 +25,8 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot import cli
+from accerl_lerobot import cli, snapshot
+from accerl_lerobot.checkpoint import TRAINING_STATE
 from accerl_lerobot.config import DatasetConfig, RunConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.export_dreams import write_dreams
@@ -231,16 +232,16 @@ def test_dreams_of_a_copy_are_known_for_what_they_are(tiny_checkpoint: Path, wor
         assert all(np.array_equal(f, frames[0]) for f in frames)
 
 
-def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_path: Path):
+def test_it_runs_asynchronously_with_two_who_dream(tiny_checkpoint: Path, world_model: Path, tmp_path: Path):
     from accerl_lerobot.launch import RayEngine
 
     learn = OnlineLearnConfig(steps_per_episode=1.0, try_every=2, held_out=0.4, trial=LOOSE, batch=4)
-    config = dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12, record=3)
+    config = dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12, record=3, workers=2)
     config = replace(config, rollout=replace(config.rollout, workers=2))
     engine = RayEngine(replace(config, output_dir=str(tmp_path)), ("match",))
     try:
         pids = engine.pids()
-        assert {"dream", "world learning"} < set(pids)
+        assert {"dream 0", "dream 1", "world learning"} < set(pids)
         engine.train()
         history: list[Progress] = []
         for progress in polls(engine):
@@ -249,6 +250,7 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
                 os.kill(pids["inference"], signal.SIGKILL)  # dreams find the next one, too
                 history += drive(engine)
                 break
+        engine.save(tmp_path / "saved")
     finally:
         engine.close()
     last = history[-1]
@@ -267,6 +269,13 @@ def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_pa
     assert films[0].startswith("0001_") and tried - 1 <= len(films) <= tried + 1
     spent = shares(tmp_path)
     assert {"recovery", "compute", "transport", "wait_in"} <= spent["dream"].keys()
+    assert len(list((tmp_path / "timeline").glob("dream*"))) == 2
+    saved = [
+        snapshot.load(tmp_path / "saved" / TRAINING_STATE / name)["dreams"] for name in ("dreams", "dreams1")
+    ]
+    assert [len(s["rows"]) for s in saved] == [2, 2] and len({s["version"] for s in saved}) == 1
+    assert sum(s["counters"].decisions for s in saved) >= last.imagination["decisions"]
+    assert all(s["counters"].dreams for s in saved) and saved[0]["rng"].random() != saved[1]["rng"].random()
     assert {"recovery", "compute", "transport", "wait_in"} <= spent["world learning"].keys()
     kept = list(read_dreams(tmp_path / DREAMT))
     assert len(kept) == 3 and kept[-1].number > 3, "the newest"

@@ -135,7 +135,9 @@ def test_both_transports_play_the_same_episodes(engine):
     played = []
     for transport in ("ray", "shared_memory"):
         one = engine(rollout=TWO, launch=LaunchConfig(stall_s=120, transport=transport))
-        assert [end.address is None for end in one._dreams_ask] == [transport == "ray"] * 2
+        assert one._seats._peers is not None
+        (deciding,), inserting = one._seats._peers
+        assert [end.address is None for end in (deciding, inserting)] == [transport == "ray"] * 2
         one.plan(evaluation_plans(("match",), 10, "eval"))
         results = sorted(collect(one, "eval", 10), key=lambda result: result.plan.index)
         played.append([(r.plan, r.success, r.episode_return, r.steps, r.decisions) for r in results])

@@ -109,6 +109,25 @@ def test_a_configured_token_is_left_alone(bare: pytest.MonkeyPatch, name: str):
     assert found == {name: "mine"}
 
 
+def test_who_joins_a_cluster_has_the_user_s_token_and_nothing_else(bare: pytest.MonkeyPatch, tmp_path: Path):
+    bare.setenv("HOME", str(tmp_path))
+    ray_environment.prepare(joins=True)
+    assert not ray_environment.has_token()
+    assert (
+        not {"RAY_AUTH_MODE", TOKEN, TOKEN_PATH, "RAY_TMPDIR", *ray_environment.PRIVATE} & os.environ.keys()
+    )
+    assert ray_environment.passed_on().keys() >= ray_environment.WORKERS.keys()
+    (tmp_path / ".ray").mkdir()
+    (tmp_path / ".ray" / "auth_token").write_text("mine")
+    ray_environment.prepare(joins=True)
+    assert ray_environment.has_token() and os.environ["RAY_AUTH_MODE"] == "token"
+    bare.setenv(TOKEN, "mine")
+    stranger = ray_environment.without_token()
+    assert not {TOKEN, TOKEN_PATH} & stranger.keys() and stranger["RAY_AUTH_MODE"] == "disabled"
+    assert not (Path(stranger["HOME"]) / ".ray").exists()
+    assert "mine" not in ray_environment.passed_on().values()
+
+
 def test_what_the_user_has_set_is_kept(bare: pytest.MonkeyPatch):
     bare.setenv("OMP_NUM_THREADS", "7")
     bare.setenv("RAY_TMPDIR", "there")

@@ -41,7 +41,7 @@ HEADER = (
 )
 LONGEST_FILE = 400
 RAYS = {"peers.py", "ray_channel.py", "ray_calls.py", "transport_ends.py", "weights_readers.py"}
-CONDUCTOR = {"launch.py", "private_ray.py", "seats.py", "services.py", "watched.py"}
+CONDUCTOR = {"launch.py", "cluster.py", "own_ray.py", "seats.py", "services.py", "watched.py"}
 SHELLS = CONDUCTOR | {"doctor.py", "worker.py"} | RAYS
 """Files that may import Ray; all others are testable without it."""
 DISTRIBUTED = {"ranks.py", "sharding.py", "tensors.py"}

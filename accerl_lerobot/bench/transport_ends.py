@@ -42,8 +42,8 @@ from accerl_lerobot.bench.transport import (
     decision,
     request_of,
 )
+from accerl_lerobot.cluster import start_ray
 from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.private_ray import start_ray
 from accerl_lerobot.transport.contract import Caller
 from accerl_lerobot.transport.endpoint import Endpoint, listens
 from accerl_lerobot.transport.nameless import listening, new_name, new_socket

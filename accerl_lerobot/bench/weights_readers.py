@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 import ray
 
-from accerl_lerobot.private_ray import start_ray
-from accerl_lerobot.weights.channel import Tensors
+from accerl_lerobot.cluster import start_ray
+from accerl_lerobot.weights.channel import Tensors, monotonic_clock
 from accerl_lerobot.weights.reader import Received, SharedMemoryReader
 
 READY_S = 120.0
@@ -54,6 +54,7 @@ class ReadingWorker:
     def receive_weights(self, version: int, tensors: Tensors, published_s: float) -> int:
         """See `InferenceWorker`; but this one returns when they are applied."""
         nbytes = sum(tensor.nbytes for tensor in tensors.values())
+        published_s = monotonic_clock(published_s)
         self._apply(Received(version=version, tensors=tensors, published_s=published_s, nbytes=nbytes))
         return version
 

@@ -48,6 +48,7 @@ from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.contract import Asked, Server, stopped
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
+from accerl_lerobot.weights.channel import monotonic_clock
 from accerl_lerobot.weights.reader import Received, SharedMemoryReader
 
 LOOK_S = 1.0
@@ -152,6 +153,7 @@ class InferenceWorker:
 
     async def receive_weights(self, version: int, tensors: dict[str, np.ndarray], published_s: float) -> int:
         """Takes a published set; it serves from the next batch on. What is not newer is ignored."""
+        published_s = monotonic_clock(published_s)
         self._offer(Received(version=version, tensors=tensors, published_s=published_s))
         return version
 

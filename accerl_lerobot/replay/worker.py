@@ -74,6 +74,7 @@ class ReplayWorker:
         state: the ``training_state`` to go on from; None: begin.
         directory: of the run, for the journal; None: none is kept.
         timeline: folder of the timeline; None: none is kept.
+        dreamers: how many dream.
     """
 
     def __init__(
@@ -85,12 +86,15 @@ class ReplayWorker:
         state: Path | None = None,
         directory: Path | None = None,
         timeline: Path | None = None,
+        dreamers: int = 1,
     ) -> None:
         self._clock = open_clock(timeline, "replay")
         journal = None if directory is None else Journal(directory / EPISODES)
         self._replay = MixedReplay(config, imagined or ReplayConfig(), 0.0, patient, journal)
-        # Nothing is imagined until the dreamer says so.
+        # Nothing is imagined until a dreamer says so.
         self._replay.awaited = imagined is not None
+        self._mixes = [(0.0, imagined is not None)] * dreamers
+        """What each of them has said last: the share, and whether it may be more later on."""
         self._real: deque[Segment] = deque(maxlen=IN_TRANSIT if imagined else 0)
         self._real_count = 0
         self._rng = np.random.default_rng(seed)
@@ -202,10 +206,12 @@ class ReplayWorker:
         segments = list(self._real)[len(self._real) - new :]
         return News(segments, self._real_count, self._replay.real_ended, self._closed)
 
-    async def mix(self, share: float, awaited: bool) -> None:
-        """See `MixedReplay.mix`."""
+    async def mix(self, share: float, awaited: bool, who: int = 0) -> None:
+        """See `MixedReplay.mix`; imagined is what any of those who dream imagines."""
         async with self._changed:
-            self._replay.mix(share, awaited)
+            self._mixes[who] = (share, awaited)
+            shares, hopes = zip(*self._mixes, strict=True)
+            self._replay.mix(max(shares), any(hopes))
             self._changed.notify_all()
 
     async def hold(self, held: bool) -> None:

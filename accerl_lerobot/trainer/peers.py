@@ -125,8 +125,8 @@ class TrainerRank:
         from accerl_lerobot.trainer import ranks
 
         config = self._config
-        if meeting.address == ranks.LOOPBACK:
-            ranks.only_loopback()
+        here = meeting.address == ranks.LOOPBACK
+        ranks.only_at(ranks.LOOPBACK if here else ray.util.get_node_ip_address())
         store = ranks.visit(meeting, config.ranks, config.rank_timeout_s)
         group = ranks.Group(
             store, self._rank, config.ranks, self._learner.adapter.device, config.rank_timeout_s
@@ -173,10 +173,9 @@ class Peers:
         self._collect("ready", [actor.ready.remote() for actor in self._actors], LOAD_S)
         nodes = self._collect("node", [actor.node.remote() for actor in self._actors], LOAD_S)
         address = ranks.LOOPBACK
-        if set(nodes) == {str(ray.get_runtime_context().get_node_id())}:
-            ranks.only_loopback()
-        else:
+        if set(nodes) != {str(ray.get_runtime_context().get_node_id())}:
             address = ray.util.get_node_ip_address()
+        ranks.only_at(address)
         size, timeout_s = self._config.ranks, self._config.rank_timeout_s
         store, meeting = ranks.host(address, size, timeout_s)
         with self.joining("join", meeting):

@@ -27,6 +27,7 @@ from datetime import timedelta
 from typing import NamedTuple
 
 import numpy as np
+import psutil
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
@@ -140,7 +141,19 @@ def _store(meeting: Meeting, size: int, timeout_s: float, **options: bool | int)
     return dist.TCPStore(*meeting, world_size=size, timeout=timeout, wait_for_workers=False, **options)
 
 
-def only_loopback() -> None:
-    """Has gloo listen on the loopback interface and on no other; it reads a variable of this process."""
-    names = [name for _, name in socket.if_nameindex() if name.startswith("lo")]
+def only_at(address: str) -> None:
+    """Has gloo and NCCL use the interface with this address; they read variables of this process.
+
+    Left alone, gloo takes the one that this machine's name leads to, which others often cannot reach.
+
+    Raises:
+        RuntimeError: no interface has it.
+    """
+    names = [
+        name for name, found in psutil.net_if_addrs().items() if any(a.address == address for a in found)
+    ]
+    if not names:
+        raise RuntimeError(f"no interface of this machine has the address {address}")
     os.environ["GLOO_SOCKET_IFNAME"] = names[0]
+    if address != LOOPBACK:
+        os.environ["NCCL_SOCKET_IFNAME"] = names[0]

@@ -44,7 +44,7 @@ from accerl_lerobot.trainer.nonfinite import keeping
 from accerl_lerobot.trainer.peers import Learner, Peers
 from accerl_lerobot.weights.held_back import HeldBack
 from accerl_lerobot.weights.publisher import Publisher
-from accerl_lerobot.weights.ray_channel import CONNECT_S, join, make_publisher
+from accerl_lerobot.weights.ray_channel import CONNECT_S, Publishers, join, make_publisher
 
 
 class TrainerWorker:
@@ -81,7 +81,7 @@ class TrainerWorker:
         self._lock = threading.Lock()
         self._kept: Any = None
         self._in_turn = False
-        self._publisher: Publisher | None = None
+        self._publisher: Publisher | Publishers | None = None
         self._publishing = threading.Event()
         """Set once the first weights have been published."""
         self._handed_over = -1
@@ -138,7 +138,7 @@ class TrainerWorker:
         join(self._publisher, reader)
         return newest
 
-    def _train(self, replay: Any, publisher: Publisher) -> None:
+    def _train(self, replay: Any, publisher: Publisher | Publishers) -> None:
         """Makes the updates."""
         held = HeldBack(self._config.hold_back)
         n, config = self._config.batch_decisions, self._config
@@ -182,7 +182,7 @@ class TrainerWorker:
                 # It has ended early, and what is evaluated is to be what is saved.
                 self._publish(publisher, held, last=True)
 
-    def _publish(self, publisher: Publisher, held: HeldBack, last: bool) -> None:
+    def _publish(self, publisher: Publisher | Publishers, held: HeldBack, last: bool) -> None:
         """Hands the weights of now over, or those that are old enough."""
         if not held.updates:
             self._hand_over(publisher, self._update.version, self._view())
@@ -190,7 +190,7 @@ class TrainerWorker:
         for due in held.push(self._update.version, self._export(), last=last):
             self._hand_over(publisher, *due)
 
-    def _hand_over(self, publisher: Publisher, version: int, tensors: dict[str, Any]) -> None:
+    def _hand_over(self, publisher: Publisher | Publishers, version: int, tensors: dict[str, Any]) -> None:
         reach("trainer.publish")
         publisher.publish(version, tensors)
         self._handed_over = version

@@ -28,6 +28,7 @@ A new transport passes the checks in ``tests/weights/contract.py``.
 from __future__ import annotations
 
 import threading
+import time
 from abc import ABC, abstractmethod
 
 import numpy as np
@@ -106,3 +107,13 @@ def check_grows(version: int, last: int | None) -> None:
         raise ValueError(f"published version {version}: versions count updates from 0")
     if last is not None and version <= last:
         raise ValueError(f"published version {version} after {last}: versions must grow")
+
+
+def wall_clock(moment: float) -> float:
+    """A moment of `time.monotonic` on the clock that machines share as well as theirs are set."""
+    return time.time() - (time.monotonic() - moment)
+
+
+def monotonic_clock(moment: float) -> float:
+    """The inverse of `wall_clock`, on the machine that asks; never in the future."""
+    return time.monotonic() - max(0.0, time.time() - moment)

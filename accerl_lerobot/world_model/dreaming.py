@@ -38,18 +38,22 @@ from accerl_lerobot.world_model.imagination_config import FILMS, ImaginationConf
 from accerl_lerobot.world_model.imagine import Dreamer, Imagination
 from accerl_lerobot.world_model.online import OnlineLearner
 from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.pool import part
 from accerl_lerobot.world_model.recorded import DREAMS, DreamRecorder
 from accerl_lerobot.world_model.store import load_source
 from accerl_lerobot.world_model.zoo import make_dreamer
 
 
-def make_imagination(config: RunConfig, name: str, on_segment: Callable[[Segment], object]) -> Imagination:
-    """What dreams in a run.
+def make_imagination(
+    config: RunConfig, name: str, on_segment: Callable[[Segment], object], index: int = 0
+) -> Imagination:
+    """What dreams in a run, or a part of it.
 
     Args:
         config: the run; its ``policy.path`` must be set.
         name: prefix of the segments' keys.
         on_segment: see `Imagination`.
+        index: which of `ImaginationConfig.workers` dreams; each has its part of the dreams and its own draws.
 
     Raises:
         InputError: the world model cannot be loaded, or does not fit world and policy.
@@ -57,19 +61,20 @@ def make_imagination(config: RunConfig, name: str, on_segment: Callable[[Segment
     spec = _spec(config)
     dreamer = load_dreamer(config, spec)
     folder = journal_folder(config)
-    if config.imagination.record and folder is not None:
+    if config.imagination.record and folder is not None and index == 0:
         pace = spec.fps / dreamer.model.spec.chunk
         on_segment = _recorded(DreamRecorder(folder / DREAMS, config.imagination.record, pace), on_segment)
     return Imagination(
         dreamer.model,
         dreamer.success,
         spec,
-        config.imagination,
+        part(config.imagination, index),
         decision_cost=config.rollout.decision_cost,
         fails=config.rollout.time_limit == "fail",
         seed=config.seed,
         name=name,
         on_segment=on_segment,
+        index=index,
     )
 
 

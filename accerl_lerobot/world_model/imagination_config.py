@@ -107,8 +107,11 @@ class ImaginationConfig:
     success: StandInConfig = field(default_factory=StandInConfig)
     """A reward model that tells successes in place of the one in `path`; it stays as it is, and so does the
     world model."""
+    workers: int = 1
+    """Processes that dream, each with a copy of the world model, its own draws, and its part of `dreams`;
+    they are dealt out over inference services as rollout workers are, from the last one on."""
     dreams: int = 32
-    """Dreams at a time, decided and dreamt as one batch."""
+    """Dreams at a time, of all workers; those of each are decided and dreamt as one batch."""
     horizon: int | None = None
     """None: dreams last until a success or the world's time limit. A number: they last so many decisions at
     most, and V of the last observation stands for the rest. Either way they end before what is too uncertain.
@@ -133,9 +136,9 @@ class ImaginationConfig:
     memory: int = 4096
     """Newest real decisions that dreams begin at."""
     record: int = 0
-    """Newest dreams kept on disk, in the run's folder ``dreams``, of which
+    """Newest dreams kept on disk, in the run's folder ``imagined``, of which
     ``accerl export --source=imagined`` makes a LeRobotDataset; 0: none. Each holds its pictures as they are:
-    0.2 MB for 15 decisions seen by one camera of 64×64."""
+    0.2 MB for 15 decisions seen by one camera of 64×64. Of several workers the first one's are kept."""
     gap: float = 0.5
     """Nothing is imagined any more once dreams succeed so much more often, of 1, than reality does; > 0.
     Dreams of episodes from beginning to end are held against real episodes of the same time; where
@@ -163,11 +166,14 @@ class ImaginationConfig:
                 raise InputError(
                     f"imagination.{name}", getattr(self, name), f"use {' or '.join(get_args(kinds))}"
                 )
-        for name in ("dreams", "memory", "window", "witnesses"):
+        for name in ("workers", "dreams", "memory", "window", "witnesses"):
             if getattr(self, name) < 1:
                 raise InputError(f"imagination.{name}", getattr(self, name), "use at least 1")
         if self.record < 0:
             raise InputError("imagination.record", self.record, "use 0 (none) or more dreams")
+        if self.workers > self.dreams:
+            remedy = f"use at most imagination.dreams, {self.dreams}: each worker needs one"
+            raise InputError("imagination.workers", self.workers, remedy)
         if self.horizon is not None and self.horizon < 1:
             remedy = "use at least 1, or leave it out for whole episodes"
             raise InputError("imagination.horizon", self.horizon, remedy)

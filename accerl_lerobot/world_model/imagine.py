@@ -103,6 +103,7 @@ class Imagination:
         seed: of starts and dreams.
         name: prefix of the segments' keys.
         on_segment: receives what was imagined.
+        index: of several that dream beside each other with the same seed.
     """
 
     def __init__(
@@ -117,6 +118,7 @@ class Imagination:
         seed: int,
         name: str,
         on_segment: Callable[[Segment], object],
+        index: int = 0,
     ) -> None:
         self.config, self.counters = config, DreamCounters()
         # Whether there are dreams of whole episodes, which real ones can be held against.
@@ -138,7 +140,7 @@ class Imagination:
             keyframes=config.keyframes,
             whole=config.model == "oracle",
         )
-        self._rng = np.random.default_rng((seed, 3))
+        self._rng = np.random.default_rng((seed, 3, index))
         self._rows: list[_Row | None] = [None] * config.dreams
         self._state: State | None = None
         self._sequence = self._doubted_in_a_row = 0

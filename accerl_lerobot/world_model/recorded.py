@@ -13,7 +13,7 @@
 # limitations under the License.
 """Dreams on disk: what the policy was shown in them, what it did, and what that was said to be worth.
 
-``RUN/dreams/`` has one safetensors file for each of the newest ones, named by its number. A run that goes on
+``RUN/imagined/`` has one safetensors file for each of the newest ones, named by its number. A run that goes on
 from a checkpoint counts on from there, so what had been dreamt after it gives way. `demos.export_dreams`
 makes a LeRobotDataset of them. NumPy only.
 """
@@ -36,7 +36,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.safety import Origin, brief, check_safetensors
 
-DREAMS = "dreams"
+DREAMS = "imagined"
 """Folder of a run's."""
 ABOUT = "dream"
 """Name of the JSON in a file's metadata."""

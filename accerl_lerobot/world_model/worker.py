@@ -11,14 +11,14 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""The processes that imagine: one dreams, another learns what it dreams with.
+"""The processes that imagine: one or several dream, another learns what they dream with.
 
     Dreaming      consumes    decisions from inference, real segments from replay, promoted models
                   produces    imagined segments for replay
                   waits for   decisions; and replay, while what it imagined stands at the door
                   outlives    inference: its successor is asked again what has not been answered
     WorldLearning consumes    real segments from replay
-                  produces    world models that have passed their trial, for the dreamer
+                  produces    world models that have passed their trial, for all who dream
                   waits for   real experience
 
 Both end with the process, or when replay says that the run is over. Until a model has passed, batches are
@@ -39,19 +39,21 @@ from accerl_lerobot import snapshot
 from accerl_lerobot.checkpoint import TRAINING_STATE, WORLD_MODEL
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import reach
+from accerl_lerobot.placement import numbered
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.transport.lasting import LastingCaller
 from accerl_lerobot.world_model.dreaming import make_imagination, make_learner
 from accerl_lerobot.world_model.online import Promotion
+from accerl_lerobot.world_model.pool import DREAMS, check_workers
 
 if TYPE_CHECKING:
     from accerl_lerobot.config import RunConfig
 
 AT_THE_DOOR = 2
 """Messages to replay that may be waiting before dreams pause."""
-DREAMS, LEARNER = "dreams", "world_learner"
-"""Names of their states."""
+LEARNER = "world_learner"
+"""Name of its state."""
 PAUSE_S = 0.02
 """How long a worker with nothing to do sleeps."""
 TAKEN_OVER_S = 30.0
@@ -67,10 +69,18 @@ class DreamWorker:
         config: the run; its ``policy.path`` must be set.
         state: the ``training_state`` to go on from; None: begin.
         timeline: folder of the timeline; None: none is kept.
+        index: which one of `ImaginationConfig.workers` it is.
+
+    Raises:
+        InputError: the state is of a run with another number of them.
     """
 
-    def __init__(self, config: RunConfig, state: Path | None = None, timeline: Path | None = None) -> None:
-        self._clock = open_clock(timeline, "dream")
+    def __init__(
+        self, config: RunConfig, state: Path | None = None, timeline: Path | None = None, index: int = 0
+    ) -> None:
+        workers = config.imagination.workers
+        name = numbered("dream", workers)[index]
+        self._clock = open_clock(timeline, name)
         import torch
 
         torch.set_num_threads(config.trainer.num_threads)
@@ -78,7 +88,8 @@ class DreamWorker:
         self._patience_s = 2 * config.launch.stall_s
         self._share, self._batch = config.imagination.share, config.inference.max_batch
         self._outbox: list[Segment] = []
-        self._dreams = make_imagination(config, "dream", self._outbox.append)
+        self._dreams = make_imagination(config, name.replace(" ", ""), self._outbox.append, index)
+        self._index, self._saved = index, f"{DREAMS}{index or ''}"
         self._lock = threading.Lock()
         self._dreaming = threading.Lock()
         """Held while dreams change; outside, nothing stands in the outbox."""
@@ -87,7 +98,8 @@ class DreamWorker:
         self._promising = config.imagination.learns
         self._cursor = 0
         if state is not None:
-            saved = snapshot.load(state / DREAMS)
+            check_workers(state, workers)
+            saved = snapshot.load(state / self._saved)
             self._dreams.restore(saved["dreams"])
             self._cursor = saved["cursor"]
         self._clock.enter(WAIT_IN)
@@ -122,8 +134,9 @@ class DreamWorker:
             time.sleep(PAUSE_S)
         with self._dreaming:
             saved = {"dreams": self._dreams.state(), "cursor": self._cursor}
-            snapshot.save(directory / TRAINING_STATE / DREAMS, saved)
-            self._dreams.save_promoted(directory / WORLD_MODEL)
+            snapshot.save(directory / TRAINING_STATE / self._saved, saved)
+            if not self._index:  # all dream of the same one
+                self._dreams.save_promoted(directory / WORLD_MODEL)
 
     def run(self, inference: Endpoint, inserting: Endpoint, replay: Any) -> None:
         """Dreams until replay is closed."""
@@ -142,7 +155,8 @@ class DreamWorker:
             # Both at once: a run in which nothing is imagined and nothing expected has nothing to wait for.
             if told != (self._dreams.on, promising):
                 told = (self._dreams.on, promising)
-                ray.get(replay.mix.remote(self._share if self._dreams.on else 0.0, any(told)))
+                share = self._share if self._dreams.on else 0.0
+                ray.get(replay.mix.remote(share, any(told), self._index))
             self._clock.enter(TRANSPORT)
             for ticket, stored in door.done(0.0):
                 at_the_door.discard(ticket)
@@ -220,7 +234,7 @@ class WorldLearningWorker:
             saved = {"learner": self._learner.state(), "cursor": self._cursor}
         snapshot.save(directory / TRAINING_STATE / LEARNER, saved)
 
-    def run(self, dreamer: Any, replay: Any) -> None:
+    def run(self, dreamers: list[Any], replay: Any) -> None:
         """Learns until replay is closed."""
         news, learner = _News(replay, self._cursor), self._learner
         promising: bool | None = None
@@ -239,7 +253,7 @@ class WorldLearningWorker:
                 ray.get(replay.hold.remote(held))
             if promising is not learner.promising(last):
                 promising = learner.promising(last)
-                ray.get(dreamer.expect.remote(promising))
+                ray.get([dreamer.expect.remote(promising) for dreamer in dreamers])
             if learner.owed >= 1:
                 self._clock.enter(CHECKPOINT)
                 with self._learning:
@@ -250,7 +264,8 @@ class WorldLearningWorker:
                 self._clock.enter(COMPUTE)
                 if promotion := learner.promote(last):
                     self._clock.enter(WEIGHT_SYNC)
-                    ray.get(dreamer.promote.remote(promotion))
+                    promoted = ray.put(promotion)
+                    ray.get([dreamer.promote.remote(promoted) for dreamer in dreamers])
                     learner.handed_over()
             else:
                 self._clock.enter(WAIT_IN)

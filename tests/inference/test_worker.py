@@ -197,7 +197,7 @@ def test_no_batch_sees_two_versions(play):
             for version in range(1, last + 1):
                 while len(adapter.batches) < version:
                     await asyncio.sleep(0.0002)
-                await worker.receive_weights(version, weights(version), time.monotonic())
+                await worker.receive_weights(version, weights(version), time.time())
 
         async def ask(first: int) -> list[Decision]:
             answers = []
@@ -219,7 +219,7 @@ def test_no_batch_sees_two_versions(play):
 def test_weights_that_arrive_while_nobody_asks_are_loaded(play):
     async def scene(worker, adapter):
         await asyncio.sleep(0.01)
-        await worker.receive_weights(3, weights(3), time.monotonic())
+        await worker.receive_weights(3, weights(3), time.time())
         while adapter.loaded != [3]:
             await asyncio.sleep(0.001)
         (decision,) = await worker.decide(requests(0))
@@ -232,7 +232,7 @@ def test_weights_that_arrive_while_nobody_asks_are_loaded(play):
 def test_the_first_weights_are_version_zero_and_are_loaded(play):
     async def scene(worker, adapter):
         adapter.weights = dict.fromkeys(NAMES, -1.0)  # another critic than the trainer's
-        await worker.receive_weights(0, weights(0), time.monotonic())
+        await worker.receive_weights(0, weights(0), time.time())
         (decision,) = await worker.decide(requests(0))
         assert decision.version == 0 and set(decision.chunk.ravel()) == {0.0}
 
@@ -242,7 +242,7 @@ def test_the_first_weights_are_version_zero_and_are_loaded(play):
 def test_a_batch_served_after_weights_were_received_uses_them(play):
     async def scene(worker, adapter):
         for version in range(1, 30):
-            await worker.receive_weights(version, weights(version), time.monotonic())
+            await worker.receive_weights(version, weights(version), time.time())
             (decision,) = await worker.decide(requests(0))
             assert decision.version == version
 
@@ -251,10 +251,10 @@ def test_a_batch_served_after_weights_were_received_uses_them(play):
 
 def test_older_weights_are_ignored_even_while_newer_ones_are_loaded(play):
     async def scene(worker, adapter):
-        await worker.receive_weights(4, weights(4), time.monotonic())
+        await worker.receive_weights(4, weights(4), time.time())
         while not adapter.entered.is_set():
             await asyncio.sleep(0.0005)
-        await worker.receive_weights(3, weights(3), time.monotonic())  # version 4 is being written just now
+        await worker.receive_weights(3, weights(3), time.time())  # version 4 is being written just now
         versions = [(await worker.decide(requests(i)))[0].version for i in range(3)]
         assert versions == [4, 4, 4] and adapter.loaded == [4]
 

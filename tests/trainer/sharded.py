@@ -196,7 +196,7 @@ def joined(rank: int, size: int, place: Any) -> ranks.Group:
         size: how many there are.
         place: a queue that tells where they meet.
     """
-    ranks.only_loopback()
+    ranks.only_at(ranks.LOOPBACK)
     if rank == 0:
         store, meeting = ranks.host(ranks.LOOPBACK, size, TIMEOUT_S)
         for _ in range(size - 1):

@@ -18,6 +18,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -127,3 +128,19 @@ def test_what_all_do_wrong_is_told_as_the_first_one_s(peers: Callable[[str, str]
 def test_a_lone_rank_waits_for_nobody():
     with Peers([], TrainerConfig()).joining("step", ""):
         pass
+
+
+def test_ranks_talk_over_the_interface_that_has_the_address(monkeypatch: pytest.MonkeyPatch):
+    from accerl_lerobot.trainer import ranks
+
+    for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"):
+        monkeypatch.setenv(name, "")
+    at = SimpleNamespace
+    faces = {"lo": [at(address="127.0.0.1")], "a": [at(address="fe80::1"), at(address="10.0.0.2")], "b": []}
+    monkeypatch.setattr(ranks.psutil, "net_if_addrs", lambda: faces)
+    ranks.only_at("127.0.0.1")
+    assert (os.environ["GLOO_SOCKET_IFNAME"], os.environ["NCCL_SOCKET_IFNAME"]) == ("lo", "")
+    ranks.only_at("10.0.0.2")
+    assert (os.environ["GLOO_SOCKET_IFNAME"], os.environ["NCCL_SOCKET_IFNAME"]) == ("a", "a")
+    with pytest.raises(RuntimeError, match=r"no interface of this machine has the address 10\.0\.0\.3"):
+        ranks.only_at("10.0.0.3")

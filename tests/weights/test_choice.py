@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+import time
 from concurrent.futures import Future
 from typing import Any
 
@@ -23,7 +24,8 @@ import ray as real_ray
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.weights import ray_channel
-from accerl_lerobot.weights.ray_channel import RayPublisher, join, make_publisher
+from accerl_lerobot.weights.channel import monotonic_clock, wall_clock
+from accerl_lerobot.weights.ray_channel import Publishers, RayPublisher, join, make_publisher
 from accerl_lerobot.weights.reader import Received, SharedMemoryReader
 from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
 from tests.local_ray import Handle, Local
@@ -74,7 +76,8 @@ class Inference:
         ((True, True), "auto", SharedMemoryPublisher),
         ((True, True), "shared_memory", SharedMemoryPublisher),
         ((True, True), "ray", RayPublisher),
-        ((True, False), "auto", RayPublisher),
+        ((True, False), "auto", Publishers),
+        ((False, False), "auto", RayPublisher),
     ],
 )
 def test_the_choice(here: tuple[bool, ...], transport: str, expected: type):
@@ -106,6 +109,35 @@ def test_one_that_cannot_be_reached_does_not_join():
     with pytest.raises(InputError, match="a worker that was started anew is elsewhere"):
         join(publisher, Inference(here=False).handle)
     publisher.close()
+
+
+def test_each_reader_has_its_own_way_and_the_slowest_is_named():
+    near, far = Inference(), Inference(here=False)
+    publisher = make_publisher([near.handle, far.handle])
+    assert isinstance(publisher, Publishers)
+    for version in (1, 2):
+        publisher.publish(version, filled(float(version)))
+        publisher.flush(60)
+    shared, through_ray = publisher.parts
+    assert isinstance(shared, SharedMemoryPublisher) and isinstance(through_ray, RayPublisher)
+    assert near.received == far.received == [(1, {1.0}), (2, {2.0})]
+    silent: Future[int] = Future()
+    far.handle.receive_weights = Handle(call=lambda *_: silent).call
+    publisher.publish(3, filled(3.0))
+    with pytest.raises(TimeoutError, match="version 3, after .* s: not received by readers 0"):
+        publisher.flush(0.3)
+    assert near.received[-1] == (3, {3.0})
+    silent.set_result(3)
+    publisher.flush(60)
+    publisher.close()
+    with pytest.raises(RuntimeError, match="closed"):
+        publisher.publish(4, filled(4.0))
+
+
+def test_a_moment_survives_the_way_to_another_machine_s_clock():
+    now = time.monotonic()
+    assert abs(monotonic_clock(wall_clock(now - 5)) - (now - 5)) < 0.5
+    assert monotonic_clock(time.time() + 100) <= time.monotonic()  # the other clock is ahead
 
 
 def test_without_memfd_there_is_ray(monkeypatch: pytest.MonkeyPatch):

@@ -20,7 +20,8 @@ import logging
 import ray
 from ray.exceptions import GetTimeoutError, RayError
 
-from accerl_lerobot.stopping import Stopping
+from accerl_lerobot.cluster import start_ray
+from accerl_lerobot.config import LaunchConfig
 
 logger = logging.getLogger(__name__)
 
@@ -28,40 +29,36 @@ RESPONDS_S = 20.0
 """How long Ray may take to start a process, or it is taken for broken."""
 
 
-def start_ray() -> None:
-    """A private Ray on this machine, without a dashboard; `ray_environment` says what keeps it private."""
-    with Stopping.kept():
-        ray.init(
-            address="local",
-            include_dashboard=False,
-            _node_ip_address="127.0.0.1",
-            log_to_driver=False,
-            configure_logging=False,
-        )
-
-
-class PrivateRay:
-    """Ray, for as long as it is not closed; one that was there before is used and left running.
+class OwnRay:
+    """Ray, for as long as it is not closed; one that was there before is used and left running, and so is a
+    cluster.
 
     Example:
-        >>> own = PrivateRay()
+        >>> own = OwnRay(config.launch)
         >>> own.start()     # for the first workers
         >>> own.start()     # for their successors: looks whether it still does what it is asked to
         >>> own.close()
+
+    Args:
+        launch: whether a cluster is to be joined.
     """
 
-    def __init__(self) -> None:
-        self._started = False
+    def __init__(self, launch: LaunchConfig) -> None:
+        self._launch, self._started = launch, False
 
     def start(self) -> None:
-        """Starts it unless it is there, or if it does not respond any more."""
+        """Starts it unless it is there, or if it does not respond any more.
+
+        Raises:
+            InputError: there is no such cluster, see `cluster.start_ray`.
+        """
         if ray.is_initialized():
             if not self._started or _responds():
                 return
             logger.warning("Ray does not respond any more and is started again")
             ray.shutdown()
         self._started = True
-        start_ray()
+        start_ray(self._launch)
 
     def close(self) -> None:
         """Ends it, if it was started here. Safe to call twice."""

@@ -17,8 +17,9 @@ from __future__ import annotations
 
 import pytest
 
-from accerl_lerobot import private_ray
-from accerl_lerobot.private_ray import PrivateRay
+from accerl_lerobot import own_ray
+from accerl_lerobot.config import LaunchConfig
+from accerl_lerobot.own_ray import OwnRay
 
 
 class Stand:
@@ -30,7 +31,7 @@ class Stand:
     def is_initialized(self) -> bool:
         return self.there
 
-    def init(self, **_: object) -> None:
+    def init(self, launch: LaunchConfig) -> None:
         self.there = True
         self.calls.append("init")
 
@@ -47,9 +48,10 @@ def test_it_is_kept_for_those_who_come_later_while_it_responds(
     responds: bool, calls: list[str], monkeypatch: pytest.MonkeyPatch
 ):
     stand = Stand()
-    monkeypatch.setattr(private_ray, "ray", stand)
-    monkeypatch.setattr(private_ray, "_responds", lambda: responds)
-    own = PrivateRay()
+    monkeypatch.setattr(own_ray, "ray", stand)
+    monkeypatch.setattr(own_ray, "start_ray", stand.init)
+    monkeypatch.setattr(own_ray, "_responds", lambda: responds)
+    own = OwnRay(LaunchConfig())
     own.start()
     own.start()
     own.close()
@@ -59,9 +61,10 @@ def test_it_is_kept_for_those_who_come_later_while_it_responds(
 
 def test_one_that_was_there_before_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch):
     stand = Stand(there=True)
-    monkeypatch.setattr(private_ray, "ray", stand)
-    monkeypatch.setattr(private_ray, "_responds", lambda: pytest.fail("it is not ours to judge"))
-    own = PrivateRay()
+    monkeypatch.setattr(own_ray, "ray", stand)
+    monkeypatch.setattr(own_ray, "start_ray", stand.init)
+    monkeypatch.setattr(own_ray, "_responds", lambda: pytest.fail("it is not ours to judge"))
+    own = OwnRay(LaunchConfig())
     own.start()
     own.close()
     assert stand.calls == [] and stand.there

@@ -1,0 +1,40 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Runs over two nodes: what is refused, that one ends right, and that it outlives the second node."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+
+def test_two_nodes():
+    """See `two_nodes`; in a process of its own, since this one may have a Ray already."""
+    clean = {k: v for k, v in os.environ.items() if not k.startswith("RAY_")}
+    root = str(Path(__file__).parents[1])
+    command = [sys.executable, "-c", "from tests import two_nodes; two_nodes.main()"]
+    done = subprocess.run(
+        command,
+        env=clean | {"PYTHONPATH": root},
+        cwd=root,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-6000:]
+    assert json.loads(done.stdout.splitlines()[-1]).keys() == {"start", "refusals", "run", "node lost"}

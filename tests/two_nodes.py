@@ -1,0 +1,230 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A cluster of two nodes on this machine, and runs that join it.
+
+What is here is called by ``test_launch_nodes.py`` in a process of its own, as one process has one Ray. The
+second node is a Ray node like any other: a raylet, an object store, workers. Since the machine is the same,
+its processes could share memory with the first one's; `FarInference` says that they cannot, so decisions go
+through Ray while segments go through shared memory.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from accerl_lerobot import ray_environment
+
+ray_environment.prepare()
+
+import pytest  # noqa: E402
+import ray  # noqa: E402
+from ray.cluster_utils import Cluster  # noqa: E402
+
+from accerl_lerobot import cluster as joining  # noqa: E402
+from accerl_lerobot import launch  # noqa: E402
+from accerl_lerobot.config import LaunchConfig  # noqa: E402
+from accerl_lerobot.envs import SimulatedConfig  # noqa: E402
+from accerl_lerobot.errors import InputError  # noqa: E402
+from accerl_lerobot.evaluation.config import evaluation_plans  # noqa: E402
+from accerl_lerobot.inference import worker as inference_worker  # noqa: E402
+from accerl_lerobot.launch import RayEngine  # noqa: E402
+from accerl_lerobot.placement_config import PlacementConfig, RoleConfig  # noqa: E402
+from accerl_lerobot.rollout.runner import RolloutConfig  # noqa: E402
+from accerl_lerobot.trainer import worker as trainer_worker  # noqa: E402
+from accerl_lerobot.trainer.config import TrainerConfig  # noqa: E402
+from accerl_lerobot.transport.shared_memory import Address  # noqa: E402
+from tests.light_workers import LightInference, LightTrainer  # noqa: E402
+from tests.runs import collect, drive, polls, tiny_run  # noqa: E402
+
+NOTICED_SOON = {"health_check_initial_delay_ms": 1000, "health_check_period_ms": 1000,
+                "health_check_timeout_ms": 2000, "health_check_failure_threshold": 3}  # fmt: skip
+SLOW = SimulatedConfig(max_steps=16, step_ms=2.0)
+FOUR = RolloutConfig(workers=4, worlds=2, segment_length=3, max_restarts=0)
+
+
+class FarInference(LightInference):
+    """Says that it is on a machine of its own."""
+
+    async def listen(self) -> Address:
+        return (await super().listen())._replace(node="another machine")
+
+
+@contextmanager
+def two_nodes() -> Iterator[tuple[Cluster, Any]]:
+    """The cluster, and its second node, which has a resource ``sim``."""
+    made = Cluster()
+    try:
+        made.add_node(
+            num_cpus=2, include_dashboard=False, _system_config=NOTICED_SOON, node_ip_address="127.0.0.1"
+        )
+        second = made.add_node(num_cpus=2, resources={"sim": 1}, node_ip_address="127.0.0.1")
+        yield made, second
+    finally:
+        ray.shutdown()
+        made.shutdown()
+
+
+def engine(address: str, nodes: str, updates: int) -> RayEngine:
+    """A run with its rollout workers on these nodes."""
+    placement = PlacementConfig(rollout=RoleConfig(nodes=nodes, cpus=0.5))
+    config = tiny_run(
+        Path("nowhere"),
+        env=SLOW,
+        rollout=FOUR,
+        trainer=TrainerConfig(updates=updates, batch_decisions=16),
+        launch=LaunchConfig(address=address, placement=placement, stall_s=60.0),
+    )
+    return RayEngine(config, ("match",))
+
+
+def parent(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+
+
+def raylet(node: Any) -> int:
+    """Process id."""
+    return int(node.all_processes["raylet"][0].process.pid)
+
+
+def refused(make: Callable[[], Any]) -> str:
+    """The error of a run that must not begin."""
+    with pytest.raises(InputError) as caught:
+        make()
+    return str(caught.value)
+
+
+def a_run_over_two_nodes_ends_right(made: Cluster, second: Any) -> None:
+    """Each worker is where it was sent, and of the run nothing is left but the cluster."""
+    one = engine(made.address, "sim", updates=12)
+    pids = one.pids()
+    first = {name for name, pid in pids.items() if parent(pid) == raylet(made.head_node)}
+    assert first == {"inference", "replay", "trainer"}
+    assert {name for name, pid in pids.items() if parent(pid) == raylet(second)} == pids.keys() - first
+    assert ray.get(ray.remote(lambda: os.environ["OMP_NUM_THREADS"]).remote()) == "1"
+    one.plan(evaluation_plans(("match",), 6, "before"))
+    assert sorted(r.plan.index for r in collect(one, "before", 6)) == list(range(6))
+    one.train()
+    history = drive(one)
+    assert [u["update"] for p in history for u in p.updates] == [i + 1.0 for i in range(12)]
+    assert history[-1].replay["duplicates"] == 0 == history[-1].rollout["restarts"]
+    one.close()
+    deadline = time.monotonic() + 30
+    while left := [name for name, pid in pids.items() if Path(f"/proc/{pid}").exists()]:
+        assert time.monotonic() < deadline, left
+        time.sleep(0.1)
+    assert not ray.is_initialized() and second.all_processes["raylet"][0].process.poll() is None
+
+
+def what_does_not_fit_is_refused(made: Cluster, second: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By name, before any worker is started."""
+    address = made.address
+    text = refused(lambda: engine("127.0.0.1:1", "sim", 1))
+    assert text.startswith("launch.address='127.0.0.1:1': nobody listens at 127.0.0.1:1 (")
+    wrong = ray_environment.private_folder() / "wrong"
+    wrong.write_text("0" * 64)
+    with monkeypatch.context() as patch:
+        patch.setenv("RAY_AUTH_TOKEN_PATH", str(wrong))
+        text = refused(lambda: engine(address, "sim", 1))
+        assert "it does not take the token that is configured here" in text and "0" * 64 not in text
+        patch.setenv("RAY_AUTH_TOKEN_PATH", str(wrong.parent / "none"))
+        assert "there is no token" in refused(lambda: engine(address, "sim", 1))
+    with monkeypatch.context() as patch:  # a cluster that answers strangers as it answers us
+        patch.setattr(joining, "without_token", lambda: dict(os.environ))
+        assert "it asks for no token" in refused(lambda: engine(address, "sim", 1))
+    assert not ray.is_initialized()
+    key = next(n["NodeID"] for n in _nodes(address) if "sim" in n["Resources"])
+    teller = joining._teller
+
+    def other_teller() -> Any:
+        tell = teller()
+
+        def other(mark: str | None, policy: str | None) -> dict[str, str]:
+            import ray
+
+            there = ray.is_initialized() and ray.get_runtime_context().get_node_id() == key
+            return tell(mark, policy) | ({"lerobot": ""} if there else {})
+
+        return other
+
+    with monkeypatch.context() as patch:
+        patch.setattr(joining, "_teller", other_teller)
+        text = refused(lambda: engine(address, "sim", 1))
+        assert "node 1 (127.0.0.1) has lerobot missing, and this is" in text
+
+
+def _nodes(address: str) -> list[dict[str, Any]]:
+    ray.init(address=address, log_to_driver=False, configure_logging=False)
+    found = [node for node in ray.nodes() if node["Alive"]]
+    ray.shutdown()
+    return found
+
+
+def a_node_that_leaves_takes_nothing_along(made: Cluster, second: Any) -> None:
+    """Its rollout workers sit on the first one then, though none may be started again for its own fault."""
+    one = engine(made.address, "all", updates=1_000_000)
+    pids = one.pids()
+    there = {name for name, pid in pids.items() if parent(pid) == raylet(second)}
+    assert there and there < {f"rollout {i}" for i in range(4)}
+    one.train()
+    for progress in polls(one):
+        if progress.version >= 2:
+            break
+    one.plan(evaluation_plans(("match",), 24, "during"))
+    results = list(one.poll().episodes)
+    made.remove_node(second, allow_graceful=False)
+    for progress in polls(one):
+        results += progress.episodes
+        moved = progress.rollout.get("moved", 0.0)
+        if moved == len(there) and sum(r.plan.group == "during" for r in results) >= 24:
+            break
+    version = progress.version
+    assert sorted(r.plan.index for r in results if r.plan.group == "during") == list(range(24))
+    assert progress.rollout["restarts"] == len(there) and progress.replay["duplicates"] == 0
+    for progress in polls(one):
+        if progress.version >= version + 3:
+            break
+    assert {parent(pid) for name, pid in one.pids().items()} == {raylet(made.head_node)}
+    one.close()
+    assert "rollout.nodes='sim': no node of the cluster" in refused(lambda: engine(made.address, "sim", 1))
+
+
+def main() -> None:
+    """All of it; an assertion ends the process, and its traceback says which."""
+    seconds: dict[str, float] = {}
+    began = time.monotonic()
+
+    def lap(name: str) -> None:
+        seconds[name] = round(time.monotonic() - began - sum(seconds.values()), 1)
+
+    monkeypatch = pytest.MonkeyPatch()
+    monkeypatch.setattr(launch, "POLL_S", 0.1)
+    monkeypatch.setattr(inference_worker, "InferenceWorker", FarInference)
+    monkeypatch.setattr(trainer_worker, "TrainerWorker", LightTrainer)
+    with two_nodes() as (made, second):
+        lap("start")
+        what_does_not_fit_is_refused(made, second, monkeypatch)
+        lap("refusals")
+        monkeypatch.setattr(joining, "_check_cluster", lambda *_: None)  # it has been found to be ours
+        a_run_over_two_nodes_ends_right(made, second)
+        lap("run")
+        a_node_that_leaves_takes_nothing_along(made, second)
+        lap("node lost")
+    sys.stdout.write(json.dumps(seconds) + "\n")
