@@ -42,7 +42,7 @@ ARMS = {
 BY_SOURCE: tuple[tuple[str, str, tuple[float | None, float | None]], ...] = (
     ("Skill where pixels changed", "skill_changed", (None, 1.0)),
     ("Sensitivity to another episode's actions", "sensitivity_shuffled", (0.0, None)),
-    ("Another episode's actions, read off the dreams", "legible_shuffled", (None, 1.0)),
+    ("The change of actions, read off the dreams", "legible_change", (None, 1.0)),
     ("AUROC of the chunk", "auroc_dreamt", (None, 1.0)),
 )
 """Title, measure and limits of a chart with a line per source."""
@@ -123,14 +123,14 @@ def depth_charts(depths: Sequence[Record]) -> list[Chart]:
             unit="R²",
             x_label=DEPTH,
             limits=(None, 1.0),
-            note="By a probe that has learnt on real frames. With another episode's actions a model that "
-            "ignores them has 0 or less.",
+            note="By a probe that has learnt on real frames. The change is that from its own actions to "
+            "another episode's: a model that ignores them has 0.",
             series=tuple(
                 estimates(depths, f"legible_{of}", called, colour)
                 for of, called, colour in (
                     ("real", "off reality", 7),
                     ("true", "off dreams with its own actions", 0),
-                    ("shuffled", "off dreams with another episode's", 1),
+                    ("change", "the change, with another episode's", 1),
                 )
             ),
         ),

@@ -31,7 +31,7 @@ def source_rows(every: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
         ("sensitivity, other actions", 0, "sensitivity_shuffled"),
         ("actions read off reality", 0, "legible_real"),
         ("off dreams with the same", 0, "legible_true"),
-        ("off dreams with others", 0, "legible_shuffled"),
+        ("change of what is read", 0, "legible_change"),
     ):
         rows.append((name, [estimate((one["depths"] or [{}])[depth].get(key)) for one in every]))
     rows.append(("successes, failures dreamt", [_ended(o) for o in ends]))

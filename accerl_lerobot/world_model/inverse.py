@@ -22,8 +22,9 @@ chunk the mean action: what its steps add up to is seen, in which order they wer
     legibility     R² = 1 − Σ|read − given|² / Σ|given − mean|², in units of each action's usual spread
 
 With the true actions even a model that ignores them is read well where the scene tells what anybody would do
-there. So it is dreamt with another episode's actions, too: against these a model that does not listen has 0,
-or less where what it dreams looks like other actions.
+there. So it is dreamt from the same places with another episode's actions, too, and the *change* of what is
+read is held against the change of what was given: whatever the scene tells is in both, and falls out. A model
+that does not listen dreams the same twice, and has exactly 0.
 
 Shapes: B pairs, V cameras, H×W pixels, A action dims, M trials.
 """
@@ -103,13 +104,16 @@ class InverseProbe(nn.Module):
         read: np.ndarray = (torch.cat(parts) * self.std + self.mean).numpy()
         return read
 
-    def legibility(self, read: np.ndarray, given: np.ndarray, groups: np.ndarray) -> Estimate:
+    def legibility(
+        self, read: np.ndarray, given: np.ndarray, groups: np.ndarray, *, of_changes: bool = False
+    ) -> Estimate:
         """R² of what was read, with its interval; NaN where nothing varied.
 
         Args:
             read: (M, A).
             given: (M, A), what was really done, or dreamt with.
             groups: (M,), the episode of each.
+            of_changes: whether both are differences, whose mean is taken to be 0.
         """
         varied = self.std.numpy() > STILL
         scale = self.std.numpy()[varied]
@@ -117,7 +121,8 @@ class InverseProbe(nn.Module):
         given = given[:, varied] / scale
 
         def of(rows: np.ndarray) -> float:
-            spread = float(np.square(given[rows] - given[rows].mean(0)).sum())
+            mean = 0.0 if of_changes else given[rows].mean(0)
+            spread = float(np.square(given[rows] - mean).sum())
             return 1 - float(wrong[rows].sum()) / spread if spread > 0 else float("nan")
 
         return bootstrap(groups, of)

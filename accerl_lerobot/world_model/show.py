@@ -20,10 +20,10 @@ from typing import Any
 from rich.table import Table
 
 from accerl_lerobot.world_model.by_source import estimate, number, source_rows
-from accerl_lerobot.world_model.trial import LEGIBLE, NEVER
+from accerl_lerobot.world_model.trial import NEVER
 
-READ = ("real", *LEGIBLE)
-"""Of what the actions are read."""
+READ = ("real", "true", "change")
+"""Off what the actions are read."""
 
 
 def table(found: dict[str, Any]) -> Table:
@@ -31,8 +31,8 @@ def table(found: dict[str, Any]) -> Table:
     outcome = "passed" if found["passed"] else "FAILED"
     shown = Table(title=f"{found['trials']} trials: {outcome}")
     columns = (
-        "depth", "trials", "skill, changed pixels", "sensitivity", "read off: reality", "dreams",
-        "of others", "PSNR", "AUROC", "false success: true", "none",
+        "depth", "trials", "skill, changed pixels", "sensitivity", "read: real, dreamt, change",
+        "PSNR", "AUROC", "false success: true", "none",
     )  # fmt: skip
     for column in columns:
         shown.add_column(column, justify="right")
@@ -42,7 +42,7 @@ def table(found: dict[str, Any]) -> Table:
             str(row["trials"]),
             estimate(row.get("skill_changed")),
             estimate(row.get("sensitivity_shuffled")),
-            *(number((row.get(f"legible_{of}") or {}).get("value"), 2) for of in READ),
+            " ".join(number((row.get(f"legible_{of}") or {}).get("value"), 2) for of in READ),
             number(row.get("psnr"), 1),
             estimate(row.get("auroc_dreamt")),
             *(number(row.get(f"false_success_{arm}"), 2) for arm in NEVER),

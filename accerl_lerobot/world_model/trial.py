@@ -49,7 +49,7 @@ ARMS = ("true", "shuffled", "zero", "opposite", "failed")
 PAIRS = 400
 """Real pairs of frames that the success model is tried on, half of them successes."""
 LEGIBLE = ("true", "shuffled")
-"""Arms whose actions are read off the dreams."""
+"""Arms whose actions are read off the dreams, and compared."""
 NEVER = ("true", "zero")
 """Arms that cannot succeed, the first one from failures. Actions of other episodes may well do so."""
 
@@ -112,11 +112,11 @@ def try_out(
 
     Returns:
         ``depths``: a row per depth with `judge`'s estimates of skill and sensitivity, errors in pixels and
-        state, with a probe ``legible_real`` and ``legible_<arm>``, how well the actions can be read off the
-        frames, and with a success model AUROC on the chunk dreamt there and the share of them taken for a
-        success under each arm's actions; ``auroc_real``, of the success model on real pairs, its
-        ``threshold``, and ``outcomes``, see `outcomes.judged`; ``gates``: each with its value and whether it
-        holds; ``passed``; ``trials``, of so many ``episodes``.
+        state, with a probe ``legible_real``, ``legible_true`` and ``legible_change``, see `inverse.py`, and
+        with a success model AUROC on the chunk dreamt there and the share of them taken for a success under
+        each arm's actions; ``auroc_real``, of the success model on real pairs, its ``threshold``, and
+        ``outcomes``, see `outcomes.judged`; ``gates``: each with its value and whether it holds; ``passed``;
+        ``trials``, of so many ``episodes``.
     """
     rng = np.random.default_rng((seed, 1))
     ended: dict[str, Any] = {}
@@ -212,15 +212,19 @@ def _legible(
         return {}
     real, context = windows.frames[rows], windows.context
 
-    def read(before: np.ndarray, after: np.ndarray, actions: np.ndarray) -> dict[str, float]:
-        return probe.legibility(probe.read(before, after), actions[rows, d].mean(1), groups)._asdict()
+    def read(frames: np.ndarray, after: np.ndarray) -> np.ndarray:
+        return probe.read(real[:, context - 1] if d == 0 else frames[:, d - 1], after)
 
-    found = {"legible_real": read(real[:, context - 1 + d], real[:, context + d], windows.actions)}
-    for arm in LEGIBLE:
-        dreamt = arms[arm].frames[rows]
-        before = real[:, context - 1] if d == 0 else dreamt[:, d - 1]
-        found[f"legible_{arm}"] = read(before, dreamt[:, d], given[arm])
-    return found
+    asked = {arm: given[arm][rows, d].mean(1) for arm in LEGIBLE}
+    frames = {arm: arms[arm].frames[rows] for arm in LEGIBLE}
+    said = {arm: read(frames[arm], frames[arm][:, d]) for arm in LEGIBLE}
+    seen = probe.read(real[:, context - 1 + d], real[:, context + d])
+    changed, wanted = (of["shuffled"] - of["true"] for of in (said, asked))
+    return {
+        "legible_real": probe.legibility(seen, asked["true"], groups)._asdict(),
+        "legible_true": probe.legibility(said["true"], asked["true"], groups)._asdict(),
+        "legible_change": probe.legibility(changed, wanted, groups, of_changes=True)._asdict(),
+    }
 
 
 def _judged(

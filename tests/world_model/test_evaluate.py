@@ -107,7 +107,7 @@ def test_the_same_measures_on_every_source(
             "sensitivity_shuffled",
             "legible_real",
             "legible_true",
-            "legible_shuffled",
+            "legible_change",
         } < {*one["depths"][0]}
     assert {p.name for p in out.iterdir()} == {
         "config.yaml", "trial.json", "preview.mp4", "preview_online.mp4", "preview_perturbed.mp4",

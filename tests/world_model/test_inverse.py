@@ -47,18 +47,21 @@ def legible(kind: str, probe: InverseProbe) -> list[dict[str, dict[str, float]]]
 
 def test_off_an_exact_world_dreams_are_read_as_reality_is(probe: InverseProbe):
     rows = legible("exact", probe)
-    assert all(set(row) == {"legible_real", "legible_true", "legible_shuffled"} for row in rows)
+    assert all(set(row) == {"legible_real", "legible_true", "legible_change"} for row in rows)
     for row in rows:
         assert row["legible_real"]["low"] > 0.6
         assert row["legible_true"]["value"] == pytest.approx(row["legible_real"]["value"], abs=0.1)
-        assert row["legible_shuffled"]["low"] > 0.5
+        assert row["legible_change"]["low"] > 0.5
 
 
 @pytest.mark.parametrize("kind", ["deaf", "copy"])
 def test_what_a_world_that_does_not_listen_was_told_cannot_be_read(kind: str, probe: InverseProbe):
     for row in legible(kind, probe):
         assert row["legible_real"]["low"] > 0.6, "reality is not to blame"
-        assert row["legible_shuffled"]["value"] < 0.05 and row["legible_shuffled"]["high"] < 0.1
+        change = row["legible_change"]
+        assert change == pytest.approx({"value": 0, "low": 0, "high": 0}, abs=1e-5), (
+            "it dreams the same twice"
+        )
 
 
 def test_it_is_not_read_where_it_has_learnt(probe: InverseProbe):
@@ -88,6 +91,15 @@ def test_equal_seeds_give_equal_probes_and_leave_the_global_generator_alone():
     pairs = np.random.default_rng(0).integers(256, size=(2, 5, 1, 16, 16, 3)).astype(np.uint8)
     assert np.array_equal(one.read(*pairs), same.read(*pairs))
     assert not np.array_equal(one.read(*pairs), other.read(*pairs))
+
+
+def test_legibility_of_changes_is_about_none_at_all():
+    probe = InverseProbe(1, 1)
+    given, groups = np.array([[2.0], [2.0]]), np.arange(2)
+    assert math.isnan(probe.legibility(given, given, groups).value), "they do not vary"
+    assert probe.legibility(given, given, groups, of_changes=True).value == 1
+    assert probe.legibility(given * 0, given, groups, of_changes=True).value == 0
+    assert probe.legibility(given / 2, given, groups, of_changes=True).value == pytest.approx(0.75)
 
 
 def test_legibility_by_hand():
