@@ -41,7 +41,7 @@ HEADER = (
 )
 LONGEST_FILE = 400
 RAYS = {"peers.py", "ray_channel.py", "ray_calls.py", "transport_ends.py", "weights_readers.py"}
-SHELLS = {"launch.py", "seats.py", "watched.py", "doctor.py", "worker.py"} | RAYS
+SHELLS = {"launch.py", "seats.py", "services.py", "watched.py", "doctor.py", "worker.py"} | RAYS
 """Files that may import Ray; all others are testable without it."""
 DISTRIBUTED = {"ranks.py", "sharding.py", "tensors.py"}
 """Files that may know of other processes of a `torch.distributed` group."""
