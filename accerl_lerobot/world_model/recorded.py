@@ -13,8 +13,8 @@
 # limitations under the License.
 """Dreams on disk: what the policy was shown in them, what it did, and what that was said to be worth.
 
-``RUN/imagined/`` has one safetensors file for each of the newest ones, named by its number. A run that goes on
-from a checkpoint counts on from there, so what had been dreamt after it gives way. `demos.export_dreams`
+``RUN/imagined/`` has one safetensors file for each of the newest ones, named by its number. A run that goes
+on from a checkpoint counts on from there, so what had been dreamt after it gives way. `demos.export_dreams`
 makes a LeRobotDataset of them. NumPy only.
 """
 
