@@ -170,7 +170,8 @@ class RolloutWorker:
             in_world_s=0.0 if entered is None else now - entered,
             stuck_s=0.0 if moved is None or entered is not None else now - moved,
             spent=self._spent,
-            away_s=self._deciding.away_s,
+            # Before its work begins, nobody has told it where inference is.
+            away_s=0.0 if moved is None else self._deciding.away_s,
             away_why=self._deciding.why,
         )
 
