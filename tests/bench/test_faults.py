@@ -150,6 +150,7 @@ def test_every_point_is_somewhere_that_a_target_can_be_hit():
     assert places("everything", "kill") == [ANYWHERE] and places("everything", "exit") == []
     assert places("trainer rank", "hang") == ["rank.step"]
     assert places("trainer", "nans") == places("trainer", "nan") == ["trainer.loss"]
+    assert places("inference", "nans") == [], "a decision or two that replay refuses end nobody"
     assert ANYWHERE not in places("driver", "kill")[1:] and places("driver", "stop") == []
 
 
