@@ -83,9 +83,10 @@ def places(target: str, fault: str) -> list[str]:
     """Where this can befall a target; none: it cannot."""
     if target == EVERYTHING:
         return [ANYWHERE] if fault == "kill" else []
+    if fault == NANS:
+        return ["trainer.loss"] if target == "trainer" else []
     prefix = PREFIX.get(target, target)
-    what = NAN if fault == NANS else fault
-    found = [p for p, faults in POINTS.items() if p.split(".")[0] == prefix and what in faults]
+    found = [p for p, faults in POINTS.items() if p.split(".")[0] == prefix and fault in faults]
     if fault in SIGNALS and (target, fault) != (DRIVER, "stop"):
         found.insert(0, ANYWHERE)
     return found

@@ -197,7 +197,7 @@ def costs(run: Path) -> dict[str, float]:
         log = MetricsLog(Path(scratch), WandBConfig(), {})
         for record in records:
             values = {k: v for k, v in record.items() if k not in ("kind", "wall_s", "update")}
-            log.write(record["kind"], record["update"], values)
+            log.write(record["kind"], int(record["update"]), values)
         log.close()
         metrics_s = time.perf_counter() - began
         began = time.perf_counter()

@@ -29,7 +29,7 @@ from accerl_lerobot import snapshot
 from accerl_lerobot.bench.audit import audit_segments, audit_updates
 from accerl_lerobot.bench.faults import BenchFaultsConfig, bench_faults, markdown
 from accerl_lerobot.bench.hits import ANYWHERE, FAULTS, places
-from accerl_lerobot.bench.soak import BenchSoakConfig, compare
+from accerl_lerobot.bench.soak import BenchSoakConfig, compare, costs
 from accerl_lerobot.bench.victims import CLASSES, Victim, await_hit, descendants, hit, title
 from accerl_lerobot.checkpoint import CHECKPOINTS, TRAINING_STATE, save_checkpoint
 from accerl_lerobot.errors import InputError
@@ -150,6 +150,7 @@ def test_every_point_is_somewhere_that_a_target_can_be_hit():
     assert places("everything", "kill") == [ANYWHERE] and places("everything", "exit") == []
     assert places("trainer rank", "hang") == ["rank.step"]
     assert places("trainer", "nans") == places("trainer", "nan") == ["trainer.loss"]
+    assert places("inference", "nans") == [], "a decision or two that replay refuses end nobody"
     assert ANYWHERE not in places("driver", "kill")[1:] and places("driver", "stop") == []
 
 
@@ -237,6 +238,8 @@ def test_a_run_of_time_survives_what_is_done_to_it(tmp_path: Path):
     assert (run["exit"], run["left_behind"], run["skipped_updates"]) == (143, 0, 0)
     assert run["lost"] == run["doubled"] == run["segments_lost"] == run["segments_doubled"] == 0
     assert run["books"] and run["segments"] > 0
+    spent = costs(root / run["run"])
+    assert len(spent) == 5 and all(0 < share < 1 for share in spent.values()), spent
     written = json.loads((root / "faults.json").read_text())
     assert written["hits"] == result["hits"] and (root / "faults.png").stat().st_size > 1000
 

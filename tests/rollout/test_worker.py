@@ -304,6 +304,14 @@ def test_a_world_that_hangs_shows_in_the_report(stage, monkeypatch: pytest.Monke
     assert one.order(True).in_world_s < 0.2
 
 
+def test_who_has_not_been_set_to_work_is_not_away_from_inference():
+    """Others may take long to start, and it is restarted if it seems to be."""
+    worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), ("match",), 0, 0, 0, (8, 2))
+    time.sleep(0.05)
+    report = worker.report(True, [])
+    assert (report.away_s, report.stuck_s, report.in_world_s) == (0.0, 0.0, 0.0)
+
+
 def test_a_thread_that_hangs_outside_of_a_world_shows_in_the_report(stage, monkeypatch: pytest.MonkeyPatch):
     release = threading.Event()
     hangs = iter([True])
