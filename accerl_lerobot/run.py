@@ -195,14 +195,14 @@ def train(
     tasks = check_world(config)
     check_placement(replace(config, output_dir=str(directory)))
     if checkpoint is None:
-        _check_imagination(config)
+        _check_imagination(config, going_on=False)
         config = _warm_started(config, directory, console)
     else:
         go_back_to(checkpoint)
         config = _going_on(config, directory, checkpoint, console)
         if load is None:
             check_start(config)
-        _check_imagination(config)
+        _check_imagination(config, going_on=True)
         console.say(f"going on from {checkpoint}")
     before_s = 0.0 if checkpoint is None else None
     config = replace(config, output_dir=str(directory))
@@ -345,12 +345,12 @@ def _start(config: RunConfig, directory: Path) -> str | None:
     return path if on_the_hub or Path(path).expanduser().is_dir() else None
 
 
-def _check_imagination(config: RunConfig) -> None:
+def _check_imagination(config: RunConfig, going_on: bool) -> None:
     if config.imagination.share:
         from accerl_lerobot.world_model.dreaming import check_imagination
 
         path = config.imagination.path
-        if path is not None and not Path(path).expanduser().is_dir():
+        if going_on and path is not None and not Path(path).expanduser().is_dir():
             remedy = (
                 "no such folder; what a run begins to dream with is not in its checkpoints: put a copy there"
             )
