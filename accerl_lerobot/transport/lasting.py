@@ -68,7 +68,7 @@ class LastingCaller(Caller):
 
     @property
     def away_s(self) -> float:
-        """For how long it has not been found where it was last said to be, in s; 0 before it is tried."""
+        """For how long it was not found where it was last said to be, in seconds; 0 before it is tried."""
         since = self._away_since
         return 0.0 if since is None else time.monotonic() - since
 
