@@ -259,7 +259,8 @@ class RayEngine(Engine):
         self._seats.start(plan)
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
         for worker, reference in ready:
-            worker.await_start(reference, max(START_S, self._limit))
+            here = plan.places[worker.name].node.number == 0
+            worker.await_start(reference, max(START_S, self._limit), here)
         way = c.launch.transport, self._limit
         deciding, inserting = self._inference.open(), self._replay.endpoint("insert", *way)
         # Those that get one rollout worker more come first.

@@ -56,22 +56,25 @@ class Watched:
         self.name, self.actor = name, actor
         self.work: Any = None
         self.process: psutil.Process | None = None
-        """None: it has not said yet which one it is."""
+        """None: it has not said yet which one it is, or is on another node."""
         self.answered = False
         self._question: Any = None
         self._asked = 0.0
 
-    def await_start(self, reference: Any, timeout: float) -> None:
+    def await_start(self, reference: Any, timeout: float, here: bool) -> None:
         """Waits until it is ready.
 
         Args:
             reference: of the call that asks whether it is.
             timeout: seconds.
+            here: whether it is on this node; a process of that number on another one is none to touch.
 
         Raises:
             WorkerError: it did not start.
         """
         pid = self.result(reference, "ready", timeout)
+        if not here:
+            return
         with contextlib.suppress(psutil.NoSuchProcess):  # whoever asks it anything will hear of that
             self.process = psutil.Process(pid)
 

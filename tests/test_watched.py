@@ -1,0 +1,49 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""An actor under supervision."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import psutil
+import pytest
+
+from accerl_lerobot import watched
+from accerl_lerobot.watched import Watched, end
+
+
+class Stand:
+    """Stands in for `ray`: every reference is its own answer, and nobody is killed."""
+
+    def get(self, reference: Any, timeout: float) -> Any:
+        return reference
+
+    def kill(self, actor: Any) -> None:
+        pass
+
+
+@pytest.mark.parametrize("here", [True, False])
+def test_only_a_process_of_this_node_is_ended_by_its_number(here: bool, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(watched, "ray", Stand())
+    monkeypatch.setattr(watched, "GONE_S", 0.2)
+    with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]) as process:
+        worker = Watched("somebody", None)
+        worker.await_start(process.pid, 1.0, here)
+        assert (worker.process == psutil.Process(process.pid)) is here
+        end([worker])
+        assert (process.poll() is not None) is here
+        process.kill()
