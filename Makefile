@@ -2,7 +2,7 @@
 #
 # make quickstart   install what is missing, run recipes/quickstart.yaml
 # make test         install what is missing, run the tests
-# ARGS adds arguments: make quickstart ARGS="--seed=1", make test ARGS="tests/replay -x"
+# ARGS adds arguments: make quickstart ARGS="--seed=1", make test ARGS="tests/replay -x -n 0"
 
 SHELL := /bin/bash
 RUN ?= outputs/quickstart-$(shell date +%Y%m%d-%H%M%S)
@@ -42,7 +42,7 @@ quickstart: setup
 
 test: setup
 	@.ci/browser
-	.venv/bin/python -m pytest $(ARGS)
+	.venv/bin/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 check: lint format-check types
 
