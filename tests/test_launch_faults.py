@@ -368,7 +368,8 @@ def test_a_worker_that_does_not_find_inference_is_replaced(engine, monkeypatch):
     monkeypatch.setattr(seats, "AWAY_S", 1.0)
     one = engine(env=HARD, rollout=TWO, trainer=ENDLESS)
     until_training(one)
-    there = one._dreams_ask[0]
+    assert one._seats._peers is not None
+    there = one._seats._peers[0][0]
     one._seats._seats[1].moved = replace(there, address=Address(this_node(), "accerl-nobody"))
     before = one.pids()["rollout 1"]
     restarts = 0.0
