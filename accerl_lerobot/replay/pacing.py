@@ -61,7 +61,9 @@ class ReplayConfig:
     A safety net: choose the pace so that `lag_bound` stays below it, and nothing is thrown away.
     """
     ahead: int = 512
-    """Decisions the rollouts may be ahead of the trainer, from one batch to `capacity`."""
+    """Decisions to learn from, each counted as often as it will be, that the rollouts may be ahead of the
+    trainer; from one batch to `capacity`. Where worlds end their segments together, room for all of them
+    keeps both sides busy. It costs lag."""
 
     def __post_init__(self) -> None:
         if self.capacity < 1:
