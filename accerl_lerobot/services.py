@@ -49,8 +49,15 @@ logger = logging.getLogger(__name__)
 
 STEADY_S = 30.0
 """After so long a time of service, what was before is forgotten."""
+LONGEST_PAUSE_S = 8.0
+"""Before a process is started again; a pause is twice as long as the one before."""
 QUICK_S = 0.2
 """How long an answer is waited for that most likely comes at once."""
+
+
+def pause_s(restarts: int) -> float:
+    """Seconds before a process is started again where there have been so many in a row already."""
+    return min(2.0 ** (restarts - 1), LONGEST_PAUSE_S) if restarts else 0.0
 
 
 @dataclass(kw_only=True)
@@ -238,7 +245,7 @@ class Services:
         logger.warning("%s worker is started again: %s", service.name, reason)
         ray.kill(service.worker.actor)
         service.worker.work = None
-        pause = 2.0 ** (service.restarts - 1) if service.restarts else 0.0
+        pause = pause_s(service.restarts)
         service.up, service.coming, service.awaited, service.metrics = False, None, None, {}
         service.begins = time.monotonic() + pause
         service.restarts += 1

@@ -42,6 +42,7 @@ from accerl_lerobot.launch import RayEngine
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout import worker as rollout_worker
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
+from accerl_lerobot.services import pause_s
 from accerl_lerobot.trainer import worker as trainer_worker
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.transport.endpoint import Transport
@@ -332,6 +333,10 @@ def test_a_trainer_that_hangs_while_it_is_saved_is_found_as_soon_as_any(engine, 
     with pytest.raises(WorkerError, match="trainer worker has not answered for 5 s, in write"):
         one.save(tmp_path / HANGS)
     assert time.monotonic() - began < 30, "and not after the minutes that large files may take"
+
+
+def test_the_pause_before_another_start_grows_and_has_an_end():
+    assert [pause_s(restarts) for restarts in (0, 1, 2, 3, 4, 5, 1000)] == [0, 1, 2, 4, 8, 8, 8]
 
 
 class NoRoom(LightInference):
