@@ -272,6 +272,19 @@ def check_not_pickled(folder: Path, weights: str, origin: Origin) -> None:
     raise origin.refuse(weights, "is missing; give a folder with the weights as safetensors")
 
 
+def checked_weights(
+    folder: Path, weights: str, origin: Origin
+) -> tuple[Path, dict[str, tuple[str, tuple[int, ...]]]]:
+    """Where a folder's weights are, and what `check_safetensors` says of them.
+
+    Raises:
+        InputError: see there and `check_not_pickled`.
+    """
+    check_not_pickled(folder, weights, origin)
+    path = safe_join(folder, weights, origin)
+    return path, check_safetensors(path, origin)
+
+
 def check_remote_code(trust: bool, revision: str | None, room: str, name: str = "code_revision") -> None:
     """Code from the Hub is run only where it is asked for, and one version of it that is named.
 

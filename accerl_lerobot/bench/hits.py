@@ -108,16 +108,10 @@ def strike(
     """
     place, count = rng.choice(places(target, fault)), len(victim.pids(target))
     said_before = victim.log.stat().st_size
+    fired, outcome, said, seconds = False, "survived", "", None
     try:
         began, pid = _befall(victim, orders, name, target, fault, place, rng, in_a_row)
-    except RuntimeError as error:
-        found = audit_updates(victim.records())
-        return Hit(
-            target=target, fault=fault, place=place, fired=False, outcome="lost", said=str(error),
-            lost=found["lost"], doubled=found["doubled"], books=found["books"],
-        )  # fmt: skip
-    outcome, said, seconds = "survived", "", None
-    try:
+        fired = True
         try:
             _recover(victim, target, fault, pid, count)
         except RuntimeError as error:
@@ -133,7 +127,7 @@ def strike(
         outcome, said = "lost", str(error)
     found = audit_updates(victim.records())
     return Hit(
-        target=target, fault=fault, place=place, fired=True, outcome=outcome, seconds=seconds, said=said,
+        target=target, fault=fault, place=place, fired=fired, outcome=outcome, seconds=seconds, said=said,
         lost=found["lost"], doubled=found["doubled"], books=found["books"],
     )  # fmt: skip
 

@@ -131,8 +131,7 @@ def join(publisher: Publisher | Publishers, reader: Any) -> None:
             return
         if isinstance(part, SharedMemoryPublisher) and _answered(reader.open_weights.remote(part.address)):
             return
-    else:
-        raise InputError(FIELD, "shared_memory", "a worker that was started anew is elsewhere; use ray")
+    raise InputError(FIELD, "shared_memory", "a worker that was started anew is elsewhere; use ray")
 
 
 def _answered(answer: Any) -> bool:

@@ -33,15 +33,7 @@ from torch.nn import functional
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.files import check_origin, check_policy_config, check_processor
 from accerl_lerobot.policies.guard import Budget, guarded, input_error
-from accerl_lerobot.safety import (
-    Origin,
-    brief,
-    check_not_pickled,
-    check_safetensors,
-    file_size,
-    read_json,
-    safe_join,
-)
+from accerl_lerobot.safety import Origin, brief, checked_weights, file_size, read_json, safe_join
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
 if TYPE_CHECKING:
@@ -222,9 +214,7 @@ def _pairs(settings: Any, spec: WorldModelSpec, origin: Origin) -> bool:
 def _load(settings: Any, folder: Path, origin: Origin, code_revision: str | None) -> Any:
     from lerobot.rewards.factory import get_reward_model_class
 
-    check_not_pickled(folder, WEIGHTS, origin)
-    weights = safe_join(folder, WEIGHTS, origin)
-    stored = check_safetensors(weights, origin)
+    weights, stored = checked_weights(folder, WEIGHTS, origin)
     try:
         with (
             guarded(origin.field.removesuffix(".path"), code_revision),

@@ -31,15 +31,7 @@ from safetensors.torch import load_file, save_file
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.guard import Budget, guarded
-from accerl_lerobot.safety import (
-    Origin,
-    brief,
-    check_not_pickled,
-    check_safetensors,
-    file_size,
-    read_json,
-    safe_join,
-)
+from accerl_lerobot.safety import Origin, brief, checked_weights, file_size, read_json, safe_join
 from accerl_lerobot.world_model.bounds import check_pixel_model, check_spec, check_success_model
 from accerl_lerobot.world_model.config import PixelModelConfig
 from accerl_lerobot.world_model.contract import WorldModelSpec
@@ -124,7 +116,7 @@ def load_world_model(
     content = read_json(safe_join(directory, CONFIG, origin), origin)
     check_spec(content.get("spec"), origin)
     check_pixel_model(content.get("model"), origin)
-    weights = _weights(directory, origin)
+    weights, _ = checked_weights(directory, WEIGHTS, origin)
     try:
         spec = dict(content["spec"])
         spec |= {k: tuple(spec[k]) for k in ("cameras", "image_size")}
@@ -148,7 +140,7 @@ def load_world_model(
 
 def _success(directory: Path, origin: Origin) -> SuccessPairsRewardModel:
     check_success_model(read_json(safe_join(directory, CONFIG, origin), origin), origin)
-    weights = _weights(directory, origin)
+    weights, _ = checked_weights(directory, WEIGHTS, origin)
     try:
         with guarded("path"), Budget(file_size(weights, origin), origin.field, origin.value):
             return SuccessPairsRewardModel.from_pretrained(directory, strict=True).eval()
@@ -158,10 +150,3 @@ def _success(directory: Path, origin: Origin) -> SuccessPairsRewardModel:
         raise InputError(
             origin.field, origin.value, f"the success model is broken ({brief(error)})"
         ) from error
-
-
-def _weights(directory: Path, origin: Origin) -> Path:
-    check_not_pickled(directory, WEIGHTS, origin)
-    path = safe_join(directory, WEIGHTS, origin)
-    check_safetensors(path, origin)
-    return path
