@@ -237,10 +237,18 @@ def saved_version(state: Path) -> int:
     return int(json.loads((state / STEP).read_text())["step"])
 
 
-def let_go(checkpoints: Path, keep: int) -> None:
-    """Removes the training state of all but the newest `keep` checkpoints; their policies stay."""
+def let_go(checkpoints: Path, keep: int, needed: str | None = None) -> None:
+    """Removes the training state of all but the newest `keep` checkpoints; their policies stay.
+
+    Args:
+        checkpoints: their folder.
+        keep: how many.
+        needed: name of one more that is spared: a worker that is lost begins again where all of them did.
+    """
     having = [path for path in _numbered(checkpoints) if (path / TRAINING_STATE).is_dir()]
     for path in having[: max(0, len(having) - keep)]:
+        if path.name == needed:
+            continue
         # First, or one half removed would count as broken. What is left is not read, let alone vouched for.
         with contextlib.suppress(*UNREADABLE):  # a broken manifest says nothing of it
             manifest = _manifest(path)

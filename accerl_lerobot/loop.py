@@ -18,7 +18,6 @@ from __future__ import annotations
 import json
 import math
 import shutil
-import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -47,9 +46,9 @@ from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.evaluation.pictures import before_after, success_curve
 from accerl_lerobot.evaluation.summary import summarise
 from accerl_lerobot.metrics import MetricsLog, plain
-from accerl_lerobot.resume import how_to_go_on
+from accerl_lerobot.resume import heed_stop
 from accerl_lerobot.rollout.runner import EpisodeResult
-from accerl_lerobot.stopping import StoppedError, Stopping
+from accerl_lerobot.stopping import Stopping
 from accerl_lerobot.timeline import CHECKPOINT, EVALUATION, TIMELINE, TRAINING, Clock, NoClock
 from accerl_lerobot.timeline.watch import Watch
 
@@ -65,17 +64,6 @@ _STATE = (
     "before", "evaluations", "curve", "recent", "explored", "lags", "lag_max", "mismatch_max", "during",
     "base", "groups", "steps", "evaluated", "saved",
 )  # fmt: skip
-
-
-def heed_stop(stop: Stopping, directory: Path) -> None:
-    """Ends a run that was asked to stop.
-
-    Raises:
-        StoppedError: it was.
-    """
-    if stop.asked is not None:
-        words = f"stopped by {signal.Signals(stop.asked).name}; to go on: {how_to_go_on(directory)}"
-        raise StoppedError(stop.asked, words)
 
 
 def run_plans(
@@ -162,6 +150,7 @@ class Loop:
         """Env steps of the training, once it has ended."""
         self.evaluated = self.saved = 0
         """Evaluations and checkpoints that were due by the number of updates."""
+        self._began_at: str | None = None
         self._training_since: float | None = None
         self._saved_at = time.monotonic()
         self._watch = Watch(directory / TIMELINE)
@@ -178,6 +167,7 @@ class Loop:
         evaluation = self.config.evaluation
         filmed: list[EpisodeResult] = []
         if state is not None:
+            self._began_at = state.parent.name
             self._restore(snapshot.load(state / RUN_STATE), saved_version(state))
             if (self.directory / f"{FILMED}.json").is_file():
                 filmed = snapshot.load(self.directory / FILMED)
@@ -382,7 +372,7 @@ class Loop:
 
         with self.times.clock.during(CHECKPOINT):
             path = save_checkpoint(self.directory / CHECKPOINTS, write)
-        let_go(self.directory / CHECKPOINTS, self.config.save_keep)
+        let_go(self.directory / CHECKPOINTS, self.config.save_keep, self._began_at)
         self._saved_at = time.monotonic()
         self.console.say(f"checkpoint {path / PRETRAINED}")
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 import fcntl
 import json
 import shlex
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,6 +27,7 @@ from typing import Any, NamedTuple
 from accerl_lerobot.checkpoint import CHECKPOINTS, CONFIG, LAST, SUMMARY
 from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.stopping import StoppedError, Stopping
 
 LOCK = ".lock"
 CHANGEABLE = (
@@ -40,6 +42,17 @@ CHANGEABLE = (
 def how_to_go_on(directory: Path) -> str:
     """The command that goes on with a run."""
     return f"accerl train --resume=true --config_path={shlex.quote(str(directory / CONFIG))}"
+
+
+def heed_stop(stop: Stopping, directory: Path) -> None:
+    """Ends a run that was asked to stop.
+
+    Raises:
+        StoppedError: it was.
+    """
+    if stop.asked is not None:
+        words = f"stopped by {signal.Signals(stop.asked).name}; to go on: {how_to_go_on(directory)}"
+        raise StoppedError(stop.asked, words)
 
 
 class Begun(NamedTuple):

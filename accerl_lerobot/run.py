@@ -55,11 +55,12 @@ from accerl_lerobot.engine import Engine, WorkerError
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.hub.portable import AWAY
-from accerl_lerobot.loop import Loop, Times, heed_stop
+from accerl_lerobot.loop import Loop, Times
 from accerl_lerobot.metrics import METRICS, MetricsLog
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.preflight import check_placement, check_start
 from accerl_lerobot.replay.journal import EPISODES
+from accerl_lerobot.resume import heed_stop
 from accerl_lerobot.stopping import Stopping
 from accerl_lerobot.timeline import RECOVERY, open_clock
 

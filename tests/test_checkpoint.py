@@ -211,6 +211,16 @@ def test_only_the_newest_keep_what_it_takes_to_go_on(tmp_path: Path):
         newest_whole(tmp_path, "000003")
 
 
+def test_the_one_that_the_workers_began_from_is_spared(tmp_path: Path):
+    for version in range(1, 6):
+        save_checkpoint(tmp_path, state_writer(version))
+        let_go(tmp_path, keep=1, needed="000002")
+    kept = [path.name for path in sorted(tmp_path.glob("0*")) if (path / TRAINING_STATE).exists()]
+    assert kept == ["000002", "000005"]
+    let_go(tmp_path, keep=1, needed="000004")
+    assert not (tmp_path / "000002" / TRAINING_STATE).exists()
+
+
 def test_what_is_let_go_vouches_for_nothing_else(tmp_path: Path):
     for version in (1, 2):
         save_checkpoint(tmp_path, state_writer(version))

@@ -20,18 +20,22 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from accerl_lerobot import snapshot
 from accerl_lerobot.bench.audit import audit_segments, audit_updates
 from accerl_lerobot.bench.faults import BenchFaultsConfig, bench_faults, markdown
 from accerl_lerobot.bench.hits import ANYWHERE, FAULTS, places
+from accerl_lerobot.bench.light_run import light_config
 from accerl_lerobot.bench.soak import BenchSoakConfig, compare, costs
-from accerl_lerobot.bench.victims import CLASSES, Victim, await_hit, descendants, hit, title
+from accerl_lerobot.bench.victims import CLASSES, LIGHT, Victim, await_hit, descendants, hit, title
 from accerl_lerobot.checkpoint import CHECKPOINTS, TRAINING_STATE, save_checkpoint
+from accerl_lerobot.config import encode
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.fault_points import POINTS
 from accerl_lerobot.replay import MixedReplay, ReplayConfig
@@ -242,6 +246,25 @@ def test_a_run_of_time_survives_what_is_done_to_it(tmp_path: Path):
     assert len(spent) == 5 and all(0 < share < 1 for share in spent.values()), spent
     written = json.loads((root / "faults.json").read_text())
     assert written["hits"] == result["hits"] and (root / "faults.png").stat().st_size > 1000
+
+
+def test_a_service_comes_back_long_after_the_run_was_taken_back(tmp_path: Path):
+    """Where it begins again is still there, whatever has been saved since."""
+    light = tmp_path / "light.yaml"
+    config = replace(light_config(updates=1_000_000), save_every_s=0.0, save_every_updates=1, save_keep=1)
+    light.write_text(yaml.safe_dump(encode(config), sort_keys=False))
+    victim = Victim(tmp_path / "run", [f"--config_path={light}"], tmp_path / "run.log", LIGHT)
+    try:
+        for target, updates in (("trainer", 4), ("inference", 20)):
+            victim.await_update(max(victim.updates(), default=0) + updates, 120.0)
+            (pid,) = victim.pids(target)
+            assert hit(pid, signal.SIGKILL)
+            victim.await_successors(target, pid, 1, 120.0)
+        before = set(victim.pids("trainer"))
+        victim.await_update(max(victim.updates()) + 20, 120.0)
+        assert set(victim.pids("trainer")) == before
+    finally:
+        victim.kill()
 
 
 def test_a_soak_compares_each_block_with_its_neighbour():
