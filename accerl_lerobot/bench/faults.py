@@ -54,6 +54,8 @@ IMAGINING = ("dream", "world learning")
 TARGETS = (*CLASSES, DRIVER, EVERYTHING)
 GRACE_S = 60.0
 """How long a run may take to stop when it is asked to."""
+WAIT_S = 3600.0
+"""How long a run may take from one hit to the moment of the next."""
 ENDLESS = 1_000_000
 
 
@@ -86,8 +88,9 @@ class BenchFaultsConfig:
     stall_s: float = 10.0
     """``launch.stall_s`` of the runs: how long a process that hangs is waited for."""
     updates: int = 0
-    """When what was to befall everything has, that run goes on to so many updates and ends by itself, and so
-    does one that was left alone, to compare what they have learnt; 0: it is asked to stop like others."""
+    """Where everything is hit: that happens at random moments of so many updates. When it has, the run goes
+    on to the last of them and ends by itself, and so does one that was left alone, to compare what they have
+    learnt. 0: hits follow each other, and the run is asked to stop like others."""
     seed: int = 0
     """Of the order, the places and the moments."""
 
@@ -245,14 +248,17 @@ def _target(
     """All hits of one target, in one run unless it is lost."""
     rng, done = random.Random(f"{config.seed} {target} where"), 0
     changes = start.ranks() if target == "trainer rank" else []
+    moments = sorted(rng.randint(_first(config), max(config.updates, _first(config))) for _ in drawn)
     while done < len(drawn):
         name = f"{target.replace(' ', '_')}-{len(result['runs'])}"
         orders = Path(config.output_dir).expanduser().resolve() / f"{name}.orders"
         victim = start.run(name, *changes, orders=orders)
         found: dict[str, Any] = {"target": target, "run": name}
         try:
-            victim.await_update(20 if config.recipe is None else 7, START_S)
+            victim.await_update(_first(config), START_S)
             while done < len(drawn):
+                if target == EVERYTHING and config.updates:
+                    victim.await_update(moments[done], WAIT_S)
                 in_a_row = start.recipe.trainer.max_nonfinite
                 struck = strike(victim, orders, str(done), target, drawn[done], rng, in_a_row)
                 result["hits"].append(asdict(struck))
@@ -270,6 +276,11 @@ def _target(
         finally:
             victim.kill()
         result["runs"].append(found | audit_updates(victim.records()) | audit_segments(victim.folder))
+
+
+def _first(config: BenchFaultsConfig) -> int:
+    """The update before which nothing happens."""
+    return 20 if config.recipe is None else 7
 
 
 def end_run(victim: Victim) -> dict[str, Any]:
