@@ -23,6 +23,14 @@ from typing import NamedTuple
 
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 
+LONGEST_PAUSE_S = 8.0
+"""Before what was lost is started again; a pause is twice as long as the one before."""
+
+
+def pause_s(restarts: int) -> float:
+    """Seconds before what was lost is started again where that has been done so often in a row already."""
+    return min(2.0 ** (restarts - 1), LONGEST_PAUSE_S) if restarts else 0.0
+
 
 @dataclass(kw_only=True)
 class Progress:

@@ -51,7 +51,7 @@ from accerl_lerobot.checkpoint import (
 )
 from accerl_lerobot.config import LaunchConfig, RunConfig, encode, timeline_folder
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine import Engine, WorkerError
+from accerl_lerobot.engine import Engine, WorkerError, pause_s
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.hub.portable import AWAY
@@ -71,8 +71,6 @@ logger = logging.getLogger(__name__)
 
 BASE = "base"
 """Folder of a run: the policy that it began from, where that had to be computed back."""
-FIRST_PAUSE_S = 1.0
-"""Before all workers are started again the first time; twice as long each time."""
 WARM_START = "warm_start.json"
 """File that says which policy a run's own demonstrations and SFT have led to."""
 
@@ -269,7 +267,7 @@ class Recovery:
         self._most, self._times, self._reached = most, 0, ""
 
     def next(self, checkpoints: Path, console: Console, error: WorkerError) -> Path:
-        """The checkpoint to go on from; waits a little, longer each time.
+        """The checkpoint to go on from; where that is done again waits a little, longer each time.
 
         Raises:
             WorkerError: the one given: there is no checkpoint, or it has been tried often enough.
@@ -284,8 +282,9 @@ class Recovery:
             raise error
         for why in passed:
             console.say(f"passed over checkpoint {why}")
-        pause = FIRST_PAUSE_S * 2 ** (self._times - 1)
-        console.say(f"{error}\ngoing on from {path} in {pause:.0f} s ({self._times} of {self._most} times)")
+        pause = pause_s(self._times - 1)
+        when = f" in {pause:.0f} s" if pause else ""
+        console.say(f"{error}\ngoing on from {path}{when} ({self._times} of {self._most} times)")
         time.sleep(pause)
         return path
 

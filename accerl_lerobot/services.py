@@ -36,7 +36,7 @@ from ray.exceptions import RayActorError, RayError
 
 from accerl_lerobot.cluster import alive, on
 from accerl_lerobot.config import RunConfig, timeline_folder
-from accerl_lerobot.engine import WorkerError
+from accerl_lerobot.engine import WorkerError, pause_s
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.inference.pool import added, dealt, together
 from accerl_lerobot.placement import Plan
@@ -49,15 +49,8 @@ logger = logging.getLogger(__name__)
 
 STEADY_S = 30.0
 """After so long a time of service, what was before is forgotten."""
-LONGEST_PAUSE_S = 8.0
-"""Before a process is started again; a pause is twice as long as the one before."""
 QUICK_S = 0.2
 """How long an answer is waited for that most likely comes at once."""
-
-
-def pause_s(restarts: int) -> float:
-    """Seconds before a process is started again where there have been so many in a row already."""
-    return min(2.0 ** (restarts - 1), LONGEST_PAUSE_S) if restarts else 0.0
 
 
 @dataclass(kw_only=True)

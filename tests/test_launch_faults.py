@@ -33,7 +33,7 @@ import ray
 from accerl_lerobot import launch, seats
 from accerl_lerobot.bench.victims import alive
 from accerl_lerobot.config import LaunchConfig
-from accerl_lerobot.engine import Progress, WorkerError
+from accerl_lerobot.engine import Progress, WorkerError, pause_s
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
@@ -42,7 +42,6 @@ from accerl_lerobot.launch import RayEngine
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout import worker as rollout_worker
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
-from accerl_lerobot.services import pause_s
 from accerl_lerobot.trainer import worker as trainer_worker
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.transport.endpoint import Transport

@@ -274,7 +274,7 @@ def losing(monkeypatch: pytest.MonkeyPatch, config: RunConfig, lost_at: list[int
 
     monkeypatch.setattr(run, "make_engine", make)
     monkeypatch.setattr(run, "check_policy", lambda config: 1)
-    monkeypatch.setattr(run, "FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr(run, "pause_s", lambda times: 0.01 * times)
     return made
 
 

@@ -48,8 +48,10 @@ AWAIT_S = 90.0
 START_S = 300.0
 """How long a run may take to recover, or to its first update."""
 SPARE = 20
-"""Updates after a fault that ends neither trainer nor replay: some were made before it and told of late, and
-some can be made of what replay has."""
+"""Updates after a fault that ends nobody: some were made before it and told of late, and some can be made of
+what replay has."""
+LATE = 16
+"""Decisions that may be told of after their service has a successor, although they were made before."""
 TIDY_S = 10.0
 """How long what was killed may take to be gone."""
 
@@ -67,8 +69,8 @@ class Hit:
     outcome: str
     """See above."""
     seconds: float | None = None
-    """From the fault to an update that had not been made before, for inference `SPARE` of them, for a rollout
-    worker to its successor; where it loses nobody: None."""
+    """From the fault to an update that had not been made before; of inference to decisions that had not, of a
+    rollout worker to its successor; where nobody is lost: None."""
     lost: int = 0
     """Updates missing from the log."""
     doubled: int = 0
@@ -188,12 +190,12 @@ def _recover(victim: Victim, target: str, fault: str, pid: int, count: int) -> N
     else:
         victim.wait(lambda: pid not in victim.pids(target), START_S, f"{target} {pid} was left as it is")
         victim.await_successors(target, pid, count, START_S)
-        newest = max(last, *victim.updates())
         if target == "inference":
-            victim.await_update(newest + SPARE, START_S)
+            made = victim.decisions()
+            victim.wait(lambda: victim.decisions() > made + LATE, START_S, "nothing was decided any more")
         elif target != "rollout":
             # Who is there now was started from a checkpoint, long after what was made before was told.
-            victim.await_update(newest + 1, START_S)
+            victim.await_update(max(last, *victim.updates()) + 1, START_S)
 
 
 def _reason(victim: Victim, error: RuntimeError, since: int) -> str:

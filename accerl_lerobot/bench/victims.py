@@ -106,6 +106,11 @@ class Victim:
         """Numbers of the updates that it has logged, in order."""
         return [int(record["update"]) for record in self.records() if record["kind"] == "train"]
 
+    def decisions(self) -> float:
+        """How many it has logged."""
+        records = self.records()
+        return max((record["decisions"] for record in records if record["kind"] == "rollout"), default=0.0)
+
     def await_update(self, number: int, timeout: float) -> None:
         """Waits until it has logged this update.
 
