@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,14 +28,15 @@ import torch
 
 from accerl_lerobot import cli, snapshot
 from accerl_lerobot.checkpoint import TRAINING_STATE
-from accerl_lerobot.config import DatasetConfig, RunConfig
+from accerl_lerobot.config import DatasetConfig, LaunchConfig, RunConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.export_dreams import write_dreams
 from accerl_lerobot.demos.windows import check_dataset
-from accerl_lerobot.engine import Progress
+from accerl_lerobot.engine import Progress, WorkerError
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Segment
+from accerl_lerobot.fault_points import VARIABLE, order, proof
 from accerl_lerobot.local import LocalEngine
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
@@ -284,6 +286,32 @@ def test_it_runs_asynchronously_with_two_who_dream(tiny_checkpoint: Path, world_
     write_dreams(kept, tmp_path / "set", "some/dreams", "simulated", Console())
     with pytest.raises(InputError, match=r"action has shape \(8,\) here and \(2,\) in the world"):
         check_dataset(DatasetConfig(repo_id="some/dreams", root=str(tmp_path / "set")), ENV, {})
+
+
+@pytest.mark.parametrize("point", ["dream.step", "learning.step"])
+def test_one_that_hangs_while_others_wait_for_it_is_found_when_it_is_saved(
+    tiny_checkpoint: Path, world_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, point: str
+):
+    from accerl_lerobot.launch import RayEngine
+
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "orders"))
+    taken = order(tmp_path / "orders", "1", point, "hang")
+    learn = OnlineLearnConfig(steps_per_episode=1.0, try_every=2, held_out=0.4, trial=LOOSE, batch=4)
+    # Long enough for an update beside other work, and for a trial.
+    rooms = {"launch": LaunchConfig(stall_s=15.0)}
+    config = dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12, rooms=rooms)
+    engine = RayEngine(config, ("match",))
+    try:
+        engine.train()
+        for _ in polls(engine):
+            if proof(taken) is not None:
+                break
+        began = time.monotonic()
+        with pytest.raises(WorkerError, match=rf"a step of {point[:5]}\w* has not ended for 15 s"):
+            engine.save(tmp_path / "saved")
+    finally:
+        engine.close()
+    assert time.monotonic() - began < 60, "and not after the minutes that large files may take"
 
 
 def test_asynchronously_a_run_ends_when_its_episodes_are_used_up(tiny_checkpoint: Path):

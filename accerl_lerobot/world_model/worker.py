@@ -30,6 +30,8 @@ from __future__ import annotations
 import os
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -84,8 +86,9 @@ class DreamWorker:
         import torch
 
         torch.set_num_threads(config.trainer.num_threads)
+        self._limit = config.launch.stall_s
         # Inference that hangs is the conductor's to notice, which takes `stall_s`; this is for the worst.
-        self._patience_s = 2 * config.launch.stall_s
+        self._patience_s = 2 * self._limit
         self._share, self._batch = config.imagination.share, config.inference.max_batch
         self._outbox: list[Segment] = []
         self._dreams = make_imagination(config, name.replace(" ", ""), self._outbox.append, index)
@@ -128,11 +131,15 @@ class DreamWorker:
         return self._dreams.metrics()
 
     def save(self, directory: Path) -> None:
-        """Writes its part of a checkpoint, once it has taken over what was promoted."""
+        """Writes its part of a checkpoint, once it has taken over what was promoted.
+
+        Raises:
+            TimeoutError: it hangs.
+        """
         deadline = time.monotonic() + TAKEN_OVER_S
         while self._promoted is not None and time.monotonic() < deadline:
             time.sleep(PAUSE_S)
-        with self._dreaming:
+        with _within(self._limit, self._dreaming, "a step of dreams"):
             saved = {"dreams": self._dreams.state(), "cursor": self._cursor}
             snapshot.save(directory / TRAINING_STATE / self._saved, saved)
             if not self._index:  # all dream of the same one
@@ -209,6 +216,7 @@ class WorldLearningWorker:
 
         torch.set_num_threads(config.trainer.num_threads)
         torch.manual_seed(config.seed)
+        self._limit = config.launch.stall_s
         self._learner = make_learner(config)
         self._learning = threading.Lock()
         """Held while it changes, but not during a trial, which is of a copy."""
@@ -229,8 +237,12 @@ class WorldLearningWorker:
         return self._learner.metrics()
 
     def save(self, directory: Path) -> None:
-        """Writes its part of ``training_state``."""
-        with self._learning:
+        """Writes its part of ``training_state``.
+
+        Raises:
+            TimeoutError: it hangs.
+        """
+        with _within(self._limit, self._learning, "a step of learning"):
             saved = {"learner": self._learner.state(), "cursor": self._cursor}
         snapshot.save(directory / TRAINING_STATE / LEARNER, saved)
 
@@ -270,6 +282,22 @@ class WorldLearningWorker:
             else:
                 self._clock.enter(WAIT_IN)
                 time.sleep(PAUSE_S)
+
+
+@contextmanager
+def _within(seconds: float, lock: threading.Lock, what: str) -> Iterator[None]:
+    """Holds a lock that others hold for a moment.
+
+    Raises:
+        TimeoutError: one of them has held it for so long.
+    """
+    if not lock.acquire(timeout=seconds):
+        remedy = "raise launch.stall_s if one takes that long"
+        raise TimeoutError(f"{what} has not ended for {seconds:.0f} s; {remedy}")
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 class _News:
