@@ -243,18 +243,23 @@ def let_go(checkpoints: Path, keep: int, needed: str | None = None) -> None:
     Args:
         checkpoints: their folder.
         keep: how many.
-        needed: name of one more that is spared: a worker that is lost begins again where all of them did.
+        needed: name of one more whose weights are spared, although it cannot be gone on from any more: a
+            service that is lost begins again where all workers did.
     """
     having = [path for path in _numbered(checkpoints) if (path / TRAINING_STATE).is_dir()]
     for path in having[: max(0, len(having) - keep)]:
-        if path.name == needed:
-            continue
         # First, or one half removed would count as broken. What is left is not read, let alone vouched for.
         with contextlib.suppress(*UNREADABLE):  # a broken manifest says nothing of it
             manifest = _manifest(path)
             left = {k: v for k, v in manifest["files"].items() if Path(k).parts[0] != TRAINING_STATE}
-            _write_manifest(path, manifest | {"files": left})
-        shutil.rmtree(path / TRAINING_STATE)
+            if left != manifest["files"]:
+                _write_manifest(path, manifest | {"files": left})
+        if path.name != needed:
+            shutil.rmtree(path / TRAINING_STATE)
+            continue
+        for file in (path / TRAINING_STATE).iterdir():
+            if file.stem != WEIGHTS:
+                shutil.rmtree(file) if file.is_dir() else file.unlink()
 
 
 def _numbered(checkpoints: Path) -> list[Path]:

@@ -153,8 +153,8 @@ class RunConfig:
     case, and when the run is asked to stop; before the training there is one if there are any by number or
     time."""
     save_keep: int = 2
-    """Checkpoints that keep what it takes to go on from them, the newest ones, at least 1, and the one
-    that the workers there are have begun from; the others keep their policies."""
+    """Checkpoints that keep what it takes to go on from them, the newest ones, at least 1; the others keep
+    their policies."""
     resume: bool = False
     """Go on with the run whose config is ``--config_path``: ``RUN/config.yaml``, or that of one of its
     checkpoints, ``RUN/checkpoints/last/config.yaml``."""

@@ -189,6 +189,7 @@ class Loop:
         write_atomically(self.directory / SUMMARY, json.dumps(summary, indent=2) + "\n")
         for left in self.directory.glob(f"{FILMED}.*"):
             left.unlink()
+        let_go(self.directory / CHECKPOINTS, self.config.save_keep)  # nobody begins again any more
         return dict(summary)
 
     def _state(self) -> dict[str, Any]:

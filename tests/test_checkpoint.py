@@ -30,6 +30,7 @@ from accerl_lerobot.checkpoint import (
     PRETRAINED,
     RUN_STATE,
     TRAINING_STATE,
+    WEIGHTS,
     begun,
     defect,
     displaced,
@@ -211,14 +212,25 @@ def test_only_the_newest_keep_what_it_takes_to_go_on(tmp_path: Path):
         newest_whole(tmp_path, "000003")
 
 
-def test_the_one_that_the_workers_began_from_is_spared(tmp_path: Path):
+def test_of_the_one_that_the_workers_began_from_the_weights_are_spared(tmp_path: Path):
     for version in range(1, 6):
-        save_checkpoint(tmp_path, state_writer(version))
+        write = state_writer(version)
+        save_checkpoint(tmp_path, lambda folder, write=write: (write(folder), with_weights(folder))[0])
         let_go(tmp_path, keep=1, needed="000002")
     kept = [path.name for path in sorted(tmp_path.glob("0*")) if (path / TRAINING_STATE).exists()]
     assert kept == ["000002", "000005"]
-    let_go(tmp_path, keep=1, needed="000004")
-    assert not (tmp_path / "000002" / TRAINING_STATE).exists()
+    spared = tmp_path / "000002" / TRAINING_STATE
+    assert sorted(p.name for p in spared.iterdir()) == ["weights.json", "weights.safetensors"]
+    assert snapshot.load(spared / WEIGHTS)["w"].tolist() == [1.0, 2.0] and defect(tmp_path / "000002") is None
+    with pytest.raises(InputError, match="000002: its training state was not kept"):
+        newest_whole(tmp_path, "000004")  # and not what is older still
+    assert newest_whole(tmp_path)[0].name == "000005"
+    let_go(tmp_path, keep=1)
+    assert not spared.exists()
+
+
+def with_weights(folder: Path) -> None:
+    snapshot.save(folder / TRAINING_STATE / WEIGHTS, {"w": np.array([1.0, 2.0])})
 
 
 def test_what_is_let_go_vouches_for_nothing_else(tmp_path: Path):

@@ -307,11 +307,11 @@ def test_one_that_hangs_while_others_wait_for_it_is_found_when_it_is_saved(
             if proof(taken) is not None:
                 break
         began = time.monotonic()
-        with pytest.raises(WorkerError, match=rf"a step of {point[:5]}\w* has not ended for 15 s"):
+        with pytest.raises(WorkerError, match=rf"a step of {point[:5]}\w* has not ended for"):
             engine.save(tmp_path / "saved")
+        assert time.monotonic() - began < 60, "and not after the minutes that large files may take"
     finally:
         engine.close()
-    assert time.monotonic() - began < 60, "and not after the minutes that large files may take"
 
 
 def test_asynchronously_a_run_ends_when_its_episodes_are_used_up(tiny_checkpoint: Path):

@@ -54,6 +54,8 @@ IMAGINING = ("dream", "world learning")
 TARGETS = (*CLASSES, DRIVER, EVERYTHING)
 GRACE_S = 60.0
 """How long a run may take to stop when it is asked to."""
+LATEST = 0.9
+"""Share of a run's updates in which it is hit: the last ones are to be left to it."""
 WAIT_S = 3600.0
 """How long a run may take from one hit to the moment of the next."""
 ENDLESS = 1_000_000
@@ -248,17 +250,19 @@ def _target(
     """All hits of one target, in one run unless it is lost."""
     rng, done = random.Random(f"{config.seed} {target} where"), 0
     changes = start.ranks() if target == "trainer rank" else []
-    moments = sorted(rng.randint(_first(config), max(config.updates, _first(config))) for _ in drawn)
+    last = max(_first(config), int(LATEST * config.updates))
+    moments = sorted(rng.randint(_first(config), last) for _ in drawn)
     while done < len(drawn):
         name = f"{target.replace(' ', '_')}-{len(result['runs'])}"
         orders = Path(config.output_dir).expanduser().resolve() / f"{name}.orders"
         victim = start.run(name, *changes, orders=orders)
         found: dict[str, Any] = {"target": target, "run": name}
+        before = done
         try:
             victim.await_update(_first(config), START_S)
             while done < len(drawn):
                 if target == EVERYTHING and config.updates:
-                    victim.await_update(moments[done], WAIT_S)
+                    victim.await_update(moments[done], WAIT_S, every=1.0)
                 in_a_row = start.recipe.trainer.max_nonfinite
                 struck = strike(victim, orders, str(done), target, drawn[done], rng, in_a_row)
                 result["hits"].append(asdict(struck))
@@ -271,8 +275,8 @@ def _target(
                 found["success"] = _finish(victim, start, config.updates)
         except (RuntimeError, subprocess.TimeoutExpired) as error:
             found["error"] = str(error)
-            if not any(hit["target"] == target for hit in result["hits"]):
-                done = len(drawn)  # it did not even begin
+            if done == before:
+                done = len(drawn)  # it did not even come to be hit, nor would another one
         finally:
             victim.kill()
         result["runs"].append(found | audit_updates(victim.records()) | audit_segments(victim.folder))

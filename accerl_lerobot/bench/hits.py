@@ -20,6 +20,7 @@ lost        neither
 
 from __future__ import annotations
 
+import itertools
 import random
 import signal
 import subprocess
@@ -50,8 +51,6 @@ START_S = 300.0
 SPARE = 20
 """Updates after a fault that ends nobody: some were made before it and told of late, and some can be made of
 what replay has."""
-LATE = 16
-"""Decisions that may be told of after their service has a successor, although they were made before."""
 TIDY_S = 10.0
 """How long what was killed may take to be gone."""
 
@@ -191,8 +190,10 @@ def _recover(victim: Victim, target: str, fault: str, pid: int, count: int) -> N
         victim.wait(lambda: pid not in victim.pids(target), START_S, f"{target} {pid} was left as it is")
         victim.await_successors(target, pid, count, START_S)
         if target == "inference":
-            made = victim.decisions()
-            victim.wait(lambda: victim.decisions() > made + LATE, START_S, "nothing was decided any more")
+            # More than may have been decided before and is told of late.
+            told = victim.decisions()
+            enough = told[-1] + max(b - a for a, b in itertools.pairwise(told))
+            victim.wait(lambda: victim.decisions()[-1] > enough, START_S, "nothing was decided any more")
         elif target != "rollout":
             # Who is there now was started from a checkpoint, long after what was made before was told.
             victim.await_update(max(last, *victim.updates()) + 1, START_S)

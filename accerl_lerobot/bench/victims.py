@@ -106,18 +106,17 @@ class Victim:
         """Numbers of the updates that it has logged, in order."""
         return [int(record["update"]) for record in self.records() if record["kind"] == "train"]
 
-    def decisions(self) -> float:
-        """How many it has logged."""
-        records = self.records()
-        return max((record["decisions"] for record in records if record["kind"] == "rollout"), default=0.0)
+    def decisions(self) -> list[float]:
+        """How many had been made, each time that it has logged that; 0 at first."""
+        return [0.0, *(record["decisions"] for record in self.records() if record["kind"] == "rollout")]
 
-    def await_update(self, number: int, timeout: float) -> None:
-        """Waits until it has logged this update.
+    def await_update(self, number: int, timeout: float, every: float = LOOK_S) -> None:
+        """Waits until it has logged this update; looks `every` so many seconds.
 
         Raises:
             RuntimeError: it ended before, or did not get there in time.
         """
-        self.wait(lambda: self.updates()[-1:] >= [number], timeout, f"update {number} was not reached")
+        self.wait(lambda: self.updates()[-1:] >= [number], timeout, f"update {number} was not reached", every)
 
     def await_successors(self, target: str, gone: int, count: int, timeout: float) -> None:
         """Waits until a target has as many processes as before, none of them `gone`.
@@ -150,13 +149,14 @@ class Victim:
         self.process.wait()
         return everyone
 
-    def wait(self, there: Callable[[], bool], timeout: float, otherwise: str) -> None:
+    def wait(self, there: Callable[[], bool], timeout: float, otherwise: str, every: float = LOOK_S) -> None:
         """Looks again and again, until what is waited for is there.
 
         Args:
             there: whether it is.
             timeout: seconds.
             otherwise: how the error begins.
+            every: seconds between two looks.
 
         Raises:
             RuntimeError: the run ended before, or it did not come in time.
@@ -165,7 +165,7 @@ class Victim:
         while not there():
             code = self.process.poll()
             if code is None and time.monotonic() <= deadline:
-                time.sleep(LOOK_S)
+                time.sleep(every)
                 continue
             ended = f"it ended with code {code}" if code is not None else f"in {timeout:.0f} s"
             raise RuntimeError(f"{otherwise}: {ended}; {self.log}:\n{last_words(self.log)}")

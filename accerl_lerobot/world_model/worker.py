@@ -59,7 +59,7 @@ LEARNER = "world_learner"
 PAUSE_S = 0.02
 """How long a worker with nothing to do sleeps."""
 TAKEN_OVER_S = 30.0
-"""How long a promoted model may take to be taken over; a moment, unless nobody decides."""
+"""How long a promoted model may take to be taken over at most; a moment, unless nobody decides."""
 LOOK_S = 0.2
 """How often replay is asked for new real segments."""
 
@@ -136,10 +136,11 @@ class DreamWorker:
         Raises:
             TimeoutError: it hangs.
         """
-        deadline = time.monotonic() + TAKEN_OVER_S
-        while self._promoted is not None and time.monotonic() < deadline:
+        began = time.monotonic()
+        while self._promoted is not None and time.monotonic() < began + min(TAKEN_OVER_S, self._limit / 2):
             time.sleep(PAUSE_S)
-        with _within(self._limit, self._dreaming, "a step of dreams"):
+        left = began + self._limit - time.monotonic()
+        with _within(left, self._dreaming, "a step of dreams"):
             saved = {"dreams": self._dreams.state(), "cursor": self._cursor}
             snapshot.save(directory / TRAINING_STATE / self._saved, saved)
             if not self._index:  # all dream of the same one
@@ -293,7 +294,7 @@ def _within(seconds: float, lock: threading.Lock, what: str) -> Iterator[None]:
     """
     if not lock.acquire(timeout=seconds):
         remedy = "raise launch.stall_s if one takes that long"
-        raise TimeoutError(f"{what} has not ended for {seconds:.0f} s; {remedy}")
+        raise TimeoutError(f"{what} has not ended for {seconds:.0f} s or more; {remedy}")
     try:
         yield
     finally:
