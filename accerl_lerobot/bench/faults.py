@@ -250,8 +250,10 @@ def _target(
     """All hits of one target, in one run unless it is lost."""
     rng, done = random.Random(f"{config.seed} {target} where"), 0
     changes = start.ranks() if target == "trainer rank" else []
-    last = max(_first(config), int(LATEST * config.updates))
-    moments = sorted(rng.randint(_first(config), last) for _ in drawn)
+    moments: list[int] = []
+    if target == EVERYTHING and config.updates:
+        last = max(_first(config), int(LATEST * config.updates))
+        moments = sorted(rng.randint(_first(config), last) for _ in drawn)
     while done < len(drawn):
         name = f"{target.replace(' ', '_')}-{len(result['runs'])}"
         orders = Path(config.output_dir).expanduser().resolve() / f"{name}.orders"
@@ -261,7 +263,7 @@ def _target(
         try:
             victim.await_update(_first(config), START_S)
             while done < len(drawn):
-                if target == EVERYTHING and config.updates:
+                if moments:
                     victim.await_update(moments[done], WAIT_S, every=1.0)
                 in_a_row = start.recipe.trainer.max_nonfinite
                 struck = strike(victim, orders, str(done), target, drawn[done], rng, in_a_row)
@@ -271,7 +273,7 @@ def _target(
                 if struck.outcome == "lost":
                     break
             found |= end_run(victim)
-            if target == EVERYTHING and config.updates:
+            if moments:
                 found["success"] = _finish(victim, start, config.updates)
         except (RuntimeError, subprocess.TimeoutExpired) as error:
             found["error"] = str(error)

@@ -192,7 +192,7 @@ def _recover(victim: Victim, target: str, fault: str, pid: int, count: int) -> N
         if target == "inference":
             # More than may have been decided before and is told of late.
             told = victim.decisions()
-            enough = told[-1] + max(b - a for a, b in itertools.pairwise(told))
+            enough = told[-1] + max((b - a for a, b in itertools.pairwise(told)), default=0.0)
             victim.wait(lambda: victim.decisions()[-1] > enough, START_S, "nothing was decided any more")
         elif target != "rollout":
             # Who is there now was started from a checkpoint, long after what was made before was told.
