@@ -84,7 +84,7 @@ class EvalRun:
 
 @dataclass(frozen=True, kw_only=True)
 class WorldModelRun:
-    """``accerl world-model``: a world model, and a success model, from a LeRobotDataset."""
+    """``accerl world-model``: a world model, and a success model, from one or two LeRobotDatasets."""
 
     seed: int = 0
     """0 to 99."""
@@ -95,6 +95,10 @@ class WorldModelRun:
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     """The world it is to be a model of: its cameras, sizes and rate."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    """Demonstrations, some of which fail."""
+    online: DatasetConfig = field(default_factory=DatasetConfig)
+    """Episodes of a policy, as ``accerl export`` writes them, learnt from together with those; without a name
+    there are none. How a policy fails no demonstration shows."""
     world_model: WorldModelConfig = field(default_factory=TinyConfig)
 
     def __post_init__(self) -> None:
@@ -117,7 +121,8 @@ class WorldModelEvalRun:
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """Episodes it has not learnt from; of the dataset that it has, those that were held out are taken."""
     online: DatasetConfig = field(default_factory=DatasetConfig)
-    """Episodes of a policy, as ``accerl export`` writes them; without a name there are none."""
+    """Episodes of a policy, as ``accerl export`` writes them, of which the same is true; without a name there
+    are none."""
     perturbed: PerturbedConfig = field(default_factory=PerturbedConfig)
     """Episodes of `dataset`, played again in `env` with other actions."""
     env: EnvConfig = field(default_factory=MetaWorldConfig)

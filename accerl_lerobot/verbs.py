@@ -187,14 +187,9 @@ def evaluate(arguments: list[str]) -> int:
 def world_model(arguments: list[str]) -> int:
     """``accerl world-model``; 1 if it fails its trial."""
     config: WorldModelRun = parse(WorldModelRun, arguments, recipe_class=RunConfig)
-    from accerl_lerobot.world_model.offline import learn_from_dataset
+    from accerl_lerobot.world_model.offline import learn_world_model
 
-    return _tried(
-        config,
-        lambda directory, console: learn_from_dataset(
-            config.world_model, config.env, config.dataset, directory, config.seed, console
-        ),
-    )
+    return _tried(config, lambda directory, console: learn_world_model(config, directory, console))
 
 
 def world_model_eval(arguments: list[str]) -> int:

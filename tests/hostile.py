@@ -135,7 +135,7 @@ def write_examples(scratch: Path) -> dict[str, Path]:
     world = PixelWorldModel(spec, PixelModelConfig(context=1, heads=2, network=network))
     success = SuccessPairsRewardModel(SuccessPairsConfig(chunk=2, channels=(8,), hidden=8, device="cpu"))
     source = Source(repo_id="a/b", fingerprint="0", learnt=(0, 1), held_out=(2,))
-    save_world_model(scratch / "world_model", world, success, source)
+    save_world_model(scratch / "world_model", world, success, [source])
     config = PolicyConfig(path=str(write_gaussian_actor(scratch / "made")), device="cpu")
     save_pretrained(load_adapter(config), scratch / "policy", config)
     shutil.copytree(DATASET, scratch / "dataset")
@@ -250,12 +250,12 @@ def loaders(trial: Trial, at: dict[str, Path], times: int) -> None:
     from accerl_lerobot.demos.windows import open_metadata
     from accerl_lerobot.policies.config import PolicyConfig
     from accerl_lerobot.policies.loading import load_adapter
-    from accerl_lerobot.world_model.store import load_source, load_world_model
+    from accerl_lerobot.world_model.store import load_sources, load_world_model
 
     world, policy, dataset = at["world_model"], at["policy"], at["dataset"]
 
     def whole_world() -> None:
-        load_source(world)
+        load_sources(world)
         load_world_model(world)
 
     for part, share in (("config.json", 8), ("model.safetensors", 8), ("success_model/config.json", 4)):

@@ -42,6 +42,8 @@ def source_rows(every: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
 
 
 def _holding(gates: dict[str, Any]) -> str:
+    """Of a source's own, which have no source in their name."""
+    gates = {name: gate for name, gate in gates.items() if "." not in name}
     return f"{sum(gate['holds'] for gate in gates.values())} of {len(gates)}"
 
 

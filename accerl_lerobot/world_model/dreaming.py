@@ -20,7 +20,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from accerl_lerobot.config import RunConfig, journal_folder
+from accerl_lerobot.config import DatasetConfig, RunConfig, journal_folder
 from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import WorldSpec
@@ -34,13 +34,14 @@ from accerl_lerobot.world_model.dataset import check_metadata, fingerprint, load
 from accerl_lerobot.world_model.episodes import Episode
 from accerl_lerobot.world_model.films import TrialFilms
 from accerl_lerobot.world_model.fit import check_fit
-from accerl_lerobot.world_model.imagination_config import FILMS, ImaginationConfig
+from accerl_lerobot.world_model.imagination_config import FILMS, ImaginationConfig, OnlineLearnConfig
 from accerl_lerobot.world_model.imagine import Dreamer, Imagination
 from accerl_lerobot.world_model.online import OnlineLearner
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.pool import part
 from accerl_lerobot.world_model.recorded import DREAMS, DreamRecorder
-from accerl_lerobot.world_model.store import load_source
+from accerl_lerobot.world_model.sources import ONLINE, named
+from accerl_lerobot.world_model.store import known, load_sources
 from accerl_lerobot.world_model.zoo import make_dreamer
 
 
@@ -112,15 +113,15 @@ def make_learner(config: RunConfig, dreamer: Dreamer | None = None) -> OnlineLea
     if isinstance(model, ShuffledModel):
         model = model.model
     assert isinstance(model, PixelWorldModel) and success is not None  # as `check_imagination` has found
+    sources = load_sources(Path(str(config.imagination.path)), "imagination.path")
     offline: list[Episode] = []
     held_out: list[Episode] = []
-    if learn.dataset.repo_id is not None:
-        episodes = load_episodes(learn.dataset, model.spec)
-        source = load_source(Path(str(config.imagination.path)), "imagination.path")
-        if source is not None and source.fingerprint == fingerprint(open_metadata(learn.dataset)):
-            offline, held_out = ([episodes[i] for i in part] for part in (source.learnt, source.held_out))
-        else:
-            offline = episodes
+    for room, dataset in _datasets(learn):
+        with named(room):
+            episodes = load_episodes(dataset, model.spec, ONLINE if room.endswith(ONLINE) else "demo")
+        source = known(sources, fingerprint(open_metadata(dataset)))
+        offline += episodes if source is None else [episodes[i] for i in source.learnt]
+        held_out += [] if source is None else [episodes[i] for i in source.held_out]
     return OnlineLearner(
         model,
         success,
@@ -149,8 +150,15 @@ def check_imagination(config: RunConfig) -> None:
     executed = getattr(policy, "n_action_steps", 1)
     dreamer = _dreamer(config, _spec(config), executed, policy.n_obs_steps)
     learn = config.imagination.learn
-    if config.imagination.learns and learn.dataset.repo_id is not None:
-        check_metadata(open_metadata(learn.dataset), learn.dataset.repo_id, dreamer.model.spec)
+    for room, dataset in _datasets(learn) if config.imagination.learns else ():
+        with named(room):
+            check_metadata(open_metadata(dataset), str(dataset.repo_id), dreamer.model.spec)
+
+
+def _datasets(learn: OnlineLearnConfig) -> list[tuple[str, DatasetConfig]]:
+    """Those that are named, each with its room."""
+    rooms = {"dataset": learn.dataset, ONLINE: learn.online}
+    return [(f"imagination.learn.{room}", of) for room, of in rooms.items() if of.repo_id is not None]
 
 
 def _films(config: RunConfig) -> TrialFilms | None:

@@ -11,11 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""A saved world model on episodes from several sources, each with the same measures.
-
-    held out    of the dataset that it has learnt from, those that it has not; or dataset: all of another one
-    online      what a policy lived through, as ``accerl export`` writes it
-    perturbed   episodes of the first source, played again in the world with noise on their actions
+"""A saved world model on episodes of one or several sources.
 
 <output_dir>/
   trial.json                 what became of the first; under ``sources`` what became of the others
@@ -26,8 +22,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -40,21 +35,17 @@ from accerl_lerobot.envs import World, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.dataset import check_metadata, fingerprint, load_episodes
-from accerl_lerobot.world_model.episodes import Episode, amount
-from accerl_lerobot.world_model.films import film
+from accerl_lerobot.world_model.episodes import Episode
 from accerl_lerobot.world_model.inverse import InverseProbe, learn_probe
 from accerl_lerobot.world_model.perturbed import SOURCE as PERTURBED
 from accerl_lerobot.world_model.perturbed import check_world, perturbed_episodes
+from accerl_lerobot.world_model.sources import DATASET, HELD_OUT, ONLINE, named, try_sources
 from accerl_lerobot.world_model.stand_in import SuccessModel, load_stand_in
-from accerl_lerobot.world_model.store import Source, load_source, load_world_model
-from accerl_lerobot.world_model.trial import try_out
+from accerl_lerobot.world_model.store import Source, known, load_sources, load_world_model
 
 if TYPE_CHECKING:
     from accerl_lerobot.dataset_config import DatasetConfig
     from accerl_lerobot.verb_configs import WorldModelEvalRun
-
-HELD_OUT, DATASET, ONLINE = "held out", "dataset", "online"
-"""Names of sources."""
 
 
 class _Part(NamedTuple):
@@ -71,8 +62,7 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
     """Tries a saved world model; `directory` exists and is empty.
 
     Returns:
-        What `try_out` found on the first source, which ``name`` tells, with how many episodes were ``tried``;
-        and ``sources``: name → the same of the others. Also in ``trial.json``.
+        See `try_sources`; also in ``trial.json``.
 
     Raises:
         InputError: no world model there, a dataset or a world of another kind, or nothing was held out.
@@ -83,22 +73,27 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
     given = config.success.threshold is not None
     if config.success.path is not None:
         success = load_stand_in(config.success, model.spec, "success")
-    spec, source = model.spec, load_source(path)
-    part = _part(config.dataset, source, spec)
-    with _named("online"):
-        theirs = _part(config.online, source, spec) if config.online.repo_id is not None else None
+    spec, sources_of = model.spec, load_sources(path)
+    parts = {"dataset": _part(config.dataset, sources_of, spec)}
+    if config.online.repo_id is not None:
+        with named("online"):
+            parts[ONLINE] = _part(config.online, sources_of, spec)
+    part = parts["dataset"]
     world, starts = _world(config, part, spec)
-    if part.learnt:
-        console.say(
-            f"it has learnt from this dataset: tried on the {len(part.tried)} episodes that were held out"
-        )
+    for room, one in parts.items():
+        if one.learnt:
+            console.say(
+                f"it has learnt from {getattr(config, room).repo_id} ({room}): tried on the {len(one.tried)} "
+                "episodes that were held out"
+            )
     sources: dict[str, list[Episode]] = {}
     with console.stage("episodes"):
         first = HELD_OUT if part.learnt else DATASET
         sources[first] = load_episodes(config.dataset, spec, both=success is not None, only=part.tried)
-        if theirs is not None:
-            with _named("online"):
-                sources[ONLINE] = load_episodes(config.online, spec, ONLINE, both=False, only=theirs.tried)
+        if ONLINE in parts:
+            with named("online"):
+                theirs = load_episodes(config.online, spec, ONLINE, both=False, only=parts[ONLINE].tried)
+                sources[ONLINE] = theirs
     if world is not None:
         chosen = _rng(config.seed).permutation(len(starts))[: config.perturbed.episodes].tolist()
         again = [sources[first][i] for i in chosen], [starts[i] for i in chosen]
@@ -110,28 +105,24 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
             finally:
                 world.close()
     probe = _probe(config, part, spec, sources[first], console)
-    found: dict[str, dict[str, Any]] = {}
-    for name, episodes in sources.items():
-        with console.stage(f"trial, {name}"):
-            # Its threshold was set on the very episodes that were held out: here it is set on some of them
-            # and tried on others. On other sources it is what it is; one that stands in has none yet.
-            fresh = name == (HELD_OUT if config.success.path is None else first) and not given
-            told = try_out(model, episodes, config.trial, success, config.seed, fresh, probe)
-            found[name] = {"name": name} | told | {"tried": amount(episodes)}
-            video = "preview.mp4" if name == first else f"preview_{name}.mp4"
-            film(directory / video, model, episodes, config.trial, config.seed)
-        if probe is not None:
-            probe.known = frozenset()  # which are of the first
-    result = found.pop(first) | {"sources": found}
+    learnt = [name for name, one in zip((first, ONLINE), parts.values(), strict=False) if one.learnt]
+    # The threshold was set on the very episodes that were held out: here it is set on some of them and tried
+    # on others. On other sources it is what it is; one that stands in has none yet.
+    fresh: Sequence[str] = learnt if config.success.path is None else [first]
+    result = try_sources(
+        model, sources, config.trial, success, directory, console,
+        learnt=learnt, fresh=() if given else fresh, seed=config.seed, probe=probe,
+    )  # fmt: skip
     (directory / "trial.json").write_text(json.dumps(result, indent=2) + "\n")
     return result
 
 
-def _part(dataset: DatasetConfig, source: Source | None, spec: WorldModelSpec) -> _Part:
-    """Of the dataset that it has learnt from, what was held out; of another one everything."""
+def _part(dataset: DatasetConfig, sources: Sequence[Source], spec: WorldModelSpec) -> _Part:
+    """Of a dataset that it has learnt from, what was held out; of another one everything."""
     meta = open_metadata(dataset)
     check_metadata(meta, dataset.repo_id or "", spec)
-    if source is None or source.fingerprint != fingerprint(meta):
+    source = known(sources, fingerprint(meta))
+    if source is None:
         return _Part(meta, list(range(meta.total_episodes)), [])
     if not source.held_out:
         remedy = "the world model has learnt from every episode of it; give another dataset"
@@ -174,16 +165,6 @@ def _probe(
             known = sorted(rng.permutation(len(tried))[: min(most, len(tried) // 2)].tolist())
             episodes = [tried[i] for i in known]
         return learn_probe(episodes, chunk=spec.chunk, config=config.inverse, seed=config.seed, known=known)
-
-
-@contextmanager
-def _named(room: str) -> Iterator[None]:
-    """What is refused of a dataset bears the name of its room."""
-    try:
-        yield
-    except InputError as error:
-        field = error.field.replace("dataset.", f"{room}.", 1)
-        raise InputError(field, error.value, error.remedy) from error
 
 
 def _rng(seed: int) -> np.random.Generator:

@@ -45,7 +45,7 @@ class OnlineLearnConfig:
     lr: float = 3e-4
     """Constant after the first 50 steps."""
     offline: float = 0.5
-    """Share of windows, in [0, 1], from the dataset that it was pre-trained on, where `dataset` names it."""
+    """Share of windows, in [0, 1], from what it was pre-trained on, where `dataset` and `online` name it."""
     recent: float = 0.7
     """Share of the others, in [0, 1], from the newest quarter of episodes."""
     failures: float = 0.6
@@ -61,6 +61,8 @@ class OnlineLearnConfig:
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """What it was pre-trained on: of it, it learns from the episodes that it knows, and is tried on those
     that were held out. Another dataset is learnt from whole."""
+    online: DatasetConfig = field(default_factory=DatasetConfig)
+    """Episodes of an earlier policy that it was pre-trained on, in the same way."""
     trial: TrialConfig = field(
         default_factory=lambda: TrialConfig(
             most=120, depth=4, auroc=0.6, false_success=0.5, recall=0.3, false_positives=0.3

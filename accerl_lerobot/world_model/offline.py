@@ -16,7 +16,8 @@
 <output_dir>/
   world_model/     what `store.py` writes
   trial.json       what became of it
-  preview.mp4      what happened, what it dreamt with those actions, and with another episode's
+  preview.mp4      what happened, what it dreamt with those actions, and with another episode's; of a policy's
+                   episodes preview_online.mp4
   metrics.jsonl    losses
 """
 
@@ -26,7 +27,7 @@ import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -40,12 +41,15 @@ from accerl_lerobot.world_model.config import WorldModelConfig
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.dataset import fingerprint, load_episodes
 from accerl_lerobot.world_model.episodes import Episode, amount, split
-from accerl_lerobot.world_model.films import film
 from accerl_lerobot.world_model.learn import pretrain
 from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.sources import HELD_OUT, ONLINE, named, try_sources
 from accerl_lerobot.world_model.store import SUCCESS, Source, save_world_model
 from accerl_lerobot.world_model.success import Examples, SuccessLearner, new_success_model
-from accerl_lerobot.world_model.trial import calibrate, try_out
+from accerl_lerobot.world_model.trial import calibrate
+
+if TYPE_CHECKING:
+    from accerl_lerobot.verb_configs import WorldModelRun
 
 EVERY = 20
 """Steps between two lines of metrics."""
@@ -71,29 +75,34 @@ def world_spec(config: WorldModelConfig, env: EnvConfig) -> WorldModelSpec:
     )
 
 
-def learn_from_dataset(
-    config: WorldModelConfig,
-    env: EnvConfig,
-    dataset: DatasetConfig,
-    directory: Path,
-    seed: int,
-    console: Console,
-) -> dict[str, Any]:
+class _Part(NamedTuple):
+    """One dataset's episodes."""
+
+    learn: list[Episode]
+    held: list[Episode]
+    source: Source
+
+
+def learn_world_model(run: WorldModelRun, directory: Path, console: Console) -> dict[str, Any]:
     """Does all of it; `directory` exists and is empty.
 
     Returns:
-        What `try_out` found, with ``seconds`` of the learning and how many ``episodes`` and ``env_steps``
+        What `try_sources` found, with ``seconds`` of the learning and how many ``episodes`` and ``env_steps``
         were learnt from and held out; also in ``trial.json``.
 
     Raises:
-        InputError: nothing can be learnt from this dataset, see `load_episodes`.
+        InputError: nothing can be learnt from a dataset, see `load_episodes`, or both are the same.
     """
-    spec = world_spec(config, env)
+    config, seed = run.world_model, run.seed
+    spec, rng = world_spec(config, run.env), _rng(seed)
     with console.stage("episodes"):
-        episodes = load_episodes(dataset, spec)
-    learnt, held_out = split(episodes, config.held_out, _rng(seed))
-    learn, held = ([episodes[i] for i in part] for part in (learnt, held_out))
-    _check_held_out(dataset, learn, held, config)
+        parts = {HELD_OUT: _part(run.dataset, "demo", config, spec, rng)}
+        if run.online.repo_id is not None:
+            with named("online"):
+                parts[ONLINE] = _part(run.online, ONLINE, config, spec, rng)
+                if parts[ONLINE].source.fingerprint == parts[HELD_OUT].source.fingerprint:
+                    raise InputError("dataset.repo_id", run.online.repo_id, "it is the dataset; name another")
+    learn = [episode for part in parts.values() for episode in part.learn]
     torch.manual_seed(seed)
     model = PixelWorldModel(spec, config.model)
     started = time.monotonic()
@@ -121,20 +130,38 @@ def learn_from_dataset(
                 record("success_model", step, metrics)
         success.eval()
     seconds = time.monotonic() - started
+    save_world_model(directory / "world_model", serving, None, [part.source for part in parts.values()])
+    held = {name: part.held for name, part in parts.items()}
+    # The policy's come last: the threshold that is kept is that of a policy's failures, where there are any.
+    found = try_sources(
+        serving, held, config.trial, success, directory, console, learnt=held, fresh=held, seed=seed
+    )
+    every = [episode for part in held.values() for episode in part]
+    found |= {"seconds": seconds, "learnt": amount(learn), "held_out": amount(every)}
+    found |= {"threshold": success.config.threshold}
+    (directory / "trial.json").write_text(json.dumps(found, indent=2) + "\n")
+    success.save_pretrained(directory / "world_model" / SUCCESS)  # with its threshold
+    return found
+
+
+def _part(
+    dataset: DatasetConfig,
+    name: str,
+    config: WorldModelConfig,
+    spec: WorldModelSpec,
+    rng: np.random.Generator,
+) -> _Part:
+    episodes = load_episodes(dataset, spec, name)
+    learnt, held_out = split(episodes, config.held_out, rng)
+    learn, held = ([episodes[i] for i in part] for part in (learnt, held_out))
+    _check_held_out(dataset, learn, held, config)
     source = Source(
         repo_id=dataset.repo_id or "",
         fingerprint=fingerprint(open_metadata(dataset)),
         learnt=tuple(learnt),
         held_out=tuple(held_out),
     )
-    save_world_model(directory / "world_model", serving, None, source)
-    amounts = {"seconds": seconds, "learnt": amount(learn), "held_out": amount(held)}
-    with console.stage("trial"):
-        found = try_out(serving, held, config.trial, success, seed, fresh=True) | amounts
-        film(directory / "preview.mp4", serving, held, config.trial, seed)
-    (directory / "trial.json").write_text(json.dumps(found, indent=2) + "\n")
-    success.save_pretrained(directory / "world_model" / SUCCESS)  # with its threshold
-    return found
+    return _Part(learn, held, source)
 
 
 def _check_held_out(

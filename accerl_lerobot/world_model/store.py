@@ -22,6 +22,7 @@ world_model/
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -62,35 +63,36 @@ def save_world_model(
     directory: Path,
     model: PixelWorldModel,
     success: SuccessPairsRewardModel | None = None,
-    source: Source | None = None,
+    sources: Sequence[Source] = (),
 ) -> None:
     """Writes all of it into a folder that does not exist."""
     directory.mkdir(parents=True)
     spec = asdict(model.spec) | {"provides": sorted(model.spec.provides)}
     content = {"spec": spec, "model": draccus.encode(model.config)}
-    content |= {} if source is None else {"source": asdict(source)}
+    content["sources"] = [asdict(source) for source in sources]
     (directory / CONFIG).write_text(json.dumps(content, indent=2) + "\n")
     save_file({k: v.contiguous() for k, v in model.state_dict().items()}, directory / WEIGHTS)
     if success is not None:
         success.save_pretrained(directory / SUCCESS)
 
 
-def load_source(directory: Path, field: str = "path") -> Source | None:
-    """What a saved world model has learnt from; None if it does not say. `field` is named in the error.
+def load_sources(directory: Path, field: str = "path") -> tuple[Source, ...]:
+    """What a saved world model has learnt from; none if it does not say. `field` is named in the error.
 
     Raises:
         InputError: it says something else.
     """
     try:
         origin = Origin(field, str(directory))
-        said = read_json(safe_join(directory, CONFIG, origin), origin).get("source")
-        if said is None:
-            return None
-        return Source(
-            repo_id=str(said["repo_id"]),
-            fingerprint=str(said["fingerprint"]),
-            learnt=tuple(map(int, said["learnt"])),
-            held_out=tuple(map(int, said["held_out"])),
+        said = read_json(safe_join(directory, CONFIG, origin), origin).get("sources", [])
+        return tuple(
+            Source(
+                repo_id=str(one["repo_id"]),
+                fingerprint=str(one["fingerprint"]),
+                learnt=tuple(map(int, one["learnt"])),
+                held_out=tuple(map(int, one["held_out"])),
+            )
+            for one in said
         )
     except InputError:
         raise
@@ -98,6 +100,11 @@ def load_source(directory: Path, field: str = "path") -> Source | None:
         raise InputError(
             field, str(directory), f"its {CONFIG} does not say what it learnt ({brief(error)})"
         ) from error
+
+
+def known(sources: Iterable[Source], fingerprint: str) -> Source | None:
+    """The one that is of this dataset."""
+    return next((source for source in sources if source.fingerprint == fingerprint), None)
 
 
 def load_world_model(

@@ -71,7 +71,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]
     print_ = fingerprint(open_metadata(DatasetConfig(repo_id="a/b", root=str(demos))))
     source = Source(repo_id="a/b", fingerprint=print_, learnt=(0, 1, 2, 3), held_out=(4, 5, 6, 7))
     spec = world_spec(CONFIG, ENV)
-    save_world_model(root / "model", PixelWorldModel(spec, CONFIG.model), new_success_model(5), source)
+    save_world_model(root / "model", PixelWorldModel(spec, CONFIG.model), new_success_model(5), [source])
     return demos, root / "model", others
 
 

@@ -28,19 +28,29 @@ from accerl_lerobot.config import DatasetConfig
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.world_model import offline
+from accerl_lerobot.world_model import offline, sources
 from accerl_lerobot.world_model.config import WorldModelConfig
-from accerl_lerobot.world_model.store import load_source, load_world_model, save_world_model
+from accerl_lerobot.world_model.store import load_sources, load_world_model, save_world_model
 from accerl_lerobot.world_model.success import new_success_model
 from tests.world_model.test_pixels import awake, dots, dream, model, windows
 
 
+def recorded(root: Path, episodes: int, seed: int) -> Path:
+    env = SimulatedConfig(max_steps=60, hold=25, image_size=16)
+    of = DemosConfig(
+        episodes=episodes, failure_share=0.5, processes=1, root=str(root), repo_id="a/b", seed=seed
+    )
+    return record_demos(env, of)
+
+
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("demos") / "dataset"
-    env = SimulatedConfig(max_steps=60, hold=25, image_size=16)
-    record_demos(env, DemosConfig(episodes=8, failure_share=0.5, processes=1, root=str(root), repo_id="a/b"))
-    return root
+    return recorded(tmp_path_factory.mktemp("demos") / "dataset", 8, 0)
+
+
+@pytest.fixture(scope="module")
+def rollouts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recorded(tmp_path_factory.mktemp("rollouts") / "dataset", 6, 1)
 
 
 def arguments(demos: Path, output_dir: Path) -> list[str]:
@@ -94,8 +104,8 @@ def test_a_saved_one_is_tried_on_another_dataset(
     code = cli.main(["world-model-eval", *told, f"--output_dir={tmp_path / 'again'}"])
     found = json.loads(capsys.readouterr().out)
     assert code == (0 if found["passed"] else 1)
-    source = load_source(path)
-    assert source is not None and sorted(source.learnt + source.held_out) == list(range(8))
+    (source,) = load_sources(path)
+    assert sorted(source.learnt + source.held_out) == list(range(8))
     assert found["tried"]["episodes"] == len(source.held_out) < 8, "it has learnt from the others"
     save_world_model(tmp_path / "unknown", load_world_model(path)[0])
     told[0] = f"--path={tmp_path / 'unknown'}"
@@ -143,7 +153,7 @@ def test_one_success_is_not_enough_to_learn_from_and_be_judged_on():
 
 
 def test_the_trial_is_on_episodes_that_were_not_learnt_from(
-    demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    demos: Path, rollouts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     seen: dict[str, list[bytes]] = {}
 
@@ -155,11 +165,63 @@ def test_the_trial_is_on_episodes_that_were_not_learnt_from(
         return called
 
     monkeypatch.setattr(offline, "pretrain", spy("learnt", 1, offline.pretrain))
-    monkeypatch.setattr(offline, "try_out", spy("tried", 1, offline.try_out))
+    monkeypatch.setattr(sources, "try_out", spy("tried", 1, sources.try_out))
     monkeypatch.setattr(offline, "Examples", spy("success", 0, offline.Examples))
-    cli.main(arguments(demos, tmp_path / "out"))
-    assert set(seen["learnt"]) == set(seen["success"]) and len(set(seen["learnt"] + seen["tried"])) == 8
+    cli.main([*arguments(demos, tmp_path / "out"), "--online.repo_id=a/b", f"--online.root={rollouts}"])
+    assert set(seen["learnt"]) == set(seen["success"]) and len(set(seen["learnt"] + seen["tried"])) == 14
     assert not set(seen["learnt"]) & set(seen["tried"])
+
+
+def test_a_policys_episodes_are_learnt_from_beside_demonstrations(
+    demos: Path, rollouts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    theirs = ["--online.repo_id=a/rollouts", f"--online.root={rollouts}"]
+    out = tmp_path / "out"
+    code = cli.main([*arguments(demos, out), *theirs])
+    stdout, stderr = capsys.readouterr()
+    found = json.loads(stdout)
+    both = load_sources(out / "world_model")
+    assert [source.repo_id for source in both] == ["a/b", "a/rollouts"]
+    assert [sorted(s.learnt + s.held_out) for s in both] == [list(range(8)), list(range(6))]
+    assert found["learnt"]["episodes"] == sum(len(source.learnt) for source in both)
+    assert found["held_out"]["episodes"] == sum(len(source.held_out) for source in both)
+    online = found["sources"]["online"]
+    own = {name: gate for name, gate in found["gates"].items() if "." not in name}
+    assert found["gates"] == own | {f"online.{name}": gate for name, gate in online["gates"].items()}
+    assert found["passed"] is all(gate["holds"] for gate in found["gates"].values()) is (code == 0)
+    assert (out / "preview_online.mp4").stat().st_size > 1000
+    _, success = load_world_model(out / "world_model")
+    assert success is not None and success.config.threshold == found["threshold"] == online["threshold"]
+    assert "By source" in stderr and f" of {len(own)} │" in stderr and stderr.count(" wanted") == 2 * len(own)
+    told = [f"--path={out / 'world_model'}", "--dataset.repo_id=a/b", f"--dataset.root={demos}", *theirs]
+    capsys.readouterr()  # LeRobot prints
+    cli.main(["world-model-eval", *told, "--trial.depth=2", f"--output_dir={tmp_path / 'again'}"])
+    stdout, stderr = capsys.readouterr()
+    again = json.loads(stdout)
+    tried = [one["tried"]["episodes"] for one in (again, again["sources"]["online"])]
+    assert tried == [len(source.held_out) for source in both] and set(again["gates"]) == set(found["gates"])
+    assert f"it has learnt from a/rollouts (online): tried on the {tried[1]} episodes" in stderr
+    assert (
+        cli.main(["report", str(out)]) == 0
+        and "episodes that a policy lived through" in (out / "report.html").read_text()
+    )
+
+
+@pytest.mark.parametrize(
+    ("of", "message"),
+    [
+        ("demos", "online.repo_id='a/b': it is the dataset; name another"),
+        ("nowhere", "online.root='nowhere': no meta/info.json there"),
+    ],
+)
+def test_a_policys_episodes_that_are_refused(
+    of: str, message: str, request: pytest.FixtureRequest, demos: Path, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):  # fmt: skip
+    root = of if of == "nowhere" else request.getfixturevalue(of)
+    theirs = ["--online.repo_id=a/b", f"--online.root={root}"]
+    assert cli.main([*arguments(demos, tmp_path / "out"), *theirs]) == 2
+    assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
 def test_what_is_saved_dreams_the_same(tmp_path: Path):

@@ -1,0 +1,103 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Trials of a world model on episodes from several sources: which they are, and which of them decide.
+
+held out    of the dataset that it has learnt from, those that it has not; or dataset: all of another one
+online      what a policy lived through, as ``accerl export`` writes it; of that, too, what was held out
+perturbed   episodes of the first source, played again in the world with noise on their actions
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from accerl_lerobot.console import Console
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model.episodes import Episode, amount
+from accerl_lerobot.world_model.films import film
+from accerl_lerobot.world_model.trial import try_out
+
+if TYPE_CHECKING:
+    from accerl_lerobot.world_model.config import TrialConfig
+    from accerl_lerobot.world_model.inverse import InverseProbe
+    from accerl_lerobot.world_model.pixels import PixelWorldModel
+    from accerl_lerobot.world_model.stand_in import SuccessModel
+
+HELD_OUT, DATASET, ONLINE = "held out", "dataset", "online"
+"""Names of sources."""
+PREVIEW = "preview.mp4"
+
+
+def try_sources(
+    model: PixelWorldModel,
+    sources: dict[str, list[Episode]],
+    config: TrialConfig,
+    success: SuccessModel | None,
+    directory: Path,
+    console: Console,
+    *,
+    learnt: Collection[str] = (),
+    fresh: Collection[str] = (),
+    seed: int = 0,
+    probe: InverseProbe | None = None,
+) -> dict[str, Any]:
+    """Tries a world model on each of them, and films it.
+
+    Args:
+        model: in inference.
+        sources: name → episodes that it has not learnt from.
+        config: what is tried, and what it takes to pass.
+        success: what tells successes, if anything does.
+        directory: where ``preview.mp4`` goes, of the first, and ``preview_<source>.mp4`` of the others.
+        console: progress for people.
+        learnt: sources of which it has learnt from other episodes. Their gates count, too.
+        fresh: sources on whose episodes the success threshold is set anew; what the last one sets is kept.
+        seed: of what is drawn.
+        probe: what reads actions off frames, if anything does.
+
+    Returns:
+        What `try_out` found on the first, with its ``name`` and how many episodes were ``tried``; and
+        ``sources``: name → the same of the others. Gates of others that count are among the first's, as
+        ``<source>.<gate>``, and ``passed`` says whether all hold.
+    """
+    first, *others = sources
+    found: dict[str, dict[str, Any]] = {}
+    for name, episodes in sources.items():
+        with console.stage(f"trial, {name}"):
+            told = try_out(model, episodes, config, success, seed, name in fresh, probe)
+            found[name] = {"name": name} | told | {"tried": amount(episodes)}
+            video = directory / (PREVIEW if name == first else f"preview_{name}.mp4")
+            film(video, model, episodes, config, seed)
+        if probe is not None:
+            probe.known = frozenset()  # which are of the first
+    result = found.pop(first)
+    gates = dict(result["gates"])
+    for name in others:
+        if name in learnt:
+            gates |= {f"{name}.{gate}": held for gate, held in found[name]["gates"].items()}
+    passed = all(gate["holds"] for gate in gates.values())
+    return result | {"gates": gates, "passed": passed, "sources": found}
+
+
+@contextmanager
+def named(room: str) -> Iterator[None]:
+    """What is refused of a dataset bears the name of its room."""
+    try:
+        yield
+    except InputError as error:
+        field = error.field.replace("dataset.", f"{room}.", 1)
+        raise InputError(field, error.value, error.remedy) from error

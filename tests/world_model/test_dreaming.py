@@ -1,0 +1,97 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What a run's world model goes on learning from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from accerl_lerobot.config import DatasetConfig, RunConfig
+from accerl_lerobot.demos.record import DemosConfig, record_demos
+from accerl_lerobot.demos.windows import open_metadata
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, WorldModelConfig
+from accerl_lerobot.world_model.dataset import fingerprint
+from accerl_lerobot.world_model.dreaming import check_imagination, make_learner
+from accerl_lerobot.world_model.imagination_config import ImaginationConfig, OnlineLearnConfig
+from accerl_lerobot.world_model.offline import world_spec
+from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.store import Source, save_world_model
+from accerl_lerobot.world_model.success import new_success_model
+from tests.runs import tiny_run
+
+ENV = SimulatedConfig(max_steps=16, hold=8)
+
+
+def recorded(root: Path, episodes: int, seed: int) -> DatasetConfig:
+    of = DemosConfig(
+        episodes=episodes, failure_share=0.5, processes=1, root=str(root), repo_id="a/b", seed=seed
+    )
+    return DatasetConfig(repo_id="a/b", root=str(record_demos(ENV, of)))
+
+
+@pytest.fixture(scope="module")
+def datasets(tmp_path_factory: pytest.TempPathFactory) -> tuple[DatasetConfig, DatasetConfig]:
+    """Demonstrations, and what stands for a policy's episodes."""
+    root = tmp_path_factory.mktemp("datasets")
+    return recorded(root / "demos", 5, 0), recorded(root / "rollouts", 4, 1)
+
+
+def run(checkpoint: Path, folder: Path, learn: OnlineLearnConfig, sources: list[Source]) -> RunConfig:
+    """One that imagines with a model that has learnt from these."""
+    torch.manual_seed(0)
+    config = PixelModelConfig(network=NetworkConfig(channels=(8, 8), condition=8, planes=2))
+    spec = world_spec(WorldModelConfig(chunk=4, image_size=32, model=config), ENV)
+    save_world_model(folder, PixelWorldModel(spec, config), new_success_model(4), sources)
+    imagination = ImaginationConfig(share=0.5, horizon=2, path=str(folder), learn=learn)
+    return tiny_run(checkpoint, env=ENV, imagination=imagination)
+
+
+def known(dataset: DatasetConfig, learnt: tuple[int, ...], held_out: tuple[int, ...]) -> Source:
+    print_ = fingerprint(open_metadata(dataset))
+    return Source(repo_id="a/b", fingerprint=print_, learnt=learnt, held_out=held_out)
+
+
+def test_it_goes_on_with_what_it_has_learnt_from_and_never_with_what_was_held_out(
+    tiny_checkpoint: Path, datasets: tuple[DatasetConfig, DatasetConfig], tmp_path: Path
+):
+    demos, rollouts = datasets
+    both = OnlineLearnConfig(dataset=demos, online=rollouts)
+    sources = [known(demos, (0, 2), (1, 3, 4)), known(rollouts, (1, 2, 3), (0,))]
+    learner = make_learner(run(tiny_checkpoint, tmp_path / "both", both, sources))
+    assert [e.source for e in learner._offline] == ["demo"] * 2 + ["online"] * 3
+    assert [e.source for e in learner._held_offline] == ["demo"] * 3 + ["online"]
+    of = {e.actions.tobytes() for e in learner._offline}
+    assert len(of) == 5 and not of & {e.actions.tobytes() for e in learner._held_offline}
+
+    learner = make_learner(run(tiny_checkpoint, tmp_path / "one", replace(both, dataset=rollouts), sources))
+    assert len(learner._offline) == 6, "whichever room it is named in"
+    learner = make_learner(run(tiny_checkpoint, tmp_path / "none", both, []))
+    assert (len(learner._offline), len(learner._held_offline)) == (9, 0), (
+        "what it does not know it takes whole"
+    )
+
+
+@pytest.mark.parametrize("room", ["dataset", "online"])
+def test_a_dataset_that_is_not_there_is_named_by_its_room(room: str, tiny_checkpoint: Path, tmp_path: Path):
+    learn = OnlineLearnConfig(**{room: DatasetConfig(repo_id="a/b", root="nowhere")})
+    config = run(tiny_checkpoint, tmp_path / "model", learn, [])
+    for refused in (check_imagination, make_learner):
+        with pytest.raises(InputError, match=rf"^imagination.learn.{room}.root='nowhere': no meta/info.json"):
+            refused(config)
