@@ -129,7 +129,7 @@ def write_examples(scratch: Path) -> dict[str, Path]:
 
     spec = WorldModelSpec(
         cameras=("observation.images.front",), image_size=(8, 8), state_dim=2, action_dim=2, chunk=2, fps=10,
-        context=1, provides=frozenset({"pixels", "state"}),
+        context=1, provides=frozenset({"pixels", "state"}), tasks=("reach",),
     )  # fmt: skip
     network = NetworkConfig(channels=(8,), condition=8, planes=2)
     world = PixelWorldModel(spec, PixelModelConfig(context=1, heads=2, network=network))

@@ -64,6 +64,8 @@ class WorldModelSpec:
     """L."""
     provides: frozenset[str]
     """Of pixels, state, uncertainty, success."""
+    tasks: tuple[str, ...] = ()
+    """Names of the world's tasks; none: it does not say."""
 
 
 @dataclass(frozen=True, kw_only=True)

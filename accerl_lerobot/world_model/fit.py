@@ -31,8 +31,8 @@ def check_fit(spec: WorldModelSpec, world: WorldSpec, executed: int, history: in
         judged: whether there is a success model beside it.
 
     Raises:
-        InputError: it shows other cameras or another robot, goes another number of steps at a time, cannot
-            tell a success, or the policy looks back at what is not imagined.
+        InputError: it shows other cameras, another robot or other tasks, goes another number of steps at a
+            time, cannot tell a success, or the policy looks back at what is not imagined.
     """
 
     def refuse(value: object, why: str) -> InputError:
@@ -52,6 +52,11 @@ def check_fit(spec: WorldModelSpec, world: WorldSpec, executed: int, history: in
         if theirs != ours:
             remedy = f"is the world model's {name}, and the world's is {ours}; learn one of this world"
             raise refuse(theirs, remedy)
+    if spec.tasks and (others := [task for task in world.tasks if task not in spec.tasks]):
+        known = ", ".join(spec.tasks)
+        raise InputError(
+            "env.task", others[0], f"the world model in imagination.path is of {known}; name one"
+        )
     if spec.chunk != executed:
         why = f"env steps to a dream's chunk, and the policy executes {executed} actions per decision"
         raise refuse(spec.chunk, f"{why}; learn one with world_model.chunk={executed}")

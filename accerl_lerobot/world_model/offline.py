@@ -71,6 +71,7 @@ def world_spec(config: WorldModelConfig, env: EnvConfig) -> WorldModelSpec:
         chunk=config.chunk,
         context=config.model.context,
         fps=seen.fps,
+        tasks=seen.tasks,
         provides=frozenset(provides),
     )
 

@@ -126,7 +126,7 @@ def load_world_model(
     weights, _ = checked_weights(directory, WEIGHTS, origin)
     try:
         spec = dict(content["spec"])
-        spec |= {k: tuple(spec[k]) for k in ("cameras", "image_size")}
+        spec |= {k: tuple(spec.get(k, ())) for k in ("cameras", "image_size", "tasks")}
         spec |= {"provides": frozenset(spec["provides"])}
         with Budget(file_size(weights, origin), field, str(directory)):
             model = PixelWorldModel(

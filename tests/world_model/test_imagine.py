@@ -341,6 +341,17 @@ def test_a_world_model_of_something_else_is_refused(
         check_fit(replace(SPEC, **change), WORLD_SPEC, executed, history, judged)
 
 
+def test_a_world_model_of_another_task_is_refused():
+    known = (*WORLD_SPEC.tasks, "another")
+    check_fit(replace(SPEC, tasks=known), WORLD_SPEC, K, 1, True)
+    message = (
+        f"^env.task='unheard of': the world model in imagination.path is of {', '.join(known)}; name one"
+    )
+    with pytest.raises(InputError, match=message):
+        tasks = (*WORLD_SPEC.tasks, "unheard of")
+        check_fit(replace(SPEC, tasks=known), replace(WORLD_SPEC, tasks=tasks), K, 1, True)
+
+
 def test_one_that_tells_successes_needs_no_success_model():
     check_fit(replace(SPEC, provides=SPEC.provides | {"success"}), WORLD_SPEC, K, 1, False)
 
