@@ -33,7 +33,7 @@ VERBS = {
     "demos": ("verbs:demos", "record scripted-expert demonstrations into a LeRobotDataset"),
     "sft": ("verbs:sft", "fine-tune on a LeRobotDataset with LeRobot's own trainer"),
     "eval": ("verbs:evaluate", "success of a checkpoint, with its confidence interval"),
-    "world-model": ("verbs:world_model", "learn to dream a world from a LeRobotDataset, and be tried on it"),
+    "world-model": ("verbs:world_model", "learn to dream a world from LeRobotDatasets, and be tried on them"),
     "world-model-eval": ("verbs:world_model_eval", "try a world model on episodes of one or several sources"),
     "push": ("verbs:push", "a policy, world model, dataset or run to the Hub, as one commit"),
     "pull": ("verbs:pull", "what was pushed into a new folder, pinned and checked"),

@@ -76,9 +76,9 @@ class LaunchConfig:
     all are.
     """
     max_recoveries: int = 3
-    """How often in a row, no later checkpoint having been reached in between, all workers are started again
-    from the last checkpoint because one of them was lost that is not started again alone; once more ends the
-    run with its error."""
+    """How often in a row, no later update or checkpoint having been reached in between, all workers are
+    started again from the last checkpoint because one of them was lost that is not started again alone; once
+    more ends the run with its error."""
     timeline: bool = True
     """Whether every worker records what it does when, for ``accerl timeline``: up to 8 MB each time one is
     started."""
@@ -167,6 +167,7 @@ class RunConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 100:
             raise InputError("seed", self.seed, "use 0 to 99")
+        self.dataset.check("dataset")
         if self.save_every_updates < 0:
             raise InputError("save_every_updates", self.save_every_updates, "use 0 (none by number) or more")
         if not self.save_every_s >= 0:

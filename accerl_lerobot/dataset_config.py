@@ -31,8 +31,12 @@ class DatasetConfig:
     revision: str | None = None
     """Hub revision."""
 
-    def __post_init__(self) -> None:
+    def check(self, room: str) -> None:
+        """Refuses a folder without a name; `room` is where it is on the command line.
+
+        Raises:
+            InputError: there is one.
+        """
         if self.root is not None and self.repo_id is None:
-            raise InputError(
-                "dataset.repo_id", None, "name the dataset in dataset.root; any owner/name will do"
-            )
+            remedy = f"name the dataset in {room}.root; any owner/name will do"
+            raise InputError(f"{room}.repo_id", None, remedy)

@@ -96,6 +96,8 @@ class Times:
     """Training, in processes before this one."""
     before_s: float | None = 0.0
     """All, in processes before this one; None: the checkpoint will tell."""
+    furthest: int = 0
+    """The latest update that has been made in this process, whether or not it was lost since."""
     clock: Clock = field(default_factory=NoClock)
     """The driver's row of the timeline."""
 
@@ -292,6 +294,7 @@ class Loop:
             self.lag_max = max(self.lag_max, metrics["lag_max"])
             self.mismatch_max = max(self.mismatch_max, metrics["ratio_max_dev"])
             self.log.write("train", int(metrics["update"]), metrics)
+            self.times.furthest = max(self.times.furthest, int(metrics["update"]))
 
     def _record(self, progress: Progress) -> None:
         self.times.clock.beat()

@@ -222,7 +222,7 @@ def train(
             except WorkerError as error:
                 times.clock.enter(RECOVERY)
                 heed_stop(stop, directory)
-                checkpoint = recovery.next(directory / CHECKPOINTS, console, error)
+                checkpoint = recovery.next(directory / CHECKPOINTS, console, error, times.furthest)
                 heed_stop(stop, directory)
                 go_back_to(checkpoint)
                 config = _going_on(config, directory, checkpoint, console)
@@ -264,10 +264,17 @@ class Recovery:
     """
 
     def __init__(self, most: int) -> None:
-        self._most, self._times, self._reached = most, 0, ""
+        self._most, self._times, self._begun, self._furthest = most, 0, "", -1
 
-    def next(self, checkpoints: Path, console: Console, error: WorkerError) -> Path:
+    def next(self, checkpoints: Path, console: Console, error: WorkerError, furthest: int) -> Path:
         """The checkpoint to go on from; where that is done again waits a little, longer each time.
+
+        Args:
+            checkpoints: of the run.
+            console: is told.
+            error: what was lost.
+            furthest: the latest update so far. A run that gets further each time is not stuck, though it may
+                be hit again before its next checkpoint.
 
         Raises:
             WorkerError: the one given: there is no checkpoint, or it has been tried often enough.
@@ -276,8 +283,9 @@ class Recovery:
             path, passed = newest_whole(checkpoints)
         except InputError:
             raise error from None
-        self._times = self._times + 1 if path.name == self._reached else 1
-        self._reached = path.name
+        stuck = path.name == self._begun and furthest <= self._furthest
+        self._times = self._times + 1 if stuck else 1
+        self._begun, self._furthest = path.name, max(furthest, self._furthest)
         if self._times > self._most:
             raise error
         for why in passed:

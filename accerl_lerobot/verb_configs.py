@@ -62,6 +62,7 @@ class SFTRun:
     sft: SFTConfig = field(default_factory=SFTConfig)
 
     def __post_init__(self) -> None:
+        self.dataset.check("dataset")
         if self.sft.init_path is None:
             check_chunk(self.sft.policy)
 
@@ -93,7 +94,7 @@ class WorldModelRun:
     job_name: str = "world_model"
     """Last part of the folder's name."""
     env: EnvConfig = field(default_factory=MetaWorldConfig)
-    """The world it is to be a model of: its cameras, sizes and rate."""
+    """The world it is to be a model of: its cameras, sizes, rate and tasks."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """Demonstrations, some of which fail."""
     online: DatasetConfig = field(default_factory=DatasetConfig)
@@ -104,6 +105,8 @@ class WorldModelRun:
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 100:
             raise InputError("seed", self.seed, "use 0 to 99")
+        self.dataset.check("dataset")
+        self.online.check("online")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,3 +140,5 @@ class WorldModelEvalRun:
             raise InputError("path", None, "name the folder world_model of an accerl world-model run")
         if self.seed < 0:
             raise InputError("seed", self.seed, "use 0 or more")
+        self.dataset.check("dataset")
+        self.online.check("online")

@@ -184,6 +184,10 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--algorithm.advantage=group"], "algorithm.advantage='group': add --rollout.group_size=8, say"),
     (["--replay.ahead=3"], "replay.ahead=3: use at least one batch, 128, or both sides wait for each other"),
     (["--dataset.root=x"], "dataset.repo_id=None: name the dataset in dataset.root"),
+    (
+        ["--imagination.learn.online.root=x"],
+        "imagination.learn.online.repo_id=None: name the dataset in imagination.learn.online.root",
+    ),
     (["--demos.seed=1"], "demos.seed=1: a run's demonstrations take its own seed; use --seed"),
     (["--policy.path=x", "--sft.steps=5"], "policy.path='x': add --sft.steps=0 to improve this checkpoint"),
     (["--sft.policy.chunk_size=5"], "sft.policy={'chunk_size': 5}: name LeRobot's policy type, e.g."),

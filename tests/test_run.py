@@ -303,6 +303,19 @@ def test_a_worker_that_is_lost_again_and_again_ends_the_run(
     assert len(made) == 3 and all(engine.closed for engine in made)
 
 
+def test_a_run_that_gets_further_each_time_is_not_stuck(
+    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    """Though no checkpoint is reached in between."""
+    launch = LaunchConfig(engine="local", max_recoveries=1)
+    config = local_run(tiny_checkpoint, tmp_path, launch=launch)
+    made = losing(monkeypatch, config, [6, 7, 8, 9])
+    summary = run.train(config, tmp_path, Console())
+    assert len(made) == 5 and summary["updates"] == 12
+    assert capsys.readouterr().err.count("(1 of 1 times)") == 4
+    assert [r["update"] for r in records(tmp_path, "train")] == list(range(1, 13)), "none twice"
+
+
 def test_without_a_checkpoint_there_is_nothing_to_go_on_from(
     tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

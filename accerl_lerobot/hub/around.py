@@ -35,7 +35,7 @@ FOLDER = "accerl_run"
 EVALUATION, TRIAL = "evaluation.json", "trial.json"
 KEPT = {
     POLICY: (RECIPE, SUMMARY, EVALUATION, "success_curve.png", "before_after.mp4"),
-    WORLD_MODEL: (RECIPE, TRIAL, "preview.mp4"),
+    WORLD_MODEL: (RECIPE, TRIAL, "preview.mp4", "preview_online.mp4"),
     SUCCESS_MODEL: (RECIPE, TRIAL),
 }
 """Kind → files of its run that go with it."""

@@ -111,10 +111,10 @@ def _tags(kind: str, config: Mapping[str, Any], around: Around) -> list[str]:
 
 
 def _datasets(recipe: Mapping[str, Any]) -> list[str] | None:
-    dataset = recipe.get("dataset") or {}
-    name = dataset.get("repo_id")
+    rooms = [recipe.get(room) or {} for room in ("dataset", "online")]
     # Beside a folder the name is a label, and no dataset on the Hub.
-    return [name] if name and not dataset.get("root") else None
+    names = [room["repo_id"] for room in rooms if room.get("repo_id") and not room.get("root")]
+    return names or None
 
 
 def _base_model(recipe: Mapping[str, Any]) -> str | None:

@@ -83,7 +83,7 @@ def gate_table(caption: str, rows: Sequence[tuple[str, float | None, str, bool]]
                 Cell(text=number(value, 3), number=True),
                 Cell(text=wanted, number=True),
                 Cell(text="holds" if holds else "fails", good=holds),
-                Cell(text=MEANING.get(name, "")),
+                Cell(text=MEANING.get(name.rpartition(".")[2], "")),
             )
             for name, value, wanted, holds in rows
         ],

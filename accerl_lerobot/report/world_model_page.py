@@ -200,9 +200,10 @@ def _headline(run: Run) -> str:
 def _lead(found: Record) -> str:
     if not found:
         return ""
-    text = f"{count(found['trials'], 'trial')}"
-    if "episodes" in found:
-        text += f" on {count(found['episodes'], 'episode')} it had not learnt from"
+    every = [found, *(found.get("sources") or {}).values()]
+    text = count(sum(one["trials"] for one in every), "trial")
+    if all("episodes" in one for one in every):
+        text += f" on {count(sum(one['episodes'] for one in every), 'episode')} it had not learnt from"
     return (
         f"{text}; each dreams on from a real frame with the actions that were really made, and with others."
     )

@@ -30,7 +30,8 @@ SPEC = {
 """Field of a `WorldModelSpec` → its smallest and largest value."""
 MODEL = {"steps": (1, 1000), "context": (1, 64), "heads": (2, 64)}
 NETWORK = {"space_to_depth": (1, 64), "blocks": (1, 64), "condition": (1, 16_384), "planes": (0, 1024)}
-CAMERAS_MOST, TASKS_MOST, SIDE_MOST, LEVELS_MOST, WIDTH_MOST = 16, 4096, 2048, 8, 16_384
+CAMERAS_MOST, SIDE_MOST, LEVELS_MOST, WIDTH_MOST = 16, 2048, 8, 16_384
+TASKS_MOST, NAME_MOST = 4096, 200
 
 
 def check_spec(spec: Any, origin: Origin) -> None:
@@ -47,8 +48,9 @@ def check_spec(spec: Any, origin: Origin) -> None:
     for camera in cameras:
         check_name(camera, f"{CONFIG}: spec.cameras", origin)
     tasks = mapping.get("tasks", [])
-    if not isinstance(tasks, list) or len(tasks) > TASKS_MOST or not all(isinstance(t, str) for t in tasks):
-        raise origin.refuse(f"{CONFIG}: spec.tasks", f"a list of at most {TASKS_MOST} names is wanted")
+    if not isinstance(tasks, list) or len(tasks) > TASKS_MOST or not all(map(_is_name, tasks)):
+        wanted = f"a list of at most {TASKS_MOST} names of at most {NAME_MOST} printable characters is wanted"
+        raise origin.refuse(f"{CONFIG}: spec.tasks", wanted)
     if not isinstance(provides, list) or not all(isinstance(name, str) for name in provides):
         raise origin.refuse(f"{CONFIG}: spec.provides", "a list of names is wanted")
     _sides(mapping.get("image_size"), 2, SIDE_MOST, "spec.image_size", origin)
@@ -79,6 +81,10 @@ def check_success_model(config: dict[str, Any], origin: Origin) -> None:
     _numbers(config, {"chunk": (1, 4096), "hidden": (1, WIDTH_MOST), "shift": (0, 256)}, "", origin)
     if "channels" in config:
         _sides(config["channels"], None, WIDTH_MOST, "channels", origin)
+
+
+def _is_name(value: object) -> bool:
+    return isinstance(value, str) and 0 < len(value) <= NAME_MOST and value.isprintable()
 
 
 def _mapping(value: Any, what: str, origin: Origin) -> dict[str, Any]:

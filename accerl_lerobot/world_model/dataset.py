@@ -73,9 +73,10 @@ def load_episodes(
 
 
 def fingerprint(meta: Any) -> str:
-    """What tells a dataset from others, whatever it is called: its sizes and statistics of its actions."""
+    """What tells a dataset from others, whatever it is called: how long each of its episodes is, in their
+    order, and statistics of its actions."""
     moments = [np.asarray(meta.stats["action"][k], np.float64).round(6).tolist() for k in ("mean", "std")]
-    said = json.dumps([meta.total_episodes, meta.total_frames, meta.fps, moments])
+    said = json.dumps([list(map(int, meta.episodes["length"])), meta.fps, moments])
     return hashlib.sha256(said.encode()).hexdigest()
 
 

@@ -21,7 +21,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from accerl_lerobot.config import DatasetConfig, RunConfig, journal_folder
-from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.errors import InputError
@@ -30,7 +29,7 @@ from accerl_lerobot.policies.loading import load_lerobot_config
 from accerl_lerobot.preflight import check_sft_policy
 from accerl_lerobot.world_model.baselines import ShuffledModel
 from accerl_lerobot.world_model.config import TrialConfig
-from accerl_lerobot.world_model.dataset import check_metadata, fingerprint, load_episodes
+from accerl_lerobot.world_model.dataset import fingerprint, load_episodes
 from accerl_lerobot.world_model.episodes import Episode
 from accerl_lerobot.world_model.films import TrialFilms
 from accerl_lerobot.world_model.fit import check_fit
@@ -40,9 +39,12 @@ from accerl_lerobot.world_model.online import OnlineLearner
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.pool import part
 from accerl_lerobot.world_model.recorded import DREAMS, DreamRecorder
-from accerl_lerobot.world_model.sources import ONLINE, named
-from accerl_lerobot.world_model.store import known, load_sources
+from accerl_lerobot.world_model.sources import ONLINE, named, open_rooms
+from accerl_lerobot.world_model.store import find, load_sources
 from accerl_lerobot.world_model.zoo import make_dreamer
+
+EARLIER = "earlier"
+"""Source of the episodes that a world model has learnt from before the run."""
 
 
 def make_imagination(
@@ -104,7 +106,7 @@ def make_learner(config: RunConfig, dreamer: Dreamer | None = None) -> OnlineLea
     """What a run's world model goes on learning with, from `dreamer` on; None: from the saved one.
 
     Raises:
-        InputError: the dataset it was pre-trained on cannot be read, or is of another world.
+        InputError: a dataset it was pre-trained on cannot be read, is of another world, or is named twice.
     """
     learn = config.imagination.learn
     world = _spec(config)
@@ -116,10 +118,12 @@ def make_learner(config: RunConfig, dreamer: Dreamer | None = None) -> OnlineLea
     sources = load_sources(Path(str(config.imagination.path)), "imagination.path")
     offline: list[Episode] = []
     held_out: list[Episode] = []
-    for room, dataset in _datasets(learn):
+    rooms = _rooms(learn)
+    for room, meta in open_rooms(rooms, model.spec).items():
         with named(room):
-            episodes = load_episodes(dataset, model.spec, ONLINE if room.endswith(ONLINE) else "demo")
-        source = known(sources, fingerprint(open_metadata(dataset)))
+            # Not as a policy's, whichever it is: in a trial, this run's own failures are what counts.
+            episodes = load_episodes(rooms[room], model.spec, EARLIER, both=False)
+        source = find(sources, fingerprint(meta))
         offline += episodes if source is None else [episodes[i] for i in source.learnt]
         held_out += [] if source is None else [episodes[i] for i in source.held_out]
     return OnlineLearner(
@@ -150,15 +154,14 @@ def check_imagination(config: RunConfig) -> None:
     executed = getattr(policy, "n_action_steps", 1)
     dreamer = _dreamer(config, _spec(config), executed, policy.n_obs_steps)
     learn = config.imagination.learn
-    for room, dataset in _datasets(learn) if config.imagination.learns else ():
-        with named(room):
-            check_metadata(open_metadata(dataset), str(dataset.repo_id), dreamer.model.spec)
+    if config.imagination.learns:
+        open_rooms(_rooms(learn), dreamer.model.spec)
 
 
-def _datasets(learn: OnlineLearnConfig) -> list[tuple[str, DatasetConfig]]:
-    """Those that are named, each with its room."""
+def _rooms(learn: OnlineLearnConfig) -> dict[str, DatasetConfig]:
+    """The datasets that are named."""
     rooms = {"dataset": learn.dataset, ONLINE: learn.online}
-    return [(f"imagination.learn.{room}", of) for room, of in rooms.items() if of.repo_id is not None]
+    return {f"imagination.learn.{room}": of for room, of in rooms.items() if of.repo_id is not None}
 
 
 def _films(config: RunConfig) -> TrialFilms | None:

@@ -30,21 +30,20 @@ import numpy as np
 
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.starts import Start, read_starts
-from accerl_lerobot.demos.windows import open_metadata, origin_of
+from accerl_lerobot.demos.windows import origin_of
 from accerl_lerobot.envs import World, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.contract import WorldModelSpec
-from accerl_lerobot.world_model.dataset import check_metadata, fingerprint, load_episodes
+from accerl_lerobot.world_model.dataset import fingerprint, load_episodes
 from accerl_lerobot.world_model.episodes import Episode
 from accerl_lerobot.world_model.inverse import InverseProbe, learn_probe
 from accerl_lerobot.world_model.perturbed import SOURCE as PERTURBED
 from accerl_lerobot.world_model.perturbed import check_world, perturbed_episodes
-from accerl_lerobot.world_model.sources import DATASET, HELD_OUT, ONLINE, named, try_sources
+from accerl_lerobot.world_model.sources import DATASET, HELD_OUT, ONLINE, named, open_rooms, try_sources
 from accerl_lerobot.world_model.stand_in import SuccessModel, load_stand_in
-from accerl_lerobot.world_model.store import Source, known, load_sources, load_world_model
+from accerl_lerobot.world_model.store import Source, find, load_sources, load_world_model
 
 if TYPE_CHECKING:
-    from accerl_lerobot.dataset_config import DatasetConfig
     from accerl_lerobot.verb_configs import WorldModelEvalRun
 
 
@@ -52,6 +51,8 @@ class _Part(NamedTuple):
     """What is tried of a dataset."""
 
     meta: Any
+    source: Source | None
+    """As the world model knows it."""
     tried: list[int]
     """Indices of episodes,"""
     learnt: list[int]
@@ -70,14 +71,15 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
     path = Path(str(config.path)).expanduser()
     success: SuccessModel | None
     model, success = load_world_model(path)
-    given = config.success.threshold is not None
     if config.success.path is not None:
         success = load_stand_in(config.success, model.spec, "success")
     spec, sources_of = model.spec, load_sources(path)
-    parts = {"dataset": _part(config.dataset, sources_of, spec)}
-    if config.online.repo_id is not None:
-        with named("online"):
-            parts[ONLINE] = _part(config.online, sources_of, spec)
+    rooms = {"dataset": config.dataset}
+    rooms |= {} if config.online.repo_id is None else {ONLINE: config.online}
+    parts: dict[str, _Part] = {}
+    for room, meta in open_rooms(rooms, spec).items():
+        with named(room):
+            parts[room] = _part(meta, sources_of)
     part = parts["dataset"]
     world, starts = _world(config, part, spec)
     for room, one in parts.items():
@@ -91,7 +93,7 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
         first = HELD_OUT if part.learnt else DATASET
         sources[first] = load_episodes(config.dataset, spec, both=success is not None, only=part.tried)
         if ONLINE in parts:
-            with named("online"):
+            with named(ONLINE):
                 theirs = load_episodes(config.online, spec, ONLINE, both=False, only=parts[ONLINE].tried)
                 sources[ONLINE] = theirs
     if world is not None:
@@ -105,29 +107,32 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
             finally:
                 world.close()
     probe = _probe(config, part, spec, sources[first], console)
-    learnt = [name for name, one in zip((first, ONLINE), parts.values(), strict=False) if one.learnt]
-    # The threshold was set on the very episodes that were held out: here it is set on some of them and tried
-    # on others. On other sources it is what it is; one that stands in has none yet.
-    fresh: Sequence[str] = learnt if config.success.path is None else [first]
+    names = {"dataset": first, ONLINE: ONLINE}
+    learnt = [names[room] for room, one in parts.items() if one.learnt]
+    fresh, kept = None, False
+    if config.success.path is None:
+        # Its threshold was set on what was held out of the last of them: there, it is set on some episodes
+        # and tried on others. Elsewhere it is what it is.
+        fresh = next((names[r] for r, one in parts.items() if sources_of[-1:] == (one.source,)), None)
+    elif config.success.threshold is None:  # one that stands in has none yet
+        fresh, kept = (ONLINE if ONLINE in parts else first), True
     result = try_sources(
         model, sources, config.trial, success, directory, console,
-        learnt=learnt, fresh=() if given else fresh, seed=config.seed, probe=probe,
+        learnt=learnt, fresh=fresh, kept=kept, seed=config.seed, probe=probe,
     )  # fmt: skip
     (directory / "trial.json").write_text(json.dumps(result, indent=2) + "\n")
     return result
 
 
-def _part(dataset: DatasetConfig, sources: Sequence[Source], spec: WorldModelSpec) -> _Part:
+def _part(meta: Any, sources: Sequence[Source]) -> _Part:
     """Of a dataset that it has learnt from, what was held out; of another one everything."""
-    meta = open_metadata(dataset)
-    check_metadata(meta, dataset.repo_id or "", spec)
-    source = known(sources, fingerprint(meta))
+    source = find(sources, fingerprint(meta))
     if source is None:
-        return _Part(meta, list(range(meta.total_episodes)), [])
+        return _Part(meta, None, list(range(meta.total_episodes)), [])
     if not source.held_out:
         remedy = "the world model has learnt from every episode of it; give another dataset"
-        raise InputError("dataset.repo_id", dataset.repo_id, remedy)
-    return _Part(meta, list(source.held_out), list(source.learnt))
+        raise InputError("dataset.repo_id", meta.repo_id, remedy)
+    return _Part(meta, source, list(source.held_out), list(source.learnt))
 
 
 def _world(

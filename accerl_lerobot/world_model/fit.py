@@ -19,6 +19,9 @@ from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.contract import WorldModelSpec
 
+SHOWN = 4
+"""Of a list of tasks, in an error."""
+
 
 def check_fit(spec: WorldModelSpec, world: WorldSpec, executed: int, history: int, judged: bool) -> None:
     """Refuses a world model that cannot stand for a world, before a run begins.
@@ -53,10 +56,11 @@ def check_fit(spec: WorldModelSpec, world: WorldSpec, executed: int, history: in
             remedy = f"is the world model's {name}, and the world's is {ours}; learn one of this world"
             raise refuse(theirs, remedy)
     if spec.tasks and (others := [task for task in world.tasks if task not in spec.tasks]):
-        known = ", ".join(spec.tasks)
-        raise InputError(
-            "env.task", others[0], f"the world model in imagination.path is of {known}; name one"
+        more = "" if len(spec.tasks) <= SHOWN else f" and {len(spec.tasks) - SHOWN} more"
+        remedy = (
+            f"the world model is of {', '.join(spec.tasks[:SHOWN])}{more}; name these, or learn one of it"
         )
+        raise InputError("env.task", others[0], remedy)
     if spec.chunk != executed:
         why = f"env steps to a dream's chunk, and the policy executes {executed} actions per decision"
         raise refuse(spec.chunk, f"{why}; learn one with world_model.chunk={executed}")

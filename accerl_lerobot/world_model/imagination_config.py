@@ -78,6 +78,8 @@ class OnlineLearnConfig:
 
     def __post_init__(self) -> None:
         where = "imagination.learn"
+        self.dataset.check(f"{where}.dataset")
+        self.online.check(f"{where}.online")
         for name, least in (
             ("steps_per_episode", 0), ("batch", 2), ("try_every", 1), ("last_tries", 1), ("memory", 2),
             ("films", 0),

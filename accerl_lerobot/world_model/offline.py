@@ -26,6 +26,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -34,7 +35,6 @@ import torch
 
 from accerl_lerobot.config import DatasetConfig
 from accerl_lerobot.console import Console
-from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import WorldModelConfig
@@ -43,7 +43,7 @@ from accerl_lerobot.world_model.dataset import fingerprint, load_episodes
 from accerl_lerobot.world_model.episodes import Episode, amount, split
 from accerl_lerobot.world_model.learn import pretrain
 from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.sources import HELD_OUT, ONLINE, named, try_sources
+from accerl_lerobot.world_model.sources import HELD_OUT, ONLINE, named, open_rooms, try_sources
 from accerl_lerobot.world_model.store import SUCCESS, Source, save_world_model
 from accerl_lerobot.world_model.success import Examples, SuccessLearner, new_success_model
 from accerl_lerobot.world_model.trial import calibrate
@@ -71,12 +71,11 @@ def world_spec(config: WorldModelConfig, env: EnvConfig) -> WorldModelSpec:
         chunk=config.chunk,
         context=config.model.context,
         fps=seen.fps,
-        tasks=seen.tasks,
         provides=frozenset(provides),
     )
 
 
-class _Part(NamedTuple):
+class _Split(NamedTuple):
     """One dataset's episodes."""
 
     learn: list[Episode]
@@ -92,18 +91,26 @@ def learn_world_model(run: WorldModelRun, directory: Path, console: Console) -> 
         were learnt from and held out; also in ``trial.json``.
 
     Raises:
-        InputError: nothing can be learnt from a dataset, see `load_episodes`, or both are the same.
+        InputError: a dataset is named twice or of another world; nothing can be learnt from it, see
+            `load_episodes`, or nothing would be left to judge; an episode is in both; the world has not the
+            task of one.
     """
     config, seed = run.world_model, run.seed
     spec, rng = world_spec(config, run.env), _rng(seed)
+    rooms = {"dataset": run.dataset}
+    rooms |= {} if run.online.repo_id is None else {ONLINE: run.online}
+    metas = open_rooms(rooms, spec)
+    parts: dict[str, _Split] = {}
     with console.stage("episodes"):
-        parts = {HELD_OUT: _part(run.dataset, "demo", config, spec, rng)}
-        if run.online.repo_id is not None:
-            with named("online"):
-                parts[ONLINE] = _part(run.online, ONLINE, config, spec, rng)
-                if parts[ONLINE].source.fingerprint == parts[HELD_OUT].source.fingerprint:
-                    raise InputError("dataset.repo_id", run.online.repo_id, "it is the dataset; name another")
+        for room, dataset in rooms.items():
+            name, source = (HELD_OUT, "demo") if room == "dataset" else (ONLINE, ONLINE)
+            with named(room):
+                episodes = load_episodes(dataset, spec, source)
+                _check_new(dataset, episodes, parts)
+                parts[name] = _split(dataset, metas[room], episodes, config, rng)
     learn = [episode for part in parts.values() for episode in part.learn]
+    held = {name: part.held for name, part in parts.items()}
+    spec = replace(spec, tasks=_tasks(run.env, learn))
     torch.manual_seed(seed)
     model = PixelWorldModel(spec, config.model)
     started = time.monotonic()
@@ -132,37 +139,58 @@ def learn_world_model(run: WorldModelRun, directory: Path, console: Console) -> 
         success.eval()
     seconds = time.monotonic() - started
     save_world_model(directory / "world_model", serving, None, [part.source for part in parts.values()])
-    held = {name: part.held for name, part in parts.items()}
-    # The policy's come last: the threshold that is kept is that of a policy's failures, where there are any.
+    # The threshold is that of a policy's failures, where there are any: demonstrations fail otherwise.
+    *_, fresh = held
     found = try_sources(
-        serving, held, config.trial, success, directory, console, learnt=held, fresh=held, seed=seed
-    )
+        serving, held, config.trial, success, directory, console,
+        learnt=held, fresh=fresh, kept=True, seed=seed,
+    )  # fmt: skip
     every = [episode for part in held.values() for episode in part]
     found |= {"seconds": seconds, "learnt": amount(learn), "held_out": amount(every)}
-    found |= {"threshold": success.config.threshold}
     (directory / "trial.json").write_text(json.dumps(found, indent=2) + "\n")
     success.save_pretrained(directory / "world_model" / SUCCESS)  # with its threshold
     return found
 
 
-def _part(
+def _split(
     dataset: DatasetConfig,
-    name: str,
+    meta: Any,
+    episodes: Sequence[Episode],
     config: WorldModelConfig,
-    spec: WorldModelSpec,
     rng: np.random.Generator,
-) -> _Part:
-    episodes = load_episodes(dataset, spec, name)
+) -> _Split:
     learnt, held_out = split(episodes, config.held_out, rng)
     learn, held = ([episodes[i] for i in part] for part in (learnt, held_out))
     _check_held_out(dataset, learn, held, config)
     source = Source(
         repo_id=dataset.repo_id or "",
-        fingerprint=fingerprint(open_metadata(dataset)),
+        fingerprint=fingerprint(meta),
         learnt=tuple(learnt),
         held_out=tuple(held_out),
     )
-    return _Part(learn, held, source)
+    return _Split(learn, held, source)
+
+
+def _check_new(dataset: DatasetConfig, episodes: Sequence[Episode], parts: dict[str, _Split]) -> None:
+    """Refuses an episode that is in another dataset too: it might be learnt from there, and held out here."""
+    there = {e.actions.tobytes() for part in parts.values() for e in (*part.learn, *part.held)}
+    if twice := sum(e.actions.tobytes() in there for e in episodes):
+        remedy = f"{twice} of its episodes are in dataset, too; name one that has only others"
+        raise InputError("dataset.repo_id", dataset.repo_id, remedy)
+
+
+def _tasks(env: EnvConfig, episodes: Sequence[Episode]) -> tuple[str, ...]:
+    """Names of the world's tasks that the episodes are of, known by their instructions."""
+    world = make_world(env)
+    try:
+        told = {name: str(world.reset(0, name)["task"]) for name in world.spec.tasks}
+    finally:
+        world.close()
+    shown = {episode.task for episode in episodes}
+    if unknown := sorted(shown - set(told.values())):
+        remedy = f"an episode's task is {unknown[0][:80]!r}, which none of these is; name its task"
+        raise InputError("env.task", ", ".join(told), remedy)
+    return tuple(name for name, task in told.items() if task in shown)
 
 
 def _check_held_out(

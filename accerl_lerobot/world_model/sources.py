@@ -26,13 +26,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from accerl_lerobot.console import Console
+from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model.dataset import check_metadata, fingerprint
 from accerl_lerobot.world_model.episodes import Episode, amount
 from accerl_lerobot.world_model.films import film
 from accerl_lerobot.world_model.trial import try_out
 
 if TYPE_CHECKING:
+    from accerl_lerobot.dataset_config import DatasetConfig
     from accerl_lerobot.world_model.config import TrialConfig
+    from accerl_lerobot.world_model.contract import WorldModelSpec
     from accerl_lerobot.world_model.inverse import InverseProbe
     from accerl_lerobot.world_model.pixels import PixelWorldModel
     from accerl_lerobot.world_model.stand_in import SuccessModel
@@ -51,7 +55,8 @@ def try_sources(
     console: Console,
     *,
     learnt: Collection[str] = (),
-    fresh: Collection[str] = (),
+    fresh: str | None = None,
+    kept: bool = False,
     seed: int = 0,
     probe: InverseProbe | None = None,
 ) -> dict[str, Any]:
@@ -65,7 +70,9 @@ def try_sources(
         directory: where ``preview.mp4`` goes, of the first, and ``preview_<source>.mp4`` of the others.
         console: progress for people.
         learnt: sources of which it has learnt from other episodes. Their gates count, too.
-        fresh: sources on whose episodes the success threshold is set anew; what the last one sets is kept.
+        fresh: the source on whose episodes the success threshold is set: of some of them, for the others. All
+            other sources are judged by the threshold there is.
+        kept: whether what is set on all of `fresh` is the threshold from then on, for the other sources too.
         seed: of what is drawn.
         probe: what reads actions off frames, if anything does.
 
@@ -76,21 +83,49 @@ def try_sources(
     """
     first, *others = sources
     found: dict[str, dict[str, Any]] = {}
-    for name, episodes in sources.items():
+    known = frozenset() if probe is None else probe.known
+    for name in sorted(sources, key=lambda name: name != fresh):
+        episodes = sources[name]
+        if probe is not None:
+            probe.known = known if name == first else frozenset()  # they are of the first
+        there = None if success is None else success.config.threshold
         with console.stage(f"trial, {name}"):
-            told = try_out(model, episodes, config, success, seed, name in fresh, probe)
+            told = try_out(model, episodes, config, success, seed, name == fresh, probe)
             found[name] = {"name": name} | told | {"tried": amount(episodes)}
             video = directory / (PREVIEW if name == first else f"preview_{name}.mp4")
             film(video, model, episodes, config, seed)
-        if probe is not None:
-            probe.known = frozenset()  # which are of the first
-    result = found.pop(first)
+        if success is not None and there is not None and not kept:
+            success.config.threshold = there
+    result = found[first]
     gates = dict(result["gates"])
     for name in others:
         if name in learnt:
             gates |= {f"{name}.{gate}": held for gate, held in found[name]["gates"].items()}
     passed = all(gate["holds"] for gate in gates.values())
-    return result | {"gates": gates, "passed": passed, "sources": found}
+    rest = {name: found[name] for name in others}
+    return result | {"gates": gates, "passed": passed, "sources": rest}
+
+
+def open_rooms(rooms: dict[str, DatasetConfig], spec: WorldModelSpec) -> dict[str, Any]:
+    """The metadata of each dataset that is named, before any image is read.
+
+    Args:
+        rooms: where on the command line → what is named there.
+        spec: of the world that they have to be of.
+
+    Raises:
+        InputError: see `open_metadata` and `check_metadata`; or one is named twice.
+    """
+    opened: dict[str, Any] = {}
+    prints: dict[str, str] = {}
+    for room, dataset in rooms.items():
+        with named(room):
+            meta = opened[room] = open_metadata(dataset)
+            check_metadata(meta, str(dataset.repo_id), spec)
+            of = prints.setdefault(fingerprint(meta), room)
+            if of != room:
+                raise InputError("dataset.repo_id", dataset.repo_id, f"it is the one in {of}; name another")
+    return opened
 
 
 @contextmanager

@@ -102,7 +102,7 @@ def load_sources(directory: Path, field: str = "path") -> tuple[Source, ...]:
         ) from error
 
 
-def known(sources: Iterable[Source], fingerprint: str) -> Source | None:
+def find(sources: Iterable[Source], fingerprint: str) -> Source | None:
     """The one that is of this dataset."""
     return next((source for source in sources if source.fingerprint == fingerprint), None)
 

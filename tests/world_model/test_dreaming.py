@@ -15,7 +15,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -75,17 +74,30 @@ def test_it_goes_on_with_what_it_has_learnt_from_and_never_with_what_was_held_ou
     both = OnlineLearnConfig(dataset=demos, online=rollouts)
     sources = [known(demos, (0, 2), (1, 3, 4)), known(rollouts, (1, 2, 3), (0,))]
     learner = make_learner(run(tiny_checkpoint, tmp_path / "both", both, sources))
-    assert [e.source for e in learner._offline] == ["demo"] * 2 + ["online"] * 3
-    assert [e.source for e in learner._held_offline] == ["demo"] * 3 + ["online"]
+    assert (len(learner._offline), len(learner._held_offline)) == (5, 4)
+    every = learner._offline + learner._held_offline
+    assert not any(e.source == "online" for e in every), "a trial is about this run's own failures"
     of = {e.actions.tobytes() for e in learner._offline}
     assert len(of) == 5 and not of & {e.actions.tobytes() for e in learner._held_offline}
 
-    learner = make_learner(run(tiny_checkpoint, tmp_path / "one", replace(both, dataset=rollouts), sources))
-    assert len(learner._offline) == 6, "whichever room it is named in"
+    swapped = OnlineLearnConfig(dataset=rollouts, online=demos)
+    learner = make_learner(run(tiny_checkpoint, tmp_path / "swapped", swapped, sources))
+    assert (len(learner._offline), len(learner._held_offline)) == (5, 4), "whichever room it is named in"
     learner = make_learner(run(tiny_checkpoint, tmp_path / "none", both, []))
     assert (len(learner._offline), len(learner._held_offline)) == (9, 0), (
         "what it does not know it takes whole"
     )
+
+
+def test_a_dataset_that_is_named_twice_is_refused(
+    tiny_checkpoint: Path, datasets: tuple[DatasetConfig, DatasetConfig], tmp_path: Path
+):
+    twice = OnlineLearnConfig(dataset=datasets[0], online=datasets[0])
+    config = run(tiny_checkpoint, tmp_path / "model", twice, [])
+    message = "^imagination.learn.online.repo_id='a/b': it is the one in imagination.learn.dataset; name"
+    for refused in (check_imagination, make_learner):
+        with pytest.raises(InputError, match=message):
+            refused(config)
 
 
 @pytest.mark.parametrize("room", ["dataset", "online"])

@@ -344,9 +344,7 @@ def test_a_world_model_of_something_else_is_refused(
 def test_a_world_model_of_another_task_is_refused():
     known = (*WORLD_SPEC.tasks, "another")
     check_fit(replace(SPEC, tasks=known), WORLD_SPEC, K, 1, True)
-    message = (
-        f"^env.task='unheard of': the world model in imagination.path is of {', '.join(known)}; name one"
-    )
+    message = f"^env.task='unheard of': the world model is of {', '.join(known)}; name these, or"
     with pytest.raises(InputError, match=message):
         tasks = (*WORLD_SPEC.tasks, "unheard of")
         check_fit(replace(SPEC, tasks=known), replace(WORLD_SPEC, tasks=tasks), K, 1, True)

@@ -53,6 +53,11 @@ def rollouts(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return recorded(tmp_path_factory.mktemp("rollouts") / "dataset", 6, 1)
 
 
+@pytest.fixture(scope="module")
+def overlapping(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recorded(tmp_path_factory.mktemp("overlapping") / "dataset", 6, 0)
+
+
 def arguments(demos: Path, output_dir: Path) -> list[str]:
     return [
         "world-model", "--env.type=simulated", "--env.image_size=16", "--dataset.repo_id=a/b",
@@ -134,6 +139,7 @@ def test_what_is_refused_leaves_no_folder(demos: Path, tmp_path: Path, capsys: p
         ("--world_model.model.state_weight=-1", "world_model.model.state_weight=-1.0: use at least 0"),
         ("--world_model.image_size=13", "world_model.image_size=13: use a multiple of 8"),
         ("--seed=-1", "seed=-1: use 0 to 99"),
+        ("--env.task=mirror", "env.task='mirror': an episode's task is"),
     ],
 )
 def test_what_is_refused_before_anything_is_learnt(
@@ -190,8 +196,9 @@ def test_a_policys_episodes_are_learnt_from_beside_demonstrations(
     assert found["gates"] == own | {f"online.{name}": gate for name, gate in online["gates"].items()}
     assert found["passed"] is all(gate["holds"] for gate in found["gates"].values()) is (code == 0)
     assert (out / "preview_online.mp4").stat().st_size > 1000
-    _, success = load_world_model(out / "world_model")
+    world, success = load_world_model(out / "world_model")
     assert success is not None and success.config.threshold == found["threshold"] == online["threshold"]
+    assert world.spec.tasks == ("match",)
     assert "By source" in stderr and f" of {len(own)} │" in stderr and stderr.count(" wanted") == 2 * len(own)
     told = [f"--path={out / 'world_model'}", "--dataset.repo_id=a/b", f"--dataset.root={demos}", *theirs]
     capsys.readouterr()  # LeRobot prints
@@ -210,7 +217,8 @@ def test_a_policys_episodes_are_learnt_from_beside_demonstrations(
 @pytest.mark.parametrize(
     ("of", "message"),
     [
-        ("demos", "online.repo_id='a/b': it is the dataset; name another"),
+        ("demos", "online.repo_id='a/b': it is the one in dataset; name another"),
+        ("overlapping", "online.repo_id='a/b': 6 of its episodes are in dataset, too"),
         ("nowhere", "online.root='nowhere': no meta/info.json there"),
     ],
 )
@@ -248,6 +256,7 @@ def test_what_is_saved_dreams_the_same(tmp_path: Path):
         ("config", "config.json: spec: not a world model of accerl world-model"),
         ("weights", "model.safetensors: not safetensors"),
         ("size", "not a world model of accerl world-model"),
+        ("tasks", "config.json: spec.tasks: a list of at most 4096 names of at most 200 printable"),
     ],
 )
 def test_what_cannot_be_loaded(tmp_path: Path, harm: str, why: str):
@@ -257,6 +266,10 @@ def test_what_cannot_be_loaded(tmp_path: Path, harm: str, why: str):
         folder = tmp_path / "nowhere"
     if harm == "config":
         (folder / "config.json").write_text("{}")
+    if harm == "tasks":
+        content = json.loads((folder / "config.json").read_text())
+        content["spec"]["tasks"] = ["match", "\x1b[2J"]
+        (folder / "config.json").write_text(json.dumps(content))
     if harm == "weights":
         (folder / "model.safetensors").write_bytes(b"\x00" * 64)
     if harm == "size":
