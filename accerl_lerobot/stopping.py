@@ -38,6 +38,27 @@ class StoppedError(Exception):
         super().__init__(words)
 
 
+@contextmanager
+def unwound() -> Iterator[None]:
+    """SIGTERM ends what is inside as an error would, so that what it has started is ended, too.
+
+    Raises:
+        SystemExit: it came.
+    """
+
+    def end(number: int, frame: FrameType | None) -> None:
+        raise SystemExit(128 + number)
+
+    if threading.current_thread() is not threading.main_thread():  # Python allows it nowhere else
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 class Stopping:
     """Notes the first such signal; a second one interrupts at once.
 

@@ -56,6 +56,7 @@ from accerl_lerobot.parsing import read_arguments
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.report.config import ReportConfig
 from accerl_lerobot.rollout.runner import EpisodeResult
+from accerl_lerobot.stopping import unwound
 from accerl_lerobot.timeline.config import TimelineConfig
 from accerl_lerobot.verb_configs import DemosRun, EvalRun, SFTRun, WorldModelEvalRun, WorldModelRun
 
@@ -291,7 +292,7 @@ def bench(arguments: list[str]) -> int:
     config = parse(CONFIGS[f"bench {name}"], arguments[1:])
     name = name.replace("-", "_")
     module: Any = importlib.import_module(f"accerl_lerobot.bench.{name}")
-    with redirect_stdout(sys.stderr):
+    with redirect_stdout(sys.stderr), unwound():
         result = getattr(module, f"bench_{name}")(config)
     Console().rich.print(module.table(result))
     sys.stdout.write(json.dumps(result, indent=2) + "\n")

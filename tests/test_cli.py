@@ -16,8 +16,11 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -294,3 +297,23 @@ def test_bench_without_a_name(capsys: pytest.CaptureFixture[str]) -> None:
         == "accerl: bench='': name what is measured: world, policy, throughput, scaling, async-vs-sync, "
         "transport, weights, batching, replay, timeline, lag, dream, efficiency, faults, soak, ranking\n"
     )
+
+
+def test_a_bench_that_is_asked_to_stop_ends_what_it_has_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    from accerl_lerobot.bench import world
+
+    ended: list[bool] = []
+
+    def asked(config: object) -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(60)
+        finally:
+            ended.append(True)
+
+    monkeypatch.setattr(world, "bench_world", asked)
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as raised:
+        cli.main(["bench", "world"])
+    assert raised.value.code == 128 + signal.SIGTERM and ended
+    assert signal.getsignal(signal.SIGTERM) is before

@@ -119,7 +119,9 @@ def test_a_dataset_is_known_by_the_order_of_its_episodes_too(tmp_path: Path):
     lengths = list(opened["dataset"].episodes["length"])
     assert len(set(lengths)) > 1
     turned = SimpleNamespace(
-        stats=opened["dataset"].stats, fps=opened["dataset"].fps, episodes={"length": lengths[1:] + lengths[:1]}
+        stats=opened["dataset"].stats,
+        fps=opened["dataset"].fps,
+        episodes={"length": lengths[1:] + lengths[:1]},
     )
     assert sources.fingerprint(turned) != sources.fingerprint(opened["dataset"])
     with pytest.raises(InputError, match="^online.repo_id='a/b': it is the one in dataset; name another"):
