@@ -75,8 +75,11 @@ def bench_ranking(config: BenchRankingConfig) -> dict[str, Any]:
     """Plays and dreams.
 
     Returns:
-        ``policies``: path, real and dreamt successes of each; ``agreement``, see `agreement.agreement`;
-        ``outcomes``: bools by policy and start; ``config``.
+        ``policies``: path, real and dreamt successes of each; ``threshold`` of the success model, by which
+        they are; ``agreement``, see `agreement.agreement`; ``outcomes``: by policy and start, whether it was
+        a ``real`` success, and the highest P(success) that was ``said`` of its dream; ``even``: another
+        ``threshold``, see `even_threshold`, with ``dreamt`` successes of each and ``agreement`` by that;
+        ``config``.
 
     Raises:
         InputError: the world model, or a policy, cannot be loaded or does not fit the world.
@@ -88,7 +91,7 @@ def bench_ranking(config: BenchRankingConfig) -> dict[str, Any]:
     from accerl_lerobot.evaluation.config import evaluation_plans
     from accerl_lerobot.policies.config import PolicyConfig
     from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, resolve_device
-    from accerl_lerobot.world_model.agreement import agreement
+    from accerl_lerobot.world_model.agreement import agreement, even_threshold
     from accerl_lerobot.world_model.fit import check_fit
     from accerl_lerobot.world_model.imagine import Dreamer
     from accerl_lerobot.world_model.side_by_side import dreamt, lived
@@ -107,24 +110,32 @@ def bench_ranking(config: BenchRankingConfig) -> dict[str, Any]:
             executed = getattr(settings, "n_action_steps", 1)
             check_fit(model.spec, spec, executed, settings.n_obs_steps, judge is not None)
         starts = [(plan.task, plan.seed) for plan in evaluation_plans(spec.tasks, config.episodes, "ranking")]
-        real, imagined = [], []
+        real, said = [], []
         for number, policy in enumerate(of, 1):
             adapter = load_adapter(policy)
             with console.stage(f"policy {number} of {len(of)}", total=len(starts)) as stage:
                 real.append(lived(adapter, worlds, starts, stage.update))
-                imagined.append(dreamt(adapter, dreamer, worlds[0], starts))
+                said.append(dreamt(adapter, dreamer, worlds[0], starts))
     finally:
         for world in worlds:
             world.close()
-    outcomes = np.stack(real), np.stack(imagined)
+    happened, promised = np.stack(real), np.stack(said)
+    threshold = 0.5 if judge is None else judge.config.threshold
+    imagined, even = promised > threshold, even_threshold(happened, promised)
     result = {
         "config": asdict(config),
         "policies": [
             {"path": path, "real": int(r.sum()), "dreamt": int(d.sum()), "n": len(starts)}
-            for path, r, d in zip(config.policies, *outcomes, strict=True)
+            for path, r, d in zip(config.policies, happened, imagined, strict=True)
         ],
-        "agreement": agreement(*outcomes),
-        "outcomes": {name: rows.tolist() for name, rows in zip(("real", "dreamt"), outcomes, strict=True)},
+        "threshold": threshold,
+        "agreement": agreement(happened, imagined),
+        "even": {
+            "threshold": even,
+            "dreamt": (promised > even).sum(1).tolist(),
+            "agreement": agreement(happened, promised > even),
+        },
+        "outcomes": {"real": happened.tolist(), "said": promised.tolist()},
     }
     if config.output_dir is not None:
         folder = Path(config.output_dir).expanduser()
@@ -137,21 +148,29 @@ def bench_ranking(config: BenchRankingConfig) -> dict[str, Any]:
 
 def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
-    found = result["agreement"]
-
-    def said(name: str) -> str:
-        return f"{found[name]['value']:.2f} [{found[name]['low']:.2f}, {found[name]['high']:.2f}]"
-
+    even = result["even"]
     shown = Table(
-        title=f"{len(result['policies'])} policies: Spearman {said('spearman')}, Pearson {said('pearson')}, "
-        f"MMRV {said('mmrv')}, dreams less reality {said('bias')}, start by start {said('mcc')}"
+        title=f"{len(result['policies'])} policies, by a threshold of {result['threshold']:.3f}: "
+        f"{_said(result['agreement'])}\nby {even['threshold']:.3f}, where dreams succeed as often: "
+        f"{_said(even['agreement'])}"
     )
-    for column in ("policy", "real", "dreamt"):
+    for column in ("policy", "real", "dreamt", f"by {even['threshold']:.3f}"):
         shown.add_column(column)
-    for row in result["policies"]:
-        rates = (Rate(successes=row[kind], n=row["n"]) for kind in ("real", "dreamt"))
+    for row, dreamt in zip(result["policies"], even["dreamt"], strict=True):
+        rates = (Rate(successes=made, n=row["n"]) for made in (row["real"], row["dreamt"], dreamt))
         shown.add_row(row["path"], *map(str, rates))
     return shown
+
+
+def _said(found: dict[str, Any]) -> str:
+    names = {
+        "Spearman": "spearman", "Pearson": "pearson", "MMRV": "mmrv", "dreams less reality": "bias",
+        "start by start": "mcc",
+    }  # fmt: skip
+    return ", ".join(
+        f"{name} {found[key]['value']:.2f} [{found[key]['low']:.2f}, {found[key]['high']:.2f}]"
+        for name, key in names.items()
+    )
 
 
 def draw(path: Path, result: dict[str, Any]) -> None:

@@ -59,6 +59,22 @@ def agreement(real: np.ndarray, dreamt: np.ndarray, seed: int = 0) -> dict[str, 
     return {name: _estimate(value, [draw[name] for draw in draws])._asdict() for name, value in found.items()}
 
 
+def even_threshold(real: np.ndarray, said: np.ndarray) -> float:
+    """The threshold at which as many dreams succeed as episodes did, all policies taken together.
+
+    Args:
+        real: bool (P, N), outcomes.
+        said: float (P, N), the highest P(success) of a dream of each.
+
+    Returns:
+        In [0, 1], in the middle between two values of `said` where there are two.
+    """
+    falling, count = np.sort(said, axis=None)[::-1], int(real.sum())
+    above = falling[count - 1] if count else 1.0
+    below = falling[count] if count < len(falling) else 0.0
+    return float((above + below) / 2)
+
+
 def pearson(x: np.ndarray, y: np.ndarray) -> float:
     """Correlation; NaN where one of them does not vary."""
     x, y = x - x.mean(), y - y.mean()

@@ -134,6 +134,7 @@ def make_learner(config: RunConfig, dreamer: Dreamer | None = None) -> OnlineLea
         offline=offline,
         held_out=held_out,
         longest=longest,
+        fixed=config.imagination.threshold,
         seed=config.seed,
         on_trial=_films(config),
     )

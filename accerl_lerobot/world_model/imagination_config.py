@@ -111,6 +111,13 @@ class ImaginationConfig:
     success: StandInConfig = field(default_factory=StandInConfig)
     """A reward model that tells successes in place of the one in `path`; it stays as it is, and so does the
     world model."""
+    threshold: float | None = None
+    """P above which a frame of a dream counts as a success, in [0, 1]; an oracle knows. None: what was saved
+    with the success model of `path`, and is set anew as that goes on learning.
+
+    That one is set on dreams with the actions that were made. A policy that looks at its dreams is flattered
+    more: ``accerl bench ranking`` says at which one it succeeds as often in dreams as in reality.
+    """
     workers: int = 1
     """Processes that dream, each with a copy of the world model, its own draws, and its part of `dreams`;
     they are dealt out over inference services as rollout workers are, from the last one on."""
@@ -190,6 +197,11 @@ class ImaginationConfig:
         if self.share and self.path is None and self.model != "oracle":
             remedy = "give the folder world_model that accerl world-model has written"
             raise InputError("imagination.path", None, remedy)
+        if self.threshold is not None and not 0 <= self.threshold <= 1:
+            raise InputError("imagination.threshold", self.threshold, "use a value in [0, 1]")
+        if self.threshold is not None and self.success.path is not None:
+            remedy = "with a model that stands in, say it in imagination.success.threshold alone"
+            raise InputError("imagination.threshold", self.threshold, remedy)
         if self.share and self.success.path is not None:
             if self.success.threshold is None:
                 remedy = "say what counts as a success; accerl world-model-eval --success.path=… finds it"

@@ -131,6 +131,7 @@ class OnlineLearner:
         offline: episodes of the dataset that it has learnt from.
         held_out: others, which it is tried on beside the policy's.
         longest: chunks of a dream at most.
+        fixed: threshold of the success model, whatever it becomes; None: it is set on the policy's episodes.
         seed: of everything random.
         on_trial: shown what was tried.
     """
@@ -145,10 +146,11 @@ class OnlineLearner:
         offline: Sequence[Episode] = (),
         held_out: Sequence[Episode] = (),
         longest: int = 15,
+        fixed: float | None = None,
         seed: int = 0,
         on_trial: OnTrial | None = None,
     ) -> None:
-        self.config, self.trial = config, trial
+        self.config, self.trial, self._fixed = config, trial, fixed
         self._on_trial = on_trial
         self.owed = 0.0
         """Gradient steps that are due."""
@@ -282,7 +284,9 @@ class OnlineLearner:
 
     def _set_threshold(self, success: SuccessPairsRewardModel, dreams: list[Scores]) -> None:
         """By dreams of the policy's own episodes; without a failure among them it stays."""
-        if dreams:
+        if self._fixed is not None:
+            success.config.threshold = self._fixed
+        elif dreams:
             found = together(*dreams)
             least = threshold(found, np.ones(len(found.achieved), bool), self.trial)
             success.config.threshold = least or success.config.threshold

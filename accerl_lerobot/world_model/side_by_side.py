@@ -33,6 +33,8 @@ from accerl_lerobot.world_model.frames import observed, seen
 from accerl_lerobot.world_model.imagine import Dreamer
 from accerl_lerobot.world_model.success import probabilities
 
+CERTAIN = 0.999
+"""P(success) beyond which nobody asks how sure it is."""
 Start = tuple[str, int]
 """Task and seed of `World.reset`."""
 
@@ -74,7 +76,10 @@ def lived(
 def dreamt(
     policy: PolicyAdapter, dreamer: Dreamer, world: World, starts: Sequence[Start], batch: int = 32
 ) -> np.ndarray:
-    """Success of each start in dreams, bool (N,).
+    """The highest P(success) of each start in dreams, float64 (N,).
+
+    What lies above a threshold is what would succeed by it: until a dream succeeds nothing in it depends on
+    where that is. Dreams are broken off above `CERTAIN`.
 
     Args:
         policy: decides, as in `lived`.
@@ -106,7 +111,7 @@ def _dreamt(policy: PolicyAdapter, dreamer: Dreamer, world: World, starts: Seque
         tasks,
     )
     low, high = world.spec.action_low, world.spec.action_high
-    success = np.zeros(count, bool)
+    highest = np.zeros(count)
     alive: list[int] = list(range(count))
     for made in range(math.ceil(world.spec.max_steps / spec.chunk)):
         requests = [_request(observations[i], starts[i], made) for i in alive]
@@ -116,9 +121,9 @@ def _dreamt(policy: PolicyAdapter, dreamer: Dreamer, world: World, starts: Seque
             state, torch.from_numpy(actions), [noise_seed(starts[i][1], 1, made) for i in alive]
         )
         after = dream.frames.cpu().numpy()
-        achieved = probabilities(judge, frames, after) > judge.config.threshold
-        success[[alive[row] for row in np.flatnonzero(achieved)]] = True
-        on = np.flatnonzero(~achieved).tolist()
+        said = probabilities(judge, frames, after)
+        highest[alive] = np.maximum(highest[alive], said)
+        on = np.flatnonzero(said <= CERTAIN).tolist()
         if not on:
             break
         robots = dream.robot.cpu().numpy()
@@ -126,7 +131,7 @@ def _dreamt(policy: PolicyAdapter, dreamer: Dreamer, world: World, starts: Seque
             observations[alive[row]] = observed(after[row], robots[row], tasks[alive[row]], spec, world.spec)
         state, frames = rows(dream.state, on), after[on]
         alive = [alive[row] for row in on]
-    return success
+    return highest
 
 
 def _request(observation: Observation, start: Start, made: int) -> Request:

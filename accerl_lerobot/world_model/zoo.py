@@ -55,6 +55,8 @@ def make_dreamer(
         return Dreamer(dreams, load_stand_in(config.success, model.spec, "imagination.success", where))
     if success is not None:
         success.config.device = str(where)
+        if config.threshold is not None:
+            success.config.threshold = config.threshold
     return Dreamer(dreams, None if success is None else success.to(where))
 
 

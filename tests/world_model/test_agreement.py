@@ -19,7 +19,7 @@ import math
 import numpy as np
 import pytest
 
-from accerl_lerobot.world_model.agreement import agreement, matthews, mmrv, pearson, spearman
+from accerl_lerobot.world_model.agreement import agreement, even_threshold, matthews, mmrv, pearson, spearman
 
 
 def outcomes(rates: list[float], count: int = 20) -> np.ndarray:
@@ -80,3 +80,12 @@ def test_other_shapes_are_refused():
     ):
         with pytest.raises(ValueError, match="both must be"):
             agreement(real, dreamt)
+
+
+def test_the_threshold_at_which_dreams_succeed_as_often():
+    said = np.array([[0.2, 0.9, 0.7, 0.99], [0.95, 0.1, 0.8, 0.6]])
+    real = np.array([[False, True, False, True], [True, False, False, False]])
+    least = even_threshold(real, said)
+    assert least == pytest.approx((0.9 + 0.8) / 2) and (said > least).sum() == 3
+    assert even_threshold(np.zeros((2, 4), bool), said) == pytest.approx((1 + 0.99) / 2)
+    assert even_threshold(np.ones((2, 4), bool), said) == pytest.approx(0.1 / 2)

@@ -38,7 +38,7 @@ NETWORK = NetworkConfig(space_to_depth=2, channels=(8, 8), condition=8, planes=2
 
 def learner(**config: Any) -> OnlineLearner:
     torch.manual_seed(0)
-    options = {k: config.pop(k) for k in ("offline", "held_out_offline") if k in config}
+    options = {k: config.pop(k) for k in ("offline", "held_out_offline", "fixed") if k in config}
     options = {k.removesuffix("_offline"): v for k, v in options.items()}
     fields = {"steps_per_episode": 2.0, "batch": 4, "try_every": 4, "held_out": 0.25}
     model = PixelWorldModel(SPEC, PixelModelConfig(network=NETWORK))
@@ -179,6 +179,21 @@ def test_what_passes_is_promoted_and_what_does_not_is_not(monkeypatch: pytest.Mo
     assert tried == [["demo", "online"], ["demo", "online", "online"]]
     assert made.metrics()["gate_auroc"] == 0.5 and made.metrics()["promoted"] == 1
     assert made.owed == 0
+
+
+@pytest.mark.parametrize(("fixed", "served"), [(None, 0.7), (0.95, 0.95)])
+def test_a_threshold_that_was_named_stays(
+    monkeypatch: pytest.MonkeyPatch, fixed: float | None, served: float
+):
+    monkeypatch.setattr(online, "threshold", lambda *_: 0.7)
+    passes(monkeypatch, True)
+    made = learner(fixed=fixed)
+    for segment in episodes(*[False] * 4):
+        made.add(segment)
+        made.owed = 0
+    made._learner.count = 1
+    promotion = made.promote(last=False)
+    assert promotion is not None and promotion.success.config.threshold == served
 
 
 def test_what_was_tried_is_shown(monkeypatch: pytest.MonkeyPatch):

@@ -226,3 +226,18 @@ def test_a_run_dreams_with_it(tmp_path: Path):
         replace(config, learn=OnlineLearnConfig())
     with pytest.raises(InputError, match="the oracle knows"):
         replace(config, model="oracle")
+    with pytest.raises(InputError, match=r"^imagination.threshold=0.9: with a model that stands in"):
+        replace(config, threshold=0.9)
+
+
+def test_a_run_may_name_the_threshold_of_the_success_model(tmp_path: Path):
+    spec = world_spec(WORLD_MODEL, ENV)
+    success = new_success_model(5)
+    save_world_model(tmp_path / "world", PixelWorldModel(spec, WORLD_MODEL.model), success)
+    config = ImaginationConfig(share=0.5, path=str(tmp_path / "world"))
+    for threshold, expected in ((None, success.config.threshold), (0.97, 0.97)):
+        chosen = replace(config, threshold=threshold)
+        dreamer = make_dreamer(chosen, ENV, None, 5, "cpu")  # type: ignore[arg-type]
+        assert dreamer.success is not None and dreamer.success.config.threshold == expected
+    with pytest.raises(InputError, match=r"^imagination.threshold=1.5: use a value in \[0, 1\]"):
+        replace(config, threshold=1.5)
