@@ -34,9 +34,6 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate
 
-LEAST = 3
-"""Policies; of two there is no rank correlation to speak of."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class BenchRankingConfig:
@@ -45,7 +42,8 @@ class BenchRankingConfig:
     path: str | None = None
     """The folder named world_model that ``accerl world-model`` wrote."""
     policies: tuple[str, ...] = ()
-    """Checkpoints, at least 3; 12 and more say something."""
+    """Checkpoints. One is enough for the threshold by which it succeeds as often in dreams as in reality; 3
+    can be ranked, and 12 and more say something."""
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     """The world."""
     episodes: int = 50
@@ -60,8 +58,8 @@ class BenchRankingConfig:
     """Folder to create, for ranking.json and ranking.png. None: only prints."""
 
     def __post_init__(self) -> None:
-        if len(set(self.policies)) < max(LEAST, len(self.policies)):
-            raise InputError("policies", self.policies, f"name at least {LEAST} different checkpoints")
+        if len(set(self.policies)) < max(1, len(self.policies)):
+            raise InputError("policies", self.policies, "name at least one checkpoint, none of them twice")
         if self.path is None:
             raise InputError("path", None, "give the folder world_model that accerl world-model has written")
         for name in ("episodes", "worlds", "num_threads"):

@@ -33,6 +33,7 @@ from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.world_model import side_by_side
+from accerl_lerobot.world_model.agreement import agreement
 from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, WorldModelConfig
 from accerl_lerobot.world_model.contract import Context, Dream, History, State, WorldModel
 from accerl_lerobot.world_model.imagine import Dreamer
@@ -140,10 +141,19 @@ def test_checkpoints_are_ranked(tmp_path: Path, tiny_checkpoint: Path):
     assert (tmp_path / "out" / "ranking.png").is_file()
 
 
+def test_of_one_policy_there_is_a_threshold_and_no_rank():
+    found = agreement(np.array([[True, False]]), np.array([[True, True]]))
+    rows = [{"path": "run", "real": 1, "dreamt": 2, "n": 2}]
+    even = {"threshold": 0.9, "dreamt": [1], "agreement": found}
+    shown = bench.table({"policies": rows, "threshold": 0.5, "agreement": found, "even": even})
+    assert shown.row_count == 1 and "Spearman nan" in str(shown.title)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"policies": ("a", "b", "a")}, "policies=.*at least 3 different"),
+        ({"policies": ("a", "b", "a")}, "policies=.*at least one checkpoint, none of them twice"),
+        ({"policies": ()}, "policies=.*at least one checkpoint"),
         ({"path": None}, "path=None: give the folder"),
         ({"episodes": 0}, "episodes=0"),
         ({"output_dir": "."}, "output_dir='.': the folder exists"),
