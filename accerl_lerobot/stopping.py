@@ -47,6 +47,7 @@ def unwound() -> Iterator[None]:
     """
 
     def end(number: int, frame: FrameType | None) -> None:
+        signal.signal(number, signal.SIG_IGN)  # a second one would interrupt what ends the rest
         raise SystemExit(128 + number)
 
     if threading.current_thread() is not threading.main_thread():  # Python allows it nowhere else

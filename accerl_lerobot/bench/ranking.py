@@ -118,7 +118,8 @@ def bench_ranking(config: BenchRankingConfig) -> dict[str, Any]:
         for world in worlds:
             world.close()
     happened, promised = np.stack(real), np.stack(said)
-    threshold = 0.5 if judge is None else judge.config.threshold
+    assert judge is not None  # as `check_fit` has found
+    threshold = judge.config.threshold
     imagined, even = promised > threshold, even_threshold(happened, promised)
     result = {
         "config": asdict(config),
@@ -148,11 +149,11 @@ def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
     even = result["even"]
     shown = Table(
-        title=f"{len(result['policies'])} policies, by a threshold of {result['threshold']:.3f}: "
-        f"{_said(result['agreement'])}\nby {even['threshold']:.3f}, where dreams succeed as often: "
+        title=f"{len(result['policies'])} policies, by a threshold of {result['threshold']:.6g}: "
+        f"{_said(result['agreement'])}\nby {even['threshold']:.6g}, where dreams succeed as often: "
         f"{_said(even['agreement'])}"
     )
-    for column in ("policy", "real", "dreamt", f"by {even['threshold']:.3f}"):
+    for column in ("policy", "real", "dreamt", f"by {even['threshold']:.6g}"):
         shown.add_column(column)
     for row, dreamt in zip(result["policies"], even["dreamt"], strict=True):
         rates = (Rate(successes=made, n=row["n"]) for made in (row["real"], row["dreamt"], dreamt))

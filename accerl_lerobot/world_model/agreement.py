@@ -60,19 +60,19 @@ def agreement(real: np.ndarray, dreamt: np.ndarray, seed: int = 0) -> dict[str, 
 
 
 def even_threshold(real: np.ndarray, said: np.ndarray) -> float:
-    """The threshold at which as many dreams succeed as episodes did, all policies taken together.
+    """The threshold at which about as many dreams succeed as episodes did, all policies taken together.
 
     Args:
         real: bool (P, N), outcomes.
         said: float (P, N), the highest P(success) of a dream of each.
 
     Returns:
-        In [0, 1], in the middle between two values of `said` where there are two.
+        In [0, 1], in the middle between two values of `said`, or between one and an end of that range.
     """
-    falling, count = np.sort(said, axis=None)[::-1], int(real.sum())
-    above = falling[count - 1] if count else 1.0
-    below = falling[count] if count < len(falling) else 0.0
-    return float((above + below) / 2)
+    values = np.concatenate([[0.0], np.unique(said), [1.0]])
+    cuts = (values[1:] + values[:-1]) / 2
+    above = (said.reshape(-1, 1) > cuts).sum(0)
+    return float(cuts[np.argmin(np.abs(above - real.sum()))])
 
 
 def pearson(x: np.ndarray, y: np.ndarray) -> float:

@@ -39,7 +39,7 @@ from accerl_lerobot.world_model.online import OnlineLearner
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.pool import part
 from accerl_lerobot.world_model.recorded import DREAMS, DreamRecorder
-from accerl_lerobot.world_model.sources import ONLINE, named, open_rooms
+from accerl_lerobot.world_model.sources import ONLINE, check_apart, named, open_rooms
 from accerl_lerobot.world_model.store import find, load_sources
 from accerl_lerobot.world_model.zoo import make_dreamer
 
@@ -123,6 +123,7 @@ def make_learner(config: RunConfig, dreamer: Dreamer | None = None) -> OnlineLea
         with named(room):
             # Not as a policy's, whichever it is: in a trial, this run's own failures are what counts.
             episodes = load_episodes(rooms[room], model.spec, EARLIER, both=False)
+            check_apart(rooms[room], episodes, offline + held_out)
         source = find(sources, fingerprint(meta))
         offline += episodes if source is None else [episodes[i] for i in source.learnt]
         held_out += [] if source is None else [episodes[i] for i in source.held_out]

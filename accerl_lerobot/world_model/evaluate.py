@@ -115,7 +115,8 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
         # and tried on others. Elsewhere it is what it is.
         fresh = next((names[r] for r, one in parts.items() if sources_of[-1:] == (one.source,)), None)
     elif config.success.threshold is None:  # one that stands in has none yet
-        fresh, kept = (ONLINE if ONLINE in parts else first), True
+        both = len({episode.success for episode in sources.get(ONLINE, ())}) == 2
+        fresh, kept = (ONLINE if both else first), True
     result = try_sources(
         model, sources, config.trial, success, directory, console,
         learnt=learnt, fresh=fresh, kept=kept, seed=config.seed, probe=probe,

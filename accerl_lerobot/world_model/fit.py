@@ -15,6 +15,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.contract import WorldModelSpec
@@ -55,7 +57,7 @@ def check_fit(spec: WorldModelSpec, world: WorldSpec, executed: int, history: in
         if theirs != ours:
             remedy = f"is the world model's {name}, and the world's is {ours}; learn one of this world"
             raise refuse(theirs, remedy)
-    if spec.tasks and (others := [task for task in world.tasks if task not in spec.tasks]):
+    if spec.tasks and (others := [task for task in world.tasks if not _is_of(task, spec.tasks)]):
         more = "" if len(spec.tasks) <= SHOWN else f" and {len(spec.tasks) - SHOWN} more"
         remedy = (
             f"the world model is of {', '.join(spec.tasks[:SHOWN])}{more}; name these, or learn one of it"
@@ -70,3 +72,9 @@ def check_fit(spec: WorldModelSpec, world: WorldSpec, executed: int, history: in
     if not judged and "success" not in spec.provides:
         why = "there is no success model beside the world model, and it cannot tell a success"
         raise refuse(None, f"{why}; learn both with accerl world-model")
+
+
+def _is_of(task: str, known: Sequence[str]) -> bool:
+    """A suite of which one task is played alone has only its own name: it may be any of them."""
+    suite, _, number = task.partition("/")
+    return task in known or suite in known or (not number and any(k.startswith(f"{suite}/") for k in known))

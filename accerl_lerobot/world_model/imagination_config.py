@@ -116,7 +116,8 @@ class ImaginationConfig:
     with the success model of `path`, and is set anew as that goes on learning.
 
     That one is set on dreams with the actions that were made. A policy that looks at its dreams is flattered
-    more: ``accerl bench ranking`` says at which one it succeeds as often in dreams as in reality.
+    more: ``accerl bench ranking`` says at which one it succeeds as often in dreams as in reality. Trials are
+    judged by it, too, so a strict one needs a lower `learn.trial.recall`.
     """
     workers: int = 1
     """Processes that dream, each with a copy of the world model, its own draws, and its part of `dreams`;

@@ -43,7 +43,7 @@ from accerl_lerobot.world_model.dataset import fingerprint, load_episodes
 from accerl_lerobot.world_model.episodes import Episode, amount, split
 from accerl_lerobot.world_model.learn import pretrain
 from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.sources import HELD_OUT, ONLINE, named, open_rooms, try_sources
+from accerl_lerobot.world_model.sources import HELD_OUT, ONLINE, check_apart, named, open_rooms, try_sources
 from accerl_lerobot.world_model.store import SUCCESS, Source, save_world_model
 from accerl_lerobot.world_model.success import Examples, SuccessLearner, new_success_model
 from accerl_lerobot.world_model.trial import calibrate
@@ -106,11 +106,15 @@ def learn_world_model(run: WorldModelRun, directory: Path, console: Console) -> 
             name, source = (HELD_OUT, "demo") if room == "dataset" else (ONLINE, ONLINE)
             with named(room):
                 episodes = load_episodes(dataset, spec, source)
-                _check_new(dataset, episodes, parts)
+                check_apart(
+                    dataset, episodes, [e for part in parts.values() for e in (*part.learn, *part.held)]
+                )
                 parts[name] = _split(dataset, metas[room], episodes, config, rng)
     learn = [episode for part in parts.values() for episode in part.learn]
     held = {name: part.held for name, part in parts.items()}
-    spec = replace(spec, tasks=_tasks(run.env, learn))
+    spec = replace(
+        spec, tasks=_tasks(run.env, [e for part in parts.values() for e in (*part.learn, *part.held)])
+    )
     torch.manual_seed(seed)
     model = PixelWorldModel(spec, config.model)
     started = time.monotonic()
@@ -169,14 +173,6 @@ def _split(
         held_out=tuple(held_out),
     )
     return _Split(learn, held, source)
-
-
-def _check_new(dataset: DatasetConfig, episodes: Sequence[Episode], parts: dict[str, _Split]) -> None:
-    """Refuses an episode that is in another dataset too: it might be learnt from there, and held out here."""
-    there = {e.actions.tobytes() for part in parts.values() for e in (*part.learn, *part.held)}
-    if twice := sum(e.actions.tobytes() in there for e in episodes):
-        remedy = f"{twice} of its episodes are in dataset, too; name one that has only others"
-        raise InputError("dataset.repo_id", dataset.repo_id, remedy)
 
 
 def _tasks(env: EnvConfig, episodes: Sequence[Episode]) -> tuple[str, ...]:

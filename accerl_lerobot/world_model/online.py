@@ -280,7 +280,9 @@ class OnlineLearner:
     def _scored(
         self, model: PixelWorldModel, success: SuccessPairsRewardModel, episodes: list[Episode]
     ) -> list[Scores]:
-        return [scores(model, success, episodes, self.trial, self._seed)] if episodes else []
+        if not episodes or self._fixed is not None:
+            return []
+        return [scores(model, success, episodes, self.trial, self._seed)]
 
     def _set_threshold(self, success: SuccessPairsRewardModel, dreams: list[Scores]) -> None:
         """By dreams of the policy's own episodes; without a failure among them it stays."""

@@ -75,8 +75,7 @@ def scores(
     else:
         at = [Place(e, f) for e, times in enumerate(shown) for f in spaced(times, config.every)]
         depth = config.depth
-    if len(at) > config.most:
-        at = [at[i] for i in sorted(rng.choice(len(at), config.most, replace=False))]
+    at = drawn(episodes, at, config.most, rng)
     replayed = replay(model, episodes, at, depth)
     windows, made = replayed.windows, replayed.made
     # Who does nothing has as much time as anybody.
@@ -101,6 +100,18 @@ def scores(
             highest[rows] = np.maximum(highest[rows], said)
     achieved = (windows.success & made).any(1)
     return Scores(**best, achieved=achieved, episode=windows.episode)
+
+
+def drawn(
+    episodes: Sequence[Episode], at: Sequence[Place], most: int, rng: np.random.Generator
+) -> list[Place]:
+    """At most so many of these places, in their order; those in the policy's own episodes before others."""
+    if len(at) <= most:
+        return list(at)
+    own = np.array([episodes[place.episode].source == "online" for place in at])
+    first = rng.permutation(len(at))
+    first = first[np.argsort(~own[first], kind="stable")]
+    return [at[i] for i in sorted(first[:most].tolist())]
 
 
 def together(*parts: Scores) -> Scores:

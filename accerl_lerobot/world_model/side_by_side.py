@@ -28,13 +28,11 @@ from accerl_lerobot.envs.base import World
 from accerl_lerobot.experience import Observation, Request
 from accerl_lerobot.policies.base import PolicyAdapter
 from accerl_lerobot.seeds import noise_seed
-from accerl_lerobot.world_model.contract import Context, rows
+from accerl_lerobot.world_model.contract import Context
 from accerl_lerobot.world_model.frames import observed, seen
 from accerl_lerobot.world_model.imagine import Dreamer
 from accerl_lerobot.world_model.success import probabilities
 
-CERTAIN = 0.999
-"""P(success) beyond which nobody asks how sure it is."""
 Start = tuple[str, int]
 """Task and seed of `World.reset`."""
 
@@ -79,7 +77,7 @@ def dreamt(
     """The highest P(success) of each start in dreams, float64 (N,).
 
     What lies above a threshold is what would succeed by it: until a dream succeeds nothing in it depends on
-    where that is. Dreams are broken off above `CERTAIN`.
+    where that is. So all are dreamt to the world's time limit.
 
     Args:
         policy: decides, as in `lived`.
@@ -112,25 +110,20 @@ def _dreamt(policy: PolicyAdapter, dreamer: Dreamer, world: World, starts: Seque
     )
     low, high = world.spec.action_low, world.spec.action_high
     highest = np.zeros(count)
-    alive: list[int] = list(range(count))
     for made in range(math.ceil(world.spec.max_steps / spec.chunk)):
-        requests = [_request(observations[i], starts[i], made) for i in alive]
-        decisions = policy.decide(requests, 0)
+        decisions = policy.decide(
+            [_request(o, s, made) for o, s in zip(observations, starts, strict=True)], 0
+        )
         actions = np.stack([np.clip(d.chunk, low, high) for d in decisions]).astype(np.float32)
         dream = model.step(
-            state, torch.from_numpy(actions), [noise_seed(starts[i][1], 1, made) for i in alive]
+            state, torch.from_numpy(actions), [noise_seed(seed, 1, made) for _, seed in starts]
         )
-        after = dream.frames.cpu().numpy()
-        said = probabilities(judge, frames, after)
-        highest[alive] = np.maximum(highest[alive], said)
-        on = np.flatnonzero(said <= CERTAIN).tolist()
-        if not on:
-            break
-        robots = dream.robot.cpu().numpy()
-        for row in on:
-            observations[alive[row]] = observed(after[row], robots[row], tasks[alive[row]], spec, world.spec)
-        state, frames = rows(dream.state, on), after[on]
-        alive = [alive[row] for row in on]
+        after, robots = dream.frames.cpu().numpy(), dream.robot.cpu().numpy()
+        highest = np.maximum(highest, probabilities(judge, frames, after))
+        observations = [
+            observed(after[row], robots[row], tasks[row], spec, world.spec) for row in range(count)
+        ]
+        state, frames = dream.state, after
     return highest
 
 

@@ -20,7 +20,7 @@ perturbed   episodes of the first source, played again in the world with noise o
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -126,6 +126,18 @@ def open_rooms(rooms: dict[str, DatasetConfig], spec: WorldModelSpec) -> dict[st
             if of != room:
                 raise InputError("dataset.repo_id", dataset.repo_id, f"it is the one in {of}; name another")
     return opened
+
+
+def check_apart(dataset: DatasetConfig, episodes: Sequence[Episode], others: Sequence[Episode]) -> None:
+    """Refuses a dataset that shares episodes with another, where they might be held out while it is learnt from.
+
+    Raises:
+        InputError: some are.
+    """
+    there = {episode.actions.tobytes() for episode in others}
+    if twice := sum(episode.actions.tobytes() in there for episode in episodes):
+        remedy = f"{twice} of its episodes are in dataset, too; name one that has only others"
+        raise InputError("dataset.repo_id", dataset.repo_id, remedy)
 
 
 @contextmanager

@@ -38,7 +38,7 @@ from accerl_lerobot.world_model.config import TrialConfig
 from accerl_lerobot.world_model.contract import WorldModel
 from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, held
 from accerl_lerobot.world_model.inverse import InverseProbe
-from accerl_lerobot.world_model.outcomes import judged, scores, spaced, threshold
+from accerl_lerobot.world_model.outcomes import drawn, judged, scores, spaced, threshold
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.replayed import Dreams, cut_alike, dream
 from accerl_lerobot.world_model.stand_in import SuccessModel
@@ -61,8 +61,7 @@ def trial_windows(episodes: Sequence[Episode], model: WorldModel, config: TrialC
     """
     at = [Place(e, f) for e, episode in enumerate(episodes) for f in spaced(episode.times, config.every)]
     rng = np.random.default_rng(seed)
-    if len(at) > config.most:
-        at = [at[i] for i in sorted(rng.choice(len(at), config.most, replace=False))]
+    at = drawn(episodes, at, config.most, rng)
     windows = cut(episodes, at, chunk=model.spec.chunk, context=model.spec.context, chunks=config.depth)
     return replace(windows, actions=held(windows.actions, windows.steps))
 

@@ -89,3 +89,8 @@ def test_the_threshold_at_which_dreams_succeed_as_often():
     assert least == pytest.approx((0.9 + 0.8) / 2) and (said > least).sum() == 3
     assert even_threshold(np.zeros((2, 4), bool), said) == pytest.approx((1 + 0.99) / 2)
     assert even_threshold(np.ones((2, 4), bool), said) == pytest.approx(0.1 / 2)
+    tied = np.array([[1.0, 1.0, 1.0, 0.5]])
+    least = even_threshold(np.array([[True, True, False, False]]), tied)
+    assert least == pytest.approx(0.75) and (tied > least).sum() == 3, (
+        "two would be none or all three of them"
+    )

@@ -14,6 +14,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
@@ -348,6 +349,19 @@ def test_a_world_model_of_another_task_is_refused():
     with pytest.raises(InputError, match=message):
         tasks = (*WORLD_SPEC.tasks, "unheard of")
         check_fit(replace(SPEC, tasks=known), replace(WORLD_SPEC, tasks=tasks), K, 1, True)
+
+
+@pytest.mark.parametrize(
+    ("known", "played", "fits"),
+    [
+        ("suite/3", "suite", True), ("suite", "suite/3", True), ("suite/3", "suite/3", True),
+        ("suite/3", "suite/4", False), ("suite/3", "suit", False), ("suit/3", "suite", False),
+    ],
+)  # fmt: skip
+def test_a_task_that_is_played_alone_bears_the_name_of_its_suite(known: str, played: str, fits: bool):
+    spec, world = replace(SPEC, tasks=(known,)), replace(WORLD_SPEC, tasks=(played,))
+    with contextlib.nullcontext() if fits else pytest.raises(InputError, match="^env.task="):
+        check_fit(spec, world, K, 1, True)
 
 
 def test_one_that_tells_successes_needs_no_success_model():

@@ -24,8 +24,8 @@ import torch
 
 from accerl_lerobot.world_model import outcomes, success
 from accerl_lerobot.world_model.config import TrialConfig
-from accerl_lerobot.world_model.episodes import Episode
-from accerl_lerobot.world_model.outcomes import Scores, judged, scores, spaced, threshold, together
+from accerl_lerobot.world_model.episodes import Episode, Place
+from accerl_lerobot.world_model.outcomes import Scores, drawn, judged, scores, spaced, threshold, together
 from accerl_lerobot.world_model.success import Dreamt, Examples
 from tests.world_model.test_pixels import SIZE, K, dots
 from tests.world_model.test_trial import Deterministic
@@ -194,3 +194,14 @@ def test_a_success_model_learns_how_dreams_end():
     assert on_the_right(None, pairs[0], pairs[1])[pairs[2]].mean() > 0.7
     hard = exact.chances[~exact.success]
     assert set(np.round(np.unique(hard), 6)) <= {0.2, 1.0}
+
+
+def test_what_the_policy_itself_has_lived_through_is_tried_first():
+    episodes = [replace(e, source="online" if i in (4, 7) else "earlier") for i, e in enumerate(dots(12))]
+    at = [Place(e, f) for e in range(12) for f in (0, 1)]
+    for seed in range(5):
+        chosen = drawn(episodes, at, 6, np.random.default_rng(seed))
+        assert len(chosen) == 6 and chosen == sorted(chosen)
+        assert {place for place in chosen if place.episode in (4, 7)} == {(4, 0), (4, 1), (7, 0), (7, 1)}
+    assert drawn(episodes, at, 24, np.random.default_rng(0)) == at
+    assert len(drawn(episodes, at, 3, np.random.default_rng(0))) == 3

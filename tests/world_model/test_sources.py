@@ -116,13 +116,12 @@ def test_a_dataset_is_known_by_the_order_of_its_episodes_too(tmp_path: Path):
     one, other = recorded("one", 0), recorded("other", 1)
     opened = open_rooms({"dataset": one, "online": other}, spec)
     assert [meta.total_episodes for meta in opened.values()] == [3, 3]
-    lengths = list(opened["dataset"].episodes["length"])
-    assert len(set(lengths)) > 1
-    turned = SimpleNamespace(
-        stats=opened["dataset"].stats,
-        fps=opened["dataset"].fps,
-        episodes={"length": lengths[1:] + lengths[:1]},
-    )
+    meta = opened["dataset"]
+    ends = {key: list(meta.episodes[key]) for key in ("dataset_from_index", "dataset_to_index")}
+    turned = SimpleNamespace(stats=meta.stats, fps=meta.fps, episodes=ends)
+    assert sources.fingerprint(turned) == sources.fingerprint(meta)
+    ends["dataset_to_index"][0] += 1
+    ends["dataset_from_index"][1] += 1
     assert sources.fingerprint(turned) != sources.fingerprint(opened["dataset"])
     with pytest.raises(InputError, match="^online.repo_id='a/b': it is the one in dataset; name another"):
         open_rooms({"dataset": one, "online": one}, spec)
