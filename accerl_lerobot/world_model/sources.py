@@ -129,7 +129,7 @@ def open_rooms(rooms: dict[str, DatasetConfig], spec: WorldModelSpec) -> dict[st
 
 
 def check_apart(dataset: DatasetConfig, episodes: Sequence[Episode], others: Sequence[Episode]) -> None:
-    """Refuses a dataset that shares episodes with another, where they may be held out while it is learnt from.
+    """Refuses a dataset that shares episodes with another, where they may be held out while learnt from here.
 
     Raises:
         InputError: some are.
