@@ -167,7 +167,7 @@ def test_a_run_that_was_left_goes_on_as_if_it_had_not(
     chosen: dict[str, Any] = {"model": model, "horizon": None, "beginnings": 0.5, "window": 4, "gap": 2.0}
     chosen["witnesses"] = 2
     if model != "oracle":
-        chosen |= {"path": str(world_model), "learn": learn}
+        chosen |= {"path": str(world_model), "learn": learn, "calibrate": 12}
     config = dreaming(tiny_checkpoint, episodes=24, **chosen)
 
     def told(history: list[Progress]) -> list[Any]:

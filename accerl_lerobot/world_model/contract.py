@@ -32,6 +32,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from accerl_lerobot.snapshot import kind
@@ -43,6 +44,24 @@ State = dict[str, Tensor]
 def rows(state: State, chosen: Sequence[int] | np.ndarray) -> State:
     """Some of the batch."""
     return {key: tensor[chosen] for key, tensor in state.items()}
+
+
+def replaced(state: State, at: list[int], fresh: State) -> State:
+    """The state with some rows replaced; where a dimension grows with a dream, the shorter is padded."""
+    merged = {}
+    for key, old in state.items():
+        new = fresh[key].to(old.device)
+        sides = [max(a, b) for a, b in zip(old.shape[1:], new.shape[1:], strict=True)]
+        old, new = (_padded(x, sides) for x in (old, new))
+        merged[key] = old.clone()
+        merged[key][at] = new
+    return merged
+
+
+def _padded(x: Tensor, sides: list[int]) -> Tensor:
+    """At the far end of each dimension but the first."""
+    missing = [n for want, have in zip(sides, x.shape[1:], strict=True) for n in (want - have, 0)]
+    return torch.nn.functional.pad(x, missing[::-1]) if any(missing) else x
 
 
 @dataclass(frozen=True, kw_only=True)

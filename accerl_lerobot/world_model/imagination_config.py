@@ -119,6 +119,10 @@ class ImaginationConfig:
     more: ``accerl bench ranking`` says at which one it succeeds as often in dreams as in reality. Trials are
     judged by it, too, so a strict one needs a lower `learn.trial.recall`.
     """
+    calibrate: int = 0
+    """First dreams, from beginnings of real episodes to their ends, that nothing is learnt from: the
+    threshold is set, anew for each world model, so that as many of them succeed as of these episodes. 0:
+    none. It asks for `horizon` None. An oracle needs none."""
     workers: int = 1
     """Processes that dream, each with a copy of the world model, its own draws, and its part of `dreams`;
     they are dealt out over inference services as rollout workers are, from the last one on."""
@@ -181,6 +185,13 @@ class ImaginationConfig:
         for name in ("workers", "dreams", "memory", "window", "witnesses"):
             if getattr(self, name) < 1:
                 raise InputError(f"imagination.{name}", getattr(self, name), "use at least 1")
+        if self.calibrate < 0:
+            raise InputError("imagination.calibrate", self.calibrate, "use 0 (none) or more dreams")
+        if self.calibrate and (self.horizon is not None or self.threshold is not None):
+            remedy = (
+                "leave imagination.horizon and threshold out: whole dreams are held against whole episodes"
+            )
+            raise InputError("imagination.calibrate", self.calibrate, remedy)
         if self.record < 0:
             raise InputError("imagination.record", self.record, "use 0 (none) or more dreams")
         if self.workers > self.dreams:

@@ -38,7 +38,8 @@ from accerl_lerobot.optimizers import copied
 from accerl_lerobot.rollout.segments import SegmentBuilder
 from accerl_lerobot.snapshot import kind
 from accerl_lerobot.world_model.baselines import OracleModel, ShuffledModel
-from accerl_lerobot.world_model.contract import Context, Dream, State, WorldModel
+from accerl_lerobot.world_model.calibration import Calibration
+from accerl_lerobot.world_model.contract import Context, Dream, State, WorldModel, replaced
 from accerl_lerobot.world_model.frames import observed
 from accerl_lerobot.world_model.guard import KillSwitch
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
@@ -76,6 +77,10 @@ class _Row:
     ends_at: int
     """Decisions after which the world's time limit ends it."""
     depth: int = 0
+    calibrates: bool = False
+    """Whether nothing is to be learnt from it, see `Calibration`;"""
+    highest: float = 0.0
+    """then, P(success) so far."""
 
 
 class Dreamer(NamedTuple):
@@ -130,6 +135,7 @@ class Imagination:
         """Whether no model has passed its trial yet."""
         self._model, self._world = model, world
         self._success = None if "success" in model.spec.provides else success
+        self._calibration = Calibration(config.calibrate if self._success is not None else 0)
         self._cost, self._fails, self._name = decision_cost, fails, name
         self._on_segment = on_segment
         self._starts = StartPool(
@@ -172,6 +178,7 @@ class Imagination:
         self._success = promotion.success.to(device)
         self.version, self.waits = promotion.version, False
         self.switch.reset()
+        self._calibration.reset()
 
     def state(self) -> dict[str, Any]:
         """All that `restore` needs; see `snapshot`."""
@@ -183,6 +190,7 @@ class Imagination:
         return {
             "counters": replace(self.counters),
             "switch": self.switch.state(),
+            "calibration": self._calibration.state(),
             "version": (self.version, self.waits),
             "starts": self._starts.state(),
             "rng": self._rng,
@@ -204,6 +212,8 @@ class Imagination:
             model, success, self._success.config.threshold = state["promoted"]
             self._learned.load_state_dict(model)
             self._success.load_state_dict(success)
+        self._calibration.restore(state["calibration"])
+        self._take_over()
         if isinstance(self._model, OracleModel):
             self._model.tasks = state["tasks"]
         if state["dreams"] is not None:
@@ -235,7 +245,8 @@ class Imagination:
 
     def requests(self) -> list[Request]:
         """What is to be decided, one for each dream; none before anything real was seen, or switched off."""
-        if not len(self._starts) or not self.on:
+        calibrates = self._calibration.going_on
+        if not self.on or not (self._starts.told if calibrates else len(self._starts)):
             return []
         self._begin([i for i, row in enumerate(self._rows) if row is None])
         return [
@@ -268,6 +279,9 @@ class Imagination:
             over = dream.done is not None and bool(dream.done[i])
             self._step(i, row, decision, actions[i], float(said[i]), observation, over)
             row.frames = frames[i]
+        if self._calibration.complete():
+            self._take_over()
+            self._rows = [None] * len(self._rows)
 
     def close(self) -> None:
         """Ends simulators, if it is they that dream."""
@@ -279,6 +293,7 @@ class Imagination:
         beside, real = self.switch.shares
         return {k: float(v) for k, v in asdict(self.counters).items()} | {
             "version": float(self.version),
+            "threshold": self._threshold,
             "success": self.switch.share,
             "success_beside": beside,
             "success_real": real,
@@ -295,16 +310,18 @@ class Imagination:
         observation: Observation,
         over: bool,
     ) -> None:
-        achieved = said > self._threshold
+        achieved = said > self._threshold and not row.calibrates
         gained = said - row.potential if self.config.reward == "potential" else float(achieved)
         row.builder.add(decision, actions, gained - self._cost, len(actions), observation)
         row.potential, row.depth = said, row.depth + 1
+        row.highest = max(row.highest, said)
         self.counters.decisions += 1
         late = row.depth >= row.ends_at
         over = over and not late
         if achieved or late or over or row.depth == self.config.horizon:
             self.counters.successes += achieved
-            self._compare(row.start, achieved)
+            if not row.calibrates:
+                self._compare(row.start, achieved)
             terminated = achieved or over or (late and self._fails)
             self._end(i, row, terminated=terminated, truncated=late, success=achieved)
 
@@ -321,6 +338,9 @@ class Imagination:
         self, i: int, row: _Row, *, terminated: bool, truncated: bool = False, success: bool = False
     ) -> None:
         self._rows[i] = None
+        if row.calibrates:
+            self._calibration.add(bool(row.start.achieved), row.highest)
+            return
         self.counters.dreams += 1
         if not row.builder.decisions:
             return
@@ -335,14 +355,15 @@ class Imagination:
         """Fills the rows that are free."""
         if not rows:
             return
-        starts = self._starts.draw(len(rows), self._rng)
+        calibrates = self._calibration.going_on
+        starts = self._starts.draw(len(rows), self._rng, told=calibrates)
         parts = [np.stack([getattr(s, part) for s in starts]) for part in Context._fields]
         state = self._model.begin(
             Context(*(torch.from_numpy(part) for part in parts)),
             [s.task for s in starts],
             [s.history for s in starts],
         )
-        self._state = state if self._state is None else _replaced(self._state, rows, state)
+        self._state = state if self._state is None else replaced(self._state, rows, state)
         newest = parts[0][:, -1]
         judge = self._success
         said = np.zeros(len(rows)) if judge is None else probabilities(judge, newest, newest)
@@ -354,6 +375,7 @@ class Imagination:
                 frames=frames,
                 potential=float(potential),
                 ends_at=max(1, self._limit - start.origin.decision),
+                calibrates=calibrates,
             )
 
     def _said(self, dream: Dream, frames: np.ndarray) -> np.ndarray:
@@ -363,27 +385,14 @@ class Imagination:
             return dream.success.cpu().numpy()
         return probabilities(self._success, np.stack([r.frames for r in self._rows if r is not None]), frames)
 
+    def _take_over(self) -> None:
+        """What calibration has found, if it has."""
+        if self._success is not None and self._calibration.threshold is not None:
+            self._success.config.threshold = self._calibration.threshold
+
     @property
     def _threshold(self) -> float:
         return 0.5 if self._success is None else self._success.config.threshold
 
     def _observation(self, frames: np.ndarray, robot: np.ndarray, task: str) -> Observation:
         return observed(frames, robot, task, self._model.spec, self._world)
-
-
-def _replaced(state: State, rows: list[int], fresh: State) -> State:
-    """The state with some rows replaced; where a dimension grows with a dream, the shorter is padded."""
-    merged = {}
-    for key, old in state.items():
-        new = fresh[key].to(old.device)
-        sides = [max(a, b) for a, b in zip(old.shape[1:], new.shape[1:], strict=True)]
-        old, new = (_padded(x, sides) for x in (old, new))
-        merged[key] = old.clone()
-        merged[key][rows] = new
-    return merged
-
-
-def _padded(x: torch.Tensor, sides: list[int]) -> torch.Tensor:
-    """At the far end of each dimension but the first."""
-    missing = [n for want, have in zip(sides, x.shape[1:], strict=True) for n in (want - have, 0)]
-    return torch.nn.functional.pad(x, missing[::-1]) if any(missing) else x

@@ -117,13 +117,23 @@ class StartPool:
         self._count = sum(len(held.segment) for held in self._held)
         self._outcomes = state["outcomes"]
 
-    def draw(self, count: int, rng: np.random.Generator) -> list[Start]:
+    @property
+    def told(self) -> bool:
+        """Whether there is a beginning of an episode that has ended."""
+        return any(held.first.any() and held.name in self._outcomes for held in self._held)
+
+    def draw(self, count: int, rng: np.random.Generator, told: bool = False) -> list[Start]:
         """So many starts, with repetition.
+
+        Args:
+            count: how many.
+            rng: draws them.
+            told: only beginnings of episodes of which it is known how they ended.
 
         Raises:
             ValueError: there are none yet.
         """
-        if not self._count:
+        if not self._count or (told and not self.told):
             raise ValueError("no real experience to dream from yet")
         lengths = np.array([len(h.segment) for h in self._held])
         allowed = np.concatenate([h.allowed for h in self._held])
@@ -134,6 +144,8 @@ class StartPool:
         first = np.concatenate([h.first for h in self._held])
         if first.any():
             chances = self.beginnings * first / first.sum() + (1 - self.beginnings) * chances
+        if told:
+            chances = np.concatenate([h.first * (h.name in self._outcomes) for h in self._held]).astype(float)
         drawn = rng.choice(self._count, size=count, p=chances / chances.sum())
         ends = np.cumsum(lengths)
         of = np.searchsorted(ends, drawn, side="right")

@@ -1,0 +1,72 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A success threshold by which dreams of the policy end in a success as often as what it lives through.
+
+Set on dreams with the actions that were made, a threshold is too low for a policy that looks at what is
+dreamt and acts on it. How much too low can be measured where a dream begins at the beginning of a real
+episode: the policy has played that one, and how it ended is known.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from accerl_lerobot.world_model.agreement import even_threshold
+
+LEAST = 0.5
+
+
+class Calibration:
+    """Collects dreams that nothing is learnt from, until there are enough.
+
+    Args:
+        dreams: how many; 0: none are wanted.
+    """
+
+    def __init__(self, dreams: int) -> None:
+        self._wanted = dreams
+        self._pairs: list[tuple[bool, float]] = []
+        self.threshold: float | None = None
+        """What came of it; None: nothing yet."""
+
+    @property
+    def going_on(self) -> bool:
+        """Whether dreams are wanted."""
+        return self._wanted > 0 and self.threshold is None
+
+    def add(self, achieved: bool, highest: float) -> None:
+        """Takes a dream: how the episode ended that it begins with, and the highest P(success) in it."""
+        self._pairs.append((achieved, highest))
+
+    def complete(self) -> bool:
+        """Sets the threshold, at least `LEAST`, once there are enough dreams; whether it did."""
+        if not self.going_on or len(self._pairs) < self._wanted:
+            return False
+        real, said = (np.array(column)[None] for column in zip(*self._pairs, strict=True))
+        self.threshold = max(LEAST, even_threshold(real, said))
+        return True
+
+    def reset(self) -> None:
+        """Another model dreams."""
+        self._pairs, self.threshold = [], None
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs; see `snapshot`."""
+        return {"pairs": list(self._pairs), "threshold": self.threshold}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave."""
+        self._pairs, self.threshold = [tuple(pair) for pair in state["pairs"]], state["threshold"]
