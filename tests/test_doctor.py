@@ -266,4 +266,4 @@ def test_dreams_are_checked_where_there_are_any(capsys: pytest.CaptureFixture[st
     assert doctor.main([recipe, "--imagination.path=nowhere"]) == 1
     assert "FAIL  dreams     imagination.path='nowhere': config.json: is missing" in capsys.readouterr().out
     doctor.main([recipe, "--imagination.model=oracle"])
-    assert "ok    dreams     50% of every batch; what dreams: oracle" in capsys.readouterr().out
+    assert "ok    dreams     90% of every batch; what dreams: oracle" in capsys.readouterr().out

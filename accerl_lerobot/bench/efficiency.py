@@ -48,7 +48,7 @@ from accerl_lerobot.errors import InputError
 
 ARMS = {
     "none": ("--imagination.share=0",),
-    "learned": ("--imagination.model=learned",),
+    "learned": ("--imagination.model=learned", "--imagination.learn.steps_per_episode=5"),
     "frozen": ("--imagination.model=learned", "--imagination.learn.steps_per_episode=0"),
     "copy": ("--imagination.model=copy",),
     "shuffled": ("--imagination.model=shuffled",),
