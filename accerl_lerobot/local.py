@@ -265,6 +265,7 @@ class LocalEngine(Engine):
             return
         learner, on = self._world_learner, self._dreams.on
         awaited = learner is not None and learner.promising(self._replay.real_ended)
+        awaited = awaited or self._dreams.prepares
         self._replay.mix(self._config.imagination.share if on else 0.0, on or awaited)
         if not self._exploring:
             return

@@ -39,34 +39,40 @@ class Calibration:
     def __init__(self, dreams: int) -> None:
         self._wanted = dreams
         self._pairs: list[tuple[bool, float]] = []
+        self._done = dreams == 0
         self.threshold: float | None = None
-        """What came of it; None: nothing yet."""
+        """What came of it; None: nothing yet, or nothing at all."""
 
     @property
     def going_on(self) -> bool:
         """Whether dreams are wanted."""
-        return self._wanted > 0 and self.threshold is None
+        return not self._done
 
     def add(self, achieved: bool, highest: float) -> None:
         """Takes a dream: how the episode ended that it begins with, and the highest P(success) in it."""
         self._pairs.append((achieved, highest))
 
     def complete(self) -> bool:
-        """Sets the threshold, at least `LEAST`, once there are enough dreams; whether it did."""
-        if not self.going_on or len(self._pairs) < self._wanted:
+        """Sets the threshold, at least `LEAST`, once there are enough dreams; whether there are.
+
+        Where all episodes ended alike there is none that could be told from them.
+        """
+        if self._done or len(self._pairs) < self._wanted:
             return False
         real, said = (np.array(column)[None] for column in zip(*self._pairs, strict=True))
-        self.threshold = max(LEAST, even_threshold(real, said))
+        self.threshold = max(LEAST, even_threshold(real, said)) if real.any() and not real.all() else None
+        self._done = True
         return True
 
     def reset(self) -> None:
         """Another model dreams."""
-        self._pairs, self.threshold = [], None
+        self._pairs, self.threshold, self._done = [], None, self._wanted == 0
 
     def state(self) -> dict[str, Any]:
         """All that `restore` needs; see `snapshot`."""
-        return {"pairs": list(self._pairs), "threshold": self.threshold}
+        return {"pairs": list(self._pairs), "threshold": self.threshold, "done": self._done}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Goes on from what `state` gave."""
-        self._pairs, self.threshold = [tuple(pair) for pair in state["pairs"]], state["threshold"]
+        self._pairs = [tuple(pair) for pair in state["pairs"]]
+        self.threshold, self._done = state["threshold"], state["done"]

@@ -78,7 +78,15 @@ def make_imagination(
         name=name,
         on_segment=on_segment,
         index=index,
+        ended=_witnesses(config),
     )
+
+
+def _witnesses(config: RunConfig) -> int:
+    """Real episodes to calibrate by: all there will be, or so many that those under way matter little."""
+    rollout = config.rollout
+    enough = config.imagination.witnesses + rollout.workers * rollout.worlds
+    return min(enough, rollout.episodes or enough)
 
 
 def _recorded(

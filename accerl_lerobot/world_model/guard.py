@@ -21,7 +21,23 @@ flatters; the outcome of the episode that a dream began in may be older.
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 from typing import Any
+
+from accerl_lerobot.snapshot import kind
+
+
+@kind
+@dataclass
+class DreamCounters:
+    """What was imagined so far."""
+
+    dreams: int = 0
+    """That have ended."""
+    decisions: int = 0
+    successes: int = 0
+    doubted: int = 0
+    """Dreams that ended before something too uncertain."""
 
 
 class KillSwitch:

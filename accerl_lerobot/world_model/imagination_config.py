@@ -122,7 +122,12 @@ class ImaginationConfig:
     calibrate: int = 0
     """First dreams, from beginnings of real episodes to their ends, that nothing is learnt from: the
     threshold is set, anew for each world model, so that as many of them succeed as of these episodes. 0:
-    none. It asks for `horizon` None. An oracle needs none."""
+    none. An oracle needs none.
+
+    It waits until `witnesses` episodes have ended, and as many more as are played at a time, or all there
+    will be; where all end alike it leaves the threshold as it was. It asks for `horizon` None and a `memory`
+    that holds these episodes. Each of several workers does it for itself.
+    """
     workers: int = 1
     """Processes that dream, each with a copy of the world model, its own draws, and its part of `dreams`;
     they are dealt out over inference services as rollout workers are, from the last one on."""

@@ -36,12 +36,11 @@ from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.experience import IMAGINED, Decision, Observation, Request, Segment
 from accerl_lerobot.optimizers import copied
 from accerl_lerobot.rollout.segments import SegmentBuilder
-from accerl_lerobot.snapshot import kind
 from accerl_lerobot.world_model.baselines import OracleModel, ShuffledModel
 from accerl_lerobot.world_model.calibration import Calibration
 from accerl_lerobot.world_model.contract import Context, Dream, State, WorldModel, replaced
 from accerl_lerobot.world_model.frames import observed
-from accerl_lerobot.world_model.guard import KillSwitch
+from accerl_lerobot.world_model.guard import DreamCounters, KillSwitch
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.stand_in import SuccessModel, device_of
@@ -51,19 +50,6 @@ from accerl_lerobot.world_model.success import probabilities
 
 if TYPE_CHECKING:
     from accerl_lerobot.world_model.online import Promotion
-
-
-@kind
-@dataclass
-class DreamCounters:
-    """What was imagined so far."""
-
-    dreams: int = 0
-    """That have ended."""
-    decisions: int = 0
-    successes: int = 0
-    doubted: int = 0
-    """Dreams that ended before something too uncertain."""
 
 
 @dataclass(kw_only=True)
@@ -109,6 +95,7 @@ class Imagination:
         name: prefix of the segments' keys.
         on_segment: receives what was imagined.
         index: of several that dream beside each other with the same seed.
+        ended: real episodes that must have ended before anything is calibrated: those that end first succeed.
     """
 
     def __init__(
@@ -124,6 +111,7 @@ class Imagination:
         name: str,
         on_segment: Callable[[Segment], object],
         index: int = 0,
+        ended: int = 1,
     ) -> None:
         self.config, self.counters = config, DreamCounters()
         # Whether there are dreams of whole episodes, which real ones can be held against.
@@ -136,6 +124,7 @@ class Imagination:
         self._model, self._world = model, world
         self._success = None if "success" in model.spec.provides else success
         self._calibration = Calibration(config.calibrate if self._success is not None else 0)
+        self._ended = ended
         self._cost, self._fails, self._name = decision_cost, fails, name
         self._on_segment = on_segment
         self._starts = StartPool(
@@ -241,12 +230,18 @@ class Imagination:
     @property
     def on(self) -> bool:
         """Whether anything is to be imagined now."""
-        return not self.waits and not self.switch.tripped and self._doubted_in_a_row < self.config.window
+        off = self.waits or self.prepares or self.switch.tripped
+        return not off and self._doubted_in_a_row < self.config.window
+
+    @property
+    def prepares(self) -> bool:
+        """Whether it waits for real episodes to end, by which it is to be calibrated."""
+        starts = self._starts
+        return self._calibration.going_on and not (starts.ended >= self._ended and starts.told)
 
     def requests(self) -> list[Request]:
         """What is to be decided, one for each dream; none before anything real was seen, or switched off."""
-        calibrates = self._calibration.going_on
-        if not self.on or not (self._starts.told if calibrates else len(self._starts)):
+        if not len(self._starts) or not self.on:
             return []
         self._begin([i for i, row in enumerate(self._rows) if row is None])
         return [

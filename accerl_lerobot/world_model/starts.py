@@ -85,6 +85,8 @@ class StartPool:
         self._held: deque[_Held] = deque()
         self._outcomes: dict[Name, bool] = {}
         """Of episodes that have ended, and of which something is held."""
+        self.ended = 0
+        """Episodes that have ended so far."""
         self._count = 0
 
     def __len__(self) -> int:
@@ -100,6 +102,7 @@ class StartPool:
         name = segment.origin[:2]
         if (segment.terminated or segment.truncated) and name in names:
             self._outcomes[name] = segment.terminated and segment.success
+            self.ended += 1
         while self._held and self._count - len(self._held[0].segment) >= self.memory:
             gone = self._held.popleft()
             self._count -= len(gone.segment)
@@ -109,13 +112,14 @@ class StartPool:
 
     def state(self) -> dict[str, Any]:
         """All that `restore` needs; see `snapshot`."""
-        return {"segments": [held.segment for held in self._held], "outcomes": dict(self._outcomes)}
+        held = [held.segment for held in self._held]
+        return {"segments": held, "outcomes": dict(self._outcomes), "ended": self.ended}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Goes on from what `state` gave."""
         self._held.extend(_Held(segment, self.spec) for segment in state["segments"])
         self._count = sum(len(held.segment) for held in self._held)
-        self._outcomes = state["outcomes"]
+        self._outcomes, self.ended = state["outcomes"], state["ended"]
 
     @property
     def told(self) -> bool:

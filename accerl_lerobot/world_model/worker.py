@@ -156,7 +156,7 @@ class DreamWorker:
             self._clock.enter(CHECKPOINT)
             with self._dreaming:
                 self._clock.enter(COMPUTE)
-                promising = self._swap()
+                promising = self._swap() or self._dreams.prepares
                 for segment in news.fresh():
                     self._dreams.remember(segment)
                 self._cursor = news.cursor

@@ -43,10 +43,18 @@ def test_it_lets_as_many_dreams_succeed_as_episodes_did():
     assert not calibration.going_on and not calibration.complete()
     calibration.reset()
     assert calibration.going_on and calibration.threshold is None
-    for _ in range(4):
-        calibration.add(True, 0.1)
+    for highest in (0.1, 0.2, 0.3, 0.4):
+        calibration.add(highest > 0.1, highest)
     assert calibration.complete() and calibration.threshold == 0.5, "less than that says nothing"
     assert not Calibration(0).going_on
+
+
+@pytest.mark.parametrize("outcome", [True, False])
+def test_where_all_episodes_ended_alike_nothing_is_told(outcome: bool):
+    calibration = Calibration(3)
+    for highest in (0.1, 0.9, 0.5):
+        calibration.add(outcome, highest)
+    assert calibration.complete() and calibration.threshold is None and not calibration.going_on
 
 
 def act(dreams: Imagination, requests: list[Request]) -> list[Decision]:
@@ -84,13 +92,28 @@ def test_an_episode_that_has_not_ended_is_no_measure(bright: Any):
     dreams, _ = imagination(Counting(), bright, horizon=None, calibrate=4)
     [*_, first, last] = lived(3, length=2)
     dreams.remember(first)
-    assert dreams.requests() == []
+    assert dreams.requests() == [] and dreams.prepares and not dreams.on
     dreams.remember(last)
-    assert len(dreams.requests()) == 4
+    assert len(dreams.requests()) == 4 and not dreams.prepares and dreams.on
     held: StartPool = pool(horizon=None)
     held.add(first)
     with pytest.raises(ValueError, match="no real experience"):
         held.draw(1, np.random.default_rng(0), told=True)
+
+
+def test_it_waits_for_the_failures_which_end_last(bright: Any):
+    """Of eight worlds, one succeeds at once: its episode alone would say that all do."""
+    dreams, _ = imagination(Counting(), bright, horizon=None, calibrate=400, keyframes=0.0, ended=8)
+    episodes = [*lived(1, solve_at=0), *(segment for seed in range(10, 17) for segment in lived(seed))]
+    share = np.mean([episode.success for episode in episodes])
+    assert len(episodes) == 8 and share < 0.3
+    for episode in episodes:
+        assert dreams.requests() == []
+        dreams.remember(episode)
+    while dreams._calibration.going_on:
+        dreams.advance(act(dreams, dreams.requests()))
+    real = [achieved for achieved, _ in dreams._calibration._pairs]
+    assert np.mean(real) == pytest.approx(share, abs=0.05)
 
 
 def test_each_model_is_calibrated_anew(bright: Any):

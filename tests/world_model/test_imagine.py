@@ -92,6 +92,7 @@ def imagination(
     model: WorldModel, success: Any = None, *, fails: bool = True, world: Any = WORLD_SPEC, **config: Any
 ) -> tuple[Imagination, list[Segment]]:
     kind = "oracle" if isinstance(model, OracleModel) else "learned"
+    ended = config.pop("ended", 1)
     fields: dict[str, Any] = {
         "share": 0.5, "path": "x", "dreams": 4, "horizon": 3, "beginnings": 0.0, "model": kind,
         "learn": OnlineLearnConfig(steps_per_episode=0),
@@ -100,6 +101,7 @@ def imagination(
     dreams = Imagination(
         model, success, world, ImaginationConfig(**(fields | config)),
         decision_cost=0.01, fails=fails, seed=0, name="dream", on_segment=made.append,
+        ended=ended,
     )  # fmt: skip
     return dreams, made
 
