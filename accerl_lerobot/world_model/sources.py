@@ -136,7 +136,7 @@ def check_apart(dataset: DatasetConfig, episodes: Sequence[Episode], others: Seq
     """
     there = {episode.actions.tobytes() for episode in others}
     if twice := sum(episode.actions.tobytes() in there for episode in episodes):
-        remedy = f"{twice} of its episodes are in dataset, too; name one that has only others"
+        remedy = f"{twice} of its episodes are in the other dataset, too; name one that has only others"
         raise InputError("dataset.repo_id", dataset.repo_id, remedy)
 
 

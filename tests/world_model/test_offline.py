@@ -218,7 +218,7 @@ def test_a_policys_episodes_are_learnt_from_beside_demonstrations(
     ("of", "message"),
     [
         ("demos", "online.repo_id='a/b': it is the one in dataset; name another"),
-        ("overlapping", "online.repo_id='a/b': 6 of its episodes are in dataset, too"),
+        ("overlapping", "online.repo_id='a/b': 6 of its episodes are in the other dataset, too"),
         ("nowhere", "online.root='nowhere': no meta/info.json there"),
     ],
 )
