@@ -122,7 +122,7 @@ class ImaginationConfig:
     calibrate: int = 0
     """First dreams, from beginnings of real episodes to their ends, that nothing is learnt from: the
     threshold is set, anew for each world model, so that as many of them succeed as of these episodes. 0:
-    none. An oracle needs none.
+    none, which did better on door-open where the world model had learnt long enough. An oracle needs none.
 
     It waits until `witnesses` episodes have ended, and as many more as are played at a time, or all there
     will be; where all end alike it leaves the threshold as it was. It asks for `horizon` None and a `memory`
