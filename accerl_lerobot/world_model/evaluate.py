@@ -39,7 +39,15 @@ from accerl_lerobot.world_model.episodes import Episode
 from accerl_lerobot.world_model.inverse import InverseProbe, learn_probe
 from accerl_lerobot.world_model.perturbed import SOURCE as PERTURBED
 from accerl_lerobot.world_model.perturbed import check_world, perturbed_episodes
-from accerl_lerobot.world_model.sources import DATASET, HELD_OUT, ONLINE, named, open_rooms, try_sources
+from accerl_lerobot.world_model.sources import (
+    DATASET,
+    HELD_OUT,
+    ONLINE,
+    named,
+    open_rooms,
+    rooms_of,
+    try_sources,
+)
 from accerl_lerobot.world_model.stand_in import SuccessModel, load_stand_in
 from accerl_lerobot.world_model.store import Source, find, load_sources, load_world_model
 
@@ -74,10 +82,8 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
     if config.success.path is not None:
         success = load_stand_in(config.success, model.spec, "success")
     spec, sources_of = model.spec, load_sources(path)
-    rooms = {"dataset": config.dataset}
-    rooms |= {} if config.online.repo_id is None else {ONLINE: config.online}
     parts: dict[str, _Part] = {}
-    for room, meta in open_rooms(rooms, spec).items():
+    for room, meta in open_rooms(rooms_of(config), spec).items():
         with named(room):
             parts[room] = _part(meta, sources_of)
     part = parts["dataset"]

@@ -43,7 +43,15 @@ from accerl_lerobot.world_model.dataset import fingerprint, load_episodes
 from accerl_lerobot.world_model.episodes import Episode, amount, split
 from accerl_lerobot.world_model.learn import pretrain
 from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.sources import HELD_OUT, ONLINE, check_apart, named, open_rooms, try_sources
+from accerl_lerobot.world_model.sources import (
+    HELD_OUT,
+    ONLINE,
+    check_apart,
+    named,
+    open_rooms,
+    rooms_of,
+    try_sources,
+)
 from accerl_lerobot.world_model.store import SUCCESS, Source, save_world_model
 from accerl_lerobot.world_model.success import Examples, SuccessLearner, new_success_model
 from accerl_lerobot.world_model.trial import calibrate
@@ -97,24 +105,21 @@ def learn_world_model(run: WorldModelRun, directory: Path, console: Console) -> 
     """
     config, seed = run.world_model, run.seed
     spec, rng = world_spec(config, run.env), _rng(seed)
-    rooms = {"dataset": run.dataset}
-    rooms |= {} if run.online.repo_id is None else {ONLINE: run.online}
+    rooms = rooms_of(run)
     metas = open_rooms(rooms, spec)
     parts: dict[str, _Split] = {}
+    every: list[Episode] = []
     with console.stage("episodes"):
         for room, dataset in rooms.items():
             name, source = (HELD_OUT, "demo") if room == "dataset" else (ONLINE, ONLINE)
             with named(room):
                 episodes = load_episodes(dataset, spec, source)
-                check_apart(
-                    dataset, episodes, [e for part in parts.values() for e in (*part.learn, *part.held)]
-                )
+                check_apart(dataset, episodes, every)
                 parts[name] = _split(dataset, metas[room], episodes, config, rng)
+            every += episodes
     learn = [episode for part in parts.values() for episode in part.learn]
     held = {name: part.held for name, part in parts.items()}
-    spec = replace(
-        spec, tasks=_tasks(run.env, [e for part in parts.values() for e in (*part.learn, *part.held)])
-    )
+    spec = replace(spec, tasks=_tasks(run.env, every))
     torch.manual_seed(seed)
     model = PixelWorldModel(spec, config.model)
     started = time.monotonic()
@@ -149,8 +154,8 @@ def learn_world_model(run: WorldModelRun, directory: Path, console: Console) -> 
         serving, held, config.trial, success, directory, console,
         learnt=held, fresh=fresh, kept=True, seed=seed,
     )  # fmt: skip
-    every = [episode for part in held.values() for episode in part]
-    found |= {"seconds": seconds, "learnt": amount(learn), "held_out": amount(every)}
+    tried = [episode for part in held.values() for episode in part]
+    found |= {"seconds": seconds, "learnt": amount(learn), "held_out": amount(tried)}
     (directory / "trial.json").write_text(json.dumps(found, indent=2) + "\n")
     success.save_pretrained(directory / "world_model" / SUCCESS)  # with its threshold
     return found

@@ -35,6 +35,7 @@ from accerl_lerobot.world_model.trial import try_out
 
 if TYPE_CHECKING:
     from accerl_lerobot.dataset_config import DatasetConfig
+    from accerl_lerobot.verb_configs import WorldModelEvalRun, WorldModelRun
     from accerl_lerobot.world_model.config import TrialConfig
     from accerl_lerobot.world_model.contract import WorldModelSpec
     from accerl_lerobot.world_model.inverse import InverseProbe
@@ -104,6 +105,11 @@ def try_sources(
     passed = all(gate["holds"] for gate in gates.values())
     rest = {name: found[name] for name in others}
     return result | {"gates": gates, "passed": passed, "sources": rest}
+
+
+def rooms_of(run: WorldModelRun | WorldModelEvalRun) -> dict[str, DatasetConfig]:
+    """``dataset``, which has to be there, and ``online``, if it is named."""
+    return {DATASET: run.dataset} | ({} if run.online.repo_id is None else {ONLINE: run.online})
 
 
 def open_rooms(rooms: dict[str, DatasetConfig], spec: WorldModelSpec) -> dict[str, Any]:

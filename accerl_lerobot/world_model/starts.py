@@ -87,6 +87,8 @@ class StartPool:
         """Of episodes that have ended, and of which something is held."""
         self.ended = 0
         """Episodes that have ended so far."""
+        self.told = False
+        """Whether there is a beginning of an episode that has ended. Kept: it is also read on another thread."""
         self._count = 0
 
     def __len__(self) -> int:
@@ -109,6 +111,7 @@ class StartPool:
             names.pop(0)
             if gone.name not in names:
                 self._outcomes.pop(gone.name, None)
+        self.told = self._is_told()
 
     def state(self) -> dict[str, Any]:
         """All that `restore` needs; see `snapshot`."""
@@ -120,10 +123,9 @@ class StartPool:
         self._held.extend(_Held(segment, self.spec) for segment in state["segments"])
         self._count = sum(len(held.segment) for held in self._held)
         self._outcomes, self.ended = state["outcomes"], state["ended"]
+        self.told = self._is_told()
 
-    @property
-    def told(self) -> bool:
-        """Whether there is a beginning of an episode that has ended."""
+    def _is_told(self) -> bool:
         return any(held.first.any() and held.name in self._outcomes for held in self._held)
 
     def draw(self, count: int, rng: np.random.Generator, told: bool = False) -> list[Start]:
