@@ -88,7 +88,7 @@ class StartPool:
         self.ended = 0
         """Episodes that have ended so far."""
         self.told = False
-        """Whether there is a beginning of an episode that has ended. Kept: it is also read on another thread."""
+        """Whether there is a beginning of an episode that has ended; kept, as another thread reads it."""
         self._count = 0
 
     def __len__(self) -> int:
