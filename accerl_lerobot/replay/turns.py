@@ -18,7 +18,9 @@
     synchronous    a batch is collected, then learned from, then the weights are handed over
 
 The last two are what asynchrony is measured against: the same workers, held back. All worlds are decided for
-together in them, as by a vectorised environment, so a step takes as long as its slowest world.
+together in them, as by a vectorised environment, so a step takes as long as its slowest world. An inference
+service that is lost while it has answered some of them leaves these a decision ahead: from then on some
+decisions are an update older than the schedule alone would have them.
 """
 
 from __future__ import annotations
