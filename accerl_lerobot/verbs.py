@@ -36,6 +36,7 @@ from accerl_lerobot.bench.dream import BenchDreamConfig
 from accerl_lerobot.bench.efficiency import BenchEfficiencyConfig
 from accerl_lerobot.bench.faults import BenchFaultsConfig
 from accerl_lerobot.bench.lag import BenchLagConfig
+from accerl_lerobot.bench.latency import BenchLatencyConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.ranking import BenchRankingConfig
 from accerl_lerobot.bench.replay import BenchReplayConfig
@@ -322,6 +323,7 @@ CONFIGS: dict[str, type[Any]] = {
     "bench batching": BenchBatchingConfig,
     "bench replay": BenchReplayConfig,
     "bench timeline": BenchTimelineConfig,
+    "bench latency": BenchLatencyConfig,
     "bench lag": BenchLagConfig,
     "bench dream": BenchDreamConfig,
     "bench efficiency": BenchEfficiencyConfig,

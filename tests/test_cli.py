@@ -295,7 +295,8 @@ def test_bench_without_a_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert (
         capsys.readouterr().err
         == "accerl: bench='': name what is measured: world, policy, throughput, scaling, async-vs-sync, "
-        "transport, weights, batching, replay, timeline, lag, dream, efficiency, faults, soak, ranking\n"
+        "transport, weights, batching, replay, timeline, latency, lag, dream, efficiency, faults, soak, "
+        "ranking\n"
     )
 
 

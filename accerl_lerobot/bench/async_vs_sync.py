@@ -56,6 +56,8 @@ class BenchAsyncVsSyncConfig(MachineryConfig):
 
     cvs: tuple[float, ...] = (0.0, 0.1, 0.3, 0.5, 1.0)
     """Laws of latency: standard deviation over mean; takes the place of `latency_cv`."""
+    traces: tuple[str, ...] = ()
+    """More laws: files of `accerl bench latency`, each a world's own; takes the place of `latency_trace`."""
     seconds: float = 8.0
     """Of a block, at least, above 0."""
     rounds: int = 3
@@ -69,16 +71,18 @@ class BenchAsyncVsSyncConfig(MachineryConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.cvs or any(cv < 0 for cv in self.cvs):
-            raise InputError("cvs", self.cvs, "name at least one, none below 0")
+        if any(cv < 0 for cv in self.cvs):
+            raise InputError("cvs", self.cvs, "name none below 0")
+        if not (self.cvs or self.traces):
+            raise InputError("cvs", self.cvs, "name at least one law, here or in traces")
         if not self.seconds > 0:
             raise InputError("seconds", self.seconds, "use a positive time")
         if self.rounds < 1:
             raise InputError("rounds", self.rounds, "use at least 1")
         if self.learning_updates < 0:
             raise InputError("learning_updates", self.learning_updates, "use 0 (none) or more")
-        for cv in self.cvs:  # what a run would refuse is refused now
-            replace_law(self, cv).run_config()
+        for law in laws(self):  # what a run would refuse is refused now
+            law.run_config()
         for seed in self.seeds if self.learning_updates else ():
             LEARNING.run_config(updates=self.learning_updates, seed=seed)
 
@@ -93,11 +97,11 @@ def bench_async_vs_sync(config: BenchAsyncVsSyncConfig) -> dict[str, Any]:
     console, root = Console(), Path(config.output_dir)
     root.mkdir(parents=True, exist_ok=True)
     result: dict[str, Any] = {"config": asdict(config), "host": host(), "floors": floors(), "laws": []}
-    with console.stage("laws", total=len(config.cvs)) as stage:
-        for cv in config.cvs:
-            law = _law(config, cv)
+    with console.stage("laws", total=len(laws(config))) as stage:
+        for of in laws(config):
+            law = _law(config, of)
             result["laws"].append(law)
-            stage.update(len(result["laws"]), f"CV {cv:g}: S {law['speed_up']['median']:.2f}")
+            stage.update(len(result["laws"]), f"CV {of.cv:.3g}: S {law['speed_up']['median']:.2f}")
     result |= {"learning": {}, "host_after": host()}
     write(root, "async_vs_sync", result, markdown(result))
     if config.learning_updates:
@@ -122,7 +126,8 @@ def compare(config: MachineryConfig, blocks: list[Block]) -> dict[str, Any]:
     }
     reached = [rate / config.bound for rate in rates[ASYNCHRONOUS]]
     return {
-        "latency_cv": config.latency_cv,
+        "cv": config.cv,
+        "trace": config.latency_trace,
         "bound": config.bound,
         "rates": {arm: spread(values) for arm, values in rates.items()},
         "trainer_waits": {arm: statistics.median(values) for arm, values in waits.items()},
@@ -152,17 +157,21 @@ def markdown(result: dict[str, Any]) -> str:
     return text
 
 
-def replace_law(config: MachineryConfig, cv: float) -> MachineryConfig:
-    """The same machinery under another law."""
+def laws(config: BenchAsyncVsSyncConfig) -> list[MachineryConfig]:
+    """The same machinery under each law, those of `cvs` first."""
     sizes = {field.name: getattr(config, field.name) for field in fields(MachineryConfig)}
-    return MachineryConfig(**sizes | {"latency_cv": cv})
+    made = [MachineryConfig(**sizes | {"latency_cv": cv, "latency_trace": None}) for cv in config.cvs]
+    return made + [MachineryConfig(**sizes | {"latency_trace": trace}) for trace in config.traces]
 
 
-def _law(config: BenchAsyncVsSyncConfig, cv: float) -> dict[str, Any]:
-    of = replace_law(config, cv)
+def _law(config: BenchAsyncVsSyncConfig, of: MachineryConfig) -> dict[str, Any]:
     with of.open() as engine:
         order = config.rounds * (*ARMS, *reversed(ARMS))
         return compare(of, [engine.block(arm, config.seconds) for arm in order])
+
+
+def _named(law: dict[str, Any]) -> str:
+    return f"{law['cv']:.3g}" + (f" ({Path(law['trace']).stem})" if law["trace"] else "")
 
 
 def _learning(config: BenchAsyncVsSyncConfig, console: Console) -> dict[str, Any]:
@@ -204,7 +213,7 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
     for law in result["laws"]:
         rows.append(
             [
-                f"{law['latency_cv']:g}",
+                _named(law),
                 *(ranged(law["rates"][arm], ".0f") for arm in ARMS),
                 ranged(law["speed_up"], ".2f"),
                 ranged(law["speed_up_over_overlap"], ".2f"),
@@ -232,21 +241,21 @@ def _learnt(result: dict[str, Any]) -> str:
 
 def _draw(path: Path, result: dict[str, Any]) -> None:
     """Speed-up by law, beside the largest one possible."""
-    laws = result["laws"]
-    x = range(len(laws))
+    found = result["laws"]
+    x = range(len(found))
     with drawing(path) as axes:
-        axes.plot(x, [law["largest_speed_up"] for law in laws], "k_", ms=30, label="S*, the most possible")
+        axes.plot(x, [law["largest_speed_up"] for law in found], "k_", ms=30, label="S*, the most possible")
         for name, key, place in (
             ("over synchronous", "speed_up", -0.1),
             ("over overlap", "speed_up_over_overlap", 0.1),
         ):
-            middle = [law[key]["median"] for law in laws]
+            middle = [law[key]["median"] for law in found]
             error = [
-                [m - law[key]["min"] for m, law in zip(middle, laws, strict=True)],
-                [law[key]["max"] - m for m, law in zip(middle, laws, strict=True)],
+                [m - law[key]["min"] for m, law in zip(middle, found, strict=True)],
+                [law[key]["max"] - m for m, law in zip(middle, found, strict=True)],
             ]
             axes.errorbar([i + place for i in x], middle, yerr=error, fmt="o", capsize=3, label=name)
-        axes.set_xticks(list(x), [f"{law['latency_cv']:g}" for law in laws])
+        axes.set_xticks(list(x), [_named(law) for law in found])
         axes.set(
             xlabel="latency of the worlds: standard deviation over mean",
             ylabel="speed-up of the asynchronous schedule",

@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from accerl_lerobot.bench.blocks import Measured
 from accerl_lerobot.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.envs.simulated import read_trace
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import Load
@@ -48,6 +49,8 @@ class MachineryConfig:
     """Mean time a world takes from a decision to its next observation, in milliseconds; above 0."""
     latency_cv: float = 0.5
     """Standard deviation of that over its mean, lognormal; 0: always the mean."""
+    latency_trace: str | None = None
+    """File of `accerl bench latency`, for its law in place of the lognormal one; scaled to `latency_ms`."""
     image_size: int = 64
     """Height and width of the one image of an observation, 8 to 480; 317 makes it 301 KB."""
     segment_length: int = 4
@@ -70,6 +73,13 @@ class MachineryConfig:
             raise InputError("latency_ms", self.latency_ms, "use a positive time")
         if self.segment_length < 1 or EPISODE % self.segment_length:
             raise InputError("segment_length", self.segment_length, f"use a divisor of {EPISODE}")
+        if self.latency_trace is not None:
+            read_trace(self.latency_trace)
+
+    @property
+    def cv(self) -> float:
+        """Standard deviation of the worlds' latency over its mean."""
+        return self.latency_cv if self.latency_trace is None else float(read_trace(self.latency_trace).std())
 
     @property
     def batch(self) -> int:
@@ -110,8 +120,9 @@ class MachineryConfig:
                 reward="dense",
                 image_size=self.image_size,
                 frame_ms=self.latency_ms,
-                latency="lognormal" if self.latency_cv else "constant",
+                latency=self._law,
                 latency_cv=self.latency_cv,
+                latency_trace=self.latency_trace,
             ),
             rollout=RolloutConfig(workers=self.worlds, worlds=1, segment_length=self.segment_length),
             inference=InferenceConfig(max_batch=self.max_batch, max_wait_s=self.max_wait_ms / 1000),
@@ -130,6 +141,12 @@ class MachineryConfig:
             ),
             launch=LaunchConfig(stall_s=120.0),
         )
+
+    @property
+    def _law(self) -> str:
+        if self.latency_trace is not None:
+            return "trace"
+        return "lognormal" if self.latency_cv else "constant"
 
     def open(self) -> Measured:
         """An engine of it, which has begun to train."""

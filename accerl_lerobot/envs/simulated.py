@@ -19,9 +19,11 @@ For tests and for measuring the machinery around a world without a simulator's c
 from __future__ import annotations
 
 import collections
+import functools
 import math
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -71,9 +73,12 @@ class SimulatedConfig(EnvConfig):
     frame_ms: float = 0.0
     """Mean time an observation takes, in milliseconds."""
     latency: str = "constant"
-    """``constant`` or ``lognormal``; drawn from the episode's seed."""
+    """``constant``, ``lognormal`` or ``trace``; drawn from the episode's seed."""
     latency_cv: float = 0.5
     """Standard deviation over mean of the lognormal law, 0 to 10."""
+    latency_trace: str | None = None
+    """File that `accerl bench latency` has written of another world: an episode takes a stretch of it, from a
+    moment drawn from its seed, scaled to the means above."""
     crash_after: int = 0
     """Env steps of this instance after which it raises; 0 for never."""
     nan_after: int = 0
@@ -96,8 +101,11 @@ class SimulatedConfig(EnvConfig):
             raise InputError("env.tolerance", self.tolerance, "use a positive distance")
         if self.reward not in ("success", "dense"):
             raise InputError("env.reward", self.reward, "use success or dense")
-        if self.latency not in ("constant", "lognormal"):
-            raise InputError("env.latency", self.latency, "use constant or lognormal")
+        if self.latency not in ("constant", "lognormal", "trace"):
+            raise InputError("env.latency", self.latency, "use constant, lognormal or trace")
+        if (self.latency == "trace") != (self.latency_trace is not None):
+            remedy = "name a file of `accerl bench latency` for env.latency=trace, and for no other"
+            raise InputError("env.latency_trace", self.latency_trace, remedy)
         if not 0 <= self.latency_cv <= 10:
             raise InputError("env.latency_cv", self.latency_cv, "use 0 to 10")
         for name in ("step_ms", "frame_ms", "crash_after", "nan_after"):
@@ -135,6 +143,8 @@ class SimulatedWorld(World):
         self._target: np.ndarray = np.zeros(dims, np.float32)
         self._recent: collections.deque[np.ndarray] = collections.deque(maxlen=config.hold)
         self._clock = np.random.default_rng(0)
+        self._trace = read_trace(config.latency_trace) if config.latency_trace is not None else np.ones(1)
+        self._at = 0
         self._steps = 0
         self._success = False
         self._done = True
@@ -150,6 +160,7 @@ class SimulatedWorld(World):
             raise InputError("task", task, f"this world has: {', '.join(self.spec.tasks)}")
         rng = np.random.default_rng((seed, 0))
         self._clock = np.random.default_rng((seed, 1))
+        self._at = int(self._clock.integers(len(self._trace)))
         self._task = task
         self._target = rng.uniform(-_REACH, _REACH, self.config.action_dim).astype(np.float32)
         self._recent.clear()
@@ -220,8 +231,40 @@ class SimulatedWorld(World):
         """Seconds, drawn anew for each step and each observation."""
         if mean_ms == 0 or self.config.latency == "constant":
             return mean_ms / 1000
+        if self.config.latency == "trace":
+            self._at = (self._at + 1) % len(self._trace)
+            return mean_ms / 1000 * float(self._trace[self._at])
         variance = math.log1p(self.config.latency_cv**2)
         return mean_ms / 1000 * math.exp(self._clock.normal(-variance / 2, math.sqrt(variance)))
+
+
+@functools.cache
+def read_trace(path: str) -> np.ndarray:
+    """Durations, one on each line of a text file; what follows a ``#`` is for people.
+
+    Returns:
+        float64 (T,), divided by their mean.
+
+    Raises:
+        InputError: it cannot be read, or there is a line that is no duration, or none that is one.
+    """
+    try:
+        lines = Path(path).read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError("latency_trace", path, f"it cannot be read ({error}); use a text file") from None
+    found = []
+    for number, line in enumerate(lines, start=1):
+        if not (said := line.partition("#")[0].strip()):
+            continue
+        try:
+            found.append(float(said))
+        except ValueError:
+            found.append(math.nan)
+        if not 0 <= found[-1] < math.inf:
+            raise InputError("latency_trace", path, f"line {number}, {said!r}, is no duration; use numbers")
+    if not sum(found) > 0:
+        raise InputError("latency_trace", path, "no time passes in it; write one duration on each line")
+    return np.asarray(found) / np.mean(found)
 
 
 def _wait(delay: float) -> None:

@@ -87,6 +87,17 @@ def test_speed_ups_are_of_neighbouring_blocks():
     assert found["processor_bound"] and len(found["blocks"]) == 6
 
 
+def test_laws_of_a_study(tmp_path: Path):
+    trace = tmp_path / "trace.txt"
+    trace.write_text("1\n3\n")
+    config = BenchAsyncVsSyncConfig(worlds=3, cvs=(0.0, 0.3), traces=(str(trace),))
+    found = async_vs_sync.laws(config)
+    assert [law.cv for law in found] == [0.0, 0.3, 0.5] and {law.worlds for law in found} == {3}
+    envs = [law.run_config().env for law in found]
+    assert [env.latency for env in envs] == ["constant", "lognormal", "trace"]
+    assert [env.latency_trace for env in envs] == [None, None, str(trace)]
+
+
 def test_efficiency_is_relative_to_the_first_count():
     config = BenchScalingConfig(counts=(2, 4), update_ms=0.0)
     found = compare_counts(config, {2: [block("", 10.0), block("", 10.0)], 4: [block("", 15.0, 0.9)]})
@@ -107,12 +118,22 @@ def test_books_that_do_not_add_up_are_an_error():
 
 def test_a_small_run_of_everything(light_ray: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     small = {"worlds": 2, "latency_ms": 5.0, "update_ms": 20.0, "image_size": 16, "decide_ms": 1.0}
+    trace = tmp_path / "drawers.txt"
+    trace.write_text("1\n3\n")
     config = BenchAsyncVsSyncConfig(
-        **small, cvs=(0.5,), seconds=0.2, rounds=1, learning_updates=2, seeds=(0,), output_dir=str(tmp_path)
+        **small,
+        cvs=(),
+        traces=(str(trace),),
+        seconds=0.2,
+        rounds=1,
+        learning_updates=2,
+        seeds=(0,),
+        output_dir=str(tmp_path),
     )
     monkeypatch.setattr(async_vs_sync, "TRIALS", 4)
     result = bench_async_vs_sync(config)
     (law,) = result["laws"]
+    assert law["cv"] == 0.5 and law["trace"] == str(trace)
     assert [b["schedule"] for b in law["blocks"]] == [*ARMS, *reversed(ARMS)]
     assert all(b["decisions_per_s"] > 0 and b["updates"] >= 1 for b in law["blocks"])
     # In lock step the service sees both worlds at once.
@@ -120,7 +141,7 @@ def test_a_small_run_of_everything(light_ray: None, tmp_path: Path, monkeypatch:
     assert set(result["learning"]["success"]) == set(ARMS)
     assert json.loads((tmp_path / "async_vs_sync.json").read_text()) == json.loads(json.dumps(result))
     text = (tmp_path / "async_vs_sync.md").read_text()
-    assert "S/S*" in text and "Success after 2 updates" in text
+    assert "S/S*" in text and "0.5 (drawers)" in text and "Success after 2 updates" in text
     assert (tmp_path / "async_vs_sync.png").stat().st_size > 1000
     with Console().rich.capture():
         Console().rich.print(schedules_table(result))
@@ -159,6 +180,8 @@ def test_the_machine_is_described():
         (lambda: MachineryConfig(latency_ms=0.0), "latency_ms"),
         (lambda: MachineryConfig(segment_length=5), "segment_length"),
         (lambda: BenchAsyncVsSyncConfig(cvs=()), "cvs"),
+        (lambda: BenchAsyncVsSyncConfig(cvs=(-0.1,)), "cvs"),
+        (lambda: BenchAsyncVsSyncConfig(traces=("/nowhere",)), "latency_trace"),
         (lambda: BenchAsyncVsSyncConfig(rounds=0), "rounds"),
         (lambda: BenchAsyncVsSyncConfig(cvs=(11.0,)), "latency_cv"),
         (lambda: BenchAsyncVsSyncConfig(seeds=(100,)), "seed"),

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.envs import SimulatedConfig, SimulatedWorld
+from accerl_lerobot.envs.simulated import read_trace
 from accerl_lerobot.errors import InputError
 
 
@@ -88,6 +89,45 @@ def test_latency_is_slept_and_has_the_mean_asked_for():
     assert np.std(draws) / np.mean(draws) == pytest.approx(1.0, rel=0.15)
 
 
+def test_a_trace_is_gone_through_from_some_moment_on_and_scaled(tmp_path):
+    trace = tmp_path / "trace.txt"
+    trace.write_text("# of a world\n1.0\n\n2.0  # and a reset\n6.0\n")
+    assert read_trace(str(trace)).tolist() == [1 / 3, 2 / 3, 2.0]
+    config = SimulatedConfig(latency="trace", latency_trace=str(trace), frame_ms=0.3)
+    starts = set()
+    for seed in range(20):
+        world = SimulatedWorld(config)
+        world.reset(seed, "match")
+        draws = [round(world._delay(3.0) * 1000, 9) for _ in range(6)]
+        assert draws[:3] == draws[3:] and sorted(draws[:3]) == [1.0, 2.0, 6.0]
+        assert draws[(draws.index(1.0) + 1) % 3] == 2.0
+        starts.add(draws[0])
+        world.reset(seed, "match")
+        assert round(world._delay(3.0) * 1000, 9) == draws[0]
+    assert starts == {1.0, 2.0, 6.0}
+    assert world._delay(0.0) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (None, "cannot be read"),
+        ("1.0\nfast\n", "line 2, 'fast', is no duration"),
+        ("1.0\n-1.0\n", "line 2"),
+        ("nan\n", "line 1"),
+        ("inf\n", "line 1"),
+        ("# nothing\n", "no time passes"),
+        ("0\n0\n", "no time passes"),
+    ],
+)
+def test_a_trace_that_is_none_is_refused(tmp_path, text: str | None, why: str):
+    trace = tmp_path / "trace.txt"
+    if text is not None:
+        trace.write_text(text)
+    with pytest.raises(InputError, match=f"^latency_trace=.*{why}"):
+        SimulatedWorld(SimulatedConfig(latency="trace", latency_trace=str(trace)))
+
+
 def test_it_crashes_on_request_and_counts_over_episodes():
     world = SimulatedWorld(SimulatedConfig(crash_after=12, tolerance=1e-6))
     for seed in (0, 1):
@@ -117,6 +157,8 @@ def test_one_nan_ends_the_episode_and_the_next_is_healthy():
         ({"tolerance": 0.0}, "env.tolerance"),
         ({"step_ms": -1.0}, "env.step_ms"),
         ({"latency": "normal"}, "env.latency"),
+        ({"latency": "trace"}, "env.latency_trace"),
+        ({"latency_trace": "trace.txt"}, "env.latency_trace"),
     ],
 )
 def test_bad_values_name_their_field(values: dict, field: str):
