@@ -134,10 +134,14 @@ class WorldModelEvalRun:
     """A reward model that tells successes in place of the one beside the world model."""
     trial: TrialConfig = field(default_factory=TrialConfig)
     inverse: InverseConfig = field(default_factory=InverseConfig)
+    policies: tuple[str, ...] = ()
+    """Checkpoints that decide on what is dreamt and on what was seen: do they do the same?"""
 
     def __post_init__(self) -> None:
         if self.path is None:
             raise InputError("path", None, "name the folder world_model of an accerl world-model run")
+        if len(set(self.policies)) < len(self.policies):
+            raise InputError("policies", self.policies, "name none of them twice")
         if self.seed < 0:
             raise InputError("seed", self.seed, "use 0 or more")
         self.dataset.check("dataset")

@@ -218,7 +218,7 @@ def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Cons
         _discard_unused(directory)
         raise
     console.rich.print(table(found))
-    if found.get("sources"):
+    if found.get("sources") or found.get("alike"):
         console.rich.print(sources_table(found))
     for line in gates(found):
         console.say(line)

@@ -158,10 +158,10 @@ def depth_charts(depths: Sequence[Record]) -> list[Chart]:
 
 
 def source_blocks(found: Record) -> list[list[Block]]:
-    """A table and charts of the trials on several sources; nothing where there was one."""
-    if not found.get("sources"):
+    """A table and charts of the trials on several sources; nothing where there was one and no policy."""
+    if not (found.get("sources") or found.get("alike")):
         return []
-    every = [found, *found["sources"].values()]
+    every = [found, *(found.get("sources") or {}).values()]
     names = [str(one.get("name")) for one in every]
     table = Table(
         caption="The same measures on episodes from each source",
@@ -183,7 +183,7 @@ def source_blocks(found: Record) -> list[list[Block]]:
         )
         for title, key, limits in BY_SOURCE
     ]
-    return [[table], figures(*charts)]
+    return [[table], figures(*charts)] if len(every) > 1 else [[table]]
 
 
 def _headline(run: Run) -> str:

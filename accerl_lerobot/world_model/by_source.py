@@ -34,6 +34,10 @@ def source_rows(every: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
         ("change of what is read", 0, "legible_change"),
     ):
         rows.append((name, [estimate((one["depths"] or [{}])[depth].get(key)) for one in every]))
+    for name, key in (("first chunk", "first"), ("whole dreams", "whole")):
+        rows.append(
+            (f"policies decide alike, {name}", [estimate((one.get("alike") or {}).get(key)) for one in every])
+        )
     rows.append(("successes, failures dreamt", [_ended(o) for o in ends]))
     rows.append(("AUROC of how they end", [estimate(o.get("auroc")) for o in ends]))
     for name, key in (("false success", "false_success"), ("recall", "recall")):

@@ -33,8 +33,10 @@ from accerl_lerobot.demos.starts import Start, read_starts
 from accerl_lerobot.demos.windows import origin_of
 from accerl_lerobot.envs import World, make_world
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.world_model.contract import WorldModelSpec
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.world_model.contract import WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.dataset import fingerprint, load_episodes
+from accerl_lerobot.world_model.deciding import Decided, alike, check_policies, decide_twice, replayed_whole
 from accerl_lerobot.world_model.episodes import Episode
 from accerl_lerobot.world_model.inverse import InverseProbe, learn_probe
 from accerl_lerobot.world_model.perturbed import SOURCE as PERTURBED
@@ -71,7 +73,8 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
     """Tries a saved world model; `directory` exists and is empty.
 
     Returns:
-        See `try_sources`; also in ``trial.json``.
+        See `try_sources`, with ``alike`` of each source where policies are named, see there; also in
+        ``trial.json``.
 
     Raises:
         InputError: no world model there, a dataset or a world of another kind, or nothing was held out.
@@ -82,6 +85,7 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
     if config.success.path is not None:
         success = load_stand_in(config.success, model.spec, "success")
     spec, sources_of = model.spec, load_sources(path)
+    check_policies(config.policies, spec)
     parts: dict[str, _Part] = {}
     for room, meta in open_rooms(rooms_of(config), spec).items():
         with named(room):
@@ -127,8 +131,30 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
         model, sources, config.trial, success, directory, console,
         learnt=learnt, fresh=fresh, kept=kept, seed=config.seed, probe=probe,
     )  # fmt: skip
+    if config.policies:
+        said = _decisions(config.policies, model, sources, console)
+        result |= {"alike": said[first]}
+        for name, one in result["sources"].items():
+            one["alike"] = said[name]
     (directory / "trial.json").write_text(json.dumps(result, indent=2) + "\n")
     return result
+
+
+def _decisions(
+    policies: Sequence[str], model: WorldModel, sources: dict[str, list[Episode]], console: Console
+) -> dict[str, dict[str, Any]]:
+    """Of each source how alike these decide, see `alike`."""
+    from accerl_lerobot.policies.loading import load_adapter
+
+    decided: dict[str, list[Decided]] = {name: [] for name in sources}
+    with console.stage("policies", total=len(policies)) as stage:
+        again = {name: replayed_whole(model, episodes) for name, episodes in sources.items()}
+        for number, path in enumerate(policies, start=1):
+            adapter = load_adapter(PolicyConfig(path=path))
+            for name, dreams in again.items():
+                decided[name].append(decide_twice(adapter, model.spec, dreams))
+            stage.update(number)
+    return {name: alike(every) for name, every in decided.items()}
 
 
 def _part(meta: Any, sources: Sequence[Source]) -> _Part:

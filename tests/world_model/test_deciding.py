@@ -1,0 +1,179 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Policies that decide twice: on what was seen, and on what is dreamt."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from accerl_lerobot import cli
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import Decision, Request
+from accerl_lerobot.verb_configs import WorldModelEvalRun
+from accerl_lerobot.world_model.baselines import CopyModel
+from accerl_lerobot.world_model.deciding import (
+    Decided,
+    alike,
+    as_world,
+    check_policies,
+    decide_twice,
+    replayed_whole,
+)
+from accerl_lerobot.world_model.episodes import Episode
+from tests.policies.checkpoints import write_policy
+from tests.world_model.lived import SPEC, K, decided
+from tests.world_model.test_evaluate import folders, told
+
+__all__ = ["folders"]
+
+
+def episode(length: int, bright: int, success_at: int = -1) -> Episode:
+    """A frame every K steps, each brighter than the one before; the state counts them."""
+    count = -(-length // K) + 1
+    times = np.minimum(np.arange(count) * K, length)
+    return Episode(
+        frames=np.stack([np.full((1, 16, 16, 3), bright + 10 * i, np.uint8) for i in range(count)]),
+        times=times,
+        state=np.repeat(np.arange(count, dtype=np.float32)[:, None], 4, 1),
+        actions=np.zeros((length, 2), np.float32),
+        success_at=success_at,
+        task="Match the target",
+        source="online",
+    )
+
+
+class Looking:
+    """Its first action is how bright it is, its second what the state says; noise on both."""
+
+    def __init__(self, noise: float = 0.0) -> None:
+        self.noise, self.asked = noise, 0
+
+    def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
+        made = []
+        for request in requests:
+            self.asked += 1
+            o = request.observation
+            assert not request.explore and o["task"] == "Match the target"
+            image, state = o["observation.images.front"], o["observation.state"]
+            said = np.asarray([np.mean(image), state[0]])
+            said = said + self.noise * np.random.default_rng(request.noise_seed).standard_normal(2)
+            made.append(decided(np.tile(said, (K + 2, 1))))
+        return made
+
+
+def test_it_decides_wherever_a_chunk_was_followed_by_another():
+    episodes = [episode(3 * K, 0), episode(3 * K, 100, success_at=2 * K - 1), episode(2 * K - 1, 50)]
+    policy: Any = Looking()
+    dreams = replayed_whole(CopyModel(SPEC), episodes)
+    found = decide_twice(policy, SPEC, dreams)
+    # Of the first after two chunks, of the others after one: the second succeeds, the third ends.
+    assert list(zip(found.episode.tolist(), found.depth.tolist(), strict=True)) == [
+        (0, 1), (0, 2), (1, 1), (2, 1),
+    ]  # fmt: skip
+    assert policy.asked == 8 and found.real.shape == found.dreamt.shape == (4, K, 2)
+    assert found.real[:, 0].tolist() == [[10, 1], [20, 2], [110, 1], [60, 1]]
+    assert found.dreamt[:, 0].tolist() == [[0, 0], [0, 0], [100, 0], [50, 0]], "nothing has moved"
+
+
+def test_equal_noise_is_no_difference():
+    policy: Any = Looking(noise=5.0)
+    episodes = [replace(episode(3 * K, b), frames=np.full((4, 1, 16, 16, 3), b, np.uint8)) for b in (0, 99)]
+    still = [replace(e, state=np.zeros_like(e.state)) for e in episodes]
+    found = decide_twice(policy, SPEC, replayed_whole(CopyModel(SPEC), still))
+    assert np.array_equal(found.real, found.dreamt) and found.real.std() > 1
+    assert alike([found])["whole"] == {"value": 1.0, "low": 1.0, "high": 1.0}
+
+
+def by_hand(real: Sequence[float], dreamt: Sequence[float], depth: Sequence[int]) -> Decided:
+    def chunks(values: Sequence[float]) -> np.ndarray:
+        # The second action never varies, and says nothing.
+        return np.stack([np.asarray([[v, 7.0]], np.float32) for v in values])
+
+    return Decided(chunks(real), chunks(dreamt), np.arange(len(real)), np.asarray(depth))
+
+
+def test_alike_by_hand():
+    """Real actions −1, 1, −1, 1: spread 1; a dream off by ½ costs ¼ of what the mean would."""
+    found = alike([by_hand([-1, 1, -1, 1], [-0.5, 1.5, -1, 0], [1, 1, 2, 2])])
+    assert found["first"]["value"] == pytest.approx(0.75)
+    assert found["last"]["value"] == pytest.approx(0.5)
+    assert found["whole"]["value"] == pytest.approx(1 - 1.5 / 4)
+    assert found["whole"]["low"] <= found["whole"]["value"] <= found["whole"]["high"]
+    assert (found["policies"], found["decisions"]) == (1, 4)
+    # Each policy in units of its own spread.
+    both = alike([by_hand([-1, 1], [-0.5, 1.5], [1, 2]), by_hand([-100, 100], [-100, 100], [1, 2])])
+    assert both["whole"]["value"] == pytest.approx(1 - 0.5 / 4) and both["decisions"] == 4
+    assert alike([by_hand([-1, 1], [0, 0], [1, 2])])["whole"]["value"] == pytest.approx(0.0)
+
+
+def test_where_nothing_is_decided_nothing_is_said():
+    found = alike([by_hand([2, 2], [2, 2], [1, 1])])
+    assert math.isnan(found["whole"]["value"])
+    short = [episode(K, 0), episode(2, 9)]
+    none = decide_twice(Looking(), SPEC, replayed_whole(CopyModel(SPEC), short))  # type: ignore[arg-type]
+    assert none.real.shape == (0, K, 2)
+    empty = alike([none])
+    assert empty["decisions"] == 0 and math.isnan(empty["whole"]["value"])
+
+
+def test_as_a_user(folders: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    torch.manual_seed(0)
+    fields = {"chunk_size": 5, "n_action_steps": 5, "dim_model": 16, "n_heads": 2, "use_vae": False}
+    fields |= {"dim_feedforward": 16, "n_encoder_layers": 1, "pretrained_backbone_weights": None}
+    paths = [str(write_policy(tmp_path / f"act{i}", "act", seed=i, **fields)) for i in range(2)]
+    named = f"--policies={json.dumps(paths)}"
+    cli.main(told(folders, tmp_path / "one", named))
+    stdout, stderr = capsys.readouterr()
+    found = json.loads(stdout)
+    assert found["alike"]["policies"] == 2 and found["alike"]["decisions"] > 20
+    assert found["alike"]["whole"]["value"] < 1.0, "a world model that has learnt nothing is noticed"
+    assert found == json.loads((tmp_path / "one" / "trial.json").read_text())
+    assert "policies decide alike, whole dreams" in stderr
+    assert cli.main(["report", str(tmp_path / "one")]) == 0
+    assert "policies decide alike, first chunk" in (tmp_path / "one" / "report.html").read_text()
+
+    capsys.readouterr()
+    more = ["--online.repo_id=a/b", f"--online.root={folders[2]}"]
+    cli.main(told(folders, tmp_path / "two", named, *more))
+    found = json.loads(capsys.readouterr().out)
+    other = found["sources"]["online"]["alike"]
+    assert other["policies"] == 2 and other["decisions"] > found["alike"]["decisions"]
+
+
+def test_policies_that_cannot_act_in_dreams_are_refused(tmp_path: Path):
+    small = {"chunk_size": 5, "dim_model": 16, "n_heads": 2, "pretrained_backbone_weights": None}
+    fits = write_policy(tmp_path / "fits", "act", n_action_steps=K, **small)
+    check_policies([str(fits)], SPEC)
+    longer = write_policy(tmp_path / "longer", "act", n_action_steps=5, **small)
+    with pytest.raises(InputError, match=r"policies=.*longer.*executes 5 actions"):
+        check_policies([str(longer)], SPEC)
+    other = write_policy(
+        tmp_path / "other", "act", n_action_steps=K, camera="observation.images.top", **small
+    )
+    with pytest.raises(InputError, match=r"policies=.*other.*observation.images.top"):
+        check_policies([str(other)], SPEC)
+    with pytest.raises(InputError, match=r"policies=.*nowhere"):
+        check_policies([str(tmp_path / "nowhere")], SPEC)
+    with pytest.raises(InputError, match="policies=.*twice"):
+        WorldModelEvalRun(path="x", policies=("a", "a"))
+    assert as_world(SPEC).images == {"observation.images.front": (16, 16, 3)}
