@@ -34,9 +34,11 @@ from rich.console import Group
 
 from accerl_lerobot.bench.blocks import MOST_BUSY, Block, as_rows
 from accerl_lerobot.bench.host import floors, host, ranged, spread
+from accerl_lerobot.bench.latency import TRACE
 from accerl_lerobot.bench.machinery import MachineryConfig
 from accerl_lerobot.bench.study import as_markdown, as_table, write
 from accerl_lerobot.console import Console
+from accerl_lerobot.envs.simulated import read_trace
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.evaluation.pictures import drawing
@@ -71,8 +73,10 @@ class BenchAsyncVsSyncConfig(MachineryConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if any(cv < 0 for cv in self.cvs):
-            raise InputError("cvs", self.cvs, "name none below 0")
+        if any(not 0 <= cv <= 10 for cv in self.cvs):
+            raise InputError("cvs", self.cvs, "use 0 to 10")
+        for trace in self.traces:
+            read_trace(trace, "traces")
         if not (self.cvs or self.traces):
             raise InputError("cvs", self.cvs, "name at least one law, here or in traces")
         if not self.seconds > 0:
@@ -171,7 +175,11 @@ def _law(config: BenchAsyncVsSyncConfig, of: MachineryConfig) -> dict[str, Any]:
 
 
 def _named(law: dict[str, Any]) -> str:
-    return f"{law['cv']:.3g}" + (f" ({Path(law['trace']).stem})" if law["trace"] else "")
+    if law["trace"] is None:
+        return f"{law['cv']:g}"
+    # `bench latency` calls all of them alike, in folders of their own.
+    trace = Path(law["trace"])
+    return f"{law['cv']:.2f} ({trace.stem if trace.name != TRACE else trace.resolve().parent.name})"
 
 
 def _learning(config: BenchAsyncVsSyncConfig, console: Console) -> dict[str, Any]:

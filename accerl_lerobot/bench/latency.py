@@ -11,19 +11,19 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""How long a world takes from a decision to its next observation, and what law that follows.
+"""How long a world takes from a decision to its next observation, and to reset.
 
     accerl bench latency --env.type=metaworld --env.task=door-open-v3
     accerl bench async-vs-sync --traces='[outputs/latency/trace.txt]'
 
-Random actions are played. Where an episode ends its last decision is charged with the reset as well: whoever
-waits for the next observation waits for both. The second command says what asynchrony gains where many worlds
-take turns at these durations.
+Random actions are played. The second command says what asynchrony gains where many worlds take turns at these
+durations, each from another moment on; they reset together, as episodes of equal length do.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ from accerl_lerobot.bench.host import host
 from accerl_lerobot.bench.study import as_markdown, as_table, write
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, World, make_world
+from accerl_lerobot.envs.simulated import RESET
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.seeds import train_seed
@@ -52,11 +53,11 @@ class BenchLatencyConfig:
     chunk: int = 10
     """Actions per decision, at least 1."""
     decisions: int = 600
-    """Timed, at least 2; more than an episode has, or no reset is among them."""
+    """Timed, at least 2; more than an episode has, or no reset is."""
     seed: int = 0
     """Of the actions and episodes, 0 to 99."""
     output_dir: str = "outputs/latency"
-    """Folder for trace.txt (one duration on each line, in milliseconds), latency.json, .md and .png."""
+    """Folder for trace.txt (a duration on each line), latency.json, .md and .png."""
 
     def __post_init__(self) -> None:
         if self.chunk < 1:
@@ -70,9 +71,8 @@ def bench_latency(config: BenchLatencyConfig) -> dict[str, Any]:
     """Plays and times.
 
     Returns:
-        ``latency_ms`` (``mean``, ``p50``, ``p95``, ``p99``, ``max``), ``cv`` (standard deviation over mean),
-        ``resets`` (how many), ``reset_share`` (of all time: what their decisions took longer than the others'
-        mean), ``neighbours`` (correlation of one duration with the next), ``trace`` (the file), ``config``
+        ``decision_ms`` and ``reset_ms`` (None without any), see `described`; ``neighbours`` (correlation of
+        one decision's duration with the next, None where they do not vary), ``trace`` (the file), ``config``
         and ``host``.
     """
     console, root = Console(), Path(config.output_dir)
@@ -80,38 +80,40 @@ def bench_latency(config: BenchLatencyConfig) -> dict[str, Any]:
     world = make_world(config.env)
     try:
         with console.stage("decisions", total=config.decisions) as stage:
-            seconds, ends = timed(world, config, stage.update)
+            lines = timed(world, config, stage.update)
+        tasks = ", ".join(world.spec.tasks)
     finally:
         world.close()
-    result = described(seconds, ends) | {
+    decisions, resets = (
+        np.asarray([s for s, is_reset in lines if is_reset is kind]) for kind in (False, True)
+    )
+    one, other = decisions[:-1], decisions[1:]
+    varied = len(one) > 1 and one.std() > 0 and other.std() > 0
+    result = {
+        "decision_ms": described(decisions),
+        "reset_ms": described(resets) if len(resets) else None,
+        "neighbours": float(np.corrcoef(one, other)[0, 1]) if varied else None,
         "trace": str(root / TRACE),
         "config": asdict(config),
         "host": host(),
     }
-    lines = [
-        f"{1000 * s:.4f}{'  # and a reset' if end else ''}\n" for s, end in zip(seconds, ends, strict=True)
-    ]
-    (root / TRACE).write_text(
-        f"# {type(config.env).__name__}, chunks of {config.chunk}, ms\n" + "".join(lines)
-    )
-    write(
-        root,
-        "latency",
-        result,
-        as_markdown(_COLUMNS, _rows(result)),
-        lambda path, _: draw(path, seconds, ends),
-    )
+    text = "".join(f"{RESET + ' ' if is_reset else ''}{1000 * s:.4f}\n" for s, is_reset in lines)
+    (root / TRACE).write_text(f"# {tasks}, chunks of {config.chunk}, ms\n{text}")
+    write(root, "latency", result, as_markdown(_COLUMNS, _rows(result)), lambda path, _: draw(path, lines))
     console.say(f"wrote {TRACE}, latency.json, .md and .png into {root}")
     return result
 
 
-def timed(world: World, config: BenchLatencyConfig, progress: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Seconds of each decision, float64 (T,), and whether an episode ended with it, bool (T,).
+def timed(
+    world: World, config: BenchLatencyConfig, progress: Callable[[int], object]
+) -> list[tuple[float, bool]]:
+    """Seconds of each decision, and where an episode ended of its reset, in their order; True: of a reset.
 
-    The first episode's reset, in which much is built, is not timed.
+    The first reset, in which much is built, is not timed.
     """
     rng, spec = np.random.default_rng(config.seed), world.spec
-    seconds, ends = np.zeros(config.decisions), np.zeros(config.decisions, bool)
+    low, high = np.maximum(spec.action_low, -1), np.minimum(spec.action_high, 1)
+    found: list[tuple[float, bool]] = []
     episode = 0
 
     def reset() -> None:
@@ -120,34 +122,28 @@ def timed(world: World, config: BenchLatencyConfig, progress: Any) -> tuple[np.n
         episode += 1
 
     reset()
-    for i in range(config.decisions):
-        low, high = np.maximum(spec.action_low, -1), np.minimum(spec.action_high, 1)
+    for made in range(1, config.decisions + 1):
         actions = rng.uniform(low, high, (config.chunk, spec.action_dim)).astype(np.float32)
         started = time.perf_counter()
-        if world.step_chunk(actions).done:
+        done = world.step_chunk(actions).done
+        found.append((time.perf_counter() - started, False))
+        if done:
+            started = time.perf_counter()
             reset()
-            ends[i] = True
-        seconds[i] = time.perf_counter() - started
-        progress(i + 1)
-    return seconds, ends
+            found.append((time.perf_counter() - started, True))
+        progress(made)
+    return found
 
 
-def described(seconds: np.ndarray, ends: np.ndarray) -> dict[str, Any]:
-    """The law of these durations; see `bench_latency`."""
-    usual = seconds[~ends].mean() if (~ends).any() else 0.0
-    # Of durations that are all alike there is no correlation.
-    one, other = seconds[:-1], seconds[1:]
-    varied = len(one) > 1 and one.std() > 0 and other.std() > 0
+def described(seconds: np.ndarray) -> dict[str, float]:
+    """Of durations (T,): ``mean``, ``p50``, ``p95``, ``p99`` and ``longest`` in milliseconds, ``cv``
+    (standard deviation over mean) and ``n``."""
     return {
-        "latency_ms": {
-            "mean": 1000 * float(seconds.mean()),
-            **{f"p{100 * q:.0f}": 1000 * float(np.quantile(seconds, q)) for q in QUANTILES},
-            "max": 1000 * float(seconds.max()),
-        },
+        "mean": 1000 * float(seconds.mean()),
+        **{f"p{100 * q:.0f}": 1000 * float(np.quantile(seconds, q)) for q in QUANTILES},
+        "longest": 1000 * float(seconds.max()),
         "cv": float(seconds.std() / seconds.mean()),
-        "resets": int(ends.sum()),
-        "reset_share": float((seconds[ends] - usual).sum() / seconds.sum()),
-        "neighbours": float(np.corrcoef(one, other)[0, 1]) if varied else None,
+        "n": len(seconds),
     }
 
 
@@ -156,20 +152,24 @@ def table(result: dict[str, Any]) -> Table:
     return as_table("from a decision to the next observation", _COLUMNS, _rows(result))
 
 
-def draw(path: Path, seconds: np.ndarray, ends: np.ndarray) -> None:
-    """Each duration in its place, those with a reset apart."""
-    place = np.arange(len(seconds))
+def draw(path: Path, lines: Sequence[tuple[float, bool]]) -> None:
+    """Each duration in its place, resets apart."""
     with drawing(path) as axes:
-        for shown, label in ((~ends, "decision"), (ends, "with a reset")):
-            axes.scatter(place[shown], 1000 * seconds[shown], s=8, label=label, linewidths=0)
-        axes.set(xlabel="decision", ylabel="ms to the next observation")
+        for kind, label in ((False, "decision"), (True, "reset")):
+            shown = [(i, 1000 * s) for i, (s, is_reset) in enumerate(lines) if is_reset is kind]
+            axes.scatter([i for i, _ in shown], [ms for _, ms in shown], s=8, label=label, linewidths=0)
+        axes.set(xlabel="one after the other", ylabel="milliseconds")
         axes.set_ylim(bottom=0)
         axes.legend()
 
 
-_COLUMNS = ("mean", "p50", "p95", "p99", "longest", "CV", "resets", "their share")
+_COLUMNS = ("", "mean", "p50", "p95", "p99", "longest", "CV", "how many")
 
 
 def _rows(result: dict[str, Any]) -> list[list[str]]:
-    durations = [f"{ms:.1f} ms" for ms in result["latency_ms"].values()]
-    return [[*durations, f"{result['cv']:.2f}", str(result["resets"]), f"{result['reset_share']:.0%}"]]
+    rows = []
+    for name in ("decision", "reset"):
+        if (of := result[f"{name}_ms"]) is not None:
+            durations = [f"{of[key]:.1f} ms" for key in ("mean", "p50", "p95", "p99", "longest")]
+            rows.append([name, *durations, f"{of['cv']:.2f}", str(of["n"])])
+    return rows

@@ -22,6 +22,9 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
 
 from accerl_lerobot.bench.blocks import Measured
 from accerl_lerobot.config import LaunchConfig, RunConfig
@@ -37,6 +40,10 @@ from accerl_lerobot.trainer.config import TrainerConfig
 EPISODE = 16
 """Decisions of an episode."""
 CHUNK = 4
+
+
+def _resolved(path: str) -> Path:
+    return Path(path).expanduser().resolve()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +86,9 @@ class MachineryConfig:
     @property
     def cv(self) -> float:
         """Standard deviation of the worlds' latency over its mean."""
-        return self.latency_cv if self.latency_trace is None else float(read_trace(self.latency_trace).std())
+        if self.latency_trace is None:
+            return self.latency_cv
+        return float(read_trace(self.latency_trace).decisions.std())
 
     @property
     def batch(self) -> int:
@@ -88,8 +97,11 @@ class MachineryConfig:
 
     @property
     def world_bound(self) -> float:
-        """Decisions a second that the worlds cannot exceed: a reset costs them one latency more."""
-        cycle = self.latency_ms * (1 + 1 / EPISODE) + self.decide_ms + self.decide_each_ms
+        """Decisions a second that the worlds cannot exceed: an episode costs them a reset as well, which
+        takes as long as a decision, or what resets take in `latency_trace`."""
+        resets = np.ones(1) if self.latency_trace is None else read_trace(self.latency_trace).resets
+        reset = float(resets.mean()) if len(resets) else 1.0
+        cycle = self.latency_ms * (1 + reset / EPISODE) + self.decide_ms + self.decide_each_ms
         return 1000 * self.worlds / cycle
 
     @property
@@ -122,7 +134,8 @@ class MachineryConfig:
                 frame_ms=self.latency_ms,
                 latency=self._law,
                 latency_cv=self.latency_cv,
-                latency_trace=self.latency_trace,
+                # Workers run elsewhere.
+                latency_trace=None if self.latency_trace is None else str(_resolved(self.latency_trace)),
             ),
             rollout=RolloutConfig(workers=self.worlds, worlds=1, segment_length=self.segment_length),
             inference=InferenceConfig(max_batch=self.max_batch, max_wait_s=self.max_wait_ms / 1000),

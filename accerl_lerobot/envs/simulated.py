@@ -19,11 +19,11 @@ For tests and for measuring the machinery around a world without a simulator's c
 from __future__ import annotations
 
 import collections
-import functools
 import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,6 +36,8 @@ CAMERA = "front"
 INSTRUCTIONS = {"match": "Match the target", "mirror": "Mirror the target"}
 _SIGN = {"match": 1.0, "mirror": -1.0}
 _REACH = 0.8
+RESET = "reset"
+"""What a line of a trace begins with that is of a reset."""
 
 
 @EnvConfig.register_subclass("simulated")
@@ -77,8 +79,9 @@ class SimulatedConfig(EnvConfig):
     latency_cv: float = 0.5
     """Standard deviation over mean of the lognormal law, 0 to 10."""
     latency_trace: str | None = None
-    """File that `accerl bench latency` has written of another world: an episode takes a stretch of it, from a
-    moment drawn from its seed, scaled to the means above."""
+    """File that `accerl bench latency` has written of another world, scaled so that its decisions take
+    `frame_ms` on average: an episode takes a stretch of it, from a moment drawn from its seed. What a reset
+    takes is drawn from what resets took there."""
     crash_after: int = 0
     """Env steps of this instance after which it raises; 0 for never."""
     nan_after: int = 0
@@ -106,6 +109,8 @@ class SimulatedConfig(EnvConfig):
         if (self.latency == "trace") != (self.latency_trace is not None):
             remedy = "name a file of `accerl bench latency` for env.latency=trace, and for no other"
             raise InputError("env.latency_trace", self.latency_trace, remedy)
+        if self.latency == "trace" and self.step_ms:
+            raise InputError("env.step_ms", self.step_ms, "a trace is of whole decisions; use env.frame_ms")
         if not 0 <= self.latency_cv <= 10:
             raise InputError("env.latency_cv", self.latency_cv, "use 0 to 10")
         for name in ("step_ms", "frame_ms", "crash_after", "nan_after"):
@@ -143,7 +148,9 @@ class SimulatedWorld(World):
         self._target: np.ndarray = np.zeros(dims, np.float32)
         self._recent: collections.deque[np.ndarray] = collections.deque(maxlen=config.hold)
         self._clock = np.random.default_rng(0)
-        self._trace = read_trace(config.latency_trace) if config.latency_trace is not None else np.ones(1)
+        self._trace = Trace(np.ones(1), np.zeros(0))
+        if config.latency_trace is not None:
+            self._trace = read_trace(config.latency_trace, "env.latency_trace")
         self._at = 0
         self._steps = 0
         self._success = False
@@ -160,12 +167,15 @@ class SimulatedWorld(World):
             raise InputError("task", task, f"this world has: {', '.join(self.spec.tasks)}")
         rng = np.random.default_rng((seed, 0))
         self._clock = np.random.default_rng((seed, 1))
-        self._at = int(self._clock.integers(len(self._trace)))
+        self._at = int(self._clock.integers(len(self._trace.decisions)))
         self._task = task
         self._target = rng.uniform(-_REACH, _REACH, self.config.action_dim).astype(np.float32)
         self._recent.clear()
         self._steps, self._success, self._done, self._nan = 0, False, False, False
-        _wait(self._delay(self.config.frame_ms))
+        if len(resets := self._trace.resets):
+            _wait(self.config.frame_ms / 1000 * float(self._clock.choice(resets)))
+        else:
+            _wait(self._delay(self.config.frame_ms))
         return self._observe()
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
@@ -232,39 +242,52 @@ class SimulatedWorld(World):
         if mean_ms == 0 or self.config.latency == "constant":
             return mean_ms / 1000
         if self.config.latency == "trace":
-            self._at = (self._at + 1) % len(self._trace)
-            return mean_ms / 1000 * float(self._trace[self._at])
+            self._at = (self._at + 1) % len(self._trace.decisions)
+            return mean_ms / 1000 * float(self._trace.decisions[self._at])
         variance = math.log1p(self.config.latency_cv**2)
         return mean_ms / 1000 * math.exp(self._clock.normal(-variance / 2, math.sqrt(variance)))
 
 
-@functools.cache
-def read_trace(path: str) -> np.ndarray:
-    """Durations, one on each line of a text file; what follows a ``#`` is for people.
+class Trace(NamedTuple):
+    """How long a world has taken, in units of its mean decision."""
 
-    Returns:
-        float64 (T,), divided by their mean.
+    decisions: np.ndarray
+    """float64 (T,), one after the other, of mean 1."""
+    resets: np.ndarray
+    """float64 (R,); there may be none."""
+
+
+def read_trace(path: str, field: str = "latency_trace") -> Trace:
+    """A text file with a duration on each line, in whatever unit, of a decision or after the word ``reset``
+    of a reset; what follows a ``#`` is for people.
+
+    Args:
+        path: of the file.
+        field: where it is named, for an error.
 
     Raises:
-        InputError: it cannot be read, or there is a line that is no duration, or none that is one.
+        InputError: it cannot be read, there is a line that is neither, or none of a decision.
     """
     try:
-        lines = Path(path).read_text().splitlines()
+        text = Path(path).expanduser().read_text()
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError("latency_trace", path, f"it cannot be read ({error}); use a text file") from None
-    found = []
-    for number, line in enumerate(lines, start=1):
-        if not (said := line.partition("#")[0].strip()):
+        raise InputError(field, path, f"it cannot be read ({error}); use a text file") from None
+    found: dict[bool, list[float]] = {True: [], False: []}
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not (words := line.partition("#")[0].split()):
             continue
         try:
-            found.append(float(said))
+            value = float(words[-1]) if words[:-1] in ([], [RESET]) else math.nan
         except ValueError:
-            found.append(math.nan)
-        if not 0 <= found[-1] < math.inf:
-            raise InputError("latency_trace", path, f"line {number}, {said!r}, is no duration; use numbers")
-    if not sum(found) > 0:
-        raise InputError("latency_trace", path, "no time passes in it; write one duration on each line")
-    return np.asarray(found) / np.mean(found)
+            value = math.nan
+        if not 0 <= value < math.inf:
+            remedy = f"line {number}, {line.strip()!r}, is no duration; use a number, or {RESET} and a number"
+            raise InputError(field, path, remedy)
+        found[len(words) > 1].append(value)
+    if not sum(found[False]) > 0:
+        raise InputError(field, path, "no time passes in it; write one duration on each line")
+    mean = float(np.mean(found[False]))
+    return Trace(np.asarray(found[False]) / mean, np.asarray(found[True]) / mean)
 
 
 def _wait(delay: float) -> None:

@@ -31,12 +31,18 @@ import numpy as np
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.starts import Start, read_starts
 from accerl_lerobot.demos.windows import origin_of
-from accerl_lerobot.envs import World, make_world
+from accerl_lerobot.envs import World, WorldSpec, make_world
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.world_model.contract import WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.dataset import fingerprint, load_episodes
-from accerl_lerobot.world_model.deciding import Decided, alike, check_policies, decide_twice, replayed_whole
+from accerl_lerobot.world_model.deciding import (
+    Decided,
+    alike,
+    check_policies,
+    decide_twice,
+    load_policy,
+    replayed_whole,
+)
 from accerl_lerobot.world_model.episodes import Episode
 from accerl_lerobot.world_model.inverse import InverseProbe, learn_probe
 from accerl_lerobot.world_model.perturbed import SOURCE as PERTURBED
@@ -73,7 +79,7 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
     """Tries a saved world model; `directory` exists and is empty.
 
     Returns:
-        See `try_sources`, with ``alike`` of each source where policies are named, see there; also in
+        See `try_sources`, with ``alike`` of each source where policies are named (`deciding.alike`); also in
         ``trial.json``.
 
     Raises:
@@ -85,7 +91,7 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
     if config.success.path is not None:
         success = load_stand_in(config.success, model.spec, "success")
     spec, sources_of = model.spec, load_sources(path)
-    check_policies(config.policies, spec)
+    worlds = check_policies(config.policies, spec)
     parts: dict[str, _Part] = {}
     for room, meta in open_rooms(rooms_of(config), spec).items():
         with named(room):
@@ -131,28 +137,34 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
         model, sources, config.trial, success, directory, console,
         learnt=learnt, fresh=fresh, kept=kept, seed=config.seed, probe=probe,
     )  # fmt: skip
+    trial = directory / "trial.json"
+    trial.write_text(json.dumps(result, indent=2) + "\n")
     if config.policies:
-        said = _decisions(config.policies, model, sources, console)
+        said = _decisions(config.policies, worlds, model, sources, console)
         result |= {"alike": said[first]}
         for name, one in result["sources"].items():
             one["alike"] = said[name]
-    (directory / "trial.json").write_text(json.dumps(result, indent=2) + "\n")
+        trial.write_text(json.dumps(result, indent=2) + "\n")
     return result
 
 
 def _decisions(
-    policies: Sequence[str], model: WorldModel, sources: dict[str, list[Episode]], console: Console
+    policies: Sequence[str],
+    worlds: Sequence[WorldSpec],
+    model: WorldModel,
+    sources: dict[str, list[Episode]],
+    console: Console,
 ) -> dict[str, dict[str, Any]]:
     """Of each source how alike these decide, see `alike`."""
-    from accerl_lerobot.policies.loading import load_adapter
-
+    with console.stage("dreams for policies"):
+        again = {name: replayed_whole(model, episodes) for name, episodes in sources.items()}
     decided: dict[str, list[Decided]] = {name: [] for name in sources}
     with console.stage("policies", total=len(policies)) as stage:
-        again = {name: replayed_whole(model, episodes) for name, episodes in sources.items()}
-        for number, path in enumerate(policies, start=1):
-            adapter = load_adapter(PolicyConfig(path=path))
+        for number, (path, world) in enumerate(zip(policies, worlds, strict=True), start=1):
+            adapter = load_policy(path)
             for name, dreams in again.items():
-                decided[name].append(decide_twice(adapter, model.spec, dreams))
+                decided[name].append(decide_twice(adapter, model.spec, world, dreams))
+            del adapter  # before there is another one
             stage.update(number)
     return {name: alike(every) for name, every in decided.items()}
 

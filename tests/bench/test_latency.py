@@ -28,21 +28,15 @@ from accerl_lerobot.envs.simulated import read_trace
 from accerl_lerobot.errors import InputError
 
 
-def test_a_law_by_hand():
-    found = described(np.asarray([0.01, 0.01, 0.01, 0.05]), np.asarray([False, False, False, True]))
-    assert found["latency_ms"]["mean"] == pytest.approx(20.0) and found["latency_ms"]["max"] == 50.0
-    assert found["latency_ms"]["p50"] == pytest.approx(10.0)
+def test_durations_by_hand():
+    found = described(np.asarray([0.01, 0.01, 0.01, 0.05]))
+    assert found["mean"] == pytest.approx(20.0) and found["longest"] == 50.0 and found["n"] == 4
+    assert found["p50"] == pytest.approx(10.0) and found["p95"] == pytest.approx(10 + 0.85 * 40)
     assert found["cv"] == pytest.approx(np.sqrt(3) * 10 / 20)
-    assert found["resets"] == 1 and found["reset_share"] == pytest.approx(0.5)
-    assert found["neighbours"] is None  # whatever came before the reset was alike
-    turns = described(np.asarray([0.01, 0.03] * 8), np.zeros(16, bool))
-    assert turns["neighbours"] == pytest.approx(-1.0) and turns["reset_share"] == 0.0
-    every = described(np.asarray([0.01, 0.03]), np.ones(2, bool))
-    assert every["resets"] == 2 and every["reset_share"] == 1.0
 
 
 def test_a_world_of_known_durations_is_timed(tmp_path: Path):
-    """Chunks of two in episodes of four: each second decision waits for a reset as well."""
+    """Chunks of two in episodes of four: a reset after each second decision."""
     config = BenchLatencyConfig(
         env=SimulatedConfig(task="match,mirror", frame_ms=20.0, max_steps=4, tolerance=1e-6),
         chunk=2,
@@ -50,17 +44,27 @@ def test_a_world_of_known_durations_is_timed(tmp_path: Path):
         output_dir=str(tmp_path),
     )
     result = bench_latency(config)
-    text = (tmp_path / "trace.txt").read_text()
-    durations = [float(line.split("#")[0]) for line in text.splitlines()[1:]]
-    assert len(durations) == 10 and result["resets"] == 5
-    assert min(durations[::2]) >= 20.0 and min(durations[1::2]) >= 40.0
-    assert read_trace(result["trace"]) == pytest.approx(np.asarray(durations) / np.mean(durations))
-    assert text.startswith("# SimulatedConfig, chunks of 2, ms\n") and text.count("# and a reset") == 5
+    first, *lines = (tmp_path / "trace.txt").read_text().splitlines()
+    assert first == "# match, mirror, chunks of 2, ms"
+    assert [line.startswith("reset ") for line in lines] == [False, False, True] * 5
+    assert min(float(line.split()[-1]) for line in lines) >= 20.0
+    trace = read_trace(result["trace"])
+    assert len(trace.decisions) == result["decision_ms"]["n"] == 10
+    assert len(trace.resets) == result["reset_ms"]["n"] == 5
+    assert -1.0 <= result["neighbours"] <= 1.0
     assert json.loads((tmp_path / "latency.json").read_text()) == json.loads(json.dumps(result))
     assert (tmp_path / "latency.png").stat().st_size > 1000
-    assert "their share" in (tmp_path / "latency.md").read_text()
+    assert "| reset |" in (tmp_path / "latency.md").read_text()
     with Console().rich.capture():
         Console().rich.print(table(result))
+
+
+def test_a_world_that_is_not_reset(tmp_path: Path):
+    result = bench_latency(
+        BenchLatencyConfig(env=SimulatedConfig(tolerance=1e-6), decisions=2, output_dir=str(tmp_path))
+    )
+    assert result["reset_ms"] is None and result["neighbours"] is None
+    assert "reset" not in (tmp_path / "latency.md").read_text()
 
 
 @pytest.mark.parametrize("values", [{"chunk": 0}, {"decisions": 1}, {"seed": 100}])

@@ -96,6 +96,18 @@ def test_laws_of_a_study(tmp_path: Path):
     envs = [law.run_config().env for law in found]
     assert [env.latency for env in envs] == ["constant", "lognormal", "trace"]
     assert [env.latency_trace for env in envs] == [None, None, str(trace)]
+    assert [async_vs_sync._named({"cv": 0.5, "trace": t}) for t in (None, str(trace), "a/drawers.txt")] == [
+        "0.5", f"0.50 ({tmp_path.name})", "0.50 (drawers)",
+    ]  # fmt: skip
+
+
+def test_the_bound_of_a_trace_counts_its_resets(tmp_path: Path):
+    """Decisions of 32 ms, and a reset of five of them after each 16: 42 + 8 ms a decision."""
+    path = tmp_path / "trace.txt"
+    sizes = {"worlds": 10, "latency_ms": 32.0, "decide_ms": 7.5, "decide_each_ms": 0.5}
+    for text, each in (("2\n2\nreset 10\n", 32 + 10 + 8), ("2\n2\n", 32 + 2 + 8)):
+        path.write_text(text)
+        assert MachineryConfig(**sizes, latency_trace=str(path)).world_bound == pytest.approx(10_000 / each)
 
 
 def test_efficiency_is_relative_to_the_first_count():
@@ -141,7 +153,7 @@ def test_a_small_run_of_everything(light_ray: None, tmp_path: Path, monkeypatch:
     assert set(result["learning"]["success"]) == set(ARMS)
     assert json.loads((tmp_path / "async_vs_sync.json").read_text()) == json.loads(json.dumps(result))
     text = (tmp_path / "async_vs_sync.md").read_text()
-    assert "S/S*" in text and "0.5 (drawers)" in text and "Success after 2 updates" in text
+    assert "S/S*" in text and "0.50 (drawers)" in text and "Success after 2 updates" in text
     assert (tmp_path / "async_vs_sync.png").stat().st_size > 1000
     with Console().rich.capture():
         Console().rich.print(schedules_table(result))
@@ -181,9 +193,10 @@ def test_the_machine_is_described():
         (lambda: MachineryConfig(segment_length=5), "segment_length"),
         (lambda: BenchAsyncVsSyncConfig(cvs=()), "cvs"),
         (lambda: BenchAsyncVsSyncConfig(cvs=(-0.1,)), "cvs"),
-        (lambda: BenchAsyncVsSyncConfig(traces=("/nowhere",)), "latency_trace"),
+        (lambda: BenchAsyncVsSyncConfig(traces=("/nowhere",)), "traces"),
+        (lambda: MachineryConfig(latency_trace="/nowhere"), "latency_trace"),
         (lambda: BenchAsyncVsSyncConfig(rounds=0), "rounds"),
-        (lambda: BenchAsyncVsSyncConfig(cvs=(11.0,)), "latency_cv"),
+        (lambda: BenchAsyncVsSyncConfig(cvs=(11.0,)), "cvs"),
         (lambda: BenchAsyncVsSyncConfig(seeds=(100,)), "seed"),
         (lambda: BenchAsyncVsSyncConfig(learning_updates=-1), "learning_updates"),
         (lambda: BenchScalingConfig(counts=(0,)), "counts"),

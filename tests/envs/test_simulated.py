@@ -20,7 +20,7 @@ import time
 import numpy as np
 import pytest
 
-from accerl_lerobot.envs import SimulatedConfig, SimulatedWorld
+from accerl_lerobot.envs import SimulatedConfig, SimulatedWorld, simulated
 from accerl_lerobot.envs.simulated import read_trace
 from accerl_lerobot.errors import InputError
 
@@ -90,10 +90,11 @@ def test_latency_is_slept_and_has_the_mean_asked_for():
 
 
 def test_a_trace_is_gone_through_from_some_moment_on_and_scaled(tmp_path):
-    trace = tmp_path / "trace.txt"
-    trace.write_text("# of a world\n1.0\n\n2.0  # and a reset\n6.0\n")
-    assert read_trace(str(trace)).tolist() == [1 / 3, 2 / 3, 2.0]
-    config = SimulatedConfig(latency="trace", latency_trace=str(trace), frame_ms=0.3)
+    path = tmp_path / "trace.txt"
+    path.write_text("# of a world\n1.0\n\n2.0  # milliseconds\nreset 30\n6.0\nreset 60\n")
+    trace = read_trace(str(path))
+    assert trace.decisions.tolist() == [1 / 3, 2 / 3, 2.0] and trace.resets.tolist() == [10.0, 20.0]
+    config = SimulatedConfig(latency="trace", latency_trace=str(path), frame_ms=0.3)
     starts = set()
     for seed in range(20):
         world = SimulatedWorld(config)
@@ -108,15 +109,34 @@ def test_a_trace_is_gone_through_from_some_moment_on_and_scaled(tmp_path):
     assert world._delay(0.0) == 0.0
 
 
+def test_resets_take_what_they_took(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    path = tmp_path / "trace.txt"
+    waited: list[float] = []
+    monkeypatch.setattr(simulated, "_wait", lambda delay: waited.append(round(1000 * delay, 9)))
+    for text, resets in (("1\nreset 30\n1\nreset 60\n", {90.0, 180.0}), ("1\n1\n", {3.0})):
+        path.write_text(text)
+        world = SimulatedWorld(SimulatedConfig(latency="trace", latency_trace=str(path), frame_ms=3.0))
+        waited.clear()
+        for seed in range(20):
+            world.reset(seed, "match")
+        assert set(waited) == resets
+        waited.clear()
+        world.step_chunk(np.zeros((10, 2), np.float32))
+        assert waited == [3.0]
+
+
 @pytest.mark.parametrize(
     ("text", "why"),
     [
         (None, "cannot be read"),
         ("1.0\nfast\n", "line 2, 'fast', is no duration"),
         ("1.0\n-1.0\n", "line 2"),
+        ("1.0\nafter 1.0\n", "line 2, 'after 1.0'"),
+        ("1.0\nreset\n", "line 2, 'reset'"),
         ("nan\n", "line 1"),
         ("inf\n", "line 1"),
         ("# nothing\n", "no time passes"),
+        ("reset 1.0\n", "no time passes"),
         ("0\n0\n", "no time passes"),
     ],
 )
@@ -124,7 +144,7 @@ def test_a_trace_that_is_none_is_refused(tmp_path, text: str | None, why: str):
     trace = tmp_path / "trace.txt"
     if text is not None:
         trace.write_text(text)
-    with pytest.raises(InputError, match=f"^latency_trace=.*{why}"):
+    with pytest.raises(InputError, match=f"^env.latency_trace=.*{why}"):
         SimulatedWorld(SimulatedConfig(latency="trace", latency_trace=str(trace)))
 
 
@@ -159,6 +179,7 @@ def test_one_nan_ends_the_episode_and_the_next_is_healthy():
         ({"latency": "normal"}, "env.latency"),
         ({"latency": "trace"}, "env.latency_trace"),
         ({"latency_trace": "trace.txt"}, "env.latency_trace"),
+        ({"latency": "trace", "latency_trace": "trace.txt", "step_ms": 1.0}, "env.step_ms"),
     ],
 )
 def test_bad_values_name_their_field(values: dict, field: str):

@@ -18,8 +18,8 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,7 @@ from accerl_lerobot.world_model.deciding import (
     as_world,
     check_policies,
     decide_twice,
+    load_policy,
     replayed_whole,
 )
 from accerl_lerobot.world_model.episodes import Episode
@@ -66,7 +67,7 @@ class Looking:
     """Its first action is how bright it is, its second what the state says; noise on both."""
 
     def __init__(self, noise: float = 0.0) -> None:
-        self.noise, self.asked = noise, 0
+        self.noise, self.asked, self.side = noise, 0, 16
 
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
         made = []
@@ -75,17 +76,29 @@ class Looking:
             o = request.observation
             assert not request.explore and o["task"] == "Match the target"
             image, state = o["observation.images.front"], o["observation.state"]
+            assert np.shape(image) == (self.side, self.side, 3)
             said = np.asarray([np.mean(image), state[0]])
             said = said + self.noise * np.random.default_rng(request.noise_seed).standard_normal(2)
             made.append(decided(np.tile(said, (K + 2, 1))))
         return made
 
 
+def settings(side: int = 16) -> Any:
+    return SimpleNamespace(
+        image_features={"observation.images.front": SimpleNamespace(shape=(3, side, side))}
+    )
+
+
+def twice(policy: Any, episodes: list[Episode], side: int = 16) -> Decided:
+    return decide_twice(
+        policy, SPEC, as_world(SPEC, settings(side)), replayed_whole(CopyModel(SPEC), episodes)
+    )
+
+
 def test_it_decides_wherever_a_chunk_was_followed_by_another():
     episodes = [episode(3 * K, 0), episode(3 * K, 100, success_at=2 * K - 1), episode(2 * K - 1, 50)]
-    policy: Any = Looking()
-    dreams = replayed_whole(CopyModel(SPEC), episodes)
-    found = decide_twice(policy, SPEC, dreams)
+    policy = Looking()
+    found = twice(policy, episodes)
     # Of the first after two chunks, of the others after one: the second succeeds, the third ends.
     assert list(zip(found.episode.tolist(), found.depth.tolist(), strict=True)) == [
         (0, 1), (0, 2), (1, 1), (2, 1),
@@ -93,15 +106,16 @@ def test_it_decides_wherever_a_chunk_was_followed_by_another():
     assert policy.asked == 8 and found.real.shape == found.dreamt.shape == (4, K, 2)
     assert found.real[:, 0].tolist() == [[10, 1], [20, 2], [110, 1], [60, 1]]
     assert found.dreamt[:, 0].tolist() == [[0, 0], [0, 0], [100, 0], [50, 0]], "nothing has moved"
+    policy.side = 32  # what it has learnt from, and would be shown in a run
+    assert np.array_equal(twice(policy, episodes, 32).real, found.real)
 
 
-def test_equal_noise_is_no_difference():
-    policy: Any = Looking(noise=5.0)
-    episodes = [replace(episode(3 * K, b), frames=np.full((4, 1, 16, 16, 3), b, np.uint8)) for b in (0, 99)]
-    still = [replace(e, state=np.zeros_like(e.state)) for e in episodes]
-    found = decide_twice(policy, SPEC, replayed_whole(CopyModel(SPEC), still))
-    assert np.array_equal(found.real, found.dreamt) and found.real.std() > 1
-    assert alike([found])["whole"] == {"value": 1.0, "low": 1.0, "high": 1.0}
+def test_noise_is_no_spread():
+    """However noisily it decides: what it is shown is what makes its decisions differ."""
+    episodes = [episode(3 * K, b) for b in (0, 100)]
+    quiet, noisy = twice(Looking(), episodes), twice(Looking(noise=50.0), episodes)
+    assert not np.allclose(quiet.real, noisy.real)
+    assert alike([noisy])["whole"]["value"] == pytest.approx(alike([quiet])["whole"]["value"], abs=1e-6)
 
 
 def by_hand(real: Sequence[float], dreamt: Sequence[float], depth: Sequence[int]) -> Decided:
@@ -116,21 +130,26 @@ def test_alike_by_hand():
     """Real actions −1, 1, −1, 1: spread 1; a dream off by ½ costs ¼ of what the mean would."""
     found = alike([by_hand([-1, 1, -1, 1], [-0.5, 1.5, -1, 0], [1, 1, 2, 2])])
     assert found["first"]["value"] == pytest.approx(0.75)
-    assert found["last"]["value"] == pytest.approx(0.5)
     assert found["whole"]["value"] == pytest.approx(1 - 1.5 / 4)
     assert found["whole"]["low"] <= found["whole"]["value"] <= found["whole"]["high"]
     assert (found["policies"], found["decisions"]) == (1, 4)
     # Each policy in units of its own spread.
-    both = alike([by_hand([-1, 1], [-0.5, 1.5], [1, 2]), by_hand([-100, 100], [-100, 100], [1, 2])])
+    ones = [1, 1]
+    both = alike([by_hand([-1, 1], [-0.5, 1.5], ones), by_hand([-100, 100], [-100, 100], ones)])
     assert both["whole"]["value"] == pytest.approx(1 - 0.5 / 4) and both["decisions"] == 4
-    assert alike([by_hand([-1, 1], [0, 0], [1, 2])])["whole"]["value"] == pytest.approx(0.0)
+
+
+def test_the_average_frame_of_a_depth_is_worth_nothing():
+    """Early and late actions differ by far more than those of one depth do among each other."""
+    found = alike([by_hand([9, 11, -11, -9], [10, 10, -10, -10], [1, 1, 2, 2])])
+    assert found["first"]["value"] == pytest.approx(0.0) and found["whole"]["value"] == pytest.approx(0.0)
 
 
 def test_where_nothing_is_decided_nothing_is_said():
     found = alike([by_hand([2, 2], [2, 2], [1, 1])])
     assert math.isnan(found["whole"]["value"])
     short = [episode(K, 0), episode(2, 9)]
-    none = decide_twice(Looking(), SPEC, replayed_whole(CopyModel(SPEC), short))  # type: ignore[arg-type]
+    none = twice(Looking(), short)
     assert none.real.shape == (0, K, 2)
     empty = alike([none])
     assert empty["decisions"] == 0 and math.isnan(empty["whole"]["value"])
@@ -163,7 +182,10 @@ def test_as_a_user(folders: tuple[Path, Path, Path], tmp_path: Path, capsys: pyt
 def test_policies_that_cannot_act_in_dreams_are_refused(tmp_path: Path):
     small = {"chunk_size": 5, "dim_model": 16, "n_heads": 2, "pretrained_backbone_weights": None}
     fits = write_policy(tmp_path / "fits", "act", n_action_steps=K, **small)
-    check_policies([str(fits)], SPEC)
+    (world,) = check_policies([str(fits)], SPEC)
+    assert world.images == {"observation.images.front": (16, 16, 3)}
+    large = write_policy(tmp_path / "large", "act", n_action_steps=K, image=32, **small)
+    assert check_policies([str(large)], SPEC)[0].images == {"observation.images.front": (32, 32, 3)}
     longer = write_policy(tmp_path / "longer", "act", n_action_steps=5, **small)
     with pytest.raises(InputError, match=r"policies=.*longer.*executes 5 actions"):
         check_policies([str(longer)], SPEC)
@@ -176,4 +198,6 @@ def test_policies_that_cannot_act_in_dreams_are_refused(tmp_path: Path):
         check_policies([str(tmp_path / "nowhere")], SPEC)
     with pytest.raises(InputError, match="policies=.*twice"):
         WorldModelEvalRun(path="x", policies=("a", "a"))
-    assert as_world(SPEC).images == {"observation.images.front": (16, 16, 3)}
+    (fits / "model.safetensors").write_bytes(b"none")
+    with pytest.raises(InputError, match="policies=.*fits"):
+        load_policy(str(fits))
