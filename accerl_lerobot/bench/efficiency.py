@@ -44,6 +44,8 @@ from accerl_lerobot.bench.study import (
 )
 from accerl_lerobot.config import RunConfig, parse
 from accerl_lerobot.console import Console
+from accerl_lerobot.dataset_config import DatasetConfig
+from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.errors import InputError
 
 ARMS = {
@@ -125,8 +127,8 @@ def bench_efficiency(config: BenchEfficiencyConfig) -> dict[str, Any]:
 
     Returns:
         ``starts`` (success of each seed's warm start), ``cells`` (of each run success, n, real episodes and
-        env steps, updates, and what was dreamt) and ``groups``: arm, budget, successes and episodes over the
-        seeds, and means of real episodes and env steps and of updates.
+        env steps, updates, and what was dreamt), ``groups`` (arm, budget, successes and episodes over the
+        seeds, and means of real episodes and env steps and of updates) and ``beside``, see there.
 
     Raises:
         InputError: see `Study.run`.
@@ -139,7 +141,7 @@ def bench_efficiency(config: BenchEfficiencyConfig) -> dict[str, Any]:
     for run in study.runs[: len(config.arms)]:
         if run.imagination.share:
             check_imagination(replace(study.starts[run.seed], imagination=run.imagination))
-    result = compare(config, study.run(console))
+    result = compare(config, study.run(console)) | {"beside": beside(study, recipe)}
     write(study.root, "efficiency", result, markdown(result), draw)
     console.say(f"wrote efficiency.json, .md and .png into {study.root}")
     return result
@@ -160,14 +162,45 @@ def compare(config: BenchEfficiencyConfig, results: Results) -> dict[str, Any]:
     return {"config": asdict(config), "starts": results.before, "groups": groups, "cells": rows}
 
 
+def beside(study: Study, recipe: RunConfig) -> dict[str, dict[str, float]]:
+    """Real ``episodes`` and ``env_steps`` on top of those of the cells.
+
+    Returns:
+        ``demonstrations`` of a warm start, means over the seeds where each records its own, and ``world
+        model``, all that it has learnt from and was tried on; each only where there is such a thing.
+    """
+    sets: dict[str, list[DatasetConfig]] = {}
+    if recipe.policy.path is None:
+        folders = [study.start(seed) / "demos" for seed in study.starts]
+        recorded = [DatasetConfig(repo_id=recipe.demos.repo_id, root=str(folder)) for folder in folders]
+        sets["demonstrations"] = recorded if recipe.dataset.repo_id is None else [recipe.dataset]
+    dreams = any(run.imagination.share and run.imagination.model != "oracle" for run in study.runs)
+    learn = recipe.imagination.learn
+    sets["world model"] = [d for d in (learn.dataset, learn.online) if dreams and d.repo_id is not None]
+    found = {}
+    for name, datasets in sets.items():
+        if datasets:
+            metas = [open_metadata(dataset) for dataset in datasets]
+            each = len(datasets) if name == "demonstrations" else 1
+            found[name] = {
+                "episodes": sum(meta.total_episodes for meta in metas) / each,
+                "env_steps": sum(meta.total_frames for meta in metas) / each,
+            }
+    return found
+
+
 def table(result: dict[str, Any]) -> Table:
     """`result` for people: one row per arm, one column per budget."""
     return tabled("success after so many real episodes; before them", result, _columns(result), _rows(result))
 
 
 def markdown(result: dict[str, Any]) -> str:
-    """`table` for the docs."""
-    return as_markdown(_columns(result), _rows(result))
+    """`table` for the docs, and what is real beside it."""
+    lines = [
+        f"\nOn top, {name}: {of['episodes']:,.0f} real episodes, {of['env_steps']:,.0f} env steps."
+        for name, of in result["beside"].items()
+    ]
+    return as_markdown(_columns(result), _rows(result)) + "\n".join(lines) + ("\n" if lines else "")
 
 
 def draw(path: Path, result: dict[str, Any]) -> None:
@@ -196,7 +229,8 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
     for arm in result["config"]["arms"]:
         row = [arm]
         for g in (g for g in result["groups"] if g["arm"] == arm):
-            made = f"{g['episodes_explored']:.0f} episodes, {g['updates']:.0f} updates"
+            real = f"{g['episodes_explored']:.0f} episodes of {g['env_steps']:,.0f} env steps"
+            made = f"{real}, {g['updates']:.0f} updates"
             row.append(f"{rated(g)}, {made}")
         rows.append(row)
     return rows

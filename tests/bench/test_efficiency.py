@@ -15,6 +15,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,9 @@ import yaml
 from accerl_lerobot.bench import efficiency as bench
 from accerl_lerobot.bench.efficiency import ARMS, BenchEfficiencyConfig, cells
 from accerl_lerobot.bench.study import Results, Study
-from accerl_lerobot.config import RunConfig, encode, parse
+from accerl_lerobot.config import DatasetConfig, RunConfig, encode, parse
+from accerl_lerobot.demos.record import DemosConfig, record_demos
+from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from tests.runs import tiny_run
 
@@ -67,7 +70,8 @@ def result(tmp_path: Path, tiny_checkpoint: Path) -> dict[str, Any]:
         (cell, a_summary(success[cell.of["arm"], cell.of["budget"]], cell.of["budget"] - (cell.seed == 4)))
         for cell in made
     ]
-    return bench.compare(config, Results({3: a_summary(0.2), 4: a_summary(0.4)}, runs))
+    offline = {"world model": {"episodes": 494, "env_steps": 67551}}
+    return bench.compare(config, Results({3: a_summary(0.2), 4: a_summary(0.4)}, runs)) | {"beside": offline}
 
 
 def test_seeds_are_counted_together(result: dict[str, Any]):
@@ -82,7 +86,10 @@ def test_seeds_are_counted_together(result: dict[str, Any]):
 def test_the_table_and_the_picture(result: dict[str, Any], tmp_path: Path):
     lines = bench.markdown(result).splitlines()
     assert lines[0] == "| imagined | 4 real episodes | 8 real episodes |"
-    assert lines[2].startswith("| none | 10.0 % [2.8, 30.1] n=20 (10 10), 4 episodes, 4 updates | 50.0 % [")
+    assert lines[2].startswith(
+        "| none | 10.0 % [2.8, 30.1] n=20 (10 10), 4 episodes of 100 env steps, 4 updates | 50.0 % ["
+    )
+    assert lines[-1] == "On top, world model: 494 real episodes, 67,551 env steps."
     assert bench.table(result).row_count == 2
     bench.draw(tmp_path / "efficiency.png", result)
     assert (tmp_path / "efficiency.png").read_bytes().startswith(b"\x89PNG")
@@ -114,6 +121,34 @@ def test_a_study_is_run(tmp_path: Path, tiny_checkpoint: Path):
     assert 0 < cell["episodes_explored"] <= 8
     made = {p.name for p in (tmp_path / "study").iterdir()}
     assert {"efficiency.json", "efficiency.md", "efficiency.png", "none-8-seed3"} < made
+
+
+def test_what_is_real_beside_the_cells_is_counted(tmp_path: Path, tiny_checkpoint: Path):
+    config = small(tmp_path, tiny_checkpoint, arms=("none", "copy"), budgets=(4,))
+    base = parse(RunConfig, [f"--config_path={config.recipe}"])
+    assert bench.beside(Study(config, cells(config, base)), base) == {}, "nobody says what it has learnt from"
+    env = SimulatedConfig(max_steps=8)
+    sizes = {}
+    for name, episodes in (("start-seed3", 2), ("start-seed4", 4), ("learnt", 3)):
+        root = tmp_path / "study" / name / "demos"
+        record_demos(env, DemosConfig(episodes=episodes, processes=1, root=str(root), repo_id="a/b"))
+        sizes[name] = json.loads((root / "meta" / "info.json").read_text())["total_frames"]
+    learnt = DatasetConfig(repo_id="a/b", root=str(tmp_path / "study" / "learnt" / "demos"))
+    learn = replace(base.imagination.learn, dataset=learnt)
+    # A recipe that makes its own policy, and says what its world model has learnt from.
+    base = replace(
+        base,
+        policy=replace(base.policy, path=None),
+        imagination=replace(base.imagination, learn=learn),
+    )
+    assert bench.beside(Study(config, cells(config, base)), base) == {
+        "demonstrations": {"episodes": 3, "env_steps": (sizes["start-seed3"] + sizes["start-seed4"]) / 2},
+        "world model": {"episodes": 3, "env_steps": sizes["learnt"]},
+    }
+    alone = small(tmp_path, tiny_checkpoint, arms=("none", "oracle"))
+    assert set(bench.beside(Study(alone, cells(alone, base)), base)) == {"demonstrations"}
+    named = replace(base, dataset=learnt)
+    assert bench.beside(Study(config, cells(config, named)), named)["demonstrations"]["episodes"] == 3
 
 
 def test_a_world_model_that_is_missing_is_found_before_anything_runs(tmp_path: Path, tiny_checkpoint: Path):
