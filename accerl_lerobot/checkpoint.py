@@ -43,6 +43,8 @@ from accerl_lerobot.safety import Origin, safe_join
 PRETRAINED, TRAINING_STATE, WORLD_MODEL = "pretrained_model", "training_state", "world_model"
 CHECKPOINTS = "checkpoints"
 """Folder of a run's."""
+DEMOS = "demos"
+"""Folder of the demonstrations that a run has recorded for itself."""
 CONFIG, SUMMARY = "config.yaml", "summary.json"
 """Files of a run: how it is to be, and what came of it once it has ended."""
 MANIFEST, LAST = "manifest.json", "last"

@@ -42,6 +42,7 @@ from accerl_lerobot import ray_environment
 from accerl_lerobot.checkpoint import (
     CHECKPOINTS,
     CONFIG,
+    DEMOS,
     PRETRAINED,
     TRAINING_STATE,
     begun,
@@ -143,7 +144,7 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
         raise InputError("policy.path", None, remedy)
     dataset = config.dataset
     if dataset.repo_id is None:
-        root = directory / "demos"
+        root = directory / DEMOS
         with console.stage("demonstrations"):
             record_demos(config.env, replace(config.demos, root=str(root), seed=config.seed))
         dataset = replace(dataset, repo_id=config.demos.repo_id, root=str(root))
@@ -317,7 +318,7 @@ def _warm_started(config: RunConfig, directory: Path, console: Console) -> RunCo
     if config.policy.path is not None:
         return config
     if not note.is_file():
-        for name in ("demos", "demos.partial", "sft"):
+        for name in (DEMOS, f"{DEMOS}.partial", "sft"):
             shutil.rmtree(directory / name, ignore_errors=True)
         warm = warm_start(config, directory, console)
         path = Path(str(warm.policy.path)).absolute().relative_to(directory.absolute())

@@ -205,6 +205,7 @@ def world_model_eval(arguments: list[str]) -> int:
 def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Console], dict[str, Any]]) -> int:
     """Does the work in a new folder and shows the trial it ends with."""
     from accerl_lerobot.run import make_output_dir
+    from accerl_lerobot.world_model.by_source import compared
     from accerl_lerobot.world_model.show import gates, sources_table, table
 
     directory = make_output_dir(config)
@@ -218,7 +219,7 @@ def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Cons
         _discard_unused(directory)
         raise
     console.rich.print(table(found))
-    if found.get("sources") or found.get("alike"):
+    if compared(found):
         console.rich.print(sources_table(found))
     for line in gates(found):
         console.say(line)

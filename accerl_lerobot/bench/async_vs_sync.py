@@ -101,8 +101,9 @@ def bench_async_vs_sync(config: BenchAsyncVsSyncConfig) -> dict[str, Any]:
     console, root = Console(), Path(config.output_dir)
     root.mkdir(parents=True, exist_ok=True)
     result: dict[str, Any] = {"config": asdict(config), "host": host(), "floors": floors(), "laws": []}
-    with console.stage("laws", total=len(laws(config))) as stage:
-        for of in laws(config):
+    every = laws(config)
+    with console.stage("laws", total=len(every)) as stage:
+        for of in every:
             law = _law(config, of)
             result["laws"].append(law)
             stage.update(len(result["laws"]), f"CV {of.cv:.3g}: S {law['speed_up']['median']:.2f}")

@@ -23,6 +23,7 @@ before, the demonstrations of the warm start and the episodes of the pre-trainin
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,7 @@ from accerl_lerobot.bench.study import (
     together,
     write,
 )
+from accerl_lerobot.checkpoint import DEMOS
 from accerl_lerobot.config import RunConfig, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.dataset_config import DatasetConfig
@@ -169,24 +171,25 @@ def beside(study: Study, recipe: RunConfig) -> dict[str, dict[str, float]]:
         ``demonstrations`` of a warm start, means over the seeds where each records its own, and ``world
         model``, all that it has learnt from and was tried on; each only where there is such a thing.
     """
-    sets: dict[str, list[DatasetConfig]] = {}
-    if recipe.policy.path is None:
-        folders = [study.start(seed) / "demos" for seed in study.starts]
-        recorded = [DatasetConfig(repo_id=recipe.demos.repo_id, root=str(folder)) for folder in folders]
-        sets["demonstrations"] = recorded if recipe.dataset.repo_id is None else [recipe.dataset]
-    dreams = any(run.imagination.share and run.imagination.model != "oracle" for run in study.runs)
-    learn = recipe.imagination.learn
-    sets["world model"] = [d for d in (learn.dataset, learn.online) if dreams and d.repo_id is not None]
     found = {}
-    for name, datasets in sets.items():
-        if datasets:
-            metas = [open_metadata(dataset) for dataset in datasets]
-            each = len(datasets) if name == "demonstrations" else 1
-            found[name] = {
-                "episodes": sum(meta.total_episodes for meta in metas) / each,
-                "env_steps": sum(meta.total_frames for meta in metas) / each,
-            }
+    if recipe.policy.path is None:
+        folders = [study.start(seed) / DEMOS for seed in study.starts]
+        recorded = [DatasetConfig(repo_id=recipe.demos.repo_id, root=str(folder)) for folder in folders]
+        used = recorded if recipe.dataset.repo_id is None else [recipe.dataset]
+        found["demonstrations"] = {name: total / len(used) for name, total in _totals(used).items()}
+    learn = recipe.imagination.learn
+    learnt = [dataset for dataset in (learn.dataset, learn.online) if dataset.repo_id is not None]
+    if learnt and any(run.imagination.share and run.imagination.model != "oracle" for run in study.runs):
+        found["world model"] = _totals(learnt)
     return found
+
+
+def _totals(datasets: Sequence[DatasetConfig]) -> dict[str, float]:
+    metas = [open_metadata(dataset) for dataset in datasets]
+    return {
+        "episodes": sum(meta.total_episodes for meta in metas),
+        "env_steps": sum(meta.total_frames for meta in metas),
+    }
 
 
 def table(result: dict[str, Any]) -> Table:
@@ -197,10 +200,10 @@ def table(result: dict[str, Any]) -> Table:
 def markdown(result: dict[str, Any]) -> str:
     """`table` for the docs, and what is real beside it."""
     lines = [
-        f"\nOn top, {name}: {of['episodes']:,.0f} real episodes, {of['env_steps']:,.0f} env steps."
+        f"\nOn top, {name}: {of['episodes']:,.0f} real episodes, {of['env_steps']:,.0f} env steps.\n"
         for name, of in result["beside"].items()
     ]
-    return as_markdown(_columns(result), _rows(result)) + "\n".join(lines) + ("\n" if lines else "")
+    return as_markdown(_columns(result), _rows(result)) + "".join(lines)
 
 
 def draw(path: Path, result: dict[str, Any]) -> None:

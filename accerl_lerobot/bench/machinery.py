@@ -42,10 +42,6 @@ EPISODE = 16
 CHUNK = 4
 
 
-def _resolved(path: str) -> Path:
-    return Path(path).expanduser().resolve()
-
-
 @dataclass(frozen=True, kw_only=True)
 class MachineryConfig:
     """Sizes and durations of what is simulated."""
@@ -123,7 +119,7 @@ class MachineryConfig:
 
     def run_config(self, *, updates: int = 1_000_000, seed: int = 0) -> RunConfig:
         """A run of it."""
-        batch = self.batch
+        batch, trace = self.batch, self.latency_trace
         return RunConfig(
             seed=seed,
             env=SimulatedConfig(
@@ -132,10 +128,9 @@ class MachineryConfig:
                 reward="dense",
                 image_size=self.image_size,
                 frame_ms=self.latency_ms,
-                latency=self._law,
+                latency="trace" if trace else "lognormal" if self.latency_cv else "constant",
                 latency_cv=self.latency_cv,
-                # Workers run elsewhere.
-                latency_trace=None if self.latency_trace is None else str(_resolved(self.latency_trace)),
+                latency_trace=trace and str(Path(trace).expanduser().resolve()),  # workers run elsewhere
             ),
             rollout=RolloutConfig(workers=self.worlds, worlds=1, segment_length=self.segment_length),
             inference=InferenceConfig(max_batch=self.max_batch, max_wait_s=self.max_wait_ms / 1000),
@@ -154,12 +149,6 @@ class MachineryConfig:
             ),
             launch=LaunchConfig(stall_s=120.0),
         )
-
-    @property
-    def _law(self) -> str:
-        if self.latency_trace is not None:
-            return "trace"
-        return "lognormal" if self.latency_cv else "constant"
 
     def open(self) -> Measured:
         """An engine of it, which has begun to train."""

@@ -148,7 +148,7 @@ class SimulatedWorld(World):
         self._target: np.ndarray = np.zeros(dims, np.float32)
         self._recent: collections.deque[np.ndarray] = collections.deque(maxlen=config.hold)
         self._clock = np.random.default_rng(0)
-        self._trace = Trace(np.ones(1), np.zeros(0))
+        self._trace = Trace(np.ones(1), np.zeros(0))  # of constant latency
         if config.latency_trace is not None:
             self._trace = read_trace(config.latency_trace, "env.latency_trace")
         self._at = 0
@@ -239,13 +239,13 @@ class SimulatedWorld(World):
 
     def _delay(self, mean_ms: float) -> float:
         """Seconds, drawn anew for each step and each observation."""
-        if mean_ms == 0 or self.config.latency == "constant":
-            return mean_ms / 1000
-        if self.config.latency == "trace":
-            self._at = (self._at + 1) % len(self._trace.decisions)
-            return mean_ms / 1000 * float(self._trace.decisions[self._at])
-        variance = math.log1p(self.config.latency_cv**2)
-        return mean_ms / 1000 * math.exp(self._clock.normal(-variance / 2, math.sqrt(variance)))
+        if mean_ms == 0:
+            return 0.0
+        if self.config.latency == "lognormal":
+            variance = math.log1p(self.config.latency_cv**2)
+            return mean_ms / 1000 * math.exp(self._clock.normal(-variance / 2, math.sqrt(variance)))
+        self._at = (self._at + 1) % len(self._trace.decisions)
+        return mean_ms / 1000 * float(self._trace.decisions[self._at])
 
 
 class Trace(NamedTuple):

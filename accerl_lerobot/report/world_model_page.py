@@ -28,7 +28,7 @@ from accerl_lerobot.report.notes import notes, status
 from accerl_lerobot.report.read import Record, Run, column, has
 from accerl_lerobot.report.run_page import films, recipe_blocks
 from accerl_lerobot.report.words import ABSENT, count, duration, number
-from accerl_lerobot.world_model.by_source import source_rows
+from accerl_lerobot.world_model.by_source import compared, every_source, source_rows
 
 DEPTH = "depth of the dream in chunks"
 ARMS = {
@@ -159,9 +159,9 @@ def depth_charts(depths: Sequence[Record]) -> list[Chart]:
 
 def source_blocks(found: Record) -> list[list[Block]]:
     """A table and charts of the trials on several sources; nothing where there was one and no policy."""
-    if not (found.get("sources") or found.get("alike")):
+    if not compared(found):
         return []
-    every = [found, *(found.get("sources") or {}).values()]
+    every = every_source(found)
     names = [str(one.get("name")) for one in every]
     table = Table(
         caption="The same measures on episodes from each source",
@@ -200,7 +200,7 @@ def _headline(run: Run) -> str:
 def _lead(found: Record) -> str:
     if not found:
         return ""
-    every = [found, *(found.get("sources") or {}).values()]
+    every = every_source(found)
     text = count(sum(one["trials"] for one in every), "trial")
     if all("episodes" in one for one in every):
         text += f" on {count(sum(one['episodes'] for one in every), 'episode')} it had not learnt from"

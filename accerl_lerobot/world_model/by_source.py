@@ -20,6 +20,16 @@ from collections.abc import Sequence
 from typing import Any
 
 
+def every_source(found: dict[str, Any]) -> list[dict[str, Any]]:
+    """What came of a trial on each source, the first of them first."""
+    return [found, *(found.get("sources") or {}).values()]
+
+
+def compared(found: dict[str, Any]) -> bool:
+    """Whether there is more to tell by source than of one trial."""
+    return bool(found.get("sources") or found.get("alike"))
+
+
 def source_rows(every: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
     """What is told of each source: a name, and a text for each of them."""
     rows = [("episodes", [str((one.get("tried") or {}).get("episodes", "")) for one in every])]

@@ -41,7 +41,7 @@ from accerl_lerobot.policies.base import PolicyAdapter, check_fit
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.world_model import fit
 from accerl_lerobot.world_model.contract import WorldModel, WorldModelSpec
-from accerl_lerobot.world_model.episodes import Episode, Place
+from accerl_lerobot.world_model.episodes import Episode, Place, longest
 from accerl_lerobot.world_model.frames import observed
 from accerl_lerobot.world_model.judge import bootstrap
 from accerl_lerobot.world_model.replayed import Replayed, replay
@@ -131,8 +131,8 @@ def _named(path: str) -> Iterator[None]:
 
 def replayed_whole(model: WorldModel, episodes: Sequence[Episode]) -> Replayed:
     """Dreams of them from beginning to end with the actions that were made."""
-    depth = max(-(-len(episode) // model.spec.chunk) for episode in episodes)
-    return replay(model, episodes, [Place(e, 0) for e in range(len(episodes))], depth)
+    at = [Place(e, 0) for e in range(len(episodes))]
+    return replay(model, episodes, at, longest(episodes, model.spec.chunk))
 
 
 def decide_twice(policy: PolicyAdapter, spec: WorldModelSpec, world: WorldSpec, of: Replayed) -> Decided:

@@ -241,6 +241,11 @@ def amount(episodes: Sequence[Episode]) -> dict[str, int]:
     return {"episodes": len(episodes), "env_steps": sum(map(len, episodes))}
 
 
+def longest(episodes: Sequence[Episode], chunk: int) -> int:
+    """How many chunks of so many env steps the longest of them takes."""
+    return max(-(-len(episode) // chunk) for episode in episodes)
+
+
 def split(episodes: Sequence[Episode], share: float, rng: np.random.Generator) -> tuple[list[int], list[int]]:
     """Episodes to learn from and episodes to be judged on, as indices; each kind of outcome is split alike.
 

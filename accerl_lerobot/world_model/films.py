@@ -24,7 +24,7 @@ import numpy as np
 from accerl_lerobot.evaluation.pictures import captioned, write_video
 from accerl_lerobot.world_model.config import TrialConfig
 from accerl_lerobot.world_model.contract import WorldModel
-from accerl_lerobot.world_model.episodes import Episode, Place
+from accerl_lerobot.world_model.episodes import Episode, Place, longest
 from accerl_lerobot.world_model.replayed import dream, replay
 from accerl_lerobot.world_model.stand_in import SuccessModel
 from accerl_lerobot.world_model.success import probabilities
@@ -64,7 +64,7 @@ def beside(
         episode: that happened.
         scale: how much larger than life.
     """
-    depth = -(-len(episode) // model.spec.chunk)
+    depth = longest([episode], model.spec.chunk)
     replayed = replay(model, [episode], [Place(0, 0)], depth)
     made = int(replayed.made.sum())
     dreamt = np.concatenate([replayed.newest, replayed.dreams.frames[0, :made]])

@@ -30,7 +30,7 @@ import numpy as np
 from accerl_lerobot.world_model import judge
 from accerl_lerobot.world_model.config import TrialConfig
 from accerl_lerobot.world_model.contract import WorldModel
-from accerl_lerobot.world_model.episodes import Episode, Place
+from accerl_lerobot.world_model.episodes import Episode, Place, longest
 from accerl_lerobot.world_model.replayed import dream, replay
 from accerl_lerobot.world_model.stand_in import SuccessModel
 from accerl_lerobot.world_model.success import probabilities
@@ -71,7 +71,7 @@ def scores(
         at = [
             Place(e, f) for e, t in enumerate(shown) if len(t) > 1 for f in {0, int(rng.integers(len(t) - 1))}
         ]
-        depth = max(-(-len(episode) // chunk) for episode in episodes)
+        depth = longest(episodes, chunk)
     else:
         at = [Place(e, f) for e, times in enumerate(shown) for f in spaced(times, config.every)]
         depth = config.depth

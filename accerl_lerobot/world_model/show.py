@@ -19,7 +19,7 @@ from typing import Any
 
 from rich.table import Table
 
-from accerl_lerobot.world_model.by_source import estimate, number, source_rows
+from accerl_lerobot.world_model.by_source import estimate, every_source, number, source_rows
 from accerl_lerobot.world_model.trial import NEVER
 
 READ = ("real", "true", "change")
@@ -54,7 +54,7 @@ def sources_table(found: dict[str, Any]) -> Table:
     """Trials on several sources beside each other, a column each."""
     shown = Table(title="By source")
     shown.add_column("")
-    every = [found, *found["sources"].values()]
+    every = every_source(found)
     for one in every:
         shown.add_column(str(one["name"]), justify="right")
     for name, cells in source_rows(every):
