@@ -75,8 +75,6 @@ class BenchAsyncVsSyncConfig(MachineryConfig):
         super().__post_init__()
         if any(not 0 <= cv <= 10 for cv in self.cvs):
             raise InputError("cvs", self.cvs, "use 0 to 10")
-        for trace in self.traces:
-            read_trace(trace, "traces")
         if not (self.cvs or self.traces):
             raise InputError("cvs", self.cvs, "name at least one law, here or in traces")
         if not self.seconds > 0:
@@ -97,7 +95,12 @@ def bench_async_vs_sync(config: BenchAsyncVsSyncConfig) -> dict[str, Any]:
     Returns:
         ``laws``: for each, the blocks, decisions per second by arm, S, S*, S/S* and whether the processors
         were busy; ``learning``: success by arm and seed; ``config``, ``host`` and ``floors``.
+
+    Raises:
+        InputError: one of `traces` is none.
     """
+    for trace in config.traces:
+        read_trace(trace, "traces")
     console, root = Console(), Path(config.output_dir)
     root.mkdir(parents=True, exist_ok=True)
     result: dict[str, Any] = {"config": asdict(config), "host": host(), "floors": floors(), "laws": []}

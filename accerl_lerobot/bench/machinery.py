@@ -76,8 +76,6 @@ class MachineryConfig:
             raise InputError("latency_ms", self.latency_ms, "use a positive time")
         if self.segment_length < 1 or EPISODE % self.segment_length:
             raise InputError("segment_length", self.segment_length, f"use a divisor of {EPISODE}")
-        if self.latency_trace is not None:
-            read_trace(self.latency_trace)
 
     @property
     def cv(self) -> float:
@@ -151,7 +149,13 @@ class MachineryConfig:
         )
 
     def open(self) -> Measured:
-        """An engine of it, which has begun to train."""
+        """An engine of it, which has begun to train.
+
+        Raises:
+            InputError: `latency_trace` is none.
+        """
+        if self.latency_trace is not None:
+            read_trace(self.latency_trace)
         return Measured(self.run_config(), ("match",), load=self.load())
 
     def load(self) -> Load:
