@@ -145,10 +145,10 @@ class LightTrainer:
     def idle(self) -> None:
         self._idle = True
 
-    def run(self, replay: Any, readers: list[Any], transport: str) -> int:
+    def run(self, replay: Any, readers: list[Any], *_: str) -> int:
         import ray
 
-        from accerl_lerobot.weights.ray_channel import make_publisher
+        from accerl_lerobot.weights.choice import make_publisher
 
         self._publisher = publisher = make_publisher(readers, "ray")
         publisher.publish(len(self._ledger), {})
@@ -172,7 +172,7 @@ class LightTrainer:
         return self._config.updates
 
     def join(self, reader: Any) -> int:
-        from accerl_lerobot.weights.ray_channel import join
+        from accerl_lerobot.weights.choice import join
 
         assert self._publishing.wait(60)
         newest = self._publisher._version

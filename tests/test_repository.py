@@ -40,11 +40,12 @@ HEADER = (
     '# Licensed under the Apache License, Version 2.0 (the "License");\n'
 )
 LONGEST_FILE = 400
-RAYS = {"peers.py", "ray_channel.py", "ray_calls.py", "transport_ends.py", "weights_readers.py"}
+WAYS = {"choice.py", "direct.py", "pair.py", "ray_channel.py", "ray_calls.py", "transport_ends.py"}
+RAYS = WAYS | {"peers.py", "weights_readers.py"}
 CONDUCTOR = {"launch.py", "cluster.py", "own_ray.py", "seats.py", "services.py", "watched.py"}
 SHELLS = CONDUCTOR | {"doctor.py", "worker.py"} | RAYS
 """Files that may import Ray; all others are testable without it."""
-DISTRIBUTED = {"ranks.py", "sharding.py", "tensors.py"}
+DISTRIBUTED = {"meeting.py", "pair.py", "ranks.py", "sharding.py", "tensors.py"}
 """Files that may know of other processes of a `torch.distributed` group."""
 
 LIGHT = [
@@ -58,7 +59,7 @@ LIGHT = [
     "accerl_lerobot.rollout.worker",
     "accerl_lerobot.timeline",
     "accerl_lerobot.trainer.config",
-    "accerl_lerobot.weights.ray_channel",
+    "accerl_lerobot.weights.choice",
 ]
 """Modules of processes that hold no policy: torch and LeRobot would cost each 400 MB and four seconds."""
 

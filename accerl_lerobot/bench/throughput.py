@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import statistics
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from rich.table import Table
@@ -28,10 +29,11 @@ from rich.table import Table
 from accerl_lerobot.bench.async_vs_sync import ARMS
 from accerl_lerobot.bench.blocks import Block, Measured, as_rows
 from accerl_lerobot.bench.host import host, ranged, spread
-from accerl_lerobot.bench.study import as_table
+from accerl_lerobot.bench.study import as_markdown, as_table, write
 from accerl_lerobot.config import RunConfig, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.replay.pacing import decisions_under_way
 from accerl_lerobot.replay.turns import Schedule
 
@@ -50,6 +52,8 @@ class BenchThroughputConfig:
     """Of a block, at least, above 0."""
     rounds: int = 3
     """Times each schedule is measured twice, forth and back, 1 or more."""
+    output_dir: str = "outputs/throughput"
+    """Folder for throughput.json, .md and .png."""
 
     def __post_init__(self) -> None:
         if self.policy_path is None:
@@ -76,7 +80,7 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
     """
     from accerl_lerobot.run import check_policy, check_world
 
-    console = Console()
+    console, root = Console(), Path(config.output_dir)
     run: RunConfig = parse(
         RunConfig,
         [
@@ -90,6 +94,7 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
     for schedule in config.schedules:  # what cannot be under one of them is refused
         replace(run, launch=replace(run.launch, schedule=schedule))
     tasks = check_world(run)
+    root.mkdir(parents=True, exist_ok=True)
     result: dict[str, Any] = {"config": asdict(config), "host": host()}
     order = config.rounds * (*config.schedules, *reversed(config.schedules))
     blocks: list[Block] = []
@@ -103,7 +108,10 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
     result["schedules"] = {
         name: _summed([b for b in blocks if b.schedule == name]) for name in config.schedules
     }
-    return result | {"host_after": host()}
+    result |= {"host_after": host()}
+    write(root, "throughput", result, f"{_books(result)}\n\n{as_markdown(_COLUMNS, _rows(result))}", _draw)
+    console.say(f"wrote throughput.json, .md and .png into {root}")
+    return result
 
 
 def books(run: RunConfig, rollout: dict[str, float], replay: dict[str, float]) -> dict[str, float]:
@@ -129,20 +137,49 @@ def books(run: RunConfig, rollout: dict[str, float], replay: dict[str, float]) -
 
 def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
-    books, rows = result["books"], []
+    return as_table(_books(result), _COLUMNS, _rows(result))
+
+
+_COLUMNS = ("schedule", "env steps/s", "decisions/s learned from", "updates/s", "lag", "trainer waits",
+            "inference busy", "processors")  # fmt: skip
+
+
+def _books(result: dict[str, Any]) -> str:
+    books = result["books"]
+    return (
+        f"{books['generated']:.0f} decisions generated = {books['committed']:.0f} committed + "
+        f"{books['under_way']:.0f} under way + {books['dropped']:.0f} dropped"
+    )
+
+
+def _rows(result: dict[str, Any]) -> list[list[str]]:
+    rows = []
     for name, found in result["schedules"].items():
         cells = [name]
         for key in ("env_steps_per_s", "decisions_per_s"):
             cells.append(ranged(found[key], ".0f"))
         shares = (f"{found[key]:.0%}" for key in ("trainer_waits", "inference_busy", "processors"))
         rows.append([*cells, f"{found['updates_per_s']:.2f}", f"{found['lag_mean']:.1f}", *shares])
-    title = (
-        f"{books['generated']:.0f} decisions generated = {books['committed']:.0f} committed + "
-        f"{books['under_way']:.0f} under way + {books['dropped']:.0f} dropped"
-    )
-    columns = ("schedule", "env steps/s", "decisions/s learned from", "updates/s", "lag", "trainer waits",
-               "inference busy", "processors")  # fmt: skip
-    return as_table(title, columns, rows)
+    return rows
+
+
+def _draw(path: Path, result: dict[str, Any]) -> None:
+    """What is collected and what is learned from, for each schedule; whiskers are ranges of blocks."""
+    schedules = result["schedules"]
+    with drawing(path) as axes:
+        for place, (key, label) in zip(
+            (-0.2, 0.2),
+            (("env_steps_per_s", "env steps"), ("decisions_per_s", "decisions learned from")),
+            strict=True,
+        ):
+            found = [schedule[key] for schedule in schedules.values()]
+            middle = [f["median"] for f in found]
+            ends = [[f["median"] - f["min"] for f in found], [f["max"] - f["median"] for f in found]]
+            axes.bar([i + place for i in range(len(found))], middle, 0.4, yerr=ends, capsize=3, label=label)
+        names = [f"{name}\ntrainer waits {f['trainer_waits']:.0%}" for name, f in schedules.items()]
+        axes.set_xticks(range(len(names)), names)
+        axes.set(ylabel="per second", title=Path(result["config"]["recipe"]).name)
+        axes.legend()
 
 
 def _summed(blocks: list[Block]) -> dict[str, Any]:

@@ -44,10 +44,11 @@ from accerl_lerobot.errors import InputError, check_absent
 ARMS: dict[str, tuple[str, bool, float]] = {
     "shared memory": ("shared_memory", False, 1.0),
     "Ray": ("ray", False, 1.0),
+    "gloo": ("gloo", False, 1.0),
     "changes, 1 %": ("shared_memory", True, 0.01),
     "changes, 100 %": ("shared_memory", True, 1.0),
 }
-"""Arm → transport, whether only changes are sent, and the share of values that an update changes."""
+"""Arm → transport or way, whether only changes are sent, and the share of values that an update changes."""
 MB = 1 << 20
 WARM = 4
 """Publications of a block that do not count: until all slabs have been written to and mapped."""
@@ -206,10 +207,11 @@ def _block(
 ) -> dict[str, float]:
     """Publishes a few times, each after an update, and notes the last."""
     from accerl_lerobot.bench.weights_readers import ask
-    from accerl_lerobot.weights.ray_channel import make_publisher
+    from accerl_lerobot.weights.choice import make_publisher
 
     transport, changes, share = ARMS[arm]
-    publisher = make_publisher(handles, transport, changes=changes)
+    way = {"transport": "auto", "way": transport} if transport == "gloo" else {"transport": transport}
+    publisher = make_publisher(handles, changes=changes, **way)
     try:
         for version in range(WARM + 1):
             _update(tensors, 0.0, rng)

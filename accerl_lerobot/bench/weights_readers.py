@@ -22,9 +22,13 @@ from typing import Any
 
 import numpy as np
 import ray
+import torch
 
 from accerl_lerobot.cluster import start_ray
+from accerl_lerobot.transport.meeting import Meeting
 from accerl_lerobot.weights.channel import Tensors, monotonic_clock
+from accerl_lerobot.weights.direct import Coming, DirectReader
+from accerl_lerobot.weights.pair import Backend, place_of
 from accerl_lerobot.weights.reader import Received, SharedMemoryReader
 
 READY_S = 120.0
@@ -57,6 +61,19 @@ class ReadingWorker:
         published_s = monotonic_clock(published_s)
         self._apply(Received(version=version, tensors=tensors, published_s=published_s, nbytes=nbytes))
         return version
+
+    def weights_place(self) -> tuple[str, str]:
+        """See `InferenceWorker`."""
+        return place_of(torch.device("cpu"))
+
+    def meet_publisher(self, meeting: Meeting, backend: Backend) -> None:
+        """See `InferenceWorker`."""
+        self._direct = DirectReader(meeting, backend, None, self._apply)
+
+    def receive_directly(self, coming: Coming) -> int:
+        """See `InferenceWorker`."""
+        self._apply(self._direct.take(coming, lambda: None))
+        return coming.version
 
     def note(self, version: int) -> dict[str, float]:
         """When a set was applied, how long that took, and its bytes.

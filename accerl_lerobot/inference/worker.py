@@ -35,6 +35,7 @@ import time
 from collections import Counter, deque
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -50,6 +51,11 @@ from accerl_lerobot.transport.contract import Asked, Server, stopped
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
 from accerl_lerobot.weights.channel import monotonic_clock
 from accerl_lerobot.weights.reader import Received, SharedMemoryReader
+
+if TYPE_CHECKING:
+    from accerl_lerobot.transport.meeting import Meeting
+    from accerl_lerobot.weights.direct import Coming, DirectReader
+    from accerl_lerobot.weights.pair import Backend
 
 LOOK_S = 1.0
 """How long the thread that serves waits at most before it looks whether it is still wanted."""
@@ -119,6 +125,7 @@ class InferenceWorker:
         self._published: deque[Received] = deque(maxlen=1)
         self._together: deque[int] = deque(maxlen=1)
         self._reader: SharedMemoryReader | None = None
+        self._direct: DirectReader | None = None
         self._broken: BaseException | None = None
         self._swap_s = self._publish_to_served_s = 0.0
         self._unserved_since: float | None = None
@@ -164,6 +171,24 @@ class InferenceWorker:
         except OSError:
             return False
         return True
+
+    async def weights_place(self) -> tuple[str, str]:
+        """Where its weights are, see `weights.pair.Place`."""
+        from accerl_lerobot.weights.pair import place_of
+
+        return place_of(self._adapter.device)
+
+    async def meet_publisher(self, meeting: Meeting, backend: Backend) -> None:
+        """Receives weights straight from the trainer from now on, see `weights.direct`."""
+        from accerl_lerobot.weights.direct import DirectReader
+
+        device = self._adapter.device if backend == "nccl" else None
+        self._direct = await asyncio.to_thread(DirectReader, meeting, backend, device, self._offer)
+
+    async def receive_directly(self, coming: Coming) -> int:
+        """Takes the set that comes; it serves from the next batch on."""
+        assert self._direct is not None, "who sends has met this worker"
+        return await self._direct.receive(coming)
 
     def _offer(self, received: Received) -> None:
         if received.version > self._received:

@@ -42,8 +42,9 @@ from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.trainer.config import TrainerConfig
 
 if TYPE_CHECKING:
-    from accerl_lerobot.trainer.ranks import Meeting, Ranks
+    from accerl_lerobot.trainer.ranks import Ranks
     from accerl_lerobot.trainer.update import Update
+    from accerl_lerobot.transport.meeting import Meeting
 
 LOAD_S = 600.0
 """How long a rank may take to load its policy."""
@@ -123,11 +124,12 @@ class TrainerRank:
     def join(self, meeting: Meeting) -> None:
         """Meets the others."""
         from accerl_lerobot.trainer import ranks
+        from accerl_lerobot.transport.meeting import LOOPBACK, only_at, visit
 
         config = self._config
-        here = meeting.address == ranks.LOOPBACK
-        ranks.only_at(ranks.LOOPBACK if here else ray.util.get_node_ip_address())
-        store = ranks.visit(meeting, config.ranks, config.rank_timeout_s)
+        here = meeting.address == LOOPBACK
+        only_at(LOOPBACK if here else ray.util.get_node_ip_address())
+        store = visit(meeting, config.ranks, config.rank_timeout_s)
         group = ranks.Group(
             store, self._rank, config.ranks, self._learner.adapter.device, config.rank_timeout_s
         )
@@ -167,17 +169,18 @@ class Peers:
     def begin(self, learner: Learner) -> Update:
         """Meets them, once they have loaded their policies."""
         from accerl_lerobot.trainer import ranks
+        from accerl_lerobot.transport.meeting import LOOPBACK, host, only_at
 
         if not self._actors:
             return learner.begin(ranks.Ranks())
         self._collect("ready", [actor.ready.remote() for actor in self._actors], LOAD_S)
         nodes = self._collect("node", [actor.node.remote() for actor in self._actors], LOAD_S)
-        address = ranks.LOOPBACK
+        address = LOOPBACK
         if set(nodes) != {str(ray.get_runtime_context().get_node_id())}:
             address = ray.util.get_node_ip_address()
-        ranks.only_at(address)
+        only_at(address)
         size, timeout_s = self._config.ranks, self._config.rank_timeout_s
-        store, meeting = ranks.host(address, size, timeout_s)
+        store, meeting = host(address, size, timeout_s)
         with self.joining("join", meeting):
             return learner.begin(ranks.Group(store, 0, size, learner.adapter.device, timeout_s))
 

@@ -20,21 +20,15 @@ same code, everywhere, and nobody has to be told whether an update was finite. O
 
 from __future__ import annotations
 
-import os
-import socket
 from collections.abc import Callable, Sequence
 from datetime import timedelta
-from typing import NamedTuple
 
 import numpy as np
-import psutil
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
 from accerl_lerobot.trainer.batch import turns
-
-LOOPBACK = "127.0.0.1"
 
 
 class Ranks:
@@ -65,13 +59,6 @@ class Ranks:
         """What `score` says of rows, (rows, ...) on the CPU; a rank is asked of its own, `size` at once."""
         said = [(turn.own, score(turn.rows).cpu()) for turn in turns(rows, size, self.rank, self.size)]
         return self.gather(torch.cat([rows if own else rows[:0] for own, rows in said]), len(rows))
-
-
-class Meeting(NamedTuple):
-    """Where ranks find each other."""
-
-    address: str
-    port: int
 
 
 class Group(Ranks):
@@ -113,47 +100,3 @@ class Group(Ranks):
     def begin_alike(self, parameters: Sequence[nn.Parameter]) -> None:
         for parameter in parameters:
             dist.broadcast(parameter.data, src=0)
-
-
-def host(address: str, size: int, timeout_s: float) -> tuple[dist.Store, Meeting]:
-    """Opens a meeting place on one of this machine's addresses, and on no other.
-
-    Args:
-        address: the loopback, where all ranks are on one machine.
-        size: how many ranks will come.
-        timeout_s: how long they wait for what another one has to say there.
-    """
-    listener = socket.socket()
-    listener.bind((address, 0))
-    listener.listen()
-    meeting = Meeting(address, listener.getsockname()[1])
-    # A store that opens its own socket listens on every interface.
-    return _store(meeting, size, timeout_s, master_listen_fd=listener.detach(), is_master=True), meeting
-
-
-def visit(meeting: Meeting, size: int, timeout_s: float) -> dist.Store:
-    """Goes to a meeting place that another rank has opened."""
-    return _store(meeting, size, timeout_s)
-
-
-def _store(meeting: Meeting, size: int, timeout_s: float, **options: bool | int) -> dist.Store:
-    timeout = timedelta(seconds=timeout_s)
-    return dist.TCPStore(*meeting, world_size=size, timeout=timeout, wait_for_workers=False, **options)
-
-
-def only_at(address: str) -> None:
-    """Has gloo and NCCL use the interface with this address; they read variables of this process.
-
-    Left alone, gloo takes the one that this machine's name leads to, which others often cannot reach.
-
-    Raises:
-        RuntimeError: no interface has it.
-    """
-    names = [
-        name for name, found in psutil.net_if_addrs().items() if any(a.address == address for a in found)
-    ]
-    if not names:
-        raise RuntimeError(f"no interface of this machine has the address {address}")
-    os.environ["GLOO_SOCKET_IFNAME"] = names[0]
-    if address != LOOPBACK:
-        os.environ["NCCL_SOCKET_IFNAME"] = names[0]

@@ -42,9 +42,9 @@ from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEI
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.nonfinite import keeping
 from accerl_lerobot.trainer.peers import Learner, Peers
+from accerl_lerobot.weights.choice import CONNECT_S, Publishers, join, make_publisher
 from accerl_lerobot.weights.held_back import HeldBack
 from accerl_lerobot.weights.publisher import Publisher
-from accerl_lerobot.weights.ray_channel import CONNECT_S, Publishers, join, make_publisher
 
 
 class TrainerWorker:
@@ -93,20 +93,27 @@ class TrainerWorker:
         """Answers once the policy is loaded; returns this process's id."""
         return os.getpid()
 
-    def run(self, replay: Any, readers: list[Any], transport: str = "auto") -> int:
+    def run(self, replay: Any, readers: list[Any], transport: str = "auto", way: str = "auto") -> int:
         """Trains; returns the number of updates made.
 
         Args:
             replay: actor handle.
             readers: actor handles; where the weights go.
             transport: see `make_publisher`.
+            way: see there.
         """
         self._clock.enter(WEIGHT_SYNC)
-        publisher = make_publisher(readers, transport, changes=self._config.publish_changes)
+        publisher = make_publisher(
+            readers,
+            transport,
+            changes=self._config.publish_changes,
+            way=way,
+            device=self._update.adapter.device,
+        )
         try:
             # A checkpoint need not hold a critic: all start from this one.
             with self._lock:
-                self._hand_over(publisher, self._update.version, self._view())
+                self._hand_over(publisher, self._update.version, self._view(publisher))
             self._publisher = publisher
             self._publishing.set()
             self._train(replay, publisher)
@@ -185,7 +192,7 @@ class TrainerWorker:
     def _publish(self, publisher: Publisher | Publishers, held: HeldBack, last: bool) -> None:
         """Hands the weights of now over, or those that are old enough."""
         if not held.updates:
-            self._hand_over(publisher, self._update.version, self._view())
+            self._hand_over(publisher, self._update.version, self._view(publisher))
             return
         for due in held.push(self._update.version, self._export(), last=last):
             self._hand_over(publisher, *due)
@@ -224,10 +231,11 @@ class TrainerWorker:
         snapshot.save(directory / TRAINING_STATE / WEIGHTS, trained)
         snapshot.save(directory / TRAINING_STATE / "trainer", state)
 
-    def _view(self) -> dict[str, Any]:
+    def _view(self, publisher: Publisher | Publishers) -> dict[str, Any]:
         """Trainable weights, to be copied before the next update."""
+        adapter = self._update.adapter
         with self._peers.lending("lend_weights"):
-            return self._update.adapter.view_trainable()
+            return adapter.view_trainable_there() if publisher.on_device else adapter.view_trainable()
 
     def _export(self) -> dict[str, Any]:
         with self._peers.lending("lend_weights"):

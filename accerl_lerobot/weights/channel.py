@@ -30,9 +30,13 @@ from __future__ import annotations
 import threading
 import time
 from abc import ABC, abstractmethod
+from typing import Literal
 
 import numpy as np
 
+Way = Literal["auto", "gloo", "nccl"]
+"""What carries weights from the trainer to inference; auto is shared memory or Ray."""
+WAY = "launch.weights"
 Tensors = dict[str, np.ndarray]
 """Parameter name → array; dtype and shape arrive as they were sent."""
 

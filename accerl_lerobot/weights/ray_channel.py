@@ -13,8 +13,7 @@
 # limitations under the License.
 """Weights from the trainer to inference workers through Ray's object store.
 
-Readers that share this machine's memory get weights through that, all others so, at the same time. One copy
-is put into the store, each reader gets a reference, and at most one set per reader is under way: a
+One copy is put into the store, each reader gets a reference, and at most one set per reader is under way: a
 reader that is slow skips versions instead of queueing them. The trainer waits for its own copy and neither
 for the store nor for a reader. One that dies is let go of, and one that comes later gets the newest set.
 """
@@ -22,123 +21,21 @@ for the store nor for a reader. One that dies is let go of, and one that comes l
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any
 
-import numpy as np
 import ray
 from ray.exceptions import RayActorError
 
-from accerl_lerobot.errors import InputError
-from accerl_lerobot.transport.endpoint import FIELD, Transport
-from accerl_lerobot.transport.nameless import available
 from accerl_lerobot.weights.channel import wall_clock
-from accerl_lerobot.weights.publisher import FLUSH_S, Publisher
-from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
+from accerl_lerobot.weights.publisher import Publisher
 from accerl_lerobot.weights.slab import Slab
 
 logger = logging.getLogger(__name__)
 
-CONNECT_S = 60.0
-"""How long readers may take to say whether they can map the trainer's memory."""
 _POLL_S = 0.02
 """How long the thread waits for a reader before it looks for something newer."""
-
-
-class Publishers:
-    """Several, as one: some readers are on this machine, and some on others. Each copies a set for itself.
-
-    Args:
-        parts: of which each has its own readers.
-    """
-
-    def __init__(self, *parts: Publisher) -> None:
-        self.parts = parts
-
-    def publish(self, version: int, tensors: Mapping[str, np.ndarray]) -> None:
-        """See `Publisher.publish`."""
-        for part in self.parts:
-            part.publish(version, tensors)
-
-    def flush(self, timeout_s: float = FLUSH_S) -> None:
-        """See `Publisher.flush`."""
-        deadline = time.monotonic() + timeout_s
-        for part in self.parts:
-            part.flush(max(0.0, deadline - time.monotonic()))
-
-    def close(self) -> None:
-        """See `Publisher.close`."""
-        for part in self.parts:
-            part.close()
-
-
-def make_publisher(
-    readers: Sequence[Any], transport: str = "auto", *, changes: bool = False
-) -> Publisher | Publishers:
-    """The trainer's end of the transport that is asked for, with its readers connected.
-
-    Args:
-        readers: actor handles with ``receive_weights(version, tensors, published_s)`` and
-            ``open_weights(address)``, as `InferenceWorker` has them.
-        transport: shared_memory, ray, or auto: the former for readers that can reach it, that is run on this
-            machine, and the latter for the others.
-        changes: send only what has changed, where that is less; shared memory only.
-
-    Raises:
-        InputError: shared memory is asked for and not to be had.
-        ray.exceptions.RayError: a reader has died.
-    """
-    if transport not in get_args(Transport):
-        raise InputError(FIELD, transport, f"use one of {', '.join(get_args(Transport))}")
-    if transport != "ray" and available():
-        publisher = SharedMemoryPublisher(len(readers), changes=changes)
-        try:
-            answers = [reader.open_weights.remote(publisher.address) for reader in readers]
-            near = [_answered(answer) for answer in answers]
-            if all(near):
-                return publisher
-            if any(near) and transport == "auto" and not changes:
-                publisher.expect(sum(near))
-                far = [reader for reader, here in zip(readers, near, strict=True) if not here]
-                return Publishers(publisher, RayPublisher(far))
-        except BaseException:
-            publisher.close()
-            raise
-        publisher.close()
-    if transport == "shared_memory":
-        raise InputError(FIELD, transport, "it needs Linux and all workers on one machine; use ray")
-    if changes:
-        raise InputError("trainer.publish_changes", changes, "it needs shared memory: see launch.transport")
-    return RayPublisher(readers)
-
-
-def join(publisher: Publisher | Publishers, reader: Any) -> None:
-    """Has another reader receive what is published, from the newest set on.
-
-    Args:
-        publisher: of `make_publisher`.
-        reader: actor handle, see there.
-
-    Raises:
-        InputError: the trainer's memory is what is shared, and it cannot be reached from there.
-        ray.exceptions.RayError: the reader has died.
-    """
-    for part in publisher.parts if isinstance(publisher, Publishers) else (publisher,):
-        if isinstance(part, RayPublisher):
-            part.add(reader)
-            return
-        if isinstance(part, SharedMemoryPublisher) and _answered(reader.open_weights.remote(part.address)):
-            return
-    raise InputError(FIELD, "shared_memory", "a worker that was started anew is elsewhere; use ray")
-
-
-def _answered(answer: Any) -> bool:
-    try:
-        return bool(ray.get(answer, timeout=CONNECT_S))
-    except ray.exceptions.GetTimeoutError as error:
-        raise TimeoutError(f"a reader has not answered `open_weights` within {CONNECT_S:g} s") from error
 
 
 @dataclass(eq=False)

@@ -176,6 +176,26 @@ def test_a_recipe_that_a_schedule_cannot_have_is_refused(tmp_path: Path):
         bench_throughput(config)
 
 
+def test_a_recipe_is_measured_under_two_schedules(tiny_checkpoint: Path, tmp_path: Path):
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text(
+        "env: {type: simulated, max_steps: 16}\n"
+        "rollout: {workers: 1, worlds: 4, segment_length: 3}\n"
+        "replay: {capacity: 64, min_decisions: 16, ahead: 32, samples_per_insert: 2.0}\n"
+        "trainer: {updates: 12, batch_decisions: 16, warmup_updates: 0, value_warmup_updates: 0}\n"
+    )
+    config = BenchThroughputConfig(
+        recipe=str(recipe), policy_path=str(tiny_checkpoint), schedules=("asynchronous", "synchronous"),
+        seconds=1.0, rounds=1, output_dir=str(tmp_path / "out"),
+    )  # fmt: skip
+    result = bench_throughput(config)
+    assert [len(found["blocks"]) for found in result["schedules"].values()] == [2, 2]
+    assert all(found["decisions_per_s"]["min"] > 0 for found in result["schedules"].values())
+    text = (tmp_path / "out" / "throughput.md").read_text()
+    assert " decisions generated = " in text and text.count("\n| ") == 4
+    assert (tmp_path / "out" / "throughput.png").stat().st_size > 1000
+
+
 def test_the_machine_is_described():
     assert host()["cores"] >= 1 and "ray" in host()["versions"]
     assert set(floors()) == {"memcpy_gb_per_s", "sleep_overshoot_us", "pipe_us"}

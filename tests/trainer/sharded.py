@@ -35,6 +35,7 @@ from accerl_lerobot.policies.value_head import Value
 from accerl_lerobot.trainer import ranks
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.update import Update
+from accerl_lerobot.transport.meeting import LOOPBACK, Meeting, host, only_at, visit
 from tests.trainer.linear import STATE, STD, LinearAdapter, make_segments
 
 TIMEOUT_S = 60.0
@@ -196,11 +197,11 @@ def joined(rank: int, size: int, place: Any) -> ranks.Group:
         size: how many there are.
         place: a queue that tells where they meet.
     """
-    ranks.only_at(ranks.LOOPBACK)
+    only_at(LOOPBACK)
     if rank == 0:
-        store, meeting = ranks.host(ranks.LOOPBACK, size, TIMEOUT_S)
+        store, meeting = host(LOOPBACK, size, TIMEOUT_S)
         for _ in range(size - 1):
             place.put(tuple(meeting))
     else:
-        store = ranks.visit(ranks.Meeting(*place.get()), size, TIMEOUT_S)
+        store = visit(Meeting(*place.get()), size, TIMEOUT_S)
     return ranks.Group(store, rank, size, torch.device("cpu"), TIMEOUT_S)

@@ -23,9 +23,10 @@ import pytest
 import ray as real_ray
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.weights import ray_channel
+from accerl_lerobot.weights import choice, ray_channel
 from accerl_lerobot.weights.channel import monotonic_clock, wall_clock
-from accerl_lerobot.weights.ray_channel import Publishers, RayPublisher, join, make_publisher
+from accerl_lerobot.weights.choice import Publishers, join, make_publisher
+from accerl_lerobot.weights.ray_channel import RayPublisher
 from accerl_lerobot.weights.reader import Received, SharedMemoryReader
 from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
 from tests.local_ray import Handle, Local
@@ -45,7 +46,8 @@ class Ray(Local):
 
 @pytest.fixture(autouse=True)
 def _without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ray_channel, "ray", Ray)
+    for module in (choice, ray_channel):
+        monkeypatch.setattr(module, "ray", Ray)
 
 
 class Inference:
@@ -141,7 +143,7 @@ def test_a_moment_survives_the_way_to_another_machine_s_clock():
 
 
 def test_without_memfd_there_is_ray(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(ray_channel, "available", lambda: False)
+    monkeypatch.setattr(choice, "available", lambda: False)
     publisher = make_publisher([Inference().handle])
     assert isinstance(publisher, RayPublisher)
     publisher.close()
@@ -160,7 +162,7 @@ def test_what_is_not_to_be_had_is_refused(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_a_reader_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(ray_channel, "CONNECT_S", 0.1)
+    monkeypatch.setattr(choice, "CONNECT_S", 0.1)
     silent: Future[bool] = Future()
     with pytest.raises(TimeoutError, match="has not answered `open_weights` within 0.1 s"):
         make_publisher([Handle(open_weights=lambda address: silent)])

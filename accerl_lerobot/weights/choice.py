@@ -1,0 +1,163 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Which way weights go to which reader.
+
+shared memory   to readers on this machine
+Ray             to all others
+gloo, NCCL      to all, if that is asked for
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, get_args
+
+import ray
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.transport.endpoint import FIELD, Transport
+from accerl_lerobot.transport.nameless import available
+from accerl_lerobot.weights.channel import WAY, Way
+from accerl_lerobot.weights.publisher import FLUSH_S, Publisher
+from accerl_lerobot.weights.ray_channel import RayPublisher
+from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
+
+if TYPE_CHECKING:
+    import torch
+
+CONNECT_S = 60.0
+"""How long readers may take to say whether they can map the trainer's memory."""
+
+
+class Publishers:
+    """Several, as one: some readers are on this machine, and some on others. Each copies a set for itself.
+
+    Args:
+        parts: of which each has its own readers.
+    """
+
+    on_device = False
+    """See `Publisher`."""
+
+    def __init__(self, *parts: Publisher) -> None:
+        self.parts = parts
+
+    def publish(self, version: int, tensors: Mapping[str, Any]) -> None:
+        """See `Publisher.publish`."""
+        for part in self.parts:
+            part.publish(version, tensors)
+
+    def flush(self, timeout_s: float = FLUSH_S) -> None:
+        """See `Publisher.flush`."""
+        deadline = time.monotonic() + timeout_s
+        for part in self.parts:
+            part.flush(max(0.0, deadline - time.monotonic()))
+
+    def close(self) -> None:
+        """See `Publisher.close`."""
+        for part in self.parts:
+            part.close()
+
+
+def make_publisher(
+    readers: Sequence[Any],
+    transport: str = "auto",
+    *,
+    changes: bool = False,
+    way: str = "auto",
+    device: torch.device | None = None,
+) -> Publisher | Publishers:
+    """The trainer's end of the transport that is asked for, with its readers connected.
+
+    Args:
+        readers: actor handles with ``receive_weights(version, tensors, published_s)`` and
+            ``open_weights(address)``, as `InferenceWorker` has them; and see `DirectPublisher`.
+        transport: shared_memory, ray, or auto: the former for readers that can reach it, that is run on this
+            machine, and the latter for the others.
+        changes: send only what has changed, where that is less; shared memory only.
+        way: gloo or nccl, in place of `transport`, which is for the rest of the run then; auto: by that.
+        device: of the trainer's policy; NCCL sends from there.
+
+    Raises:
+        InputError: shared memory or NCCL is asked for and not to be had.
+        RuntimeError: gloo or NCCL does not reach a reader.
+        ray.exceptions.RayError: a reader has died.
+    """
+    if transport not in get_args(Transport):
+        raise InputError(FIELD, transport, f"use one of {', '.join(get_args(Transport))}")
+    if way != "auto":
+        return _direct(readers, way, changes, device)
+    if transport != "ray" and available():
+        publisher = SharedMemoryPublisher(len(readers), changes=changes)
+        try:
+            answers = [reader.open_weights.remote(publisher.address) for reader in readers]
+            near = [_answered(answer) for answer in answers]
+            if all(near):
+                return publisher
+            if any(near) and transport == "auto" and not changes:
+                publisher.expect(sum(near))
+                far = [reader for reader, here in zip(readers, near, strict=True) if not here]
+                return Publishers(publisher, RayPublisher(far))
+        except BaseException:
+            publisher.close()
+            raise
+        publisher.close()
+    if transport == "shared_memory":
+        raise InputError(FIELD, transport, "it needs Linux and all workers on one machine; use ray")
+    if changes:
+        raise InputError("trainer.publish_changes", changes, "it needs shared memory: see launch.transport")
+    return RayPublisher(readers)
+
+
+def join(publisher: Publisher | Publishers, reader: Any) -> None:
+    """Has another reader receive what is published, from the newest set on.
+
+    Args:
+        publisher: of `make_publisher`.
+        reader: actor handle, see there.
+
+    Raises:
+        InputError: the trainer's memory is what is shared, and it cannot be reached from there.
+        ray.exceptions.RayError: the reader has died.
+    """
+    for part in publisher.parts if isinstance(publisher, Publishers) else (publisher,):
+        if not isinstance(part, SharedMemoryPublisher):
+            part.add(reader)
+            return
+        if _answered(reader.open_weights.remote(part.address)):
+            return
+    raise InputError(FIELD, "shared_memory", "a worker that was started anew is elsewhere; use ray")
+
+
+def _direct(readers: Sequence[Any], way: str, changes: bool, device: torch.device | None) -> Publisher:
+    from accerl_lerobot.weights.direct import DirectPublisher
+
+    if way not in get_args(Way):
+        raise InputError(WAY, way, f"use one of {', '.join(get_args(Way))}")
+    if changes:
+        raise InputError("trainer.publish_changes", changes, f"it needs shared memory: leave {WAY} out")
+    if way == "gloo":
+        return DirectPublisher(readers, "gloo")
+    if device is None or device.type != "cuda":
+        remedy = f"the trainer's policy is on {device or 'the CPU'}, and NCCL wants a GPU; use auto or gloo"
+        raise InputError(WAY, way, remedy)
+    return DirectPublisher(readers, "nccl", device)
+
+
+def _answered(answer: Any) -> bool:
+    try:
+        return bool(ray.get(answer, timeout=CONNECT_S))
+    except ray.exceptions.GetTimeoutError as error:
+        raise TimeoutError(f"a reader has not answered `open_weights` within {CONNECT_S:g} s") from error

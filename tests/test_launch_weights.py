@@ -1,0 +1,66 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A run whose weights go straight from the trainer to each inference service, through gloo.
+
+Two services; one is killed in mid-run, and the one that takes its place gets the newest weights.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+from accerl_lerobot.config import LaunchConfig
+from accerl_lerobot.inference.worker import InferenceConfig
+from accerl_lerobot.launch import RayEngine
+from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.trainer.config import TrainerConfig
+from tests.runs import polls, tiny_run
+from tests.test_ray_environment import LOOPBACK, listening
+
+
+def test_updates_go_on_and_acting_and_learning_agree(tiny_checkpoint: Path):
+    config = tiny_run(
+        tiny_checkpoint,
+        launch=LaunchConfig(weights="gloo"),
+        inference=InferenceConfig(workers=2),
+        rollout=RolloutConfig(workers=2, worlds=2, segment_length=3),
+        trainer=TrainerConfig(
+            updates=1000, batch_decisions=16, warmup_updates=0, value_warmup_updates=1, probe_every=3
+        ),
+    )
+    engine = RayEngine(config, ("match",))
+    try:
+        pids = engine.pids()
+        engine.train()
+        mismatches: list[float] = []
+        addresses: set[str] = set()
+        lost_at = back_at = 0
+        for progress in polls(engine):
+            found = [u["logprob/mismatch_max"] for u in progress.updates if "logprob/mismatch_max" in u]
+            mismatches += found if not lost_at or back_at else []
+            served = progress.inference.get("version", 0.0)
+            if not lost_at and served >= 4:
+                addresses = set(listening())
+                lost_at = progress.version
+                os.kill(pids["inference 1"], signal.SIGKILL)
+            if lost_at and not back_at and progress.inference["restarts"] and engine.pids()["inference 1"]:
+                back_at = progress.version if all(engine._inference.up) else 0
+            if back_at and served > back_at + 3 and len(mismatches) >= 4:
+                break
+        assert max(mismatches) <= 1e-4
+        assert addresses and addresses <= LOOPBACK
+    finally:
+        engine.close()
