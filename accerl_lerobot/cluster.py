@@ -46,7 +46,7 @@ from accerl_lerobot.engine import WorkerError
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.placement import Node, Place, Plan, asked, candidates, planned
 from accerl_lerobot.placement_config import WHERE
-from accerl_lerobot.ray_environment import has_token, passed_on, without_token
+from accerl_lerobot.ray_environment import check_private, has_token, passed_on, without_token
 from accerl_lerobot.stopping import Stopping
 from accerl_lerobot.transport.shared_memory import this_node
 
@@ -83,6 +83,7 @@ def start_ray(launch: LaunchConfig | None = None) -> None:
         if launch is not None and launch.address is not None:
             _join(launch)
             return
+        check_private()
         ray.init(
             address="local",
             include_dashboard=False,

@@ -70,9 +70,10 @@ class LaunchConfig:
     a message is written where the other process reads it. ray: it is copied, to any node. auto: shared memory
     between processes of one node, if the system has it, and Ray otherwise.
     """
-    weights: Way = "auto"
-    """How weights reach inference. auto: as `transport` says. gloo, nccl: torch.distributed carries them from
-    the trainer to each inference worker; nccl from GPU to GPU, for which each of them needs one of its own.
+    weights: Way = "ray"
+    """How weights reach inference where they do not go through shared memory. ray: through its object stores.
+    gloo: torch.distributed sends them straight to each inference service, which is faster, and asks for no
+    token.
     """
     stall_s: float = 300.0
     """How long, in seconds, a worker may owe an answer or a world a step, and a run stand still; > 0.
@@ -102,7 +103,7 @@ class LaunchConfig:
             raise InputError(FIELD, self.transport, f"use {' or '.join(get_args(Transport))}")
         if self.weights not in get_args(Way):
             raise InputError(WAY, self.weights, f"use {' or '.join(get_args(Way))}")
-        if self.weights != "auto" and self.engine == "local":
+        if self.weights != "ray" and self.engine == "local":
             raise InputError(WAY, self.weights, "launch.engine=local is one process; leave the field out")
         self._check_cluster()
         if not self.stall_s > 0:
@@ -207,10 +208,10 @@ class RunConfig:
         if self.trainer.publish_changes and self.launch.transport == "ray":
             remedy = "it needs shared memory: use launch.transport=auto, or leave the field out"
             raise InputError("trainer.publish_changes", True, remedy)
-        if self.trainer.publish_changes and self.launch.weights != "auto":
-            raise InputError("trainer.publish_changes", True, f"it needs shared memory: leave {WAY} out")
-        if self.launch.weights == "nccl" and self.policy.device == "cpu":
-            raise InputError(WAY, "nccl", "policy.device=cpu leaves GPUs alone; use auto or gloo")
+        if self.launch.weights != "ray" and self.launch.transport == "shared_memory":
+            raise InputError(
+                WAY, self.launch.weights, "launch.transport=shared_memory leaves nothing to it; use auto"
+            )
         if self.inference.workers > 1 and self.launch.engine == "local":
             remedy = "launch.engine=local is one process; use launch.engine=ray, or 1"
             raise InputError("inference.workers", self.inference.workers, remedy)

@@ -35,7 +35,6 @@ from typing import TYPE_CHECKING, NamedTuple
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.placement_config import WHERE, RoleConfig
 from accerl_lerobot.transport.endpoint import FIELD
-from accerl_lerobot.weights.channel import WAY
 
 if TYPE_CHECKING:
     from accerl_lerobot.config import RunConfig
@@ -208,7 +207,6 @@ def planned(nodes: Sequence[Node], config: RunConfig) -> Plan:
     places["replay"] = Place(nodes[0], 0.0, 0.0)
     plan = Plan(tuple(nodes), places)
     _check_memory(plan, config)
-    _check_nccl(plan, config)
     return plan
 
 
@@ -350,21 +348,6 @@ def _check_memory(plan: Plan, config: RunConfig) -> None:
         if far is not None:
             remedy = f"inference on {far} shares no memory with the trainer; leave the field out"
             raise InputError("trainer.publish_changes", True, remedy)
-
-
-def _check_nccl(plan: Plan, config: RunConfig) -> None:
-    """Refuses weights from GPU to GPU where the trainer and an inference service could be on the same one."""
-    if config.launch.weights != "nccl":
-        return
-    trainer = plan.places["trainer"]
-    for name, place in plan.places.items():
-        apart = place.node.number != trainer.node.number or place.gpus + trainer.gpus > 1 + TINY
-        if name.startswith("inference") and not (apart and place.gpus and trainer.gpus):
-            found = (
-                f"trainer × {trainer.gpus:g} and {name} × {place.gpus:g} GPU on {place.node}: not one each"
-            )
-            remedy = f"use {WHERE}.trainer.gpus=1 and {WHERE}.inference.gpus=1, or auto or gloo"
-            raise InputError(WAY, "nccl", f"{found}; {remedy}")
 
 
 def _bins(gpus: float) -> list[float]:

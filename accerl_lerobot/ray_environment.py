@@ -80,6 +80,16 @@ def prepare(joins: bool = False) -> None:
         os.environ["RAY_AUTH_TOKEN_PATH"] = str(write_token())
 
 
+def check_private() -> None:
+    """Refuses to start a Ray of our own that others could talk to.
+
+    Raises:
+        RuntimeError: Ray has been imported before `prepare`, by whoever has written this program.
+    """
+    if not all(os.environ.get(key) for key in PRIVATE) or not any(os.environ.get(key) for key in _AUTH):
+        raise RuntimeError("ray_environment.prepare() must come before Ray is imported")
+
+
 def has_token() -> bool:
     """Whether there is a token of the user's where Ray looks for one."""
     if os.environ.get("RAY_AUTH_TOKEN"):

@@ -175,15 +175,11 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--seed=100"], "seed=100: use 0 to 99"),
     (["--launch.engine=slurm"], "launch.engine='slurm': use ray or local"),
     (["--launch.transport=tcp"], "launch.transport='tcp': use one of auto, ray, shared_memory"),
-    (["--launch.weights=mpi"], "launch.weights='mpi': use one of auto, gloo, nccl"),
+    (["--launch.weights=mpi"], "launch.weights='mpi': use one of ray, gloo"),
     (["--launch.weights=gloo", "--launch.engine=local"], "launch.weights='gloo': launch.engine=local is one"),
     (
-        ["--launch.weights=nccl", "--policy.device=cpu"],
-        "launch.weights='nccl': policy.device=cpu leaves GPUs",
-    ),
-    (
-        ["--launch.weights=gloo", "--trainer.publish_changes=true"],
-        "trainer.publish_changes=True: it needs shared memory: leave launch.weights out",
+        ["--launch.weights=gloo", "--launch.transport=shared_memory"],
+        "launch.weights='gloo': launch.transport=shared_memory leaves nothing to it; use auto",
     ),
     (["--rollout.group_size=1"], "rollout.group_size=1: groups of one have no comparison; use 0"),
     (["--rollout.group_advantage=gae"], "rollout.group_advantage='gae': use one of grpo, rloo, grpo_no_std"),

@@ -34,7 +34,7 @@ from tests.test_ray_environment import LOOPBACK, listening
 def test_updates_go_on_and_acting_and_learning_agree(tiny_checkpoint: Path):
     config = tiny_run(
         tiny_checkpoint,
-        launch=LaunchConfig(weights="gloo"),
+        launch=LaunchConfig(weights="gloo", transport="ray"),
         inference=InferenceConfig(workers=2),
         rollout=RolloutConfig(workers=2, worlds=2, segment_length=3),
         trainer=TrainerConfig(

@@ -61,7 +61,6 @@ def run(
     dreams: int = 0,
     device: str = "auto",
     transport: Any = "auto",
-    weights: Any = "auto",
     publish_changes: bool = False,
     **placement: RoleConfig,
 ) -> RunConfig:
@@ -76,9 +75,7 @@ def run(
         inference=InferenceConfig(workers=services),
         rollout=RolloutConfig(workers=max(rollouts, services), worlds=1, segment_length=3),
         imagination=ImaginationConfig(share=0.5 if dreams else 0.0, model="oracle", workers=max(1, dreams)),
-        launch=LaunchConfig(
-            address="auto", transport=transport, weights=weights, placement=PlacementConfig(**placement)
-        ),
+        launch=LaunchConfig(address="auto", transport=transport, placement=PlacementConfig(**placement)),
     )
 
 
@@ -306,20 +303,3 @@ def test_a_run_that_does_not_fit_does_not_begin(tmp_path: Path):
     ):
         train(config, tmp_path, Console())
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
-
-
-def test_nccl_wants_a_gpu_for_the_trainer_and_one_for_each_service():
-    two = cluster((8, 2), (8, 1))
-    planned(two, run(weights="nccl"))  # nothing said, each has one
-    planned(two, run(weights="nccl", trainer=at(gpus=0.6), inference=at(gpus=0.6)))
-    planned(two, run(weights="nccl", trainer=at("0", gpus=0.5), inference=at("1", gpus=0.5)))
-    planned(cluster((8, 1)), run(weights="gloo"))
-    with pytest.raises(
-        InputError,
-        match=r"launch.weights='nccl': trainer × 0.5 and inference × 0.5 GPU on node 0 .* not one",
-    ):
-        planned(cluster((8, 1)), run(weights="nccl"))
-    with pytest.raises(InputError, match=r"trainer × 1 and inference 0 × 0 GPU on node 0"):
-        planned(two, run(weights="nccl", services=2, trainer=at(gpus=1), inference=at(gpus=0)))
-    with pytest.raises(InputError, match=r"launch.weights='nccl': trainer × 0 and inference × 0 GPU"):
-        planned(cluster((8, 0)), run(weights="nccl"))

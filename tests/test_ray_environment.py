@@ -280,3 +280,31 @@ def test_a_client_in_such_a_process_finds_no_token(tmp_path: Path):
 
     assert token({"HF_HOME": str(tmp_path)}) == "hf_storedstoredstored"
     assert token({"HF_HOME": str(tmp_path)} | ray_environment.TOKENLESS["runtime_env"]["env_vars"]) == "None"
+
+
+def test_a_ray_that_others_could_talk_to_is_not_started():
+    """Ray first, `prepare` after: too late for what Ray reads when it is imported."""
+    program = (
+        "import ray\nfrom accerl_lerobot import ray_environment\nray_environment.prepare()\n"
+        "from accerl_lerobot.cluster import start_ray\nstart_ray()\n"
+    )
+    clean = {k: v for k, v in os.environ.items() if not k.startswith("RAY_")}
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=clean, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 1 and "prepare() must come before Ray is imported" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["weights", "--sizes_mb=[1]", "--readers=[1]", "--repeats=1", "--tensors=2"],
+        ["transport", '--sizes=["12 KB"]', "--callers=[1]", "--calls=10", "--rounds=1"],
+    ],
+    ids=lambda options: options[0],
+)
+def test_benches_that_start_ray_by_themselves_have_prepared_for_it(options: list[str]):
+    clean = {k: v for k, v in os.environ.items() if not k.startswith("RAY_")}
+    command = [sys.executable, "-m", "accerl_lerobot.cli", "bench", *options]
+    done = subprocess.run(command, env=clean, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr[-2000:]

@@ -38,6 +38,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from accerl_lerobot import ray_environment
 from accerl_lerobot.bench.host import host, spread
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, check_absent
@@ -122,6 +123,7 @@ def bench_transport(config: BenchTransportConfig) -> dict[str, Any]:
     Raises:
         InputError: `output_dir` exists, or this system has no shared memory.
     """
+    ray_environment.prepare()
     from accerl_lerobot.bench.transport_ends import Crowd
 
     folder = None if config.output_dir is None else Path(config.output_dir).expanduser()

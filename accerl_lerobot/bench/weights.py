@@ -26,6 +26,7 @@ reader processes; of each block the last publication counts, when all memory has
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import perf_counter
@@ -34,21 +35,24 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot import snapshot
+from accerl_lerobot import ray_environment, snapshot
 from accerl_lerobot.bench.host import host, ranged, spread
 from accerl_lerobot.bench.study import as_markdown, as_table, named, write
 from accerl_lerobot.checkpoint import TRAINING_STATE, WEIGHTS
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, check_absent
+from accerl_lerobot.weights.channel import Way
 
-ARMS: dict[str, tuple[str, bool, float]] = {
-    "shared memory": ("shared_memory", False, 1.0),
-    "Ray": ("ray", False, 1.0),
-    "gloo": ("gloo", False, 1.0),
-    "changes, 1 %": ("shared_memory", True, 0.01),
-    "changes, 100 %": ("shared_memory", True, 1.0),
+ARMS: dict[str, tuple[str, Way, bool, float]] = {
+    "shared memory": ("shared_memory", "ray", False, 1.0),
+    "Ray": ("ray", "ray", False, 1.0),
+    "gloo": ("ray", "gloo", False, 1.0),
+    "changes, 1 %": ("shared_memory", "ray", True, 0.01),
+    "changes, 100 %": ("shared_memory", "ray", True, 1.0),
 }
-"""Arm → transport or way, whether only changes are sent, and the share of values that an update changes."""
+"""Arm → transport and way, whether only changes are sent, and the share of values that an update changes."""
+FAR = ("Ray", "gloo")
+"""Those that lead to other nodes."""
 MB = 1 << 20
 WARM = 4
 """Publications of a block that do not count: until all slabs have been written to and mapped."""
@@ -70,6 +74,9 @@ class BenchWeightsConfig:
     """Publications of each arm that count, each in a block of its own."""
     seed: int = 0
     """Of the values, and of which ones change."""
+    apart: bool = False
+    """Readers are on a Ray node of their own, with an object store of its own, and share no memory: what lies
+    between two machines, but for the cable."""
     output_dir: str | None = None
     """Folder for weights.json, weights.md and weights.png; must not exist. None: nothing is written."""
     checkpoints: str | None = None
@@ -96,17 +103,22 @@ def bench_weights(config: BenchWeightsConfig) -> dict[str, Any]:
         ``config``; ``host`` before and after.
 
     Raises:
-        InputError: the folder exists, or there are no checkpoints.
+        InputError: the folder exists, there are no checkpoints, or readers are to be apart and Ray is there.
     """
     root = None if config.output_dir is None else Path(config.output_dir).expanduser()
     if root is not None:
         check_absent(root)
     changed = [] if config.checkpoints is None else changed_shares(Path(config.checkpoints).expanduser())
+    ray_environment.prepare()
+    from accerl_lerobot.bench.weights_readers import two_nodes
+
     before, console, cells = host(), Console(), []
-    for size in config.sizes_mb:
-        for readers in config.readers:
-            with console.stage(f"{size} MB, {readers} readers"):
-                cells += _measure(config, size, readers)
+    largest = max(config.readers), MB * max(config.sizes_mb)
+    with two_nodes(*largest) if config.apart else nullcontext():
+        for size in config.sizes_mb:
+            for readers in config.readers:
+                with console.stage(f"{size} MB, {readers} readers"):
+                    cells += _measure(config, size, readers)
     result = {"config": asdict(config), "cells": cells, "changed": changed, "host": [before, host()]}
     if root is not None:
         root.mkdir(parents=True)
@@ -169,7 +181,7 @@ def draw(path: Path, result: dict[str, Any]) -> None:
     )
     for row, readers in zip(panels, config["readers"], strict=True):
         for axes, (kind, label) in zip(row, kinds.items(), strict=True):
-            for arm in ARMS:
+            for arm in _arms(config["apart"]):
                 cells = [c for c in result["cells"] if (c["arm"], c["readers"]) == (arm, readers)]
                 middle = [c[kind]["median"] for c in cells]
                 ends = [
@@ -194,12 +206,17 @@ def _measure(config: BenchWeightsConfig, size_mb: int, readers: int) -> list[dic
     elements = max(1, size_mb * MB // 4 // config.tensors)
     tensors = {f"t{i}": rng.random(elements, np.float32) for i in range(config.tensors)}
     copy = {name: np.zeros_like(tensor) for name, tensor in tensors.items()}
-    blocks: dict[str, list[dict[str, float]]] = {arm: [] for arm in ARMS}
-    with reading(readers, config.tensors, elements) as handles:
+    arms = _arms(config.apart)
+    blocks: dict[str, list[dict[str, float]]] = {arm: [] for arm in arms}
+    with reading(readers, config.tensors, elements, apart=config.apart) as handles:
         for repeat in range(config.repeats):
-            for arm in list(ARMS)[:: -1 if repeat % 2 else 1]:
+            for arm in arms[:: -1 if repeat % 2 else 1]:
                 blocks[arm].append(_block(arm, handles, tensors, copy, rng))
     return [_cell(size_mb, readers, arm, notes) for arm, notes in blocks.items()]
+
+
+def _arms(apart: bool) -> list[str]:
+    return list(FAR if apart else ARMS)
 
 
 def _block(
@@ -209,9 +226,8 @@ def _block(
     from accerl_lerobot.bench.weights_readers import ask
     from accerl_lerobot.weights.choice import make_publisher
 
-    transport, changes, share = ARMS[arm]
-    way = {"transport": "auto", "way": transport} if transport == "gloo" else {"transport": transport}
-    publisher = make_publisher(handles, changes=changes, **way)
+    transport, way, changes, share = ARMS[arm]
+    publisher = make_publisher(handles, transport, changes=changes, way=way)
     try:
         for version in range(WARM + 1):
             _update(tensors, 0.0, rng)

@@ -22,15 +22,16 @@ from typing import Any
 
 import numpy as np
 import ray
-import torch
 
 from accerl_lerobot.cluster import start_ray
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.transport.meeting import Meeting
 from accerl_lerobot.weights.channel import Tensors, monotonic_clock
 from accerl_lerobot.weights.direct import Coming, DirectReader
-from accerl_lerobot.weights.pair import Backend, place_of
 from accerl_lerobot.weights.reader import Received, SharedMemoryReader
 
+_APART = "apart"
+"""Resource of the node that is not this one."""
 READY_S = 120.0
 """How long they may take to start, and to answer."""
 
@@ -62,13 +63,13 @@ class ReadingWorker:
         self._apply(Received(version=version, tensors=tensors, published_s=published_s, nbytes=nbytes))
         return version
 
-    def weights_place(self) -> tuple[str, str]:
+    def node(self) -> str:
         """See `InferenceWorker`."""
-        return place_of(torch.device("cpu"))
+        return str(ray.get_runtime_context().get_node_id())
 
-    def meet_publisher(self, meeting: Meeting, backend: Backend) -> None:
+    def meet_publisher(self, meeting: Meeting) -> None:
         """See `InferenceWorker`."""
-        self._direct = DirectReader(meeting, backend, None, self._apply)
+        self._direct = DirectReader(meeting, self._apply)
 
     def receive_directly(self, coming: Coming) -> int:
         """See `InferenceWorker`."""
@@ -110,11 +111,20 @@ class ReadingWorker:
 
 
 @contextmanager
-def reading(count: int, tensors: int, elements: int) -> Iterator[list[Any]]:
-    """So many of them, ready; they end with the block. Ray is started if it is not there."""
+def reading(count: int, tensors: int, elements: int, *, apart: bool = False) -> Iterator[list[Any]]:
+    """So many of them, ready; they end with the block. Ray is started if it is not there.
+
+    Args:
+        count: how many.
+        tensors: of a set.
+        elements: of each tensor, float32.
+        apart: on the other node of `two_nodes`.
+
+    """
     if not ray.is_initialized():
         start_ray()
-    worker = ray.remote(ReadingWorker).options(num_cpus=0, max_concurrency=4)
+    there = {_APART: 1.0} if apart else {}
+    worker = ray.remote(ReadingWorker).options(num_cpus=0, max_concurrency=4, resources=there)
     handles = [worker.remote(tensors, elements) for _ in range(count)]
     try:
         for handle in handles:
@@ -123,6 +133,38 @@ def reading(count: int, tensors: int, elements: int) -> Iterator[list[Any]]:
     finally:
         for handle in handles:
             ray.kill(handle)
+
+
+@contextmanager
+def two_nodes(readers: int, nbytes: int) -> Iterator[None]:
+    """A Ray of two nodes on this machine, once in a process; the other one is for those that read apart.
+
+    Args:
+        readers: how many there will be at most.
+        nbytes: of a set, at most; each node has room for a few.
+
+    Raises:
+        InputError: Ray is there already, with one node.
+    """
+    from ray.cluster_utils import Cluster
+
+    if ray.is_initialized():
+        raise InputError("apart", True, "Ray has been started already, with one node; leave it out")
+    cluster = Cluster()
+    try:
+        for resources in ({}, {_APART: float(readers)}):
+            cluster.add_node(
+                num_cpus=1,
+                include_dashboard=False,
+                node_ip_address="127.0.0.1",
+                resources=resources,
+                object_store_memory=6 * nbytes + (1 << 28),
+            )
+        ray.init(address=cluster.address, log_to_driver=False, configure_logging=False)
+        yield
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
 
 
 def ask(handle: Any, method: str, *arguments: Any) -> Any:

@@ -55,7 +55,6 @@ from accerl_lerobot.weights.reader import Received, SharedMemoryReader
 if TYPE_CHECKING:
     from accerl_lerobot.transport.meeting import Meeting
     from accerl_lerobot.weights.direct import Coming, DirectReader
-    from accerl_lerobot.weights.pair import Backend
 
 LOOK_S = 1.0
 """How long the thread that serves waits at most before it looks whether it is still wanted."""
@@ -172,18 +171,17 @@ class InferenceWorker:
             return False
         return True
 
-    async def weights_place(self) -> tuple[str, str]:
-        """Where its weights are, see `weights.pair.Place`."""
-        from accerl_lerobot.weights.pair import place_of
+    async def node(self) -> str:
+        """Which machine it is on."""
+        import ray
 
-        return place_of(self._adapter.device)
+        return str(ray.get_runtime_context().get_node_id())
 
-    async def meet_publisher(self, meeting: Meeting, backend: Backend) -> None:
+    async def meet_publisher(self, meeting: Meeting) -> None:
         """Receives weights straight from the trainer from now on, see `weights.direct`."""
         from accerl_lerobot.weights.direct import DirectReader
 
-        device = self._adapter.device if backend == "nccl" else None
-        self._direct = await asyncio.to_thread(DirectReader, meeting, backend, device, self._offer)
+        self._direct = await asyncio.to_thread(DirectReader, meeting, self._offer)
 
     async def receive_directly(self, coming: Coming) -> int:
         """Takes the set that comes; it serves from the next batch on."""

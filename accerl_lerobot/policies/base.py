@@ -20,7 +20,7 @@ both run the same code on the same weights, so the ratio at equal weights is 1.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -121,12 +121,12 @@ class PolicyAdapter(nn.Module, ABC):
         """
 
     def load_trainable(
-        self, tensors: Mapping[str, Any], changed: dict[str, np.ndarray] | None = None
+        self, tensors: dict[str, np.ndarray], changed: dict[str, np.ndarray] | None = None
     ) -> None:
         """Copies published weights in place: all of them, or none when they do not fit.
 
         Args:
-            tensors: by name, all that `trainable` has; arrays or tensors.
+            tensors: by name, all that `trainable` has.
             changed: name → indices of the elements, flattened, that are to be copied, where the others are
                 known to be equal; None: all.
 
@@ -157,24 +157,17 @@ class PolicyAdapter(nn.Module, ABC):
 
         On a CPU they are the parameters' own memory, else copies of them.
         """
-        return {name: tensor.cpu().numpy() for name, tensor in self.view_trainable_there().items()}
-
-    def view_trainable_there(self) -> dict[str, Tensor]:
-        """`trainable` in float32 on its device, to be copied before the next update."""
-        return {
-            name: whole(parameter.detach()).to(torch.float32) for name, parameter in self.trainable().items()
-        }
+        named = {name: whole(parameter.detach()) for name, parameter in self.trainable().items()}
+        return {name: tensor.to("cpu", torch.float32).numpy() for name, tensor in named.items()}
 
     def export_trainable(self) -> dict[str, np.ndarray]:
         """A copy of `trainable` as NumPy arrays, safe to hand to another thread."""
         return {name: view.copy() for name, view in self.view_trainable().items()}
 
 
-def _copy(parameter: nn.Parameter, tensor: np.ndarray | Tensor) -> None:
+def _copy(parameter: nn.Parameter, tensor: np.ndarray) -> None:
     """Arrays that were received are read-only, which torch cannot express: NumPy copies where it can."""
-    if isinstance(tensor, Tensor):
-        parameter.copy_(part_of(tensor, parameter))
-    elif parameter.device.type == "cpu" and parameter.dtype == torch.float32 and not in_parts(parameter):
+    if parameter.device.type == "cpu" and parameter.dtype == torch.float32 and not in_parts(parameter):
         np.copyto(parameter.detach().numpy(), tensor)
     else:
         parameter.copy_(part_of(torch.tensor(tensor), parameter))

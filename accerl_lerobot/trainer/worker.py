@@ -93,7 +93,7 @@ class TrainerWorker:
         """Answers once the policy is loaded; returns this process's id."""
         return os.getpid()
 
-    def run(self, replay: Any, readers: list[Any], transport: str = "auto", way: str = "auto") -> int:
+    def run(self, replay: Any, readers: list[Any], transport: str = "auto", way: str = "ray") -> int:
         """Trains; returns the number of updates made.
 
         Args:
@@ -103,17 +103,11 @@ class TrainerWorker:
             way: see there.
         """
         self._clock.enter(WEIGHT_SYNC)
-        publisher = make_publisher(
-            readers,
-            transport,
-            changes=self._config.publish_changes,
-            way=way,
-            device=self._update.adapter.device,
-        )
+        publisher = make_publisher(readers, transport, changes=self._config.publish_changes, way=way)
         try:
             # A checkpoint need not hold a critic: all start from this one.
             with self._lock:
-                self._hand_over(publisher, self._update.version, self._view(publisher))
+                self._hand_over(publisher, self._update.version, self._view())
             self._publisher = publisher
             self._publishing.set()
             self._train(replay, publisher)
@@ -192,7 +186,7 @@ class TrainerWorker:
     def _publish(self, publisher: Publisher | Publishers, held: HeldBack, last: bool) -> None:
         """Hands the weights of now over, or those that are old enough."""
         if not held.updates:
-            self._hand_over(publisher, self._update.version, self._view(publisher))
+            self._hand_over(publisher, self._update.version, self._view())
             return
         for due in held.push(self._update.version, self._export(), last=last):
             self._hand_over(publisher, *due)
@@ -231,11 +225,10 @@ class TrainerWorker:
         snapshot.save(directory / TRAINING_STATE / WEIGHTS, trained)
         snapshot.save(directory / TRAINING_STATE / "trainer", state)
 
-    def _view(self, publisher: Publisher | Publishers) -> dict[str, Any]:
+    def _view(self) -> dict[str, Any]:
         """Trainable weights, to be copied before the next update."""
-        adapter = self._update.adapter
         with self._peers.lending("lend_weights"):
-            return adapter.view_trainable_there() if publisher.on_device else adapter.view_trainable()
+            return self._update.adapter.view_trainable()
 
     def _export(self) -> dict[str, Any]:
         with self._peers.lending("lend_weights"):

@@ -34,8 +34,8 @@ from typing import Literal
 
 import numpy as np
 
-Way = Literal["auto", "gloo", "nccl"]
-"""What carries weights from the trainer to inference; auto is shared memory or Ray."""
+Way = Literal["ray", "gloo"]
+"""What carries weights from the trainer to readers with which it shares no memory."""
 WAY = "launch.weights"
 Tensors = dict[str, np.ndarray]
 """Parameter name → array; dtype and shape arrive as they were sent."""

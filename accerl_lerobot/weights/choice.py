@@ -14,15 +14,14 @@
 """Which way weights go to which reader.
 
 shared memory   to readers on this machine
-Ray             to all others
-gloo, NCCL      to all, if that is asked for
+Ray, or gloo    to all others
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import ray
 
@@ -34,9 +33,6 @@ from accerl_lerobot.weights.publisher import FLUSH_S, Publisher
 from accerl_lerobot.weights.ray_channel import RayPublisher
 from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
 
-if TYPE_CHECKING:
-    import torch
-
 CONNECT_S = 60.0
 """How long readers may take to say whether they can map the trainer's memory."""
 
@@ -47,9 +43,6 @@ class Publishers:
     Args:
         parts: of which each has its own readers.
     """
-
-    on_device = False
-    """See `Publisher`."""
 
     def __init__(self, *parts: Publisher) -> None:
         self.parts = parts
@@ -76,8 +69,7 @@ def make_publisher(
     transport: str = "auto",
     *,
     changes: bool = False,
-    way: str = "auto",
-    device: torch.device | None = None,
+    way: str = "ray",
 ) -> Publisher | Publishers:
     """The trainer's end of the transport that is asked for, with its readers connected.
 
@@ -87,18 +79,17 @@ def make_publisher(
         transport: shared_memory, ray, or auto: the former for readers that can reach it, that is run on this
             machine, and the latter for the others.
         changes: send only what has changed, where that is less; shared memory only.
-        way: gloo or nccl, in place of `transport`, which is for the rest of the run then; auto: by that.
-        device: of the trainer's policy; NCCL sends from there.
+        way: to the others, ray or gloo.
 
     Raises:
-        InputError: shared memory or NCCL is asked for and not to be had.
-        RuntimeError: gloo or NCCL does not reach a reader.
+        InputError: shared memory is asked for and not to be had.
+        RuntimeError: gloo does not reach a reader.
         ray.exceptions.RayError: a reader has died.
     """
     if transport not in get_args(Transport):
         raise InputError(FIELD, transport, f"use one of {', '.join(get_args(Transport))}")
-    if way != "auto":
-        return _direct(readers, way, changes, device)
+    if way not in get_args(Way):
+        raise InputError(WAY, way, f"use one of {', '.join(get_args(Way))}")
     if transport != "ray" and available():
         publisher = SharedMemoryPublisher(len(readers), changes=changes)
         try:
@@ -109,7 +100,7 @@ def make_publisher(
             if any(near) and transport == "auto" and not changes:
                 publisher.expect(sum(near))
                 far = [reader for reader, here in zip(readers, near, strict=True) if not here]
-                return Publishers(publisher, RayPublisher(far))
+                return Publishers(publisher, _to_the_far(far, way))
         except BaseException:
             publisher.close()
             raise
@@ -118,7 +109,7 @@ def make_publisher(
         raise InputError(FIELD, transport, "it needs Linux and all workers on one machine; use ray")
     if changes:
         raise InputError("trainer.publish_changes", changes, "it needs shared memory: see launch.transport")
-    return RayPublisher(readers)
+    return _to_the_far(readers, way)
 
 
 def join(publisher: Publisher | Publishers, reader: Any) -> None:
@@ -141,19 +132,12 @@ def join(publisher: Publisher | Publishers, reader: Any) -> None:
     raise InputError(FIELD, "shared_memory", "a worker that was started anew is elsewhere; use ray")
 
 
-def _direct(readers: Sequence[Any], way: str, changes: bool, device: torch.device | None) -> Publisher:
+def _to_the_far(readers: Sequence[Any], way: str) -> Publisher:
+    if way == "ray":
+        return RayPublisher(readers)
     from accerl_lerobot.weights.direct import DirectPublisher
 
-    if way not in get_args(Way):
-        raise InputError(WAY, way, f"use one of {', '.join(get_args(Way))}")
-    if changes:
-        raise InputError("trainer.publish_changes", changes, f"it needs shared memory: leave {WAY} out")
-    if way == "gloo":
-        return DirectPublisher(readers, "gloo")
-    if device is None or device.type != "cuda":
-        remedy = f"the trainer's policy is on {device or 'the CPU'}, and NCCL wants a GPU; use auto or gloo"
-        raise InputError(WAY, way, remedy)
-    return DirectPublisher(readers, "nccl", device)
+    return DirectPublisher(readers)
 
 
 def _answered(answer: Any) -> bool:

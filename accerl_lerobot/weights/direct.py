@@ -11,39 +11,37 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Weights from the trainer straight to each reader, by gloo between hosts or by NCCL between GPUs.
+"""Weights from the trainer straight to readers whose memory it does not share, by gloo.
 
     trainer ──copies──► slab ──Ray: what comes──► reader makes room
                              ──pair: the bytes, then their digest──► compares, applies
             ◄── Ray: the call returns, and the slab is free ──
 
-For readers with a GPU of their own, or on other machines. Ray says what comes and hears of the dead; the
-bytes go by a pair, see there. At most one set per reader is under way, as with every transport.
+Ray says what comes and hears of the dead; the bytes go by a pair, see there, and not through object stores.
+At most one set per reader is under way, as with every transport.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import queue
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import ray
-import torch
-from ray.exceptions import GetTimeoutError, RayActorError
+from ray.exceptions import ActorDiedError, GetTimeoutError, RayActorError, RayTaskError
 
-from accerl_lerobot.errors import InputError
-from accerl_lerobot.transport.meeting import LOOPBACK, Meeting, host, only_at, visit
-from accerl_lerobot.weights.channel import WAY, monotonic_clock, wall_clock
-from accerl_lerobot.weights.device_slab import DeviceSlab, digest_of
-from accerl_lerobot.weights.pair import PUBLISHES, READS, Backend, Pair, Place, place_of
+from accerl_lerobot.transport.meeting import LOOPBACK, Meeting, host, visit
+from accerl_lerobot.weights.channel import monotonic_clock, wall_clock
+from accerl_lerobot.weights.pair import PUBLISHES, READS, Pair
 from accerl_lerobot.weights.publisher import FLUSH_S, Publisher, Shipment
 from accerl_lerobot.weights.reader import Received
-from accerl_lerobot.weights.slab import Layout, Slab, TornSetError
+from accerl_lerobot.weights.slab import Layout, Slab, TornSetError, digest
 
 logger = logging.getLogger(__name__)
 
@@ -74,8 +72,6 @@ class _Reader:
     under_way: Any = None
     """Reference of the call that says what comes; it returns once that is applied."""
     holds: Shipment | None = None
-    sending: list[object] = field(default_factory=list)
-    """What `Pair.send` wants kept."""
     applied: int | None = None
 
 
@@ -83,55 +79,42 @@ class DirectPublisher(Publisher):
     """The trainer's end; `DirectReader` is the other one.
 
     Args:
-        readers: actor handles with ``weights_place()``, ``meet_publisher(meeting, backend)`` and
-            ``receive_directly(coming)``.
-        backend: see `Pair`.
-        device: where slabs are; None: in the host's memory.
+        readers: actor handles with ``node()``, ``meet_publisher(meeting)`` and ``receive_directly(coming)``.
 
     Raises:
-        InputError: NCCL, and a reader has no GPU of its own.
         RuntimeError: a reader and the trainer do not reach each other.
         TimeoutError: a reader does not answer.
         ray.exceptions.RayError: a reader has died.
     """
 
-    def __init__(self, readers: Sequence[Any], backend: Backend, device: torch.device | None = None) -> None:
-        make = Slab if device is None else lambda size: DeviceSlab(size, device)
-        super().__init__(len(readers) + 2, make)
-        self.on_device = device is not None
-        self._backend, self._came = backend, 0
-        self._here = place_of(device or torch.device("cpu"))
-        self._one_at_a_time = threading.Lock()
-        self._readers: list[_Reader] = []
-        for reader in readers:
-            self._readers.append(self._meet(reader))
+    def __init__(self, readers: Sequence[Any]) -> None:
+        super().__init__(len(readers) + 2, Slab)
+        self._came = 0
+        self._readers = [self._meet(reader) for reader in readers]
         self._thread.start()
 
     def add(self, reader: Any) -> None:
         """Has another one receive what is published, from the newest set on; raises as the class does."""
-        with self._one_at_a_time:  # which interface a pair uses is the process's
-            met = self._meet(reader)
+        self._check()
+        met = self._meet(reader)
         with self._changed:
             self._readers.append(met)
             # One that takes the place of another may be here before that one is seen to have gone.
             self._limit = max(self._limit, len(self._readers) + 2)
             self._wake()
 
+    def close(self) -> None:
+        super().close()
+        for reader in self._readers:
+            reader.pair.close()
+
     def _meet(self, handle: Any) -> _Reader:
-        there = Place(*_answered(handle.weights_place.remote(), "weights_place"))
-        if self._backend == "nccl" and there.device in ("cpu", self._here.device):
-            whose = "the CPU" if there.device == "cpu" else "the trainer's GPU"
-            found = f"an inference worker has its policy on {whose}, and NCCL wants a GPU for each"
-            raise InputError(WAY, self._backend, f"{found}; use auto or gloo")
-        address = LOOPBACK if there.node == self._here.node else ray.util.get_node_ip_address()
-        only_at(address)
+        there = _answered(handle.node.remote(), "node")
+        here = there == str(ray.get_runtime_context().get_node_id())
+        address = LOOPBACK if here else ray.util.get_node_ip_address()
         store, meeting = host(address, 2, MEET_S)
-        answer = handle.meet_publisher.remote(meeting, self._backend)
-        try:
-            pair = Pair(store, PUBLISHES, self._backend, meet_s=MEET_S, timeout_s=FLUSH_S)
-        except RuntimeError:
-            _answered(answer, "meet_publisher")  # what the other end has to say of it, if it has
-            raise
+        answer = handle.meet_publisher.remote(meeting)
+        pair = _paired(lambda: Pair(store, PUBLISHES, address, meet_s=MEET_S, timeout_s=FLUSH_S), answer)
         _answered(answer, "meet_publisher")
         number, self._came = self._came, self._came + 1
         return _Reader(number, handle, pair)
@@ -142,20 +125,23 @@ class DirectPublisher(Publisher):
                 self._changed.wait_for(lambda: self._closing or self._pending is not None or self._busy())
                 if self._closing:
                     return
-            shipment = self._take()
-            if shipment is not None:
-                self._send_newest()  # readers reckon the digest while it is reckoned here
-                layout = shipment.layout
-                shipment.digest = digest_of(shipment.version, layout, shipment.slab.memory[: layout.size])
-                for reader in self._readers:
-                    if reader.holds is shipment:
-                        self._confirm(reader, shipment)
-                self._spare()
-            else:
-                ray.wait([r.under_way for r in self._readers if r.under_way is not None], timeout=_POLL_S)
-            for reader in list(self._readers):
-                self._hear(reader)
-            self._send_newest()
+            self._advance(self._take())
+
+    def _advance(self, shipment: Shipment | None) -> None:
+        """Sends what is new, or waits a moment for a reader."""
+        if shipment is not None:
+            self._send_newest()  # readers reckon the digest while it is reckoned here
+            layout = shipment.layout
+            shipment.digest = digest(shipment.version, layout, shipment.slab.memory[: layout.size])
+            for reader in self._readers:
+                if reader.holds is shipment:
+                    self._confirm(reader, shipment)
+            self._spare()
+        else:
+            ray.wait([r.under_way for r in self._readers if r.under_way is not None], timeout=_POLL_S)
+        for reader in list(self._readers):
+            self._hear(reader)
+        self._send_newest()
 
     def _send_newest(self) -> None:
         """To every reader to which nothing is under way and that has not had it."""
@@ -173,34 +159,42 @@ class DirectPublisher(Publisher):
         with self._changed:
             reader.holds = shipment
             reader.under_way = reader.handle.receive_directly.remote(coming)
-        self._send(reader, shipment.slab.memory[: _sent(shipment.layout)])
+        self._send(reader, shipment.slab.memory[: shipment.layout.size])
 
     def _confirm(self, reader: _Reader, shipment: Shipment) -> None:
-        memory = torch.frombuffer(bytearray(shipment.digest), dtype=torch.uint8)
-        self._send(reader, memory.to(shipment.slab.memory.device) if self.on_device else memory)
+        self._send(reader, np.frombuffer(bytearray(shipment.digest), np.uint8))
 
-    def _send(self, reader: _Reader, memory: Any) -> None:
-        with suppress(RuntimeError):  # the other end is gone, or has let go of the pair: the call says which
-            reader.sending.append(reader.pair.send(memory))
+    def _send(self, reader: _Reader, memory: np.ndarray) -> None:
+        with suppress(RuntimeError):  # the other end is lost: the call says whether its process is
+            reader.pair.send(memory)
 
     def _hear(self, reader: _Reader) -> None:
         if reader.under_way is None or not ray.wait([reader.under_way], timeout=0)[0]:
             return
         try:
             applied = ray.get(reader.under_way)
-        except RayActorError:
-            self._let_go(reader)
+        except RayActorError as error:
+            self._let_go(reader, error)
+            return
+        except RayTaskError as error:
+            if isinstance(error.cause, TornSetError):
+                raise
+            self._let_go(reader, error)
             return
         with self._changed:
             reader.applied, reader.under_way, reader.holds = applied, None, None
-            reader.sending.clear()
+            reader.pair.sent()
             self._changed.notify_all()
 
-    def _let_go(self, reader: _Reader) -> None:
+    def _let_go(self, reader: _Reader, error: Exception) -> None:
+        """Of one that has died. One that lives and cannot be sent to is ended: another takes its place."""
         with self._changed:
             self._readers.remove(reader)
             self._changed.notify_all()
-        logger.warning("reader %d of the weights has gone", reader.number)
+        reader.pair.close()
+        logger.warning("reader %d of the weights has gone: %s", reader.number, error)
+        if not isinstance(error, ActorDiedError):
+            ray.kill(reader.handle)
 
     def _busy(self) -> bool:
         """Whether a reader has been sent something, or has come and is owed the newest set."""
@@ -211,7 +205,7 @@ class DirectPublisher(Publisher):
     def _wake(self) -> None:
         self._changed.notify_all()
 
-    def _held(self) -> list[Any]:
+    def _held(self) -> list[Slab]:
         return [reader.holds.slab for reader in self._readers if reader.holds is not None]
 
     def _owed(self) -> str:
@@ -226,26 +220,17 @@ class DirectReader:
 
     Args:
         meeting: with the publisher.
-        backend: see `Pair`.
-        device: where sets are to be; None: in the host's memory.
         deliver: called with each set; the next one comes once it is let go of.
 
     Raises:
         RuntimeError: the publisher is not there.
     """
 
-    def __init__(
-        self,
-        meeting: Meeting,
-        backend: Backend,
-        device: torch.device | None,
-        deliver: Callable[[Received], object],
-    ) -> None:
-        self._device, self._deliver = device, deliver
-        self._slab: Slab | DeviceSlab | None = None
-        only_at(LOOPBACK if meeting.address == LOOPBACK else ray.util.get_node_ip_address())
-        store = visit(meeting, 2, MEET_S)
-        self._pair = Pair(store, READS, backend, meet_s=MEET_S, timeout_s=FLUSH_S)
+    def __init__(self, meeting: Meeting, deliver: Callable[[Received], object]) -> None:
+        self._deliver = deliver
+        self._slab: Slab | None = None
+        address = LOOPBACK if meeting.address == LOOPBACK else ray.util.get_node_ip_address()
+        self._pair = Pair(visit(meeting, 2, MEET_S), READS, address, meet_s=MEET_S, timeout_s=FLUSH_S)
 
     async def receive(self, coming: Coming) -> int:
         """Returns the version once it is applied.
@@ -260,29 +245,23 @@ class DirectReader:
         def release() -> None:
             loop.call_soon_threadsafe(applied.set_result, None)
 
-        received = await asyncio.to_thread(self.take, coming, release)
-        self._deliver(received)
+        self._deliver(await asyncio.to_thread(self.take, coming, release))
         await applied
         return coming.version
 
     def take(self, coming: Coming, release: Callable[[], None]) -> Received:
         """Waits for the bytes of a set and checks them; see `receive`."""
         layout = Layout.read(coming.layout)
-        size = _sent(layout)
-        if self._slab is None or len(self._slab) < size:
-            self._slab = Slab(size) if self._device is None else DeviceSlab(size, self._device)
-        memory = self._slab.memory
-        self._pair.receive(memory[:size])
-        published: Any = np.empty(_DIGEST, np.uint8)
-        if self._device is not None:
-            published = torch.from_numpy(published).to(self._device)
+        if self._slab is None or len(self._slab) < layout.size:
+            self._slab = Slab(layout.size)
+        whole, published = self._slab.memory[: layout.size], np.empty(_DIGEST, np.uint8)
+        self._pair.receive(whole)
         self._pair.receive(published)
-        if digest_of(coming.version, layout, memory[: layout.size]) != bytes(published.tolist()):
+        if digest(coming.version, layout, whole) != published.tobytes():
             raise TornSetError(f"weights of version {coming.version} are not what their digest says")
-        tensors: dict[str, Any] = dict(self._slab.views(layout))
+        tensors = layout.views(whole)
         for tensor in tensors.values():
-            if isinstance(tensor, np.ndarray):
-                tensor.flags.writeable = False
+            tensor.flags.writeable = False
         return Received(
             version=coming.version,
             tensors=tensors,
@@ -292,9 +271,28 @@ class DirectReader:
         )
 
 
-def _sent(layout: Layout) -> int:
-    """Bytes of a set on its way; some, even if it is empty."""
-    return max(layout.size, 8)
+def _paired(make: Callable[[], Pair], answer: Any) -> Pair:
+    """The pair, unless the other end says before that it will not come."""
+    made: queue.SimpleQueue[Pair | Exception] = queue.SimpleQueue()
+
+    def wait() -> None:
+        try:
+            made.put(make())
+        except Exception as error:
+            made.put(error)
+
+    threading.Thread(target=wait, name="meeting", daemon=True).start()
+    while True:
+        try:
+            found = made.get(timeout=_POLL_S)
+        except queue.Empty:
+            if ray.wait([answer], timeout=0)[0]:
+                ray.get(answer)  # raises if that is so
+            continue
+        if isinstance(found, Exception):
+            _answered(answer, "meet_publisher")  # what the other end has to say of it, if it has
+            raise found
+        return found
 
 
 def _answered(answer: Any, method: str) -> Any:

@@ -31,8 +31,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from accerl_lerobot.weights.channel import check_grows
-from accerl_lerobot.weights.slab import Layout
+from accerl_lerobot.weights.slab import Layout, Slab
 
 FLUSH_S = 300.0
 """How long all readers together may take for the last set: a forward pass and a copy of the weights."""
@@ -45,8 +47,7 @@ class Shipment:
 
     version: int
     layout: Layout
-    slab: Any
-    """`Slab` or `DeviceSlab`."""
+    slab: Slab
     published_s: float
     """When `publish` was called, on the clock `time.monotonic`, which all processes of a machine share."""
     digest: bytes = b""
@@ -61,29 +62,26 @@ class Publisher(ABC):
         make: makes one of at least so many bytes.
     """
 
-    on_device = False
-    """Whether `publish` is best given tensors where the trainer has them, not arrays."""
-
-    def __init__(self, slabs: int, make: Callable[[int], Any]) -> None:
+    def __init__(self, slabs: int, make: Callable[[int], Slab]) -> None:
         self._limit, self._make = slabs, make
-        self._slabs: list[Any] = []
+        self._slabs: list[Slab] = []
         """By slot; one that has become too small is replaced in its slot."""
         self._changed = threading.Condition()
         self._version: int | None = None
         self._layout = Layout.of({})
-        self._writing: Any = None
+        self._writing: Slab | None = None
         self._pending: Shipment | None = None
         self._current: Shipment | None = None
         self._failure: BaseException | None = None
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="publisher", daemon=True)
 
-    def publish(self, version: int, tensors: Mapping[str, Any]) -> None:
+    def publish(self, version: int, tensors: Mapping[str, np.ndarray]) -> None:
         """Makes a set the newest one; returns once it is copied.
 
         Args:
             version: updates behind these weights, larger than that of any set published before.
-            tensors: arrays, or tensors of torch where `on_device`; may change as soon as this has returned.
+            tensors: may change as soon as this has returned.
 
         Raises:
             ValueError: `version` does not grow; nothing is changed then.
@@ -121,6 +119,9 @@ class Publisher(ABC):
 
         Args:
             reader: actor handle.
+
+        Raises:
+            BaseException: what has ended the thread.
         """
         raise NotImplementedError(f"readers connect to a {type(self).__name__}")
 
@@ -146,7 +147,7 @@ class Publisher(ABC):
     def _owed(self) -> str:
         """Which readers do not have the newest set, in words; empty if all have it. Called with the lock."""
 
-    def _held(self) -> list[Any]:
+    def _held(self) -> list[Slab]:
         """Slabs that readers or the thread still need, besides the current one. Called with the lock."""
         return []
 
@@ -187,7 +188,7 @@ class Publisher(ABC):
         with self._changed:
             self._slabs.append(made)
 
-    def _free(self, size: int) -> Any:
+    def _free(self, size: int) -> Slab:
         """A slab to write to. What nobody has begun to send is overwritten: something newer comes."""
         with self._changed:
             self._pending = None
@@ -206,7 +207,7 @@ class Publisher(ABC):
                 self._slabs.append(made)
         return made
 
-    def _unused(self) -> list[Any]:
+    def _unused(self) -> list[Slab]:
         """Slabs that hold nothing anybody needs; called with the lock."""
         shipments = [s.slab for s in (self._pending, self._current) if s is not None]
         used = {id(slab) for slab in (*shipments, self._writing, *self._held())}

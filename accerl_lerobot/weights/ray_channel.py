@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import ray
-from ray.exceptions import RayActorError
+from ray.exceptions import ActorDiedError, RayActorError
 
 from accerl_lerobot.weights.channel import wall_clock
 from accerl_lerobot.weights.publisher import Publisher
@@ -66,7 +66,8 @@ class RayPublisher(Publisher):
         self._thread.start()
 
     def add(self, reader: Any) -> None:
-        """Has another one receive what is published, from the newest set on."""
+        """See `Publisher.add`."""
+        self._check()
         with self._changed:
             self._readers.append(_Reader(self._came, reader))
             self._came += 1
@@ -91,8 +92,10 @@ class RayPublisher(Publisher):
             for reader in list(self._readers):
                 try:
                     self._advance(reader)
-                except RayActorError:
+                except RayActorError as error:
                     self._let_go(reader)
+                    if not isinstance(error, ActorDiedError):
+                        ray.kill(reader.handle)  # it cannot be reached: another is to take its place
 
     def _advance(self, reader: _Reader) -> None:
         """Hears from a reader, and sends it the newest set if it is free and has another one.

@@ -28,7 +28,7 @@ import mmap
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import xxhash
@@ -70,11 +70,11 @@ class Layout:
     """JSON of `places`."""
 
     @classmethod
-    def of(cls, tensors: Mapping[str, Any]) -> Layout:
-        """One array or tensor of torch after the other."""
+    def of(cls, tensors: Mapping[str, np.ndarray]) -> Layout:
+        """One tensor after the other."""
         places, end = {}, 0
         for name, tensor in tensors.items():
-            places[name] = Place(_kind(tensor), tuple(tensor.shape), end)
+            places[name] = Place(tensor.dtype.str, tensor.shape, end)
             end = aligned(end + tensor.nbytes)
         return cls(places, end, json.dumps(places, separators=(",", ":")).encode())
 
@@ -84,10 +84,10 @@ class Layout:
         places = {n: Place(dtype, tuple(shape), at) for n, (dtype, shape, at) in json.loads(text).items()}
         return cls(places, max((aligned(p.offset + p.nbytes) for p in places.values()), default=0), text)
 
-    def fits(self, tensors: Mapping[str, Any]) -> bool:
+    def fits(self, tensors: Mapping[str, np.ndarray]) -> bool:
         """Whether these lie like that."""
         return len(self.places) == len(tensors) and all(
-            name == other and place.shape == tensor.shape and place.dtype == _kind(tensor)
+            name == other and place.shape == tensor.shape and place.dtype == tensor.dtype.str
             for (name, place), (other, tensor) in zip(self.places.items(), tensors.items(), strict=True)
         )
 
@@ -169,8 +169,3 @@ def digest(version: int, layout: Layout, data: np.ndarray) -> bytes:
     found.update(layout.text)
     found.update(memoryview(data[: layout.size]))
     return found.digest()
-
-
-def _kind(tensor: Any) -> str:
-    """The dtype of an array or a tensor, as NumPy writes it."""
-    return np.dtype(str(tensor.dtype).removeprefix("torch.")).str

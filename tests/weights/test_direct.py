@@ -11,27 +11,26 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Weights by gloo: the contract, with slabs of host and device; who dies, who is late, what is torn."""
+"""Weights by gloo: the contract; who dies, who is late, what is torn; by loopback and by an address."""
 
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 import ray
-import torch
 
-from accerl_lerobot.errors import InputError
-from accerl_lerobot.transport.meeting import LOOPBACK, Meeting, host, only_at, visit
-from accerl_lerobot.weights import direct
+from accerl_lerobot.transport.meeting import LOOPBACK, Meeting, host, visit
+from accerl_lerobot.weights import direct, pair
 from accerl_lerobot.weights.channel import Tensors, WeightChannel
-from accerl_lerobot.weights.choice import join, make_publisher
-from accerl_lerobot.weights.device_slab import DeviceSlab, digest_there
+from accerl_lerobot.weights.choice import Publishers, join, make_publisher
 from accerl_lerobot.weights.direct import Coming, DirectPublisher, DirectReader
-from accerl_lerobot.weights.pair import PUBLISHES, READS, Backend, Pair, Place, place_of
+from accerl_lerobot.weights.pair import PUBLISHES, READS, Pair
 from accerl_lerobot.weights.slab import Layout
 from tests.light_workers import light_ray
 from tests.weights.contract import CHECKS, Check, filled, values_of
@@ -39,7 +38,10 @@ from tests.weights.test_ray_channel import until
 
 __all__ = ["light_ray"]
 
-CPU = torch.device("cpu")
+LARGE = 200_000
+"""Elements of each of three tensors, together more than sockets keep."""
+SMALL = 1 << 16
+"""Bytes of a piece; both ends have to agree."""
 
 
 class Library:
@@ -48,25 +50,37 @@ class Library:
     def __init__(self) -> None:
         self._readers: dict[str, DirectReader] = {}
         self._received: dict[str, list[tuple[int, Tensors]]] = {}
-        self._place = tuple(place_of(CPU))
+        self._node = str(ray.get_runtime_context().get_node_id())
         self._open = threading.Event()
         self._open.set()
+        self._bites = False
 
-    def shut(self) -> None:
+    def shut(self, bites: bool = False) -> None:
+        """From now on it receives nothing, or a piece of each set."""
+        self._bites = bites
         self._open.clear()
+
+    def piece(self, size: int) -> None:
+        pair.PIECE = size
 
     def open(self) -> None:
         self._open.set()
 
-    def place(self, device: str | None = None) -> tuple[str, ...]:
-        if device is not None:
-            self._place = (self._place[0], device)
-        return self._place
+    def node(self) -> str:
+        return self._node
 
-    def meet(self, name: str, there: bool, meeting: Meeting, backend: Backend) -> None:
-        self._readers[name] = DirectReader(meeting, backend, CPU if there else None, lambda _: None)
+    def move(self, node: str) -> None:
+        self._node = node
+
+    def meet(self, name: str, meeting: Meeting) -> None:
+        if name == "stranger":
+            raise ConnectionError("no way there")
+        self._readers[name] = DirectReader(meeting, lambda _: None)
 
     def receive(self, name: str, coming: Coming) -> int:
+        if self._bites:
+            self._readers[name]._pair.receive(np.empty(SMALL, np.uint8))
+            self._bites = False
         self._open.wait(60)
         received = self._readers[name].take(coming, lambda: None)
         copies = {n: np.array(t) for n, t in received.tensors.items()}
@@ -74,6 +88,10 @@ class Library:
             copy.flags.writeable = False
         self._received.setdefault(name, []).append((received.version, copies))
         return received.version
+
+    def part(self, name: str) -> None:
+        """Loses the connection, and lives."""
+        self._readers[name]._pair.close()
 
     def newest(self, name: str) -> tuple[int, Tensors] | None:
         received = self._received.get(name)
@@ -84,13 +102,13 @@ class Library:
 
 
 class Bound:
-    """``method.remote(...)`` with some arguments already given."""
+    """``method.remote(...)`` of something that has a name."""
 
-    def __init__(self, method: Any, *given: Any) -> None:
-        self._method, self._given = method, given
+    def __init__(self, method: Any, name: str) -> None:
+        self._method, self._name = method, name
 
     def remote(self, *arguments: Any) -> Any:
-        return self._method.remote(*self._given, *arguments)
+        return self._method.remote(self._name, *arguments)
 
 
 class Reader:
@@ -98,11 +116,11 @@ class Reader:
 
     count = 0
 
-    def __init__(self, library: Any, there: bool = False) -> None:
+    def __init__(self, library: Any, name: str = "") -> None:
         Reader.count += 1
-        self.library, self.name = library, f"reader{Reader.count}"
-        self.weights_place = library.place
-        self.meet_publisher = Bound(library.meet, self.name, there)
+        self.library, self.name = library, name or f"reader{Reader.count}"
+        self.node = library.node
+        self.meet_publisher = Bound(library.meet, self.name)
         self.receive_directly = Bound(library.receive, self.name)
 
     def newest(self) -> tuple[int, Tensors] | None:
@@ -112,31 +130,24 @@ class Reader:
         return ray.get(self.library.versions.remote(self.name))
 
 
-class OnDevice(DirectPublisher):
-    """As with NCCL, but that the device is the CPU."""
-
-    def __init__(self, readers: list[Any]) -> None:
-        super().__init__(readers, "gloo", CPU)
-
-    def publish(self, version: int, tensors: Any) -> None:
-        given = {name: torch.from_numpy(np.array(tensor)) for name, tensor in tensors.items()}
-        super().publish(version, given)
+def library() -> Any:
+    return ray.remote(Library).options(num_cpus=0, max_concurrency=8).remote()
 
 
 @pytest.fixture(scope="module")
 def libraries(light_ray: None) -> Iterator[list[Any]]:
-    made = [ray.remote(Library).options(num_cpus=0, max_concurrency=8).remote() for _ in range(2)]
+    made = [library(), library()]
     yield made
-    for library in made:
-        ray.kill(library)
+    for each in made:
+        ray.kill(each)
 
 
 class Delivered(WeightChannel):
     """The publisher with its reader, as one channel: what is published has arrived."""
 
-    def __init__(self, library: Any, there: bool) -> None:
-        self.reader = Reader(library, there)
-        self.publisher = OnDevice([self.reader]) if there else DirectPublisher([self.reader], "gloo")
+    def __init__(self, library: Any) -> None:
+        self.reader = Reader(library)
+        self.publisher = DirectPublisher([self.reader])
 
     def publish(self, version: int, tensors: Tensors) -> None:
         self.publisher.publish(version, tensors)
@@ -147,19 +158,25 @@ class Delivered(WeightChannel):
         return None if found is None or found[0] <= than else found
 
 
-@pytest.mark.parametrize("there", [False, True], ids=["host", "device"])
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
-def test_contract(check: Check, there: bool, libraries: list[Any]):
-    check(lambda: Delivered(libraries[0], there))
+def test_contract(check: Check, libraries: list[Any]):
+    check(lambda: Delivered(libraries[0]))
+
+
+def test_a_set_without_any_values_arrives(libraries: list[Any]):
+    channel = Delivered(libraries[0])
+    channel.publish(1, {})
+    channel.publish(2, {"a": np.zeros((0, 3), np.float32)})
+    found = channel.newest(than=1)
+    assert found is not None and found[0] == 2 and found[1]["a"].shape == (0, 3)
 
 
 def test_a_slow_reader_skips_versions_and_holds_up_nobody(libraries: list[Any]):
     slow, quick = Reader(libraries[0]), Reader(libraries[1])
-    publisher = DirectPublisher([slow, quick], "gloo")
+    publisher = DirectPublisher([slow, quick])
     ray.get(libraries[0].shut.remote())
-    size = 200_000  # more than sockets keep
     for version in range(10):  # would not return if it waited for the reader whose gate is shut
-        publisher.publish(version, filled(float(version), size))
+        publisher.publish(version, filled(float(version), LARGE))
         until(lambda version=version: quick.versions()[-1:] == [version])
     assert slow.versions() == []
     with pytest.raises(TimeoutError, match=r"version 9, after 0.2 s: not applied by readers 0$"):
@@ -173,32 +190,84 @@ def test_a_slow_reader_skips_versions_and_holds_up_nobody(libraries: list[Any]):
     publisher.close()
     with pytest.raises(RuntimeError, match="closed"):
         publisher.publish(10, filled(10.0))
+    with pytest.raises(RuntimeError, match="closed"):
+        publisher.add(Reader(libraries[0]))
 
 
-def test_a_dead_reader_is_let_go_of_and_another_takes_its_place(libraries: list[Any]):
-    dying = ray.remote(Library).options(num_cpus=0, max_concurrency=2).remote()
-    quick = Reader(libraries[0])
-    publisher = make_publisher([Reader(dying), quick], way="gloo")
+@pytest.mark.parametrize("bites", [False, True], ids=["before", "amid"])
+def test_one_that_dies_with_bytes_under_way_is_let_go_of_and_another_takes_its_place(
+    bites: bool, light_ray: None, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(pair, "PIECE", SMALL)
+    dying, other = library(), library()
+    for each in (dying, other):
+        ray.get(each.piece.remote(SMALL))
+    ray.get(dying.shut.remote(bites))
+    quick = Reader(other)
+    publisher = make_publisher([Reader(dying)], "ray", way="gloo")
     assert isinstance(publisher, DirectPublisher)
-    publisher.publish(0, filled(0.0))
-    publisher.flush(60)
-    ray.get(dying.shut.remote())
-    publisher.publish(1, filled(1.0, 200_000))  # dies with it under way
-    until(lambda: quick.versions() == [0, 1])
+    publisher.publish(1, filled(1.0, LARGE))
+    (lost,) = publisher._readers
+    until(lambda: lost.under_way is not None)
+    time.sleep(0.3)  # a piece arrives
     ray.kill(dying)
     publisher.flush(60)
-    assert [reader.number for reader in publisher._readers] == [1]
-    late = Reader(libraries[1])
-    join(publisher, late)
-    until(lambda: late.versions() == [1])
+    until(lambda: lost.pair._group is None)
+    assert publisher._readers == [] and lost.pair._under_way == []
+    join(publisher, quick)
+    until(lambda: quick.versions()[-1:] == [1])
     publisher.publish(2, filled(2.0))
     publisher.flush(60)
-    assert late.versions() == [1, 2] and quick.versions() == [0, 1, 2]
+    assert quick.versions()[-2:] == [1, 2]
     publisher.close()
+    ray.kill(other)
+
+
+def test_pieces_arrive_in_their_order(libraries: list[Any], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(pair, "PIECE", 1000)
+    receives, meeting, store = [], None, None
+    store, meeting = host(LOOPBACK, 2, 30)
+    sent = np.random.default_rng(0).integers(0, 256, 12_345, np.uint8)
+
+    def read() -> None:
+        end = Pair(visit(meeting, 2, 30), READS, LOOPBACK, meet_s=30, timeout_s=30)
+        for _ in range(2):
+            memory = np.zeros(12_345, np.uint8)
+            end.receive(memory)
+            receives.append(memory)
+
+    thread = threading.Thread(target=read)
+    thread.start()
+    end = Pair(store, PUBLISHES, LOOPBACK, meet_s=30, timeout_s=30)
+    end.send(sent)
+    end.send(sent[::-1].copy())
+    thread.join(30)
+    assert np.array_equal(receives[0], sent) and np.array_equal(receives[1], sent[::-1])
+    assert len(end._under_way) == 26
+    end.sent()
+    assert end._under_way == []
+
+
+def test_one_that_lives_but_has_lost_the_connection_is_ended(libraries: list[Any]):
+    parted, quick = library(), Reader(libraries[0])
+    reader = Reader(parted)
+    killed: list[Any] = []
+    publisher = DirectPublisher([reader, quick])
+    publisher.publish(0, filled(0.0))
+    publisher.flush(60)
+    ray.get(parted.part.remote(reader.name))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(direct.ray, "kill", killed.append)
+        publisher.publish(1, filled(1.0))
+        publisher.flush(60)
+        until(lambda: killed == [reader])
+    assert quick.versions() == [0, 1] and [r.number for r in publisher._readers] == [1]
+    publisher.close()
+    ray.kill(parted)
 
 
 def test_a_reader_that_comes_before_anything_is_published_waits(libraries: list[Any]):
-    publisher, reader = DirectPublisher([], "gloo"), Reader(libraries[0])
+    publisher, reader = DirectPublisher([]), Reader(libraries[0])
     publisher.add(reader)
     publisher.flush(0.1)
     publisher.publish(2, filled(2.0))
@@ -210,119 +279,101 @@ def test_a_reader_that_comes_before_anything_is_published_waits(libraries: list[
 def test_what_arrives_torn_is_used_by_nobody_and_ends_the_publisher(
     libraries: list[Any], monkeypatch: pytest.MonkeyPatch
 ):
-    true = direct.digest_of
-    monkeypatch.setattr(direct, "digest_of", lambda *found: true(*found)[::-1])
+    true = direct.digest
+    monkeypatch.setattr(direct, "digest", lambda *found: true(*found)[::-1])
     reader = Reader(libraries[0])
-    publisher = DirectPublisher([reader], "gloo")
+    publisher = DirectPublisher([reader])
     publisher.publish(5, filled(5.0))
-    with pytest.raises(ray.exceptions.RayTaskError, match="version 5 are not what their digest says"):
+    torn = "version 5 are not what their digest says"
+    with pytest.raises(ray.exceptions.RayTaskError, match=torn):
         publisher.flush(60)
-    with pytest.raises(ray.exceptions.RayTaskError, match="version 5 are not what their digest says"):
+    with pytest.raises(ray.exceptions.RayTaskError, match=torn):
         publisher.publish(6, filled(6.0))
+    with pytest.raises(ray.exceptions.RayTaskError, match=torn):
+        publisher.add(Reader(libraries[0]))
     assert reader.newest() is None
 
 
 def test_a_publisher_that_is_gone_fails_who_waits_for_its_bytes():
-    only_at(LOOPBACK)
     store, meeting = host(LOOPBACK, 2, 30)
     made: list[DirectReader] = []
-    meets = threading.Thread(
-        target=lambda: made.append(DirectReader(meeting, "gloo", None, lambda _: None)), daemon=True
-    )
+    meets = threading.Thread(target=lambda: made.append(DirectReader(meeting, lambda _: None)), daemon=True)
     meets.start()
-    pair = Pair(store, PUBLISHES, "gloo", meet_s=30, timeout_s=30)
+    end = Pair(store, PUBLISHES, LOOPBACK, meet_s=30, timeout_s=30)
     meets.join(30)
-    layout = Layout.of(filled(1.0))
-    del pair
+    end.close()
     with pytest.raises(RuntimeError, match="Connection closed"):
-        made[0].take(Coming(1, 0.0, layout.text), lambda: None)
+        made[0].take(Coming(1, 0.0, Layout.of(filled(1.0)).text), lambda: None)
 
 
-def test_nccl_is_refused_where_there_is_no_gpu_for_each(
+def test_one_that_does_not_come_is_heard_of_at_once(libraries: list[Any]):
+    started = time.monotonic()
+    with pytest.raises(ConnectionError, match="no way there"):
+        DirectPublisher([Reader(libraries[0], "stranger")])
+    with pytest.raises(ray.exceptions.RayActorError):
+        dead = library()
+        ray.kill(dead)
+        DirectPublisher([Reader(dead)])
+    assert time.monotonic() - started < 30
+
+
+def test_those_on_another_machine_are_reached_by_its_address(
     libraries: list[Any], monkeypatch: pytest.MonkeyPatch
 ):
-    reader = Reader(libraries[0])
-    with pytest.raises(InputError, match=r"^launch.weights='nccl': the trainer's policy is on cpu, and NCCL"):
-        make_publisher([reader], way="nccl", device=CPU)
-    here = ray.get(libraries[0].place.remote())
-    monkeypatch.setattr(direct, "place_of", lambda device: Place(here[0], "GPU-1"))
-    monkeypatch.setattr(direct, "DeviceSlab", lambda size, device: DeviceSlab(size, CPU))
-    gpu = torch.device("cuda")
-    with pytest.raises(InputError, match="an inference worker has its policy on the CPU"):
-        make_publisher([reader], way="nccl", device=gpu)
-    ray.get(libraries[0].place.remote("GPU-1"))
-    with pytest.raises(InputError, match="an inference worker has its policy on the trainer's GPU"):
-        make_publisher([reader], way="nccl", device=gpu)
-    with pytest.raises(InputError, match=r"^launch.weights='mpi': use one of auto, gloo, nccl"):
-        make_publisher([reader], way="mpi")
-    with pytest.raises(InputError, match=r"^trainer.publish_changes=True: it needs shared memory"):
-        make_publisher([reader], way="gloo", changes=True)
+    """Both ends are here; the interface is not the loopback."""
+    addresses = [a.address for name, found in psutil.net_if_addrs().items() for a in found if name != "lo"]
+    outside = [address for address in addresses if address.count(".") == 3]
+    if not outside:
+        pytest.skip("this machine has no address but the loopback's")
+    monkeypatch.setattr(direct.ray.util, "get_node_ip_address", lambda: outside[0])
+    met: list[Meeting] = []
+    made: list[DirectReader] = []
+
+    class There:
+        """A reader in this process."""
+
+        class node:  # noqa: N801
+            @staticmethod
+            def remote() -> Any:
+                return ray.put("another node")
+
+        class meet_publisher:  # noqa: N801
+            @staticmethod
+            def remote(meeting: Meeting) -> Any:
+                met.append(meeting)
+                thread = threading.Thread(
+                    target=lambda: made.append(DirectReader(meeting, lambda _: None)), daemon=True
+                )
+                thread.start()
+                return ray.put(None)
+
+    publisher = DirectPublisher([There()])
+    until(lambda: len(made) == 1)
+    assert [meeting.address for meeting in met] == [outside[0]]
+    bound = {c.laddr.ip for c in psutil.Process().net_connections("tcp") if c.status == "LISTEN"}
+    assert "0.0.0.0" not in bound and outside[0] in bound  # noqa: S104
+    (reader,) = publisher._readers
+    reader.pair.send(np.full(100, 7, np.uint8))
+    memory = np.zeros(100, np.uint8)
+    made[0]._pair.receive(memory)
+    assert (memory == 7).all()
+    publisher.close()
 
 
-@pytest.mark.parametrize("spoil", [0, 7, 500, 1023])
-def test_the_digest_of_a_device_sees_any_word_and_its_place(spoil: int):
-    rng = np.random.default_rng(0)
-    tensors = {"a": rng.integers(0, 256, 8192, np.uint8)}
-    layout = Layout.of(tensors)
-    slab = DeviceSlab(layout.size, CPU)
-    slab.fill(layout, tensors)
-    whole = digest_there(3, layout, slab.memory)
-    assert len(whole) == 16 and whole != digest_there(4, layout, slab.memory)
-    words = slab.memory.view(torch.int64)
-    other = (spoil + 1) % 1024
-    pair = words[[spoil, other]].clone()
-    words[[spoil, other]] = pair.flip(0)
-    assert digest_there(3, layout, slab.memory) != whole
-    words[[spoil, other]] = pair
-    assert digest_there(3, layout, slab.memory) == whole
-    slab.memory[8 * spoil + 3] ^= 16
-    assert digest_there(3, layout, slab.memory) != whole
+def test_near_ones_have_shared_memory_and_far_ones_gloo(libraries: list[Any]):
+    class Near(Reader):
+        def __init__(self, there: Any, here: bool) -> None:
+            super().__init__(there)
+            self._here = here
+            self.open_weights = self
 
+        def remote(self, address: str) -> Any:
+            return ray.put(self._here)
 
-def test_the_sum_of_a_device_is_that_of_numpy(monkeypatch: pytest.MonkeyPatch):
-    """In parts or in one, it is the sum of word times mix times the odd numbers, mod 2^64."""
-    from accerl_lerobot.weights import device_slab
-
-    rng = np.random.default_rng(1)
-    data = rng.integers(0, 2**63, 300, np.uint64)
-    layout = Layout.of({"a": data})
-    slab = DeviceSlab(layout.size, CPU)
-    slab.fill(layout, {"a": data.view(np.int64)})
-    words = [int(word) for word in np.frombuffer(slab.memory.numpy().tobytes(), np.uint64)]
-    total = sum(w * 0x9E3779B97F4A7C15 * (2 * i + 1) for i, w in enumerate(words)) % 2**64
-    told: list[bytes] = []
-
-    class Hash:
-        def __init__(self, start: bytes) -> None: ...
-
-        def update(self, more: bytes) -> None:
-            told.append(more)
-
-        def digest(self) -> bytes:
-            return b""
-
-    monkeypatch.setattr(device_slab.xxhash, "xxh3_128", Hash)
-    for at_once in (7, 1 << 20):
-        monkeypatch.setattr(device_slab, "_AT_ONCE", at_once)
-        digest_there(0, layout, slab.memory)
-        assert int.from_bytes(told[-1], "little") == total
-
-
-def test_two_ends_in_one_process_wait_for_each_other_and_keep_the_order():
-    only_at(LOOPBACK)
-    store, meeting = host(LOOPBACK, 2, 30)
-    got: list[int] = []
-
-    def read() -> None:
-        pair = Pair(visit(meeting, 2, 30), READS, "gloo", meet_s=30, timeout_s=30)
-        for _ in range(3):
-            memory = np.zeros(1000, np.uint8)
-            pair.receive(memory)
-            got.append(int(memory[0]))
-
-    thread = threading.Thread(target=read)
-    thread.start()
-    pair = Pair(store, PUBLISHES, "gloo", meet_s=30, timeout_s=30)
-    kept = [pair.send(np.full(1000, value, np.uint8)) for value in (3, 1, 2)]
-    thread.join(30)
-    assert got == [3, 1, 2] and len(kept) == 3
+    publisher = make_publisher([Near(libraries[0], True), Near(libraries[1], False)], way="gloo")
+    assert isinstance(publisher, Publishers)
+    shared, far = publisher.parts
+    assert isinstance(far, DirectPublisher) and [r.handle.library for r in far._readers] == [libraries[1]]
+    join(publisher, Near(libraries[0], False))
+    assert len(far._readers) == 2
+    publisher.close()
