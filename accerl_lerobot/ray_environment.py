@@ -23,12 +23,10 @@ A run that joins a cluster (``launch.address``) takes the user's token and leave
 from __future__ import annotations
 
 import atexit
-import fcntl
 import functools
 import os
 import secrets
 import shutil
-import stat
 import sys
 import tempfile
 from pathlib import Path
@@ -56,9 +54,6 @@ found by the client in it. No wall: what runs as the same user can read what tha
 PASSED_ON = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
 """What workers on other nodes are told besides `WORKERS`, where it is set here."""
 _AUTH = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
-
-
-_PREFIX, _OWNER = "accerl-", "owner"
 
 
 def prepare(joins: bool = False) -> None:
@@ -92,7 +87,8 @@ def check_private() -> None:
         RuntimeError: Ray has been imported before `prepare`, by whoever has written this program.
     """
     if not all(os.environ.get(key) for key in PRIVATE) or not any(os.environ.get(key) for key in _AUTH):
-        raise RuntimeError("ray_environment.prepare() must come before Ray is imported")
+        remedy = "start a new process, or call ray_environment.prepare() before Ray is imported"
+        raise RuntimeError(f"Ray has been imported, and would be open to others if started now: {remedy}")
 
 
 def has_token() -> bool:
@@ -128,40 +124,12 @@ def write_token() -> Path:
 
 @functools.cache
 def private_folder() -> Path:
-    """A folder of mode 0700 from its beginning, which goes when this process ends.
-
-    One that is killed cannot see to that; the next one that makes such a folder does it.
-    """
+    """A folder of mode 0700 from its beginning, which goes when this process ends."""
     temporary = tempfile.gettempdir()
     # A socket's path has 107 bytes at most, and Ray's part of it takes up to 70.
-    where = Path(temporary if len(temporary) <= 16 else "/tmp")
-    _remove_abandoned(where)
-    folder = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=where))
-    # Open, and locked, as long as this process lives; under its name once it is.
-    lock = os.open(folder / "new", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
-    fcntl.flock(lock, fcntl.LOCK_EX)
-    os.rename(folder / "new", folder / _OWNER)
+    folder = Path(tempfile.mkdtemp(prefix="accerl-", dir=temporary if len(temporary) <= 16 else "/tmp"))
     atexit.register(_remove, folder, os.getpid())
     return folder
-
-
-def _remove_abandoned(where: Path) -> None:
-    """Removes private folders of this user whose processes have ended; others are left alone."""
-    for folder in where.glob(f"{_PREFIX}*"):
-        try:
-            found = folder.lstat()
-            if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
-                continue
-            lock = os.open(folder / _OWNER, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
-        except OSError:
-            continue
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            shutil.rmtree(folder, ignore_errors=True)
-        except BlockingIOError:
-            continue  # its process lives
-        finally:
-            os.close(lock)
 
 
 def _remove(folder: Path, owner: int) -> None:

@@ -22,6 +22,8 @@ import os
 import signal
 from pathlib import Path
 
+import psutil
+
 from accerl_lerobot.config import LaunchConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.launch import RayEngine
@@ -31,6 +33,11 @@ from tests.runs import polls, tiny_run
 from tests.test_ray_environment import LOOPBACK, listening
 
 
+def ports(pid: int) -> int:
+    """At how many a process listens."""
+    return sum(c.status == "LISTEN" for c in psutil.Process(pid).net_connections("tcp"))
+
+
 def test_updates_go_on_and_acting_and_learning_agree(tiny_checkpoint: Path):
     config = tiny_run(
         tiny_checkpoint,
@@ -38,7 +45,7 @@ def test_updates_go_on_and_acting_and_learning_agree(tiny_checkpoint: Path):
         inference=InferenceConfig(workers=2),
         rollout=RolloutConfig(workers=2, worlds=2, segment_length=3),
         trainer=TrainerConfig(
-            updates=1000, batch_decisions=16, warmup_updates=0, value_warmup_updates=1, probe_every=3
+            updates=100_000, batch_decisions=16, warmup_updates=0, value_warmup_updates=1, probe_every=3
         ),
     )
     engine = RayEngine(config, ("match",))
@@ -54,6 +61,8 @@ def test_updates_go_on_and_acting_and_learning_agree(tiny_checkpoint: Path):
             served = progress.inference.get("version", 0.0)
             if not lost_at and served >= 4:
                 addresses = set(listening())
+                # For each service a place to meet and one end of a pair; a rollout worker has what Ray opens.
+                assert ports(pids["trainer"]) >= ports(pids["rollout 0"]) + 4
                 lost_at = progress.version
                 os.kill(pids["inference 1"], signal.SIGKILL)
             if lost_at and not back_at and progress.inference["restarts"] and engine.pids()["inference 1"]:

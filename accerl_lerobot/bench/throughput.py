@@ -80,7 +80,7 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
     """
     from accerl_lerobot.run import check_policy, check_world
 
-    console, root = Console(), Path(config.output_dir)
+    console, root = Console(), Path(config.output_dir).expanduser()
     run: RunConfig = parse(
         RunConfig,
         [
@@ -94,11 +94,12 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
     for schedule in config.schedules:  # what cannot be under one of them is refused
         replace(run, launch=replace(run.launch, schedule=schedule))
     tasks = check_world(run)
+    history = check_policy(run)
     root.mkdir(parents=True, exist_ok=True)
     result: dict[str, Any] = {"config": asdict(config), "host": host()}
     order = config.rounds * (*config.schedules, *reversed(config.schedules))
     blocks: list[Block] = []
-    with Measured(run, tasks, check_policy(run)) as engine:
+    with Measured(run, tasks, history) as engine:
         with console.stage("blocks", total=len(order)) as stage:
             for schedule in order:
                 blocks.append(engine.block(schedule, config.seconds))

@@ -25,6 +25,7 @@ import ray
 
 from accerl_lerobot.cluster import start_ray
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.ray_environment import check_private
 from accerl_lerobot.transport.meeting import Meeting
 from accerl_lerobot.weights.channel import Tensors, monotonic_clock
 from accerl_lerobot.weights.direct import Coming, DirectReader
@@ -150,6 +151,7 @@ def two_nodes(readers: int, nbytes: int) -> Iterator[None]:
 
     if ray.is_initialized():
         raise InputError("apart", True, "Ray has been started already, with one node; leave it out")
+    check_private()
     cluster = Cluster()
     try:
         for resources in ({}, {_APART: float(readers)}):

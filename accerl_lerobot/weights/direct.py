@@ -28,18 +28,17 @@ import logging
 import queue
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import ray
-from ray.exceptions import ActorDiedError, GetTimeoutError, RayActorError, RayTaskError
+from ray.exceptions import ActorDiedError, GetTimeoutError, RayError, RayTaskError
 
 from accerl_lerobot.transport.meeting import LOOPBACK, Meeting, host, visit
 from accerl_lerobot.weights.channel import monotonic_clock, wall_clock
 from accerl_lerobot.weights.pair import PUBLISHES, READS, Pair
-from accerl_lerobot.weights.publisher import FLUSH_S, Publisher, Shipment
+from accerl_lerobot.weights.publisher import Publisher, Shipment
 from accerl_lerobot.weights.reader import Received
 from accerl_lerobot.weights.slab import Layout, Slab, TornSetError, digest
 
@@ -47,6 +46,8 @@ logger = logging.getLogger(__name__)
 
 MEET_S = 60.0
 """How long the two ends of a pair may take to come."""
+PIECE_S = 60.0
+"""How long a piece of a set may take to arrive; one that was cut in the middle is noticed by that alone."""
 _POLL_S = 0.02
 """How long the thread waits for a reader before it looks for something newer."""
 _DIGEST = 16
@@ -114,7 +115,7 @@ class DirectPublisher(Publisher):
         address = LOOPBACK if here else ray.util.get_node_ip_address()
         store, meeting = host(address, 2, MEET_S)
         answer = handle.meet_publisher.remote(meeting)
-        pair = _paired(lambda: Pair(store, PUBLISHES, address, meet_s=MEET_S, timeout_s=FLUSH_S), answer)
+        pair = _paired(lambda: Pair(store, PUBLISHES, address, meet_s=MEET_S, timeout_s=PIECE_S), answer)
         _answered(answer, "meet_publisher")
         number, self._came = self._came, self._came + 1
         return _Reader(number, handle, pair)
@@ -133,7 +134,7 @@ class DirectPublisher(Publisher):
             self._send_newest()  # readers reckon the digest while it is reckoned here
             layout = shipment.layout
             shipment.digest = digest(shipment.version, layout, shipment.slab.memory[: layout.size])
-            for reader in self._readers:
+            for reader in list(self._readers):
                 if reader.holds is shipment:
                     self._confirm(reader, shipment)
             self._spare()
@@ -151,7 +152,7 @@ class DirectPublisher(Publisher):
         for reader in list(self._readers):
             if reader.under_way is None and reader.applied != shipment.version:
                 self._announce(reader, shipment)
-                if shipment.digest:
+                if shipment.digest and reader in self._readers:
                     self._confirm(reader, shipment)
 
     def _announce(self, reader: _Reader, shipment: Shipment) -> None:
@@ -165,19 +166,18 @@ class DirectPublisher(Publisher):
         self._send(reader, np.frombuffer(bytearray(shipment.digest), np.uint8))
 
     def _send(self, reader: _Reader, memory: np.ndarray) -> None:
-        with suppress(RuntimeError):  # the other end is lost: the call says whether its process is
+        try:
             reader.pair.send(memory)
+        except RuntimeError as error:  # the other end is lost, whether or not its process is
+            self._let_go(reader, error)
 
     def _hear(self, reader: _Reader) -> None:
         if reader.under_way is None or not ray.wait([reader.under_way], timeout=0)[0]:
             return
         try:
             applied = ray.get(reader.under_way)
-        except RayActorError as error:
-            self._let_go(reader, error)
-            return
-        except RayTaskError as error:
-            if isinstance(error.cause, TornSetError):
+        except RayError as error:
+            if isinstance(error, RayTaskError) and isinstance(error.cause, TornSetError):
                 raise
             self._let_go(reader, error)
             return
@@ -230,7 +230,7 @@ class DirectReader:
         self._deliver = deliver
         self._slab: Slab | None = None
         address = LOOPBACK if meeting.address == LOOPBACK else ray.util.get_node_ip_address()
-        self._pair = Pair(visit(meeting, 2, MEET_S), READS, address, meet_s=MEET_S, timeout_s=FLUSH_S)
+        self._pair = Pair(visit(meeting, 2, MEET_S), READS, address, meet_s=MEET_S, timeout_s=PIECE_S)
 
     async def receive(self, coming: Coming) -> int:
         """Returns the version once it is applied.

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import ray
-from ray.exceptions import ActorDiedError, RayActorError
+from ray.exceptions import ActorDiedError, RayError, RayTaskError
 
 from accerl_lerobot.weights.channel import wall_clock
 from accerl_lerobot.weights.publisher import Publisher
@@ -92,7 +92,9 @@ class RayPublisher(Publisher):
             for reader in list(self._readers):
                 try:
                     self._advance(reader)
-                except RayActorError as error:
+                except RayTaskError:
+                    raise
+                except RayError as error:
                     self._let_go(reader)
                     if not isinstance(error, ActorDiedError):
                         ray.kill(reader.handle)  # it cannot be reached: another is to take its place

@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
 from collections.abc import Iterator
@@ -317,6 +318,12 @@ def test_one_that_does_not_come_is_heard_of_at_once(libraries: list[Any]):
     assert time.monotonic() - started < 30
 
 
+def bound() -> set[str]:
+    """Addresses at which this process listens."""
+    gc.collect()
+    return {c.laddr.ip for c in psutil.Process().net_connections("tcp") if c.status == "LISTEN"}
+
+
 def test_those_on_another_machine_are_reached_by_its_address(
     libraries: list[Any], monkeypatch: pytest.MonkeyPatch
 ):
@@ -350,14 +357,15 @@ def test_those_on_another_machine_are_reached_by_its_address(
     publisher = DirectPublisher([There()])
     until(lambda: len(made) == 1)
     assert [meeting.address for meeting in met] == [outside[0]]
-    bound = {c.laddr.ip for c in psutil.Process().net_connections("tcp") if c.status == "LISTEN"}
-    assert "0.0.0.0" not in bound and outside[0] in bound  # noqa: S104
+    assert "0.0.0.0" not in bound() and outside[0] in bound()  # noqa: S104
     (reader,) = publisher._readers
     reader.pair.send(np.full(100, 7, np.uint8))
     memory = np.zeros(100, np.uint8)
     made[0]._pair.receive(memory)
     assert (memory == 7).all()
     publisher.close()
+    made[0]._pair.close()
+    until(lambda: outside[0] not in bound())
 
 
 def test_near_ones_have_shared_memory_and_far_ones_gloo(libraries: list[Any]):
