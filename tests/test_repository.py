@@ -40,7 +40,7 @@ HEADER = (
     '# Licensed under the Apache License, Version 2.0 (the "License");\n'
 )
 LONGEST_FILE = 400
-WAYS = {"choice.py", "direct.py", "pair.py", "ray_channel.py", "ray_calls.py", "transport_ends.py"}
+WAYS = {"direct.py", "pair.py", "ray_channel.py", "ray_calls.py", "transport_ends.py"}
 RAYS = WAYS | {"peers.py", "weights_readers.py"}
 CONDUCTOR = {"launch.py", "cluster.py", "own_ray.py", "seats.py", "services.py", "watched.py"}
 SHELLS = CONDUCTOR | {"doctor.py", "worker.py"} | RAYS

@@ -23,14 +23,12 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
-import ray
-
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.transport.endpoint import FIELD, Transport
 from accerl_lerobot.transport.nameless import available
 from accerl_lerobot.weights.channel import WAY, Way
 from accerl_lerobot.weights.publisher import FLUSH_S, Publisher
-from accerl_lerobot.weights.ray_channel import RayPublisher
+from accerl_lerobot.weights.ray_channel import RayPublisher, answered
 from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
 
 CONNECT_S = 60.0
@@ -94,7 +92,7 @@ def make_publisher(
         publisher = SharedMemoryPublisher(len(readers), changes=changes)
         try:
             answers = [reader.open_weights.remote(publisher.address) for reader in readers]
-            near = [_answered(answer) for answer in answers]
+            near = [answered(answer, "open_weights", CONNECT_S) for answer in answers]
             if all(near):
                 return publisher
             if any(near) and transport == "auto" and not changes:
@@ -127,7 +125,7 @@ def join(publisher: Publisher | Publishers, reader: Any) -> None:
         if not isinstance(part, SharedMemoryPublisher):
             part.add(reader)
             return
-        if _answered(reader.open_weights.remote(part.address)):
+        if answered(reader.open_weights.remote(part.address), "open_weights", CONNECT_S):
             return
     raise InputError(FIELD, "shared_memory", "a worker that was started anew is elsewhere; use ray")
 
@@ -138,10 +136,3 @@ def _to_the_far(readers: Sequence[Any], way: str) -> Publisher:
     from accerl_lerobot.weights.direct import DirectPublisher
 
     return DirectPublisher(readers)
-
-
-def _answered(answer: Any) -> bool:
-    try:
-        return bool(ray.get(answer, timeout=CONNECT_S))
-    except ray.exceptions.GetTimeoutError as error:
-        raise TimeoutError(f"a reader has not answered `open_weights` within {CONNECT_S:g} s") from error

@@ -33,12 +33,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import ray
-from ray.exceptions import ActorDiedError, GetTimeoutError, RayError, RayTaskError
+from ray.exceptions import RayError, RayTaskError
 
 from accerl_lerobot.transport.meeting import LOOPBACK, Meeting, host, visit
 from accerl_lerobot.weights.channel import monotonic_clock, wall_clock
 from accerl_lerobot.weights.pair import PUBLISHES, READS, Pair
-from accerl_lerobot.weights.publisher import Publisher, Shipment
+from accerl_lerobot.weights.publisher import Shipment
+from accerl_lerobot.weights.ray_channel import CallingPublisher, answered
 from accerl_lerobot.weights.reader import Received
 from accerl_lerobot.weights.slab import Layout, Slab, TornSetError, digest
 
@@ -76,7 +77,7 @@ class _Reader:
     applied: int | None = None
 
 
-class DirectPublisher(Publisher):
+class DirectPublisher(CallingPublisher):
     """The trainer's end; `DirectReader` is the other one.
 
     Args:
@@ -110,22 +111,18 @@ class DirectPublisher(Publisher):
             reader.pair.close()
 
     def _meet(self, handle: Any) -> _Reader:
-        there = _answered(handle.node.remote(), "node")
+        there = answered(handle.node.remote(), "node", MEET_S)
         here = there == str(ray.get_runtime_context().get_node_id())
         address = LOOPBACK if here else ray.util.get_node_ip_address()
         store, meeting = host(address, 2, MEET_S)
         answer = handle.meet_publisher.remote(meeting)
         pair = _paired(lambda: Pair(store, PUBLISHES, address, meet_s=MEET_S, timeout_s=PIECE_S), answer)
-        _answered(answer, "meet_publisher")
+        answered(answer, "meet_publisher", MEET_S)
         number, self._came = self._came, self._came + 1
         return _Reader(number, handle, pair)
 
     def _serve(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._closing or self._pending is not None or self._busy())
-                if self._closing:
-                    return
+        while self._wait_for_work():
             self._advance(self._take())
 
     def _advance(self, shipment: Shipment | None) -> None:
@@ -187,23 +184,13 @@ class DirectPublisher(Publisher):
             self._changed.notify_all()
 
     def _let_go(self, reader: _Reader, error: Exception) -> None:
-        """Of one that has died. One that lives and cannot be sent to is ended: another takes its place."""
-        with self._changed:
-            self._readers.remove(reader)
-            self._changed.notify_all()
+        super()._let_go(reader, error)
         reader.pair.close()
-        logger.warning("reader %d of the weights has gone: %s", reader.number, error)
-        if not isinstance(error, ActorDiedError):
-            ray.kill(reader.handle)
 
     def _busy(self) -> bool:
-        """Whether a reader has been sent something, or has come and is owed the newest set."""
         return any(r.under_way is not None for r in self._readers) or (
             self._current is not None and any(r.applied is None for r in self._readers)
         )
-
-    def _wake(self) -> None:
-        self._changed.notify_all()
 
     def _held(self) -> list[Slab]:
         return [reader.holds.slab for reader in self._readers if reader.holds is not None]
@@ -290,13 +277,6 @@ def _paired(make: Callable[[], Pair], answer: Any) -> Pair:
                 ray.get(answer)  # raises if that is so
             continue
         if isinstance(found, Exception):
-            _answered(answer, "meet_publisher")  # what the other end has to say of it, if it has
+            answered(answer, "meet_publisher", MEET_S)  # what the other end has to say of it, if it has
             raise found
         return found
-
-
-def _answered(answer: Any, method: str) -> Any:
-    try:
-        return ray.get(answer, timeout=MEET_S)
-    except GetTimeoutError as error:
-        raise TimeoutError(f"a reader has not answered `{method}` within {MEET_S:g} s") from error

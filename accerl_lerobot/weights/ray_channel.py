@@ -21,12 +21,13 @@ for the store nor for a reader. One that dies is let go of, and one that comes l
 from __future__ import annotations
 
 import logging
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import ray
-from ray.exceptions import ActorDiedError, RayError, RayTaskError
+from ray.exceptions import ActorDiedError, GetTimeoutError, RayError, RayTaskError
 
 from accerl_lerobot.weights.channel import wall_clock
 from accerl_lerobot.weights.publisher import Publisher
@@ -50,7 +51,35 @@ class _Reader:
     """Version of the last one."""
 
 
-class RayPublisher(Publisher):
+class CallingPublisher(Publisher):
+    """What publishers share whose readers are called through Ray, one call to each under way."""
+
+    _readers: list[Any]
+
+    def _wait_for_work(self) -> bool:
+        """Waits for a set, or until there are readers to look after; False: it is over."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closing or self._pending is not None or self._busy())
+            return not self._closing
+
+    @abstractmethod
+    def _busy(self) -> bool:
+        """Whether a reader has been sent something, or has come and is owed the newest set."""
+
+    def _wake(self) -> None:
+        self._changed.notify_all()
+
+    def _let_go(self, reader: Any, error: Exception) -> None:
+        """Of one that has died. One that lives and cannot be reached is ended: another takes its place."""
+        with self._changed:
+            self._readers.remove(reader)
+            self._changed.notify_all()
+        logger.warning("reader %d of the weights has gone: %s", reader.number, error)
+        if not isinstance(error, ActorDiedError):
+            ray.kill(reader.handle)
+
+
+class RayPublisher(CallingPublisher):
     """The trainer's end; the readers' end is `InferenceWorker.receive_weights`.
 
     Args:
@@ -74,11 +103,7 @@ class RayPublisher(Publisher):
             self._wake()
 
     def _serve(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._closing or self._pending is not None or self._busy())
-                if self._closing:
-                    return
+        while self._wait_for_work():
             shipment = self._take()
             if shipment is not None:
                 tensors = shipment.slab.views(shipment.layout)
@@ -95,15 +120,13 @@ class RayPublisher(Publisher):
                 except RayTaskError:
                     raise
                 except RayError as error:
-                    self._let_go(reader)
-                    if not isinstance(error, ActorDiedError):
-                        ray.kill(reader.handle)  # it cannot be reached: another is to take its place
+                    self._let_go(reader, error)
 
     def _advance(self, reader: _Reader) -> None:
         """Hears from a reader, and sends it the newest set if it is free and has another one.
 
         Raises:
-            RayActorError: it has died.
+            RayError: it has died or cannot be reached, or, a RayTaskError, what it has raised.
         """
         if reader.under_way is not None:
             done, _ = ray.wait([reader.under_way], timeout=0)
@@ -120,20 +143,10 @@ class RayPublisher(Publisher):
             reader.under_way, reader.sent = sent, version
             self._changed.notify_all()
 
-    def _let_go(self, reader: _Reader) -> None:
-        with self._changed:
-            self._readers.remove(reader)
-            self._changed.notify_all()
-        logger.warning("reader %d of the weights has gone", reader.number)
-
     def _busy(self) -> bool:
-        """Whether a reader has been sent something, or has come and is owed the newest set."""
         return any(r.under_way is not None for r in self._readers) or (
             self._stored is not None and any(r.sent is None for r in self._readers)
         )
-
-    def _wake(self) -> None:
-        self._changed.notify_all()
 
     def _owed(self) -> str:
         late = [
@@ -142,3 +155,15 @@ class RayPublisher(Publisher):
             if self._version is not None and (reader.sent != self._version or reader.under_way is not None)
         ]
         return f"not received by readers {', '.join(late)}" if late else ""
+
+
+def answered(answer: Any, method: str, timeout_s: float) -> Any:
+    """What a reader answers.
+
+    Raises:
+        TimeoutError: names the question that was not answered.
+    """
+    try:
+        return ray.get(answer, timeout=timeout_s)
+    except GetTimeoutError as error:
+        raise TimeoutError(f"a reader has not answered `{method}` within {timeout_s:g} s") from error

@@ -46,8 +46,7 @@ class Ray(Local):
 
 @pytest.fixture(autouse=True)
 def _without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (choice, ray_channel):
-        monkeypatch.setattr(module, "ray", Ray)
+    monkeypatch.setattr(ray_channel, "ray", Ray)
 
 
 class Inference:

@@ -28,14 +28,14 @@ import ray
 
 from accerl_lerobot.transport.meeting import LOOPBACK, Meeting, host, visit
 from accerl_lerobot.weights import direct, pair
-from accerl_lerobot.weights.channel import Tensors, WeightChannel
+from accerl_lerobot.weights.channel import Tensors
 from accerl_lerobot.weights.choice import Publishers, join, make_publisher
 from accerl_lerobot.weights.direct import Coming, DirectPublisher, DirectReader
 from accerl_lerobot.weights.pair import PUBLISHES, READS, Pair
 from accerl_lerobot.weights.slab import Layout
 from tests.light_workers import light_ray
 from tests.weights.contract import CHECKS, Check, filled, values_of
-from tests.weights.test_ray_channel import until
+from tests.weights.test_ray_channel import Delivered, until
 
 __all__ = ["light_ray"]
 
@@ -143,29 +143,14 @@ def libraries(light_ray: None) -> Iterator[list[Any]]:
         ray.kill(each)
 
 
-class Delivered(WeightChannel):
-    """The publisher with its reader, as one channel: what is published has arrived."""
-
-    def __init__(self, library: Any) -> None:
-        self.reader = Reader(library)
-        self.publisher = DirectPublisher([self.reader])
-
-    def publish(self, version: int, tensors: Tensors) -> None:
-        self.publisher.publish(version, tensors)
-        self.publisher.flush(60)
-
-    def newest(self, than: int) -> tuple[int, Tensors] | None:
-        found = self.reader.newest()
-        return None if found is None or found[0] <= than else found
-
-
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
 def test_contract(check: Check, libraries: list[Any]):
-    check(lambda: Delivered(libraries[0]))
+    check(lambda: Delivered(reader := Reader(libraries[0]), DirectPublisher([reader])))
 
 
 def test_a_set_without_any_values_arrives(libraries: list[Any]):
-    channel = Delivered(libraries[0])
+    reader = Reader(libraries[0])
+    channel = Delivered(reader, DirectPublisher([reader]))
     channel.publish(1, {})
     channel.publish(2, {"a": np.zeros((0, 3), np.float32)})
     found = channel.newest(than=1)
@@ -226,7 +211,7 @@ def test_one_that_dies_with_bytes_under_way_is_let_go_of_and_another_takes_its_p
 
 def test_pieces_arrive_in_their_order(libraries: list[Any], monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(pair, "PIECE", 1000)
-    receives, meeting, store = [], None, None
+    receives: list[np.ndarray] = []
     store, meeting = host(LOOPBACK, 2, 30)
     sent = np.random.default_rng(0).integers(0, 256, 12_345, np.uint8)
 

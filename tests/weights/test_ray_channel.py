@@ -24,6 +24,7 @@ import pytest
 import ray
 
 from accerl_lerobot.weights.channel import Tensors, WeightChannel
+from accerl_lerobot.weights.publisher import Publisher
 from accerl_lerobot.weights.ray_channel import RayPublisher
 from tests.light_workers import light_ray
 from tests.weights.contract import CHECKS, Check, filled, values_of
@@ -97,13 +98,12 @@ def until(holds: Callable[[], bool]) -> None:
 class Delivered(WeightChannel):
     """The publisher with its reader, as one channel: what is published has arrived."""
 
-    def __init__(self, shelf: Any) -> None:
-        self.reader = Reader(shelf)
-        self.publisher = RayPublisher([self.reader])
+    def __init__(self, reader: Any, publisher: Publisher) -> None:
+        self.reader, self.publisher = reader, publisher
 
     def publish(self, version: int, tensors: Tensors) -> None:
         self.publisher.publish(version, tensors)
-        self.publisher.flush()
+        self.publisher.flush(60)
 
     def newest(self, than: int) -> tuple[int, Tensors] | None:
         found = self.reader.newest()
@@ -112,7 +112,7 @@ class Delivered(WeightChannel):
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
 def test_contract(check: Check, shelves: list[Any]):
-    check(lambda: Delivered(shelves[0]))
+    check(lambda: Delivered(reader := Reader(shelves[0]), RayPublisher([reader])))
 
 
 def test_a_slow_reader_skips_versions_and_does_not_hold_up_the_publisher(shelves: list[Any]):
