@@ -31,6 +31,7 @@ from typing import Any
 from rich.table import Table
 
 from accerl_lerobot.bench.study import (
+    INTERVALS,
     Cell,
     Results,
     Study,
@@ -49,6 +50,7 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.dataset_config import DatasetConfig
 from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.stats import mean_interval
 
 ARMS = {
     "none": ("--imagination.share=0",),
@@ -129,8 +131,8 @@ def bench_efficiency(config: BenchEfficiencyConfig) -> dict[str, Any]:
 
     Returns:
         ``starts`` (success of each seed's warm start), ``cells`` (of each run success, n, real episodes and
-        env steps, updates, and what was dreamt), ``groups`` (arm, budget, successes and episodes over the
-        seeds, and means of real episodes and env steps and of updates) and ``beside``, see there.
+        env steps, updates, and what was dreamt), ``groups`` (arm, budget, what `together` and `over_none`
+        give, and means of real episodes and env steps and of updates) and ``beside``, see there.
 
     Raises:
         InputError: see `Study.run`.
@@ -160,8 +162,23 @@ def compare(config: BenchEfficiencyConfig, results: Results) -> dict[str, Any]:
                 name: sum(row[name] for row in of) / len(of)
                 for name in ("episodes_explored", "env_steps", "updates")
             }
-            groups.append({"arm": arm, "budget": budget, **together(of), **means})
+            beside = [row for row in rows if (row["arm"], row["budget"]) == ("none", budget)]
+            gained = {} if arm == "none" else over_none(of, beside)
+            groups.append({"arm": arm, "budget": budget, **together(of), **means, **gained})
     return {"config": asdict(config), "starts": results.before, "groups": groups, "cells": rows}
+
+
+def over_none(rows: Sequence[dict[str, Any]], none: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What is gained over imagining nothing, by seeds: ``gain`` and its ``gain_ci95``, see `mean_interval`.
+
+    Empty where `none` is, or there is one seed.
+    """
+    if len(none) < 2:
+        return {}
+    without = {row["seed"]: row["success"] for row in none}
+    gains = [row["success"] - without[row["seed"]] for row in rows]
+    interval = mean_interval(gains)
+    return {"gain": sum(gains) / len(gains), "gain_ci95": (interval.low, interval.high)}
 
 
 def beside(study: Study, recipe: RunConfig) -> dict[str, dict[str, float]]:
@@ -199,7 +216,7 @@ def table(result: dict[str, Any]) -> Table:
 
 def markdown(result: dict[str, Any]) -> str:
     """`table` for the docs, and what is real beside it."""
-    lines = [
+    lines = [f"\n{INTERVALS.capitalize()}.\n"] + [
         f"\nOn top, {name}: {of['episodes']:,.0f} real episodes, {of['env_steps']:,.0f} env steps.\n"
         for name, of in result["beside"].items()
     ]
@@ -207,7 +224,7 @@ def markdown(result: dict[str, Any]) -> str:
 
 
 def draw(path: Path, result: dict[str, Any]) -> None:
-    """Success over real episodes: one line per arm with its 95 % Wilson interval, one dot per seed."""
+    """Success over real episodes: one line per arm with its 95 % interval, one dot per seed."""
     budgets = result["config"]["budgets"]
 
     def dress(axes: Any) -> None:
@@ -223,6 +240,13 @@ def draw(path: Path, result: dict[str, Any]) -> None:
     draw_lines(path, result, "arm", result["config"]["arms"], places, dress)
 
 
+def _gained(group: dict[str, Any]) -> str:
+    if "gain" not in group:
+        return ""
+    low, high = (100 * end for end in group["gain_ci95"])
+    return f", {100 * group['gain']:+.1f} points [{low:+.1f}, {high:+.1f}] over none"
+
+
 def _columns(result: dict[str, Any]) -> list[str]:
     return ["imagined", *(f"{budget} real episodes" for budget in result["config"]["budgets"])]
 
@@ -234,6 +258,6 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
         for g in (g for g in result["groups"] if g["arm"] == arm):
             real = f"{g['episodes_explored']:.0f} episodes of {g['env_steps']:,.0f} env steps"
             made = f"{real}, {g['updates']:.0f} updates"
-            row.append(f"{rated(g)}, {made}")
+            row.append(f"{rated(g)}{_gained(g)}, {made}")
         rows.append(row)
     return rows

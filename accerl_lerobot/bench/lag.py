@@ -27,6 +27,7 @@ from typing import Any
 from rich.table import Table
 
 from accerl_lerobot.bench.study import (
+    INTERVALS,
     Cell,
     Results,
     Study,
@@ -126,11 +127,11 @@ def table(result: dict[str, Any]) -> Table:
 
 def markdown(result: dict[str, Any]) -> str:
     """`table` for the docs."""
-    return as_markdown(_columns(result), _rows(result))
+    return as_markdown(_columns(result), _rows(result)) + f"\n{INTERVALS.capitalize()}.\n"
 
 
 def draw(path: Path, result: dict[str, Any]) -> None:
-    """Success over lag: one line per algorithm with its 95 % Wilson interval, one dot per seed."""
+    """Success over lag: one line per algorithm with its 95 % interval, one dot per seed."""
     lags = result["config"]["lags"]
 
     def dress(axes: Any) -> None:

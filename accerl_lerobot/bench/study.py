@@ -38,7 +38,7 @@ from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.pictures import drawing
-from accerl_lerobot.evaluation.stats import Rate
+from accerl_lerobot.evaluation.stats import Rate, mean_interval
 from accerl_lerobot.resume import locked
 
 IN_USE = "a study, or a run of one that was killed, still writes there; wait for it or end it"
@@ -114,26 +114,37 @@ class Results(NamedTuple):
 
 
 def together(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Successes and episodes of some rows of `Results.table`, and the success of each, seed by seed."""
-    return {
-        "successes": sum(round(row["success"] * row["n"]) for row in rows),
-        "n": sum(row["n"] for row in rows),
-        "by_seed": [row["success"] for row in rows],
-    }
+    """Successes and episodes of some rows of `Results.table`, one per seed.
+
+    Returns:
+        ``successes`` and ``n`` of all, ``by_seed``, the success of each, and ``ci95`` of their mean. That is
+        `mean_interval` over seeds, where there are several, and never narrower than if one policy had played
+        all episodes: seeds may be alike by chance.
+    """
+    successes, n = sum(round(row["success"] * row["n"]) for row in rows), sum(row["n"] for row in rows)
+    by_seed = [row["success"] for row in rows]
+    of = [Rate(successes=successes, n=n).interval()] + ([mean_interval(by_seed)] if len(rows) > 1 else [])
+    ci95 = (max(0.0, min(i.low for i in of)), min(1.0, max(i.high for i in of)))
+    return {"successes": successes, "n": n, "by_seed": by_seed, "ci95": ci95}
 
 
 def rated(group: dict[str, Any]) -> str:
     """Rate, interval and n of what `together` gives, and each seed's success."""
     seeds = " ".join(f"{100 * s:.0f}" for s in group["by_seed"])
-    return f"{Rate(successes=group['successes'], n=group['n'])} ({seeds})"
+    low, high = (100 * end for end in group["ci95"])
+    rate = 100 * group["successes"] / group["n"]
+    return f"{rate:.1f} % [{low:.1f}, {high:.1f}] n={group['n']} ({seeds})"
+
+
+INTERVALS = "intervals are 95 %, over seeds"
 
 
 def tabled(
     title: str, result: dict[str, Any], columns: Sequence[str], rows: Sequence[Sequence[str]]
 ) -> Table:
-    """Rows for people; the title ends with the success of each warm start."""
+    """Rows for people; the title ends with the success of each warm start, and what intervals are."""
     starts = ", ".join(f"{s:.0%}" for s in result["starts"].values())
-    return as_table(f"{title} {starts}", columns, rows)
+    return as_table(f"{title} {starts}; {INTERVALS}", columns, rows)
 
 
 def as_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
@@ -160,7 +171,7 @@ def draw_lines(
     places: Callable[[float], list[float]],
     dress: Callable[[Any], object],
 ) -> None:
-    """Success, one line per name with its 95 % Wilson interval, one dot per seed.
+    """Success, one line per name with its 95 % interval, one dot per seed.
 
     Args:
         path: of the picture.
@@ -174,11 +185,10 @@ def draw_lines(
     with drawing(path) as axes:
         for i, name in enumerate(names):
             groups = [g for g in result["groups"] if g[key] == name]
-            rates = [Rate(successes=g["successes"], n=g["n"]) for g in groups]
             x = places(i - (len(names) - 1) / 2)
-            y = [r.value for r in rates]
-            low = [max(0.0, r.value - r.interval().low) for r in rates]
-            high = [max(0.0, r.interval().high - r.value) for r in rates]
+            y = [g["successes"] / g["n"] for g in groups]
+            low = [max(0.0, rate - g["ci95"][0]) for rate, g in zip(y, groups, strict=True)]
+            high = [max(0.0, g["ci95"][1] - rate) for rate, g in zip(y, groups, strict=True)]
             axes.errorbar(x, y, yerr=[low, high], marker="o", capsize=3, color=f"C{i}", label=name)
             for place, group in zip(x, groups, strict=True):
                 seeds = group["by_seed"]

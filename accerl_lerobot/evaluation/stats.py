@@ -21,7 +21,7 @@ makes small comparisons possible.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -158,6 +158,32 @@ def paired_interval(wins: int, losses: int, n: int, confidence: float = 0.95) ->
     a, b = (wins + 1) / (n + 2), (losses + 1) / (n + 2)
     half = _quantile(confidence) * math.sqrt((a + b - (a - b) ** 2) / (n + 2))
     return Interval(low=max(-1.0, a - b - half), high=min(1.0, a - b + half))
+
+
+def mean_interval(values: Sequence[float], confidence: float = 0.95) -> Interval:
+    """Interval of the mean of what differs from run to run, by Student's t (1908).
+
+        m ± t · s / √k,  s² = Σ (x − m)² / (k − 1),  t of k − 1 degrees of freedom
+
+    Policies of several seeds differ by more than their episodes do, so all their episodes together, as if one
+    policy had played them, would say too much.
+
+    Args:
+        values: one of each run, at least two; not cut to any range.
+        confidence: above 0 and below 1.
+
+    Raises:
+        ValueError: fewer than two values, or a confidence out of range.
+    """
+    if len(values) < 2:
+        raise ValueError(f"{len(values)} values: use at least two")
+    _quantile(confidence)
+    from scipy.special import stdtrit
+
+    count, mean = len(values), math.fsum(values) / len(values)
+    spread = math.sqrt(math.fsum((x - mean) ** 2 for x in values) / (count - 1))
+    half = float(stdtrit(count - 1, (1 + confidence) / 2)) * spread / math.sqrt(count)
+    return Interval(low=mean - half, high=mean + half)
 
 
 def compare(a: Outcomes, b: Outcomes, confidence: float = 0.95) -> Comparison:

@@ -24,11 +24,12 @@ import yaml
 
 from accerl_lerobot.bench import efficiency as bench
 from accerl_lerobot.bench.efficiency import ARMS, BenchEfficiencyConfig, cells
-from accerl_lerobot.bench.study import Results, Study
+from accerl_lerobot.bench.study import Results, Study, together
 from accerl_lerobot.config import DatasetConfig, RunConfig, encode, parse
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.stats import Rate
 from tests.runs import tiny_run
 
 
@@ -83,12 +84,38 @@ def test_seeds_are_counted_together(result: dict[str, Any]):
     json.dumps(result)
 
 
+def test_intervals_are_over_seeds_and_gains_are_of_pairs():
+    """By hand: t of two degrees of freedom is 4.303 at 97.5 %, and s of (0.2, 0.5, 0.8) is 0.3."""
+    rows, none = (
+        [{"seed": seed, "success": x, "n": 10} for seed, x in enumerate(of)]
+        for of in ((0.2, 0.5, 0.8), (0.1, 0.5, 0.6))
+    )
+    found = together(rows)
+    assert (found["successes"], found["n"], found["by_seed"]) == (15, 30, [0.2, 0.5, 0.8])
+    assert found["ci95"] == (0.0, 1.0), "0.5 ± 0.745"
+    close = together([row | {"success": x} for row, x in zip(rows, (0.4, 0.5, 0.6), strict=True)])
+    assert close["ci95"] == pytest.approx(
+        (0.5 - 4.3027 * 0.1 / 3**0.5, 0.5 + 4.3027 * 0.1 / 3**0.5), abs=1e-4
+    )
+    alike = together([row | {"success": 0.5} for row in rows])
+    wilson = Rate(successes=15, n=30).interval()
+    assert alike["ci95"] == (wilson.low, wilson.high), "chance alone would not make them so alike"
+    assert together(rows[:1])["ci95"] == tuple(vars(Rate(successes=2, n=10).interval()).values())
+    gained = bench.over_none(rows, none[::-1])  # 0.1, 0 and 0.2, by seed
+    half = 4.3027 * 0.1 / 3**0.5
+    assert gained["gain"] == pytest.approx(0.1)
+    assert gained["gain_ci95"] == pytest.approx((0.1 - half, 0.1 + half), abs=1e-4)
+    assert bench.over_none(rows, []) == {} == bench.over_none(rows[:1], none[:1])
+
+
 def test_the_table_and_the_picture(result: dict[str, Any], tmp_path: Path):
     lines = bench.markdown(result).splitlines()
     assert lines[0] == "| imagined | 4 real episodes | 8 real episodes |"
     assert lines[2].startswith(
         "| none | 10.0 % [2.8, 30.1] n=20 (10 10), 4 episodes of 100 env steps, 4 updates | 50.0 % ["
     )
+    assert "(80 80), +70.0 points [+70.0, +70.0] over none, 4 episodes" in lines[3]
+    assert lines[5] == "Intervals are 95 %, over seeds."
     assert lines[-1] == "On top, world model: 494 real episodes, 67,551 env steps."
     assert bench.table(result).row_count == 2
     bench.draw(tmp_path / "efficiency.png", result)

@@ -24,6 +24,7 @@ from accerl_lerobot.evaluation.stats import (
     compare,
     format_rate,
     mcnemar_p,
+    mean_interval,
     paired_interval,
     per_task,
     task_mean,
@@ -161,6 +162,23 @@ def test_compare_turned_round_changes_only_the_sign() -> None:
     there, back = compare(a, b), compare(b, a)
     assert back.difference == -there.difference and back.p_value == there.p_value
     assert back.interval.low == pytest.approx(-there.interval.high)
+
+
+def test_a_mean_over_runs_is_as_unsure_as_they_differ() -> None:
+    """t at 97.5 %: 2.776445 of four degrees of freedom, 12.706205 of one (Student's table)."""
+    policies = [0.71, 0.47, 0.64, 0.33, 0.56]  # mean 0.542, s² = 0.08828 / 4
+    half = 2.776445 * math.sqrt(0.08828 / 4 / 5)
+    found = mean_interval(policies)
+    assert (found.low, found.high) == pytest.approx((0.542 - half, 0.542 + half), abs=1e-6)
+    assert mean_interval([0.9, 1.0]).low == pytest.approx(0.95 - 12.706205 * 0.05, abs=1e-6)
+    assert mean_interval([0.3, 0.3]).low == pytest.approx(0.3)
+    rng = random.Random(0)
+    draws = [[rng.gauss(1.0, 2.0) for _ in range(5)] for _ in range(4000)]
+    held = sum(1.0 in mean_interval(values, 0.9) for values in draws) / 4000
+    assert held == pytest.approx(0.9, abs=0.02)
+    for values, confidence in (([0.5], 0.95), ([], 0.95), ([0.1, 0.2], 1.0)):
+        with pytest.raises(ValueError):
+            mean_interval(values, confidence)
 
 
 def test_pairing_sees_what_two_intervals_do_not() -> None:
