@@ -247,9 +247,12 @@ class RunConfig:
                     f"use asynchronous, or leave out rollout.{name}: a world that has to pause is waited for"
                 )
                 raise InputError("launch.schedule", self.launch.schedule, remedy)
-        if imagination.share and self.algorithm.advantage == "group":
-            remedy = "use algorithm.advantage=gae: dreams do not begin alike, so they are not compared"
-            raise InputError("imagination.share", imagination.share, remedy)
+        if imagination.share and self.rollout.group_size:
+            # Nor could the episodes of a group, which bear one name, be told from each other.
+            remedy = (
+                "leave it out with imagination.share: dreams do not begin alike, so they are not compared"
+            )
+            raise InputError("rollout.group_size", self.rollout.group_size, remedy)
 
 
 def journal_folder(config: RunConfig) -> Path | None:

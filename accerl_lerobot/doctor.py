@@ -284,6 +284,17 @@ def dreams(config: RunConfig) -> Iterator[Check]:
     else:
         kind, share = config.imagination.model, config.imagination.share
         yield Check(name="dreams", status=OK, text=f"{share:.0%} of every batch; what dreams: {kind}")
+        yield from _unwatched(config)
+
+
+def _unwatched(config: RunConfig) -> Iterator[Check]:
+    """Says so where the kill switch can never trip: too few real episodes end beside dreams."""
+    imagination, episodes = config.imagination, config.rollout.episodes
+    beside = imagination.horizon is None and imagination.beginnings > 0
+    if beside and 0 < episodes <= imagination.witnesses:
+        why = f"that takes more real episodes than imagination.witnesses, {imagination.witnesses}"
+        text = f"are not switched off where they flatter: {why}, and rollout.episodes is {episodes}"
+        yield Check(name="dreams", status=WARN, text=text)
 
 
 def placement(config: RunConfig) -> Iterator[Check]:

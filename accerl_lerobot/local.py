@@ -263,6 +263,8 @@ class LocalEngine(Engine):
         """One decision in every dream, if any is wanted."""
         if self._dreams is None or not self._training:
             return
+        if self._replay.real_ended:
+            self._dreams.end_real()
         learner, on = self._world_learner, self._dreams.on
         awaited = learner is not None and learner.promising(self._replay.real_ended)
         awaited = awaited or self._dreams.prepares

@@ -19,6 +19,7 @@
 from __future__ import annotations
 
 import difflib
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import draccus
@@ -35,7 +36,7 @@ def check_start(config: RunConfig) -> int:
     """Refuses a run that could not begin: no policy, no dataset, or an SFT whose outcome RL could not use.
 
     Returns:
-        The policy's ``n_obs_steps``; 1 where LeRobot's trainer will tell.
+        The policy's ``n_obs_steps``.
 
     Raises:
         InputError: see above; more ranks than GPUs, or no GPU to offload from; also what `check_sft_policy`
@@ -54,23 +55,42 @@ def check_start(config: RunConfig) -> int:
         if resolve_device(config.policy.device).type == "cpu":
             remedy = "there is no GPU here, and the CPU's memory has everything already; leave the field out"
             raise InputError("trainer.cpu_offload", True, remedy)
-    if config.policy.path is not None:
-        from accerl_lerobot.policies.loading import load_lerobot_config
-
-        return int(load_lerobot_config(config.policy).n_obs_steps)
-    if config.dataset.repo_id is not None:
+    if config.policy.path is None and config.dataset.repo_id is not None:
         from accerl_lerobot.demos.windows import open_metadata
 
         open_metadata(config.dataset)
-    if config.sft.init_path is not None:
-        return 1
-    from accerl_lerobot.policies.loading import check_observations, check_type, sampler_config
+    return int(policy_to_be(config).n_obs_steps)
 
+
+def policy_to_be(config: RunConfig) -> Any:
+    """LeRobot's config of the policy that a run will act with, as far as it is known before an SFT.
+
+    Raises:
+        InputError: there is no such checkpoint; RL has no likelihood for it; what `check_sft_policy` raises.
+    """
+    from accerl_lerobot.policies.loading import (
+        check_observations,
+        check_type,
+        load_lerobot_config,
+        sampler_config,
+    )
+
+    if config.policy.path is not None:
+        return load_lerobot_config(config.policy)
+    if config.sft.init_path is not None:  # fine-tuning changes its weights alone
+        start = replace(config.policy, path=config.sft.init_path, revision=None)
+        try:
+            return load_lerobot_config(start)
+        except InputError as error:
+            field = {"policy.path": "sft.init_path", "policy.type": "sft.init_path"}.get(
+                error.field, error.field
+            )
+            raise InputError(field, error.value, error.remedy) from error
     policy_config = check_sft_policy(config.sft)
     kind = check_type(config.sft.policy["type"], "sft.policy.type", "RL needs a likelihood: ")
     sampler_config(config.policy, kind)
     check_observations(policy_config, "sft.policy.n_obs_steps")
-    return int(policy_config.n_obs_steps)
+    return policy_config
 
 
 def check_sft_policy(config: SFTConfig) -> Any:

@@ -266,4 +266,8 @@ def test_dreams_are_checked_where_there_are_any(capsys: pytest.CaptureFixture[st
     assert doctor.main([recipe, "--imagination.path=nowhere"]) == 1
     assert "FAIL  dreams     imagination.path='nowhere': config.json: is missing" in capsys.readouterr().out
     doctor.main([recipe, "--imagination.model=oracle"])
-    assert "ok    dreams     90% of every batch; what dreams: oracle" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "ok    dreams     90% of every batch; what dreams: oracle" in told
+    assert "warn  dreams     are not switched off where they flatter: that takes more real episodes" in told
+    doctor.main([recipe, "--imagination.model=oracle", "--rollout.episodes=17"])
+    assert "where they flatter" not in capsys.readouterr().out

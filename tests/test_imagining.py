@@ -343,7 +343,48 @@ def test_what_does_not_fit_is_refused_before_the_run_begins(
     assert not (tmp_path / "out" / "checkpoints").exists()
 
 
+def test_a_real_episode_that_is_lost_is_not_waited_for(tiny_checkpoint: Path, world_model: Path):
+    """All that are counted have to end before anything is calibrated, and one never does."""
+    still = OnlineLearnConfig(steps_per_episode=0)
+    options: dict[str, Any] = {"path": str(world_model), "horizon": None, "learn": still, "doubt": 1e9}
+    engine = LocalEngine(dreaming(tiny_checkpoint, calibrate=4, **options), ("match",))
+    insert, lost = engine._replay.insert, []
+
+    def inserted(segment: Segment) -> bool:
+        if segment.source == REAL and segment.terminated and not lost:
+            return bool(lost.append(segment))
+        return insert(segment)
+
+    engine._replay.insert = inserted  # type: ignore[method-assign]
+    engine.train()
+    for _ in range(2000):
+        progress = engine.poll()
+        if progress.done:
+            break
+    engine.close()
+    assert lost and progress.done and progress.version == 12
+    assert progress.imagination["decisions"] > 0
+
+
+def test_what_a_run_learns_its_world_model_from_is_real(tiny_checkpoint: Path, world_model: Path):
+    learn = OnlineLearnConfig(steps_per_episode=1.0, try_every=2, held_out=0.4, trial=LOOSE, batch=4)
+    config = dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12)
+    engine = LocalEngine(config, ("match",))
+    assert engine._world_learner is not None
+    added, taken = engine._world_learner.add, []
+    engine._world_learner.add = lambda segment: taken.append(segment) or added(segment)  # type: ignore
+    engine.train()
+    history = drive(engine)
+    engine.close()
+    assert {s.source for s in taken} == {REAL} and history[-1].imagination["decisions"] > 0
+
+
 def test_rooms_that_do_not_go_together(tiny_checkpoint: Path):
+    with pytest.raises(InputError, match=r"^rollout\.group_size=2: leave it out with imagination\.share"):
+        groups = RolloutConfig(worlds=4, segment_length=4, group_size=2)
+        tiny_run(
+            tiny_checkpoint, env=ENV, imagination=ImaginationConfig(share=0.5, model="oracle"), rollout=groups
+        )
     with pytest.raises(InputError, match=r"^imagination\.replay\.ahead=4: use at least one batch, 16"):
         dreaming(tiny_checkpoint, model="oracle", replay=replace(DREAMS, ahead=4))
     with pytest.raises(InputError, match=r"^rollout\.episodes=7: use a multiple of rollout.group_size, 4"):

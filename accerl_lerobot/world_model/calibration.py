@@ -34,19 +34,36 @@ class Calibration:
 
     Args:
         dreams: how many; 0: none are wanted.
+        ended: real episodes that must have ended before, as those that end first succeed.
     """
 
-    def __init__(self, dreams: int) -> None:
-        self._wanted = dreams
+    def __init__(self, dreams: int, ended: int = 1) -> None:
+        self._wanted, self._ended, self._real_ended = dreams, ended, False
         self._pairs: list[tuple[bool, float]] = []
         self._done = dreams == 0
         self.threshold: float | None = None
         """What came of it; None: nothing yet, or nothing at all."""
 
-    @property
-    def going_on(self) -> bool:
-        """Whether dreams are wanted."""
-        return not self._done
+    def end_real(self) -> None:
+        """No real episode will come any more; of those that were counted, some may have been lost."""
+        self._real_ended = True
+
+    def wants(self, told: bool) -> bool:
+        """Whether dreams are wanted: not where no real episode has ended, or ever will.
+
+        Args:
+            told: whether there is the beginning of one that has.
+        """
+        return not self._done and (told or not self._real_ended)
+
+    def waits(self, ended: int, told: bool) -> bool:
+        """Whether dreams are wanted, and must not begin yet.
+
+        Args:
+            ended: real episodes that have.
+            told: see `wants`.
+        """
+        return self.wants(told) and not (told and (self._real_ended or ended >= self._ended))
 
     def add(self, achieved: bool, highest: float) -> None:
         """Takes a dream: how the episode ended that it begins with, and the highest P(success) in it."""

@@ -26,9 +26,10 @@ from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.loading import load_lerobot_config
-from accerl_lerobot.preflight import check_sft_policy
+from accerl_lerobot.preflight import policy_to_be
 from accerl_lerobot.world_model.baselines import ShuffledModel
 from accerl_lerobot.world_model.config import TrialConfig
+from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.dataset import fingerprint, load_episodes
 from accerl_lerobot.world_model.episodes import Episode
 from accerl_lerobot.world_model.films import TrialFilms
@@ -40,7 +41,7 @@ from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.pool import part
 from accerl_lerobot.world_model.recorded import DREAMS, DreamRecorder
 from accerl_lerobot.world_model.sources import ONLINE, check_apart, named, open_rooms
-from accerl_lerobot.world_model.store import find, load_sources
+from accerl_lerobot.world_model.store import Source, find, load_sources
 from accerl_lerobot.world_model.zoo import make_dreamer
 
 EARLIER = "earlier"
@@ -79,7 +80,22 @@ def make_imagination(
         on_segment=on_segment,
         index=index,
         ended=_witnesses(config),
+        sources=_sources(config, dreamer.model.spec) if index == 0 else (),
     )
+
+
+def _sources(config: RunConfig, spec: WorldModelSpec) -> list[Source]:
+    """What a world model that goes on learning learns from, beside the run's own episodes."""
+    if not config.imagination.learns:
+        return []
+    sources = list(load_sources(Path(str(config.imagination.path)), "imagination.path"))
+    rooms = _rooms(config.imagination.learn)
+    for room, meta in open_rooms(rooms, spec).items():
+        if find(sources, known := fingerprint(meta)) is None:  # then it is learnt from whole
+            every = tuple(range(meta.total_episodes))
+            name = rooms[room].repo_id or ""
+            sources.append(Source(repo_id=name, fingerprint=known, learnt=every, held_out=()))
+    return sources
 
 
 def _witnesses(config: RunConfig) -> int:
@@ -155,12 +171,7 @@ def check_imagination(config: RunConfig) -> None:
     Raises:
         InputError: see there.
     """
-    if config.policy.path is not None:
-        policy = load_lerobot_config(config.policy)
-    elif config.sft.init_path is None:
-        policy = check_sft_policy(config.sft)
-    else:
-        return  # what is fine-tuned then is looked at when it is there
+    policy = policy_to_be(config)
     executed = getattr(policy, "n_action_steps", 1)
     dreamer = _dreamer(config, _spec(config), executed, policy.n_obs_steps)
     learn = config.imagination.learn

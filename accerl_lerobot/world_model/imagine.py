@@ -24,7 +24,7 @@ Knows no process: whoever drives it asks for `requests`, has them decided, and h
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -45,7 +45,7 @@ from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.stand_in import SuccessModel, device_of
 from accerl_lerobot.world_model.starts import Start, StartPool
-from accerl_lerobot.world_model.store import save_world_model
+from accerl_lerobot.world_model.store import Source, save_world_model
 from accerl_lerobot.world_model.success import probabilities
 
 if TYPE_CHECKING:
@@ -96,6 +96,7 @@ class Imagination:
         on_segment: receives what was imagined.
         index: of several that dream beside each other with the same seed.
         ended: real episodes that must have ended before anything is calibrated: those that end first succeed.
+        sources: what a model that is promoted has learnt from beside the run's own episodes.
     """
 
     def __init__(
@@ -112,6 +113,7 @@ class Imagination:
         on_segment: Callable[[Segment], object],
         index: int = 0,
         ended: int = 1,
+        sources: Sequence[Source] = (),
     ) -> None:
         self.config, self.counters = config, DreamCounters()
         # Whether there are dreams of whole episodes, which real ones can be held against.
@@ -123,8 +125,8 @@ class Imagination:
         """Whether no model has passed its trial yet."""
         self._model, self._world = model, world
         self._success = None if "success" in model.spec.provides else success
-        self._calibration = Calibration(config.calibrate if self._success is not None else 0)
-        self._ended = ended
+        self._calibration = Calibration(config.calibrate if self._success is not None else 0, ended)
+        self._sources = tuple(sources)
         self._cost, self._fails, self._name = decision_cost, fails, name
         self._on_segment = on_segment
         self._starts = StartPool(
@@ -152,6 +154,10 @@ class Imagination:
         self._starts.add(segment)
         if self._beside and self.on and (segment.terminated or segment.truncated):
             self.switch.lived(segment.terminated and segment.success)
+
+    def end_real(self) -> None:
+        """No real segment will come any more: what waits for one waits no longer."""
+        self._calibration.end_real()
 
     def swap(self, promotion: Promotion) -> None:
         """Another world model of the same world dreams from now on; dreams under way are dropped.
@@ -218,7 +224,7 @@ class Imagination:
     def save_promoted(self, directory: Path) -> None:
         """Writes the world model that has passed last, and its success model; nothing if none has."""
         if self.version and self._success is not None:
-            save_world_model(directory, self._learned, self._success)
+            save_world_model(directory, self._learned, self._success, self._sources)
 
     @property
     def _learned(self) -> PixelWorldModel:
@@ -236,8 +242,7 @@ class Imagination:
     @property
     def prepares(self) -> bool:
         """Whether it waits for real episodes to end, by which it is to be calibrated."""
-        starts = self._starts
-        return self._calibration.going_on and not (starts.ended >= self._ended and starts.told)
+        return self._calibration.waits(self._starts.ended, self._starts.told)
 
     def requests(self) -> list[Request]:
         """What is to be decided, one for each dream; none before anything real was seen, or switched off."""
@@ -264,7 +269,9 @@ class Imagination:
         for i, decision in enumerate(decisions):
             row = self._rows[i]
             assert row is not None
-            if doubt[i] > self.config.doubt:  # never true of a NaN
+            # A model without uncertainty says NaN of it, one that diverges of all else.
+            broken = not (np.isfinite(robot[i]).all() and np.isfinite(said[i]))
+            if doubt[i] > self.config.doubt or broken:
                 self.counters.doubted += 1
                 self._doubted_in_a_row = 0 if row.depth else self._doubted_in_a_row + 1
                 self._end(i, row, terminated=False)
@@ -350,7 +357,7 @@ class Imagination:
         """Fills the rows that are free."""
         if not rows:
             return
-        calibrates = self._calibration.going_on
+        calibrates = self._calibration.wants(self._starts.told)
         starts = self._starts.draw(len(rows), self._rng, told=calibrates)
         parts = [np.stack([getattr(s, part) for s in starts]) for part in Context._fields]
         state = self._model.begin(

@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from accerl_lerobot.experience import Segment
+from accerl_lerobot.experience import REAL, Segment
 from accerl_lerobot.world_model.config import LearnConfig, SuccessLearnConfig, TrialConfig
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.episodes import Episode, Place
@@ -199,7 +199,15 @@ class OnlineLearner:
         return not last or self.owed >= 1 or self.due(last)
 
     def add(self, segment: Segment) -> None:
-        """Takes a real segment; of the episodes that it completes, some are held out."""
+        """Takes a real segment; of the episodes that it completes, some are held out.
+
+        Raises:
+            ValueError: it was imagined: from its own dreams a world model learns nothing about the world.
+        """
+        if segment.source != REAL:
+            raise ValueError(
+                f"a world model learns from real segments, and {segment.key} is {segment.source}"
+            )
         parts = self._unfinished.add(segment)
         if parts is None:
             return
@@ -213,7 +221,7 @@ class OnlineLearner:
         self._examples, self._new = None, True
         self._since += 1
         # Where episodes come faster than it can learn, what it owes is not to grow without end.
-        most = self.config.try_every * self.config.steps_per_episode
+        most = max(1.0, self.config.try_every * self.config.steps_per_episode)
         self.owed = min(self.owed + self.config.steps_per_episode, most)
 
     def step(self) -> dict[str, float]:

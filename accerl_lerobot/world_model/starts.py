@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,6 +31,8 @@ from accerl_lerobot.world_model.frames import executed, seen
 
 Name = tuple[str, int]
 """Of an episode: its task and its seed."""
+UNDER_WAY = 1024
+"""Episodes that may go on in another segment; of those left behind by a worker that died, the oldest go."""
 
 
 @kind
@@ -55,6 +57,18 @@ class Start:
     """None: where the segment began in mid-episode, what came before is not known."""
     achieved: bool | None
     """Whether the real episode achieved the task within the horizon; None: it is not known, or not yet."""
+
+
+@kind
+class _Lead(NamedTuple):
+    """What led to a segment, which may begin in mid-episode."""
+
+    decision: int
+    """The segment's first."""
+    told: np.ndarray
+    """float32 (A,), the sum of all actions before, as far back as they are known,"""
+    first: np.ndarray
+    """and where the robot was then, float32 (S,)."""
 
 
 class StartPool:
@@ -83,6 +97,8 @@ class StartPool:
         self.beginnings, self.keyframes = beginnings, keyframes
         self._whole = whole
         self._held: deque[_Held] = deque()
+        self._leads: dict[Name, _Lead] = {}
+        """To what comes next of an episode that has not ended; the oldest first."""
         self._outcomes: dict[Name, bool] = {}
         """Of episodes that have ended, and of which something is held."""
         self.ended = 0
@@ -97,8 +113,10 @@ class StartPool:
 
     def add(self, segment: Segment) -> None:
         """Takes a real segment; the oldest ones leave."""
+        held = _Held(segment, self.spec)
+        self._follow(held)
         if not segment.origin.decision or not (self._whole or len(segment) < self.spec.context):
-            self._held.append(_Held(segment, self.spec))
+            self._held.append(held)
             self._count += len(segment)
         names = [held.name for held in self._held]
         name = segment.origin[:2]
@@ -115,15 +133,30 @@ class StartPool:
 
     def state(self) -> dict[str, Any]:
         """All that `restore` needs; see `snapshot`."""
-        held = [held.segment for held in self._held]
-        return {"segments": held, "outcomes": dict(self._outcomes), "ended": self.ended}
+        held = [(held.segment, held.lead) for held in self._held]
+        outcomes = dict(self._outcomes)
+        return {"held": held, "leads": dict(self._leads), "outcomes": outcomes, "ended": self.ended}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Goes on from what `state` gave."""
-        self._held.extend(_Held(segment, self.spec) for segment in state["segments"])
+        self._held.extend(_Held(segment, self.spec, lead) for segment, lead in state["held"])
+        self._leads.update(state["leads"])
         self._count = sum(len(held.segment) for held in self._held)
         self._outcomes, self.ended = state["outcomes"], state["ended"]
         self.told = self._is_told()
+
+    def _follow(self, held: _Held) -> None:
+        """Lets a segment know what led to it, and keeps what it leads to."""
+        segment, name = held.segment, held.name
+        lead = self._leads.pop(name, None)
+        if lead is not None and lead.decision == segment.origin.decision:
+            held.lead = lead
+        if segment.terminated or segment.truncated:
+            return
+        told = held.lead.told + executed(segment.actions, segment.steps).sum(0)
+        self._leads[name] = _Lead(segment.origin.decision + len(segment), told, held.lead.first)
+        if len(self._leads) > UNDER_WAY:
+            self._leads.pop(next(iter(self._leads)))
 
     def _is_told(self) -> bool:
         return any(held.first.any() and held.name in self._outcomes for held in self._held)
@@ -175,8 +208,8 @@ class StartPool:
             frames=held.frames[context],
             robot=held.robot[context],
             actions=_before(segment, t, spec.context),
-            told=actions.sum(0),
-            first=held.robot[0],
+            told=held.lead.told + actions.sum(0),
+            first=held.lead.first,
             task=segment.task,
             origin=segment.origin._replace(decision=segment.origin.decision + t),
             history=history,
@@ -194,12 +227,14 @@ def _before(segment: Segment, t: int, context: int) -> np.ndarray:
 
 
 class _Held:
-    """A segment, as the model sees it."""
+    """A segment, as the model sees it; without a `lead` its episode begins with it, as far as is known."""
 
-    def __init__(self, segment: Segment, spec: WorldModelSpec) -> None:
+    def __init__(self, segment: Segment, spec: WorldModelSpec, lead: _Lead | None = None) -> None:
         self.segment, self.name = segment, segment.origin[:2]
         self.first = segment.origin.decision + np.arange(len(segment)) == 0
         self.frames, self.robot = seen(segment.observations, spec)
+        nothing = np.zeros(spec.action_dim, np.float32)
+        self.lead = lead or _Lead(segment.origin.decision, nothing, self.robot[0])
         # V of a last observation that nothing was decided on is not known: the V before stands for it.
         following = np.append(segment.value[1:], 0.0 if segment.terminated else segment.value[-1])
         self.surprise = np.abs(segment.reward + following - segment.value).astype(np.float64)

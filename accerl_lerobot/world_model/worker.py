@@ -159,6 +159,8 @@ class DreamWorker:
                 promising = self._swap() or self._dreams.prepares
                 for segment in news.fresh():
                     self._dreams.remember(segment)
+                if news.ended:
+                    self._dreams.end_real()
                 self._cursor = news.cursor
             # Both at once: a run in which nothing is imagined and nothing expected has nothing to wait for.
             if told != (self._dreams.on, promising):

@@ -170,6 +170,19 @@ def test_a_segment_sent_twice_is_stored_once():
     play(scene)
 
 
+def test_news_is_real_experience_alone():
+    async def scene(_: ReplayWorker) -> None:
+        worker = ReplayWorker(CONFIG, seed=0, imagined=CONFIG)
+        await worker.insert([make_segment("a", 8)])
+        await worker.insert([make_imagined("d")])
+        news = await worker.news(0)
+        assert [s.key for s in news.segments] == ["a"] and news.cursor == 1 and not news.ended
+        await worker.end_real()
+        assert (await worker.news(1)).ended
+
+    play(scene)
+
+
 def test_imagined_is_what_any_of_several_who_dream_imagines():
     async def main() -> None:
         worker = ReplayWorker(CONFIG, seed=0, imagined=CONFIG, dreamers=2)

@@ -37,16 +37,16 @@ __all__ = ["bright"]  # a fixture
 def test_it_lets_as_many_dreams_succeed_as_episodes_did():
     calibration = Calibration(4)
     for number, (achieved, highest) in enumerate([(True, 0.9), (False, 0.95), (False, 0.7), (False, 0.8)]):
-        assert calibration.going_on and not calibration.complete(), number
+        assert calibration.wants(True) and not calibration.complete(), number
         calibration.add(achieved, highest)
     assert calibration.complete() and calibration.threshold == pytest.approx((0.95 + 0.9) / 2)
-    assert not calibration.going_on and not calibration.complete()
+    assert not calibration.wants(True) and not calibration.complete()
     calibration.reset()
-    assert calibration.going_on and calibration.threshold is None
+    assert calibration.wants(True) and calibration.threshold is None
     for highest in (0.1, 0.2, 0.3, 0.4):
         calibration.add(highest > 0.1, highest)
     assert calibration.complete() and calibration.threshold == 0.5, "less than that says nothing"
-    assert not Calibration(0).going_on
+    assert not Calibration(0).wants(True)
 
 
 @pytest.mark.parametrize("outcome", [True, False])
@@ -54,7 +54,7 @@ def test_where_all_episodes_ended_alike_nothing_is_told(outcome: bool):
     calibration = Calibration(3)
     for highest in (0.1, 0.9, 0.5):
         calibration.add(outcome, highest)
-    assert calibration.complete() and calibration.threshold is None and not calibration.going_on
+    assert calibration.complete() and calibration.threshold is None and not calibration.wants(True)
 
 
 def act(dreams: Imagination, requests: list[Request]) -> list[Decision]:
@@ -110,10 +110,35 @@ def test_it_waits_for_the_failures_which_end_last(bright: Any):
     for episode in episodes:
         assert dreams.requests() == []
         dreams.remember(episode)
-    while dreams._calibration.going_on:
+    while dreams._calibration.wants(True):
         dreams.advance(act(dreams, dreams.requests()))
     real = [achieved for achieved, _ in dreams._calibration._pairs]
     assert np.mean(real) == pytest.approx(share, abs=0.05)
+
+
+def test_episodes_that_were_lost_are_not_waited_for(bright: Any):
+    dreams, _ = imagination(Counting(), bright, horizon=None, calibrate=4, ended=8)
+    for segment in (*lived(1, solve_at=2), *lived(3)):
+        dreams.remember(segment)
+    assert dreams.prepares and not dreams.requests()
+    dreams.end_real()
+    assert not dreams.prepares
+    while dreams._calibration.wants(True):
+        dreams.advance(act(dreams, dreams.requests()))
+    assert bright.config.threshold != 0.55, "by the two that are known"
+
+
+def test_where_no_beginning_is_known_and_none_will_come_it_dreams_as_it_is(bright: Any):
+    dreams, made = imagination(Counting(), bright, horizon=None, calibrate=4, ended=8)
+    dreams.remember(lived(3, length=2)[1])
+    dreams.end_real()
+    assert not dreams.prepares and dreams.on
+    while not made:
+        requests = dreams.requests()
+        assert len(requests) == 4 and not any(row.calibrates for row in dreams._rows if row)
+        dreams.advance([decided(np.full((K, 2), 0.1)) for _ in requests])
+    dreams.swap(promotion(Counting(), bright, 7))
+    assert dreams.on and dreams.requests() and bright.config.threshold == 0.55
 
 
 def test_each_model_is_calibrated_anew(bright: Any):

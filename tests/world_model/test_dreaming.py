@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,17 +23,21 @@ import torch
 
 from accerl_lerobot.config import DatasetConfig, RunConfig
 from accerl_lerobot.demos.record import DemosConfig, record_demos
+from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.preflight import check_start
 from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, WorldModelConfig
 from accerl_lerobot.world_model.dataset import fingerprint
-from accerl_lerobot.world_model.dreaming import check_imagination, make_learner
+from accerl_lerobot.world_model.dreaming import check_imagination, make_imagination, make_learner
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig, OnlineLearnConfig
 from accerl_lerobot.world_model.offline import world_spec
+from accerl_lerobot.world_model.online import Promotion
 from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.store import Source, save_world_model
+from accerl_lerobot.world_model.store import Source, load_sources, save_world_model
 from accerl_lerobot.world_model.success import new_success_model
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 from tests.runs import tiny_run
 
 ENV = SimulatedConfig(max_steps=16, hold=8)
@@ -87,6 +92,36 @@ def test_it_goes_on_with_what_it_has_learnt_from_and_never_with_what_was_held_ou
     assert (len(learner._offline), len(learner._held_offline)) == (9, 0), (
         "what it does not know it takes whole"
     )
+
+
+def test_what_is_promoted_says_what_it_has_learnt_from(
+    tiny_checkpoint: Path, datasets: tuple[DatasetConfig, DatasetConfig], tmp_path: Path
+):
+    demos, rollouts = datasets
+    source = known(demos, (0, 2), (1, 3, 4))
+    config = run(
+        tiny_checkpoint, tmp_path / "model", OnlineLearnConfig(dataset=demos, online=rollouts), [source]
+    )
+    dreams = make_imagination(config, "dream", lambda segment: None)
+    model, success = dreams.dreamer
+    assert isinstance(model, PixelWorldModel) and isinstance(success, SuccessPairsRewardModel)
+    dreams.swap(Promotion(model, success, 7, {}))
+    dreams.save_promoted(tmp_path / "promoted")
+    assert load_sources(tmp_path / "promoted") == (source, known(rollouts, (0, 1, 2, 3), ()))
+
+
+def test_what_would_be_fine_tuned_is_looked_at_before(tiny_checkpoint: Path, tmp_path: Path):
+    config = run(tiny_checkpoint, tmp_path / "model", OnlineLearnConfig(), [])
+    path = config.policy.path
+    tuned = replace(config, policy=replace(config.policy, path=None), sft=SFTConfig(steps=1, init_path=path))
+    check_imagination(tuned)
+    two = replace(tuned, policy=replace(tuned.policy, n_action_steps=2))
+    with pytest.raises(InputError, match="executes 2 actions per decision"):
+        check_imagination(two)
+    for start in (check_imagination, check_start):
+        with pytest.raises(InputError, match=r"^sft\.init_path='nowhere'"):
+            start(replace(tuned, sft=replace(tuned.sft, init_path="nowhere")))
+    assert check_start(tuned) == 1
 
 
 def test_a_dataset_that_is_named_twice_is_refused(

@@ -187,6 +187,21 @@ def test_what_is_too_uncertain_is_not_kept(bright: Any):
     assert dreams.counters.doubted == 2 and dreams.counters.dreams == len(made) + 1
 
 
+def test_what_is_no_number_ends_a_dream_and_is_not_kept(bright: Any):
+    """A model that diverges says NaN of the robot, which nothing is larger than."""
+    model = Counting()
+    dreams, made = imagination(model, bright, dreams=2, world=ENDLESS)
+    dreams.remember(lived(3)[0])
+    play(dreams, 1, 0.1)
+    assert dreams._state is not None
+    dreams._state["robot"] = dreams._state["robot"] + torch.tensor([[0.0], [torch.nan]])
+    play(dreams, 1, 0.1)
+    assert dreams.counters.doubted == 1 and [len(s) for s in made] == [1]
+    assert np.isfinite(made[0].observations["observation.state"]).all()
+    play(dreams, 4, 0.1)
+    assert dreams.counters.doubted == 1, "its row has begun anew"
+
+
 def test_dreams_begin_anew_beside_those_that_go_on():
     oracle = OracleModel(SPEC, lambda: make_world(WORLD), 8)
     dreams, made = imagination(oracle, dreams=8, horizon=3)

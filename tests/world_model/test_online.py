@@ -23,7 +23,7 @@ import pytest
 import torch
 
 from accerl_lerobot import snapshot
-from accerl_lerobot.experience import Segment
+from accerl_lerobot.experience import IMAGINED, Segment
 from accerl_lerobot.world_model import online
 from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, TrialConfig
 from accerl_lerobot.world_model.frames import seen
@@ -91,6 +91,22 @@ def test_episodes_are_put_together_from_their_segments():
     whole = episode_of(lived(1), SPEC)
     for name in ("frames", "times", "state", "actions"):
         assert np.array_equal(getattr(made._learnt[0], name), getattr(whole, name))
+
+
+def test_dreams_are_refused():
+    [segment] = lived(1)
+    with pytest.raises(ValueError, match=f"real segments, and {segment.key} is imagined"):
+        learner().add(replace(segment, source=IMAGINED))
+
+
+def test_less_than_a_step_in_a_trial_s_time_is_made_later():
+    made = learner(steps_per_episode=0.05, try_every=4)
+    for segment in episodes(*[False] * 4):
+        made.add(segment)
+    assert made.owed == pytest.approx(0.2) and not made.due(last=False)
+    for segment in episodes(*[False] * 16):
+        made.add(segment)
+    assert made.owed == pytest.approx(1.0)
 
 
 def test_what_never_ends_is_forgotten():

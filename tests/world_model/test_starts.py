@@ -20,6 +20,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from accerl_lerobot.world_model import starts as starts_module
 from accerl_lerobot.world_model.frames import seen
 from accerl_lerobot.world_model.starts import StartPool
 from tests.world_model.lived import SPEC, K, lived
@@ -70,16 +71,47 @@ def test_where_a_segment_was_cut_the_outcome_or_the_history_is_not_known():
     assert found == {0: False, 1: None}
     held.add(second)
     starts = {s.origin.decision: s for s in held.draw(200, np.random.default_rng(0))}
-    # How fast the robot was at the third decision is in a segment that may be gone.
+    # What the third decision's frame before showed is in a segment that may be gone.
     assert set(starts) == {0, 1, 3}
     assert starts[3].history is None and starts[3].achieved is False
     assert np.array_equal(starts[3].actions[0], second.actions[0])
-    assert starts[3].told == pytest.approx(second.actions[0].sum(0), abs=1e-5), "since it is known"
-    assert np.array_equal(starts[3].first, second.observations["observation.state"][0])
+    told = first.actions.sum((0, 1)) + second.actions[0].sum(0)
+    assert starts[3].told == pytest.approx(told, abs=1e-5), "since the episode began"
+    assert np.array_equal(starts[3].first, first.observations["observation.state"][0])
+    alone = pool()
+    alone.add(second)
+    [start] = alone.draw(1, np.random.default_rng(0))
+    assert start.told == pytest.approx(second.actions[0].sum(0), abs=1e-5), "since it is known"
+    assert np.array_equal(start.first, second.observations["observation.state"][0])
     whole = pool(whole=True)
     for segment in (first, second):
         whole.add(segment)
     assert len(whole) == 2
+
+
+def test_what_led_to_a_segment_is_kept_over_several_and_when_a_pool_is_left(monkeypatch: pytest.MonkeyPatch):
+    parts, [whole] = lived(5, length=1), lived(5)
+    assert len(parts) == len(whole) == 4
+    one, other = replace(SPEC, context=1), lived(6, length=1)
+    held = StartPool(one, memory=1, horizon=None, beginnings=0.0, keyframes=0.0)
+    for t, part in enumerate(parts):
+        held.add(part)
+        [start] = held.draw(1, np.random.default_rng(0))
+        assert start.origin.decision == t
+        assert start.told == pytest.approx(whole.actions[:t].sum((0, 1)), abs=1e-5)
+        assert np.array_equal(start.first, whole.observations["observation.state"][0])
+        again = StartPool(one, memory=1, horizon=None, beginnings=0.0, keyframes=0.0)
+        again.restore(held.state())
+        assert np.array_equal(again.draw(1, np.random.default_rng(0))[0].told, start.told)
+        held = again
+    assert not held._leads, "the episode has ended"
+    monkeypatch.setattr(starts_module, "UNDER_WAY", 1)
+    held.add(parts[0])
+    held.add(other[0])
+    assert list(held._leads) == [("match", 6)]
+    held.add(other[2])  # the one between was lost
+    [start] = held.draw(1, np.random.default_rng(0))
+    assert not start.told.any() and start.origin.decision == 2
 
 
 def test_some_begin_where_episodes_began():
