@@ -83,7 +83,8 @@ def _fields(cls: type[Any], prefix: str, usual: Any = None) -> list[str]:
     for field in dataclasses.fields(cls):
         name, room = f"{prefix}{field.name}", room_of(hints[field.name])
         if room is None:
-            lines += _entry(f"--{name}={_shown(_default(field, usual))}", docs[field.name])
+            text = " ".join([docs[field.name], *_choices(field)])
+            lines += _entry(f"--{name}={_shown(_default(field, usual))}", text)
             continue
         choices, default = choices_of(room), _default(field, usual)
         if not choices:
@@ -105,6 +106,11 @@ def _entry(flag: str, text: str) -> list[str]:
     if len(start) < COLUMN:
         return textwrap.wrap(text, WIDTH, initial_indent=start.ljust(COLUMN), subsequent_indent=" " * COLUMN)
     return [start, *textwrap.wrap(text, WIDTH, initial_indent=" " * COLUMN, subsequent_indent=" " * COLUMN)]
+
+
+def _choices(field: Any) -> list[str]:
+    """What a field's values mean, where its metadata has a table of them: each entry has a `what`."""
+    return [f"{name}: {entry.what}" for name, entry in field.metadata.get("choices", {}).items()]
 
 
 def _default(field: Any, usual: Any = None) -> Any:

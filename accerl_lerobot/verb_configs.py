@@ -93,6 +93,8 @@ class WorldModelRun:
     """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
     job_name: str = "world_model"
     """Last part of the folder's name."""
+    device: str = "auto"
+    """cpu, cuda, or auto: where both networks learn and are tried."""
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     """The world it is to be a model of: its cameras, sizes, rate and tasks."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
@@ -121,6 +123,9 @@ class WorldModelEvalRun:
     """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
     job_name: str = "world_model_eval"
     """Last part of the folder's name."""
+    device: str = "auto"
+    """cpu, cuda, or auto: where the world model dreams and successes are told. What reads actions off frames
+    is small and stays on the CPU; `policies` are on CUDA when there is one."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """Episodes it has not learnt from; of the dataset that it has, those that were held out are taken."""
     online: DatasetConfig = field(default_factory=DatasetConfig)

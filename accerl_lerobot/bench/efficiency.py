@@ -196,7 +196,7 @@ def beside(study: Study, recipe: RunConfig) -> dict[str, dict[str, float]]:
         found["demonstrations"] = {name: total / len(used) for name, total in _totals(used).items()}
     learn = recipe.imagination.learn
     learnt = [dataset for dataset in (learn.dataset, learn.online) if dataset.repo_id is not None]
-    if learnt and any(run.imagination.share and run.imagination.model != "oracle" for run in study.runs):
+    if learnt and any(run.imagination.share and run.imagination.kind.folder for run in study.runs):
         found["world model"] = _totals(learnt)
     return found
 

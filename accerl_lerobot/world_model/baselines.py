@@ -56,7 +56,7 @@ class CopyModel(WorldModel):
 
 
 class ShuffledModel(WorldModel):
-    """Another model that is told the actions of the next row; a batch of one gets its own.
+    """Another model that is told the actions of the dream beside.
 
     Args:
         model: what dreams.
@@ -72,7 +72,13 @@ class ShuffledModel(WorldModel):
         return self.model.begin(context, tasks, histories)
 
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Dream:
-        """See the base class."""
+        """See the base class.
+
+        Raises:
+            ValueError: there is only one dream, which would be told its own actions.
+        """
+        if len(actions) < 2:
+            raise ValueError("a dream alone can only be told its own actions")
         return self.model.step(state, actions.roll(1, 0), seeds)
 
 

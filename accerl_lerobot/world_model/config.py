@@ -126,12 +126,15 @@ class LearnConfig:
     """Length of a window. From its second chunk on, the model learns from its own dream."""
     anchors: int = 15
     """The anchor lies up to so many chunks back, as far as dreams will go."""
+    validate_every: int = 250
+    """Gradient steps of the pre-training until the loss on held-out windows is taken again; 0: never. What is
+    learnt is the same with it and without it."""
 
     def __post_init__(self) -> None:
         for name, least in (("steps", 1), ("batch", 2), ("chunks", 1)):
             if getattr(self, name) < least:
                 raise InputError(f"world_model.learn.{name}", getattr(self, name), f"use at least {least}")
-        for name in ("warmup", "weight_decay", "anchors"):
+        for name in ("warmup", "weight_decay", "anchors", "validate_every"):
             if not getattr(self, name) >= 0:
                 raise InputError(f"world_model.learn.{name}", getattr(self, name), "use 0 or more")
         if not 0 < self.lr < 1:
@@ -167,10 +170,13 @@ class SuccessLearnConfig:
     """Episodes that are dreamt at a time,"""
     every: int = 50
     """and gradient steps until others are."""
+    validate_every: int = 50
+    """Gradient steps of the pre-training until it is tried on held-out pairs again; 0: never."""
 
     def __post_init__(self) -> None:
         for name, least in (
             ("steps", 1), ("batch", 2), ("weight_decay", 0), ("depth", 1), ("episodes", 2), ("every", 1),
+            ("validate_every", 0),
         ):  # fmt: skip
             if not getattr(self, name) >= least:
                 raise InputError(f"world_model.success.{name}", getattr(self, name), f"use at least {least}")

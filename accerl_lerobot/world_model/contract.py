@@ -16,6 +16,8 @@
     state = model.begin(context, tasks)
     dream = model.step(state, actions, seeds)         # dream.frames, dream.robot; go on from dream.state
 
+One that learns has a `loss` too. `kinds.py` has the table of those that a run can name.
+
 States are dicts of tensors with the batch in front, so that rows can be replaced, repeated and sent away. A
 model says in its `spec` what it provides. Whether a frame shows a success is another model's judgement, see
 `success.py`.
@@ -27,15 +29,20 @@ action dims.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from accerl_lerobot.snapshot import kind
+
+if TYPE_CHECKING:
+    from accerl_lerobot.envs.base import World
+    from accerl_lerobot.world_model.episodes import Windows
+    from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 
 State = dict[str, Tensor]
 """Each (B, ...)."""
@@ -159,3 +166,38 @@ class WorldModel(ABC):
             actions: float32 (B, K, A), in the world's units.
             seeds: B seeds of the randomness, so that a row does not depend on its batch.
         """
+
+
+class LearnableWorldModel(nn.Module, WorldModel):
+    """One that learns from real experience, see `learn.Learner`; what is saved is its ``state_dict``."""
+
+    @abstractmethod
+    def fit_statistics(self, windows: Windows) -> None:
+        """Takes what it normalises by from many windows, once, before the first loss."""
+
+    @abstractmethod
+    def loss(self, windows: Windows, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+        """What is minimised.
+
+        Args:
+            windows: of real episodes.
+            generator: of all randomness.
+
+        Returns:
+            The loss, a scalar, and its parts, by the names that they have in metrics.
+        """
+
+
+class Means(NamedTuple):
+    """What a world model of `kinds.KINDS` can be made of."""
+
+    config: ImaginationConfig
+    """The run's."""
+    spec: WorldModelSpec
+    """Of `learnt`; without that, of all that the real world shows."""
+    learnt: LearnableWorldModel | None
+    """The one in ``imagination.path``, in inference; None: its kind asks for no folder."""
+    simulator: Callable[[], World]
+    """A new one of the real world."""
+    device: torch.device
+    """Where it is to dream."""

@@ -45,6 +45,7 @@ from accerl_lerobot.world_model.deciding import (
 )
 from accerl_lerobot.world_model.episodes import Episode
 from accerl_lerobot.world_model.inverse import InverseProbe, learn_probe
+from accerl_lerobot.world_model.offline import device_named
 from accerl_lerobot.world_model.perturbed import SOURCE as PERTURBED
 from accerl_lerobot.world_model.perturbed import check_world, perturbed_episodes
 from accerl_lerobot.world_model.sources import (
@@ -83,13 +84,18 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
         ``trial.json``.
 
     Raises:
-        InputError: no world model there, a dataset or a world of another kind, or nothing was held out.
+        InputError: no such device, no world model there, a dataset or a world of another kind, or nothing was
+            held out.
     """
+    device = device_named(config.device)
     path = Path(str(config.path)).expanduser()
     success: SuccessModel | None
     model, success = load_world_model(path)
+    model = model.to(device)
     if config.success.path is not None:
-        success = load_stand_in(config.success, model.spec, "success")
+        success = load_stand_in(config.success, model.spec, "success", device)
+    elif success is not None:
+        success = success.to(device)
     spec, sources_of = model.spec, load_sources(path)
     worlds = check_policies(config.policies, spec)
     parts: dict[str, _Part] = {}

@@ -22,8 +22,8 @@ from accerl_lerobot.dataset_config import DatasetConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.world_model.config import StandInConfig, TrialConfig
+from accerl_lerobot.world_model.kinds import KINDS, ModelKind
 
-Kind = Literal["learned", "shuffled", "copy", "oracle"]
 Reward = Literal["potential", "success"]
 FILMS = "dreams"
 """Folder of a run with `OnlineLearnConfig.films`."""
@@ -101,10 +101,8 @@ class ImaginationConfig:
 
     share: float = 0.0
     """Of the decisions of a batch, in [0, 1): how many were imagined. 0: nothing is."""
-    model: Kind = "learned"
-    """learned: the one in `path`. oracle: a simulator, put where a dream begins, the best there can be.
-    copy: nothing ever moves. shuffled: the learnt one, told the actions of another dream. The last two are
-    placebos: what helps as much as they do is not the world model."""
+    model: str = field(default="learned", metadata={"choices": KINDS})
+    """What dreams. shuffled and copy are placebos: what helps as much as they do is not the world model."""
     path: str | None = None
     """The folder ``world_model`` that ``accerl world-model`` has written; oracle needs none, copy one for its
     success model."""
@@ -182,11 +180,9 @@ class ImaginationConfig:
         if not 0 <= self.share < 1:
             remedy = "use a share in [0, 1): some of what it learns must be real"
             raise InputError("imagination.share", self.share, remedy)
-        for name, kinds in (("model", Kind), ("reward", Reward)):
-            if getattr(self, name) not in get_args(kinds):
-                raise InputError(
-                    f"imagination.{name}", getattr(self, name), f"use {' or '.join(get_args(kinds))}"
-                )
+        for name, known in (("model", tuple(KINDS)), ("reward", get_args(Reward))):
+            if getattr(self, name) not in known:
+                raise InputError(f"imagination.{name}", getattr(self, name), f"use {' or '.join(known)}")
         for name in ("workers", "dreams", "memory", "window", "witnesses"):
             if getattr(self, name) < 1:
                 raise InputError(f"imagination.{name}", getattr(self, name), "use at least 1")
@@ -202,6 +198,11 @@ class ImaginationConfig:
         if self.workers > self.dreams:
             remedy = f"use at most imagination.dreams, {self.dreams}: each worker needs one"
             raise InputError("imagination.workers", self.workers, remedy)
+        if self.dreams < (least := self.kind.rows * self.workers):
+            remedy = f"use at least {least}, or fewer imagination.workers"
+            raise InputError(
+                "imagination.dreams", self.dreams, f"{remedy}: {self.model} needs {self.kind.rows} in each"
+            )
         if self.horizon is not None and self.horizon < 1:
             remedy = "use at least 1, or leave it out for whole episodes"
             raise InputError("imagination.horizon", self.horizon, remedy)
@@ -211,7 +212,7 @@ class ImaginationConfig:
         for name in ("beginnings", "keyframes"):
             if not 0 <= getattr(self, name) <= 1:
                 raise InputError(f"imagination.{name}", getattr(self, name), "use a share in [0, 1]")
-        if self.share and self.path is None and self.model != "oracle":
+        if self.share and self.path is None and self.kind.folder:
             remedy = "give the folder world_model that accerl world-model has written"
             raise InputError("imagination.path", None, remedy)
         if self.threshold is not None and not 0 <= self.threshold <= 1:
@@ -223,14 +224,19 @@ class ImaginationConfig:
             if self.success.threshold is None:
                 remedy = "say what counts as a success; accerl world-model-eval --success.path=… finds it"
                 raise InputError("imagination.success.threshold", None, remedy)
-            if self.model == "oracle":
-                remedy = "leave it out: the oracle knows what has succeeded"
+            if self.kind.judges:
+                remedy = f"leave it out: the {self.model} knows what has succeeded"
                 raise InputError("imagination.success.path", self.success.path, remedy)
             if self.learns:
                 remedy = "use 0 with imagination.success.path: a model that stands in does not learn"
                 raise InputError("imagination.learn.steps_per_episode", self.learn.steps_per_episode, remedy)
 
     @property
+    def kind(self) -> ModelKind:
+        """What is known of `model`."""
+        return KINDS[self.model]
+
+    @property
     def learns(self) -> bool:
         """Whether the world model goes on learning."""
-        return self.share > 0 and self.model in ("learned", "shuffled") and self.learn.steps_per_episode > 0
+        return self.share > 0 and self.kind.learns and self.learn.steps_per_episode > 0

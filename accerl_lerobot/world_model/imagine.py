@@ -135,7 +135,7 @@ class Imagination:
             horizon=config.horizon,
             beginnings=config.beginnings,
             keyframes=config.keyframes,
-            whole=config.model == "oracle",
+            whole=config.kind.whole,
         )
         self._rng = np.random.default_rng((seed, 3, index))
         self._rows: list[_Row | None] = [None] * config.dreams

@@ -29,12 +29,15 @@ import torch
 
 from accerl_lerobot.optimizers import copied, optimizer_state, restore_optimizer
 from accerl_lerobot.world_model.config import LearnConfig
+from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, places
 from accerl_lerobot.world_model.judge import shuffled
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 
 STATISTICS = 2048
 """Windows from which means and sizes are taken."""
+VALIDATED = 64
+"""Held-out windows at most of which the loss is taken."""
 
 
 class Learner:
@@ -67,16 +70,7 @@ class Learner:
 
     def windows(self, episodes: Sequence[Episode], at: Sequence[Place]) -> Windows:
         """Windows at these places, with anchors as far back as dreams will go."""
-        back = self.rng.integers(self.config.anchors + 1, size=len(at))
-        spec = self.model.spec
-        windows = cut(
-            episodes,
-            at,
-            chunk=spec.chunk,
-            context=spec.context,
-            chunks=self.config.chunks,
-            anchors=back.tolist(),
-        )
+        windows = _windows(episodes, at, self.model.spec, self.config, self.rng)
         if self._shuffle:
             donors = shuffled(len(windows), windows.episode.tolist(), self.rng)
             windows = replace(windows, actions=windows.actions[donors])
@@ -129,6 +123,34 @@ class Learner:
                 mean.lerp_(now, 1 - share)
 
 
+class Validation:
+    """The loss on windows that are not learnt from, always the same ones with the same noise.
+
+    Of the weights that serve, and with the true actions, of a placebo too. It has draws of its own: what is
+    learnt is the same with it and without it.
+
+    Args:
+        episodes: that are held out; something follows a frame of theirs.
+        spec: of the world.
+        config: how the model is trained: the windows are like those.
+        seed: of which windows, and of the noise.
+    """
+
+    def __init__(
+        self, episodes: Sequence[Episode], spec: WorldModelSpec, config: LearnConfig, seed: int
+    ) -> None:
+        at, rng = places(episodes), np.random.default_rng((seed, 9))
+        chosen = rng.choice(len(at), min(VALIDATED, len(at)), replace=False)
+        self._windows = _windows(episodes, [at[i] for i in chosen], spec, config, rng)
+        self._seed = seed
+
+    @torch.no_grad()
+    def __call__(self, model: PixelWorldModel) -> dict[str, float]:
+        """As `Learner.step`'s, without ``grad_norm``."""
+        loss, metrics = model.loss(self._windows, torch.Generator().manual_seed(self._seed))
+        return metrics | {"loss": loss.item()}
+
+
 def pretrain(
     model: PixelWorldModel,
     episodes: Sequence[Episode],
@@ -136,6 +158,8 @@ def pretrain(
     seed: int,
     shuffle: bool = False,
     on_step: Callable[[int, dict[str, float]], None] = lambda step, metrics: None,
+    held_out: Sequence[Episode] = (),
+    on_held_out: Callable[[int, dict[str, float]], None] = lambda step, metrics: None,
 ) -> Learner:
     """Fits the statistics and trains from the beginning.
 
@@ -146,11 +170,37 @@ def pretrain(
         seed: of everything random.
         shuffle: see `Learner`.
         on_step: told of each step and its losses.
+        held_out: episodes that are only looked at.
+        on_held_out: told of their losses, every `LearnConfig.validate_every` steps, see `Validation`.
     """
     at = places(episodes)
     learner = Learner(model, config, seed, shuffle)
     model.fit_statistics(learner.draw(episodes, at, min(STATISTICS, 4 * len(at))))
     learner.serving.load_state_dict(model.state_dict())
-    for step in range(config.steps):
-        on_step(step + 1, learner.step(learner.draw(episodes, at)))
+    validation = None
+    if config.validate_every and places(held_out):
+        validation = Validation(held_out, model.spec, config, seed)
+    for step in range(1, config.steps + 1):
+        on_step(step, learner.step(learner.draw(episodes, at)))
+        if validation is not None and step % config.validate_every == 0:
+            on_held_out(step, validation(learner.serving))
     return learner
+
+
+def _windows(
+    episodes: Sequence[Episode],
+    at: Sequence[Place],
+    spec: WorldModelSpec,
+    config: LearnConfig,
+    rng: np.random.Generator,
+) -> Windows:
+    """Those at these places; `rng` draws how far back their anchors lie."""
+    back = rng.integers(config.anchors + 1, size=len(at))
+    return cut(
+        episodes,
+        at,
+        chunk=spec.chunk,
+        context=spec.context,
+        chunks=config.chunks,
+        anchors=back.tolist(),
+    )

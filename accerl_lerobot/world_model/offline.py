@@ -18,7 +18,7 @@
   trial.json       what became of it
   preview.mp4      what happened, what it dreamt with those actions, and with another episode's; of a policy's
                    episodes preview_online.mp4
-  metrics.jsonl    losses
+  metrics.jsonl    losses, of what is learnt and of what is held out
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from accerl_lerobot.config import DatasetConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model.config import WorldModelConfig
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.dataset import fingerprint, load_episodes
@@ -53,14 +54,24 @@ from accerl_lerobot.world_model.sources import (
     try_sources,
 )
 from accerl_lerobot.world_model.store import SUCCESS, Source, save_world_model
-from accerl_lerobot.world_model.success import Examples, SuccessLearner, new_success_model
+from accerl_lerobot.world_model.success import Examples, SuccessLearner, new_success_model, validated
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 from accerl_lerobot.world_model.trial import calibrate
 
 if TYPE_CHECKING:
     from accerl_lerobot.verb_configs import WorldModelRun
 
 EVERY = 20
-"""Steps between two lines of metrics."""
+"""Steps between two lines of losses of what is learnt."""
+METRICS = "metrics.jsonl"
+
+
+def device_named(name: str) -> torch.device:
+    """See `resolve_device`; the field is ``device`` here."""
+    try:
+        return resolve_device(name)
+    except InputError as error:
+        raise InputError("device", error.value, error.remedy) from error
 
 
 def world_spec(config: WorldModelConfig, env: EnvConfig) -> WorldModelSpec:
@@ -99,10 +110,11 @@ def learn_world_model(run: WorldModelRun, directory: Path, console: Console) -> 
         were learnt from and held out; also in ``trial.json``.
 
     Raises:
-        InputError: a dataset is named twice or of another world; nothing can be learnt from it, see
-            `load_episodes`, or nothing would be left to judge; an episode is in both; the world has not the
-            task of one.
+        InputError: no such device; a dataset is named twice or of another world; nothing can be learnt from
+            it, see `load_episodes`, or nothing would be left to judge; an episode is in both; the world has
+            not the task of one.
     """
+    device = device_named(run.device)
     config, seed = run.world_model, run.seed
     spec, rng = world_spec(config, run.env), _rng(seed)
     rooms = rooms_of(run)
@@ -120,32 +132,9 @@ def learn_world_model(run: WorldModelRun, directory: Path, console: Console) -> 
     learn = [episode for part in parts.values() for episode in part.learn]
     held = {name: part.held for name, part in parts.items()}
     spec = replace(spec, tasks=_tasks(run.env, every))
-    torch.manual_seed(seed)
-    model = PixelWorldModel(spec, config.model)
+    tried = [episode for part in held.values() for episode in part]
     started = time.monotonic()
-    with (directory / "metrics.jsonl").open("w") as log:
-
-        def record(kind: str, step: int, metrics: dict[str, float]) -> None:
-            if step % EVERY == 0:
-                log.write(json.dumps({"kind": kind, "step": step} | metrics) + "\n")
-
-        with console.stage("world model", total=config.learn.steps) as stage:
-
-            def on_step(step: int, metrics: dict[str, float]) -> None:
-                stage.update(step, f"image {metrics['image']:.3f} state {metrics['state']:.3f}")
-                record("world_model", step, metrics)
-
-            serving = pretrain(model, learn, config.learn, seed, config.shuffle_actions, on_step).serving
-        calibrate(serving, learn, config.trial, seed)
-        success = new_success_model(config.chunk)
-        learner = SuccessLearner(success, config.success, seed)
-        with console.stage("success model", total=config.success.steps) as stage:
-            examples = Examples(learn, config.chunk)
-            for step in range(1, config.success.steps + 1):
-                metrics = learner.step(examples, serving)
-                stage.update(step, f"loss {metrics['loss']:.3f}")
-                record("success_model", step, metrics)
-        success.eval()
+    serving, success = _learn(run, spec, learn, tried, device, directory, console)
     seconds = time.monotonic() - started
     save_world_model(directory / "world_model", serving, None, [part.source for part in parts.values()])
     # The threshold is that of a policy's failures, where there are any: demonstrations fail otherwise.
@@ -154,11 +143,67 @@ def learn_world_model(run: WorldModelRun, directory: Path, console: Console) -> 
         serving, held, config.trial, success, directory, console,
         learnt=held, fresh=fresh, kept=True, seed=seed,
     )  # fmt: skip
-    tried = [episode for part in held.values() for episode in part]
     found |= {"seconds": seconds, "learnt": amount(learn), "held_out": amount(tried)}
     (directory / "trial.json").write_text(json.dumps(found, indent=2) + "\n")
     success.save_pretrained(directory / "world_model" / SUCCESS)  # with its threshold
     return found
+
+
+def _learn(
+    run: WorldModelRun,
+    spec: WorldModelSpec,
+    learn: Sequence[Episode],
+    held: Sequence[Episode],
+    device: torch.device,
+    directory: Path,
+    console: Console,
+) -> tuple[PixelWorldModel, SuccessPairsRewardModel]:
+    """World model and success model of the episodes to `learn` from; those `held` out are only looked at."""
+    config, seed = run.world_model, run.seed
+    examples, others = (Examples(part, config.chunk) for part in (learn, held))
+    torch.manual_seed(seed)
+    # Both networks begin on the CPU, and so alike wherever they learn.
+    model = PixelWorldModel(spec, config.model).to(device)
+    with (directory / METRICS).open("w") as log:
+
+        def record(kind: str, step: int, metrics: dict[str, float]) -> None:
+            log.write(json.dumps({"kind": kind, "step": step} | metrics) + "\n")
+
+        with console.stage("world model", total=config.learn.steps) as stage:
+            seen = ""
+
+            def on_step(step: int, metrics: dict[str, float]) -> None:
+                stage.update(step, _status(metrics) + seen)
+                if step % EVERY == 0:
+                    record("world_model", step, metrics)
+
+            def on_held_out(step: int, metrics: dict[str, float]) -> None:
+                nonlocal seen
+                seen = f", held out {_status(metrics)}"
+                record("world_model_held_out", step, metrics)
+
+            serving = pretrain(
+                model, learn, config.learn, seed, config.shuffle_actions, on_step, held, on_held_out
+            ).serving
+        calibrate(serving, learn, config.trial, seed)
+        success = new_success_model(config.chunk).to(device)
+        learner = SuccessLearner(success, config.success, seed)
+        with console.stage("success model", total=config.success.steps) as stage:
+            seen, every = "", config.success.validate_every
+            for step in range(1, config.success.steps + 1):
+                metrics = learner.step(examples, serving)
+                if step % EVERY == 0:
+                    record("success_model", step, metrics)
+                if every and step % every == 0:
+                    found = validated(success, others, seed)
+                    seen = f", held out {found['loss']:.3f}"
+                    record("success_model_held_out", step, found)
+                stage.update(step, f"loss {metrics['loss']:.3f}{seen}")
+    return serving, success.eval()
+
+
+def _status(metrics: dict[str, float]) -> str:
+    return f"image {metrics['image']:.3f} state {metrics['state']:.3f}"
 
 
 def _split(

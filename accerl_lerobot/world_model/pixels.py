@@ -35,7 +35,14 @@ from torch.nn import functional
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model import objectives
 from accerl_lerobot.world_model.config import PixelModelConfig
-from accerl_lerobot.world_model.contract import Context, Dream, History, State, WorldModel, WorldModelSpec
+from accerl_lerobot.world_model.contract import (
+    Context,
+    Dream,
+    History,
+    LearnableWorldModel,
+    State,
+    WorldModelSpec,
+)
 from accerl_lerobot.world_model.episodes import Windows
 from accerl_lerobot.world_model.network import Denoiser
 
@@ -45,7 +52,7 @@ LOOK = 8
 """Side of the coarse look that the state heads take."""
 
 
-class PixelWorldModel(nn.Module, WorldModel):
+class PixelWorldModel(LearnableWorldModel):
     """Trainable; `fit_statistics` comes before the first loss, and is saved with the weights.
 
     Args:

@@ -73,7 +73,10 @@ def save_world_model(
     (directory / CONFIG).write_text(json.dumps(content, indent=2) + "\n")
     save_file({k: v.contiguous() for k, v in model.state_dict().items()}, directory / WEIGHTS)
     if success is not None:
+        # Whoever loads it says where it is to be; where it was may not exist there.
+        where, success.config.device = success.config.device, "cpu"
         success.save_pretrained(directory / SUCCESS)
+        success.config.device = where
 
 
 def load_sources(directory: Path, field: str = "path") -> tuple[Source, ...]:

@@ -41,6 +41,8 @@ from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import Suc
 
 EASY = 0.1
 """How often a failure is drawn that nobody takes for a success, beside one that everybody does."""
+VALIDATED = 64
+"""Held-out pairs of frames, see `validated`."""
 
 
 class Examples:
@@ -192,7 +194,11 @@ class SuccessLearner:
         )
 
     def step(self, examples: Examples, world: WorldModel) -> dict[str, float]:
-        """Learns once from a batch of these; the world dreams its share of it."""
+        """Learns once from a batch of these; the world dreams its share of it.
+
+        Raises:
+            FloatingPointError: it has diverged.
+        """
         dreamt = round(self.config.dreamt * self.config.batch)
         parts = []
         if dreamt < self.config.batch:
@@ -203,18 +209,15 @@ class SuccessLearner:
                 self._dreamt = Dreamt.of(examples, world, self.model, config.episodes, config.depth, self.rng)
             parts.append(self._dreamt.seen(dreamt, self.rng))
         self._count += 1
-        before, after, success, progress = (np.concatenate(x) for x in zip(*parts, strict=True))
-        device = self.model.out.weight.device
-        loss, metrics = self.model.loss(
-            as_floats(before, device),
-            as_floats(after, device),
-            torch.from_numpy(success.astype(np.float32)).to(device),
-            torch.from_numpy(progress.astype(np.float32)).to(device),
-            self._generator,
-        )
+        pairs = [np.concatenate(x) for x in zip(*parts, strict=True)]
+        loss, metrics = _loss(self.model, pairs, self._generator)
         self._optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
+        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
+        if not bool(torch.isfinite(norm)):
+            raise FloatingPointError(
+                f"the success model's loss or gradient is not finite at step {self._count}; lower its lr"
+            )
         self._optimizer.step()
         return metrics
 
@@ -237,9 +240,42 @@ class SuccessLearner:
         restore_optimizer(self._optimizer, state["optimizer"])
 
 
+def validated(model: SuccessPairsRewardModel, examples: Examples, seed: int) -> dict[str, float]:
+    """``loss``, ``accuracy`` and ``progress`` on pairs that were seen, always the same ones, as they are.
+
+    Nothing is drawn that learning draws from.
+
+    Args:
+        model: in training, or not; it stays so.
+        examples: of episodes that are held out.
+        seed: of which pairs.
+    """
+    pairs, training = examples.seen(VALIDATED, np.random.default_rng((seed, 9))), model.training
+    model.eval()  # it shakes nothing then
+    with torch.no_grad():
+        _, metrics = _loss(model, pairs, None)
+    model.train(training)
+    return metrics
+
+
 def new_success_model(chunk: int) -> SuccessPairsRewardModel:
-    """One of the default size, for the CPU."""
+    """One of the default size, on the CPU; wherever it is moved to, it is saved as one for the CPU."""
     return SuccessPairsRewardModel(SuccessPairsConfig(chunk=chunk, device="cpu"))
+
+
+def _loss(
+    model: SuccessPairsRewardModel, pairs: Sequence[np.ndarray], generator: torch.Generator | None
+) -> tuple[torch.Tensor, dict[str, float]]:
+    """Of what `Examples.seen` gives."""
+    before, after, success, progress = pairs
+    device = model.out.weight.device
+    return model.loss(
+        as_floats(before, device),
+        as_floats(after, device),
+        torch.from_numpy(success.astype(np.float32)).to(device),
+        torch.from_numpy(progress.astype(np.float32)).to(device),
+        generator,
+    )
 
 
 def as_floats(frames: np.ndarray, device: torch.device) -> torch.Tensor:

@@ -40,7 +40,7 @@ from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, he
 from accerl_lerobot.world_model.inverse import InverseProbe
 from accerl_lerobot.world_model.outcomes import drawn, judged, scores, spaced, threshold
 from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.replayed import Dreams, cut_alike, dream
+from accerl_lerobot.world_model.replayed import Dreams, cut_alike, dream, made
 from accerl_lerobot.world_model.stand_in import SuccessModel
 from accerl_lerobot.world_model.success import Examples, probabilities
 
@@ -54,14 +54,18 @@ NEVER = ("true", "zero")
 """Arms that cannot succeed, the first one from failures. Actions of other episodes may well do so."""
 
 
+def trial_places(episodes: Sequence[Episode], config: TrialConfig, seed: int) -> list[Place]:
+    """Every so many env steps of each episode, at most so many."""
+    at = [Place(e, f) for e, episode in enumerate(episodes) for f in spaced(episode.times, config.every)]
+    return drawn(episodes, at, config.most, np.random.default_rng(seed))
+
+
 def trial_windows(episodes: Sequence[Episode], model: WorldModel, config: TrialConfig, seed: int) -> Windows:
-    """Every so many env steps of each episode, at most so many; chunks beyond an episode's end are not valid.
+    """The windows at `trial_places`; chunks beyond an episode's end are not valid.
 
     Their actions are whole chunks all the same, see `held`.
     """
-    at = [Place(e, f) for e, episode in enumerate(episodes) for f in spaced(episode.times, config.every)]
-    rng = np.random.default_rng(seed)
-    at = drawn(episodes, at, config.most, rng)
+    at = trial_places(episodes, config, seed)
     windows = cut(episodes, at, chunk=model.spec.chunk, context=model.spec.context, chunks=config.depth)
     return replace(windows, actions=held(windows.actions, windows.steps))
 
@@ -138,6 +142,8 @@ def try_out(
     arms = {
         arm: dream(model, windows, actions, ends if arm == "true" else None) for arm, actions in given.items()
     }
+    # Some episodes go on after their success. What follows neither succeeds nor fails, wherever it begins.
+    ahead = np.array([f < episodes[e].starts for e, f in trial_places(episodes, config, seed)])
     context = model.spec.context
     newest = windows.frames[:, context - 1]
     rows = []
@@ -157,7 +163,7 @@ def try_out(
         if probe is not None:
             row |= _legible(probe, arms, given, windows, fits, d)
         if success is not None:
-            row |= _judged(success, arms, windows, theirs, newest, d)
+            row |= _judged(success, arms, windows, made(windows)[:, d] & ahead, theirs, newest, d)
         rows.append(row)
     gates = _gates(rows, config, ended.get("outcomes"))
     return ended | {
@@ -230,22 +236,21 @@ def _judged(
     success: SuccessModel,
     arms: dict[str, Dreams],
     windows: Windows,
+    happened: np.ndarray,
     failed: np.ndarray,
     newest: np.ndarray,
     d: int,
 ) -> dict[str, Any]:
-    """What the success model makes of the chunk at this depth."""
-    # Chunks that were really made, until the task was achieved or the episode ended.
-    made = windows.valid[:, d] | windows.success[:, d]
-    labels, groups = windows.success[made, d], windows.episode[made]
+    """What the success model makes of the chunk at this depth, where it `happened`, see `replayed.made`."""
+    labels, groups = windows.success[happened, d], windows.episode[happened]
     found: dict[str, Any] = {"successes": int(labels.sum()), "failures": int((~labels).sum())}
     for arm, dreams in arms.items():
         before = newest if d == 0 else dreams.frames[:, d - 1]
         if arm == "true":
-            said = probabilities(success, before[made], dreams.ends[made, d])
+            said = probabilities(success, before[happened], dreams.ends[happened, d])
             found["auroc_dreamt"] = judge.separation(said, labels, groups)._asdict()
         # Of an episode that succeeds, some chunk before the last is all but a success.
-        counted = made & failed if arm == "true" else made
+        counted = happened & failed if arm == "true" else happened
         said = probabilities(success, before[counted], dreams.frames[counted, d])
         taken = said > success.config.threshold
         found[f"false_success_{arm}"] = float(taken.mean()) if len(taken) else float("nan")

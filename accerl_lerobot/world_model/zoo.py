@@ -11,21 +11,19 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""The world models that ``imagination.model`` can name. A new one is a class and a line here."""
+"""Makes the world models of `kinds.py`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.envs.base import WorldSpec
-from accerl_lerobot.policies.loading import resolve_device
+from accerl_lerobot.policies.loading import imported, resolve_device
 from accerl_lerobot.world_model.baselines import CopyModel, OracleModel, ShuffledModel
-from accerl_lerobot.world_model.contract import WorldModel, WorldModelSpec
+from accerl_lerobot.world_model.contract import Means, WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 from accerl_lerobot.world_model.imagine import Dreamer
-from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.stand_in import load_stand_in
 from accerl_lerobot.world_model.store import load_world_model
 
@@ -38,31 +36,56 @@ def make_dreamer(
     Args:
         config: which, and from where.
         env: the real world, for an oracle.
-        world: what that shows.
+        world: what that shows, for those that are made of no other world model.
         executed: actions that the policy executes per decision.
         device: where it dreams, see `PolicyConfig.device`.
 
     Raises:
         InputError: it cannot be loaded.
     """
-    where = resolve_device(device)
-    if config.model == "oracle":
-        return _oracle(config, env, world, executed)
-    assert config.path is not None  # ImaginationConfig has seen to that
-    model, success = load_world_model(Path(config.path), "imagination.path")
-    dreams = _LEARNED[config.model](model.eval().to(where))
+    where, kind = resolve_device(device), config.kind
+    learnt = success = None
+    if kind.folder:
+        assert config.path is not None  # ImaginationConfig has seen to that
+        learnt, success = load_world_model(Path(config.path), "imagination.path")
+        learnt.eval().to(where)
+    spec = _shown(world, executed) if learnt is None else learnt.spec
+    means = Means(config, spec, learnt, lambda: make_world(env), where)
+    model: WorldModel = imported(kind.make)(means)
     if config.success.path is not None:
-        return Dreamer(dreams, load_stand_in(config.success, model.spec, "imagination.success", where))
+        return Dreamer(model, load_stand_in(config.success, model.spec, "imagination.success", where))
     if success is not None:
         success.config.device = str(where)
         if config.threshold is not None:
             success.config.threshold = config.threshold
-    return Dreamer(dreams, None if success is None else success.to(where))
+    return Dreamer(model, None if success is None else success.to(where))
 
 
-def _oracle(config: ImaginationConfig, env: EnvConfig, world: WorldSpec, executed: int) -> Dreamer:
+def learned(means: Means) -> WorldModel:
+    """The learnt one as it is."""
+    assert means.learnt is not None  # its line in `KINDS` sees to that
+    return means.learnt
+
+
+def shuffled(means: Means) -> WorldModel:
+    """The learnt one, told the wrong actions."""
+    return ShuffledModel(learned(means))
+
+
+def copy(means: Means) -> WorldModel:
+    """Frames of the learnt one's size that never change."""
+    return CopyModel(means.spec)
+
+
+def oracle(means: Means) -> WorldModel:
+    """A simulator for each dream."""
+    return OracleModel(means.spec, means.simulator, means.config.dreams)
+
+
+def _shown(world: WorldSpec, executed: int) -> WorldModelSpec:
+    """All that a world shows, at its own size."""
     height, width, _ = next(iter(world.images.values()))
-    spec = WorldModelSpec(
+    return WorldModelSpec(
         cameras=tuple(world.images),
         image_size=(height, width),
         state_dim=world.state_dim,
@@ -72,11 +95,3 @@ def _oracle(config: ImaginationConfig, env: EnvConfig, world: WorldSpec, execute
         context=1,
         provides=frozenset({"pixels", "state"} if world.state_dim else {"pixels"}),
     )
-    return Dreamer(OracleModel(spec, lambda: make_world(env), config.dreams), None)
-
-
-_LEARNED: dict[str, Callable[[PixelWorldModel], WorldModel]] = {
-    "learned": lambda model: model,
-    "shuffled": ShuffledModel,
-    "copy": lambda model: CopyModel(model.spec),
-}

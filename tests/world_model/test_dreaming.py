@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -106,7 +107,10 @@ def test_what_is_promoted_says_what_it_has_learnt_from(
     model, success = dreams.dreamer
     assert isinstance(model, PixelWorldModel) and isinstance(success, SuccessPairsRewardModel)
     dreams.swap(Promotion(model, success, 7, {}))
+    success.config.device = "cuda:3"  # as where it dreams; who goes on may have none
     dreams.save_promoted(tmp_path / "promoted")
+    saved = json.loads((tmp_path / "promoted" / "success_model" / "config.json").read_text())
+    assert saved["device"] == "cpu" and success.config.device == "cuda:3"
     assert load_sources(tmp_path / "promoted") == (source, known(rollouts, (0, 1, 2, 3), ()))
 
 

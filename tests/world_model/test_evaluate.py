@@ -18,6 +18,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,6 +32,7 @@ from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.safety import Origin
+from accerl_lerobot.world_model import evaluate
 from accerl_lerobot.world_model.by_source import source_rows
 from accerl_lerobot.world_model.config import (
     NetworkConfig,
@@ -45,6 +47,7 @@ from accerl_lerobot.world_model.perturbed import check_world, perturbed, perturb
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.store import Source, save_world_model
 from accerl_lerobot.world_model.success import new_success_model
+from tests.world_model.test_learn_device import moved
 
 ENV = SimulatedConfig(max_steps=60, hold=25, image_size=16)
 CONFIG = WorldModelConfig(
@@ -116,6 +119,31 @@ def test_the_same_measures_on_every_source(
     assert cli.main(["report", str(out)]) == 0
     page = (out / "report.html").read_text()
     assert "By source" in page and "Dreams of perturbed episodes" in page and "read off the dreams" in page
+
+
+def test_what_dreams_and_what_judges_go_to_the_device(
+    folders: tuple[Path, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    asked, went = moved(monkeypatch)
+    tried: list[list[str]] = []
+    real = evaluate.try_sources
+
+    def try_sources(*args: Any, **options: Any) -> Any:
+        tried.append([kind for kind, device in went if device == torch.device("cpu", 0)])
+        return real(*args, **options)
+
+    monkeypatch.setattr(evaluate, "try_sources", try_sources)
+    cli.main(told(folders, tmp_path / "out", "--device=cuda:3"))
+    assert asked == ["cuda:3"] and tried == [["PixelWorldModel", "SuccessPairsRewardModel"]]
+    stands_in: list[Any] = []
+
+    def load_stand_in(*args: Any) -> Any:
+        stands_in.append(args[3])
+        raise InputError("success.path", "x", "enough")
+
+    monkeypatch.setattr(evaluate, "load_stand_in", load_stand_in)
+    cli.main(told(folders, tmp_path / "again", "--success.path=x"))
+    assert asked == ["cuda:3", "auto"] and stands_in == [torch.device("cpu", 0)]
 
 
 def test_one_that_does_not_know_the_dataset_is_tried_on_all_of_it(

@@ -16,6 +16,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,15 +24,17 @@ from typing import Any
 import pytest
 import torch
 
-from accerl_lerobot import cli
-from accerl_lerobot.config import DatasetConfig
+from accerl_lerobot import cli, console
+from accerl_lerobot.config import DatasetConfig, RunConfig, parse
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.world_model import offline, sources
+from accerl_lerobot.verb_configs import WorldModelRun
+from accerl_lerobot.world_model import learn, offline, sources
 from accerl_lerobot.world_model.config import WorldModelConfig
 from accerl_lerobot.world_model.store import load_sources, load_world_model, save_world_model
 from accerl_lerobot.world_model.success import new_success_model
+from tests.world_model.test_learn_device import moved
 from tests.world_model.test_pixels import awake, dots, dream, model, windows
 
 
@@ -61,9 +64,10 @@ def overlapping(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def arguments(demos: Path, output_dir: Path) -> list[str]:
     return [
         "world-model", "--env.type=simulated", "--env.image_size=16", "--dataset.repo_id=a/b",
-        f"--dataset.root={demos}", f"--output_dir={output_dir}", "--world_model.image_size=16",
-        "--world_model.chunk=5", "--world_model.learn.steps=25", "--world_model.success.steps=10",
-        "--world_model.trial.depth=2", "--world_model.model.network.channels=16,24",
+        f"--dataset.root={demos}", f"--output_dir={output_dir}", "--device=cpu",
+        "--world_model.image_size=16", "--world_model.chunk=5", "--world_model.learn.steps=25",
+        "--world_model.success.steps=10", "--world_model.trial.depth=2",
+        "--world_model.model.network.channels=16,24",
     ]  # fmt: skip
 
 
@@ -165,17 +169,93 @@ def test_the_trial_is_on_episodes_that_were_not_learnt_from(
 
     def spy(name: str, place: int, real: Any) -> Any:
         def called(*args: Any, **options: Any) -> Any:
-            seen.setdefault(name, []).extend(e.frames.tobytes() for e in args[place])
+            of = getattr(args[place], "episodes", args[place])
+            seen.setdefault(name, []).extend(e.frames.tobytes() for e in of)
             return real(*args, **options)
 
         return called
 
     monkeypatch.setattr(offline, "pretrain", spy("learnt", 1, offline.pretrain))
     monkeypatch.setattr(sources, "try_out", spy("tried", 1, sources.try_out))
-    monkeypatch.setattr(offline, "Examples", spy("success", 0, offline.Examples))
-    cli.main([*arguments(demos, tmp_path / "out"), "--online.repo_id=a/b", f"--online.root={rollouts}"])
+    monkeypatch.setattr(offline.SuccessLearner, "step", spy("success", 1, offline.SuccessLearner.step))
+    monkeypatch.setattr(learn.Validation, "__init__", spy("looked at", 1, learn.Validation.__init__))
+    monkeypatch.setattr(offline, "validated", spy("pairs", 1, offline.validated))
+    more = ["--online.repo_id=a/b", f"--online.root={rollouts}", "--world_model.success.validate_every=5"]
+    cli.main([*arguments(demos, tmp_path / "out"), *more])
     assert set(seen["learnt"]) == set(seen["success"]) and len(set(seen["learnt"] + seen["tried"])) == 14
     assert not set(seen["learnt"]) & set(seen["tried"])
+    assert set(seen["looked at"]) == set(seen["pairs"]) == set(seen["tried"])
+
+
+def test_held_out_losses_are_told_and_change_nothing(
+    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(console, "PLAIN_EVERY_S", -1.0)
+    logged: dict[str, list[dict[str, Any]]] = {}
+    for name, world, success in (("with", 10, 4), ("without", 0, 0)):
+        every = [
+            f"--world_model.{of}.validate_every={n}" for of, n in (("learn", world), ("success", success))
+        ]
+        cli.main([*arguments(demos, tmp_path / name), *every])
+        lines = (tmp_path / name / "metrics.jsonl").read_text().splitlines()
+        logged[name] = [json.loads(line) for line in lines]
+    err = capsys.readouterr().err
+    assert re.search(r"world model 10/25 image \S+ state \S+\n", err)
+    assert re.search(r"world model 11/25 image \S+ state \S+, held out image \S+ state \S+\n", err)
+    assert re.search(r"success model 3/10 loss \S+\n", err)
+    assert re.search(r"success model 4/10 loss \S+, held out \S+\n", err)
+    steps = [(record["kind"], record["step"]) for record in logged["with"]]
+    assert steps == [
+        ("world_model_held_out", 10), ("world_model", 20), ("world_model_held_out", 20),
+        ("success_model_held_out", 4), ("success_model_held_out", 8),
+    ]  # fmt: skip
+    assert logged["without"] == [logged["with"][1]]
+    text = (Path(__file__).parents[2] / "docs" / "metrics.md").read_text()
+    explained = text.split("## `accerl world-model`")[1].split("\n## ")[0]
+    for record in logged["with"]:
+        assert all(f"`{name}`" in explained for name in record), record
+        assert all(value >= 0 for name, value in record.items() if name != "kind")
+    for file in ("model.safetensors", "success_model/model.safetensors"):
+        one, other = ((tmp_path / name / "world_model" / file).read_bytes() for name in ("with", "without"))
+        assert one == other
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_a_placebo_is_learnt_where_one_is_asked_for(
+    shuffled: bool, demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    class Spy(learn.Learner):
+        def draw(self, *args: Any) -> Any:
+            raise InterruptedError(self._shuffle)
+
+    monkeypatch.setattr(learn, "Learner", Spy)
+    told = [*arguments(demos, tmp_path / "out")[1:], f"--world_model.shuffle_actions={shuffled}"]
+    config = parse(WorldModelRun, told, recipe_class=RunConfig)
+    with pytest.raises(InterruptedError, match=str(shuffled)):
+        offline.learn_world_model(config, tmp_path, console.Console())
+
+
+def test_both_networks_learn_on_the_device_and_are_saved_for_any(
+    demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    asked, went = moved(monkeypatch)
+    learnt: list[str] = []
+
+    def on(name: str, real: Any) -> Any:
+        def called(*args: Any, **options: Any) -> Any:
+            learnt.extend([name, *(kind for kind, device in went if device == torch.device("cpu", 0))])
+            return real(*args, **options)
+
+        return called
+
+    monkeypatch.setattr(offline, "pretrain", on("pretrain", offline.pretrain))
+    monkeypatch.setattr(offline, "SuccessLearner", on("success", offline.SuccessLearner))
+    cli.main([*arguments(demos, tmp_path / "out"), "--device=cuda:3"])
+    assert asked == ["cuda:3"]
+    models = ["PixelWorldModel", "SuccessPairsRewardModel"]
+    assert learnt == ["pretrain", models[0], "success", *models], "before the optimisers are made"
+    saved = json.loads((tmp_path / "out" / "world_model" / "success_model" / "config.json").read_text())
+    assert saved["device"] == "cpu"
 
 
 def test_a_policys_episodes_are_learnt_from_beside_demonstrations(

@@ -195,6 +195,24 @@ def test_statistics_by_hand():
     assert float(made.change) == pytest.approx(np.sqrt(np.square(off / 127.5).mean()), rel=1e-5)
 
 
+def test_only_what_is_learnt_from_is_shown_with_noise():
+    """One pass of the refiner is regression: beside the context's, no noise is in its loss."""
+    of = windows(dots(3))
+    clean, noisy, noisier = (awake(model(context_noise=level)) for level in (0.0, 0.05, 0.5))
+    for made in (clean, noisy, noisier):
+        made.fit_statistics(of)
+
+    def loss(made: PixelWorldModel, seed: int) -> float:
+        return made.loss(of, torch.Generator().manual_seed(seed))[0].item()
+
+    assert loss(clean, 0) == loss(clean, 1)
+    assert loss(noisy, 0) == loss(noisy, 0) != loss(noisy, 1)
+    off = [abs(loss(made, 0) - loss(clean, 0)) for made in (noisy, noisier)]
+    assert 0 < 3 * off[0] < off[1], "as much as was asked for"
+    for one, other in zip(dream(clean, of), dream(noisier, of), strict=True):
+        assert torch.equal(one.frames, other.frames) and torch.equal(one.robot, other.robot)
+
+
 @pytest.mark.parametrize(("objective", "steps"), [("refiner", 1), ("refiner", 2), ("flow", 4), ("edm", 3)])
 def test_the_loss_reaches_every_weight(objective: Objective, steps: int):
     made = awake(model(objective=objective, steps=steps))
@@ -292,7 +310,7 @@ def test_bad_values_name_their_field(name: str, value: object):
 @pytest.mark.parametrize(
     ("name", "value"),
     [("steps", 0), ("batch", 1), ("chunks", 0), ("warmup", -1), ("anchors", -1), ("lr", 0.0), ("lr", 1.0),
-     ("grad_clip", 0.0), ("average", 1.0)],
+     ("grad_clip", 0.0), ("average", 1.0), ("validate_every", -1)],
 )  # fmt: skip
 def test_bad_learning_names_its_field(name: str, value: object):
     with pytest.raises(InputError, match=f"^world_model.learn.{name}="):

@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model import trial
 from accerl_lerobot.world_model.config import SuccessLearnConfig, TrialConfig
 from accerl_lerobot.world_model.contract import Context, Dream, History, State, WorldModel
 from accerl_lerobot.world_model.episodes import Episode
@@ -185,6 +186,50 @@ def test_what_is_taken_for_a_success_depends_on_the_threshold():
         assert found["gates"]["false_success"]["holds"] is (shares[-1] == 0)
         assert found["threshold"] == success.config.threshold, "it is not fresh"
     assert shares == [1, 0]
+
+
+def test_what_follows_a_success_neither_succeeds_nor_fails(monkeypatch: pytest.MonkeyPatch):
+    """Trials begin at steps 0, 2, … 10, their chunks have two steps, and the success is at step 5."""
+    judged: list[int] = []
+    real = trial.probabilities
+
+    def probabilities(model: object, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        judged.append(len(before))
+        return real(model, before, after)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(trial, "probabilities", probabilities)
+    goes_on, failure = dots(2, seed=3)
+    goes_on = replace(goes_on, success_at=5)
+    success = new_success_model(K).eval()
+    found = try_out(Deterministic("exact"), [goes_on], CONFIG, success)
+    counted = [(row["successes"], row["failures"]) for row in found["depths"]]
+    assert counted == [(1, 2), (1, 1), (1, 0)], "not those that begin after it, nor chunks after it"
+    # Of the arm of true actions once for its AUROC, and none of it is of an episode that failed.
+    arms = len(ARMS) - 1
+    assert judged[1:] == [n for s, f in counted for n in (s + f, 0, *[s + f] * (arms - 1))]
+    both = try_out(Deterministic("exact"), [goes_on, failure], CONFIG, success)
+    assert [row["failures"] for row in both["depths"]] == [2 + 6, 1 + 5, 0 + 4]
+    assert [row["successes"] for row in both["depths"]] == [1, 1, 1]
+
+
+def test_where_episodes_end_with_their_success_every_chunk_that_was_made_counts():
+    episodes = with_successes(dots(40, seed=1))
+    # As a policy's episodes are looked at: now and then, and once more at the end.
+    looked = [replace(e, source="online", **seen_now_and_then(e)) for e in episodes]
+    for every in (episodes, looked):
+        windows = trial_windows(every, Deterministic("exact"), CONFIG, seed=0)
+        found = try_out(Deterministic("exact"), every, CONFIG, new_success_model(K).eval())
+        for d, row in enumerate(found["depths"]):
+            counted = windows.valid[:, d] | windows.success[:, d]
+            assert row["successes"] == windows.success[:, d].sum() > 0
+            assert row["failures"] == counted.sum() - row["successes"] > 0
+
+
+def seen_now_and_then(episode: Episode) -> dict[str, np.ndarray]:
+    """Frames and states at every K-th step, and after the last."""
+    times = np.array([*range(0, len(episode), K), len(episode)])
+    shown = np.minimum(times, len(episode) - 1)
+    return {"times": times, "frames": episode.frames[shown], "state": episode.state[shown]}
 
 
 def test_success_learning_needs_both_kinds():
