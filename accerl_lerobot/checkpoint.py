@@ -54,7 +54,7 @@ RUN_STATE, WEIGHTS = "run", "weights"
 """Names of states in `TRAINING_STATE`: how far the run has come; what is trained, exactly as it is."""
 STEP = "training_step.json"
 """LeRobot's file of how far it has come."""
-FORMAT = 1
+FORMAT = 2
 """Of the manifest and the training state; another one is refused."""
 UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError)
 """What reading a manifest raises that is none."""

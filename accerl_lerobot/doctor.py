@@ -288,12 +288,12 @@ def dreams(config: RunConfig) -> Iterator[Check]:
 
 
 def _unwatched(config: RunConfig) -> Iterator[Check]:
-    """Says so where the kill switch can never trip: too few real episodes end beside dreams."""
+    """Says so where the kill switch hardly ever trips: too few real episodes end beside dreams."""
     imagination, episodes = config.imagination, config.rollout.episodes
     beside = imagination.horizon is None and imagination.beginnings > 0
     if beside and 0 < episodes <= imagination.witnesses:
         why = f"that takes more real episodes than imagination.witnesses, {imagination.witnesses}"
-        text = f"are not switched off where they flatter: {why}, and rollout.episodes is {episodes}"
+        text = f"are hardly ever switched off where they flatter: {why}, and rollout.episodes is {episodes}"
         yield Check(name="dreams", status=WARN, text=text)
 
 

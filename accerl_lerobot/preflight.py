@@ -72,6 +72,7 @@ def policy_to_be(config: RunConfig) -> Any:
         check_observations,
         check_type,
         load_lerobot_config,
+        override,
         sampler_config,
     )
 
@@ -82,13 +83,19 @@ def policy_to_be(config: RunConfig) -> Any:
         try:
             return load_lerobot_config(start)
         except InputError as error:
-            field = {"policy.path": "sft.init_path", "policy.type": "sft.init_path"}.get(
-                error.field, error.field
+            if error.field not in ("policy.path", "policy.type", "policy.n_obs_steps"):
+                raise
+            said = (
+                ""
+                if error.field == "policy.path"
+                else f"{error.field.removeprefix('policy.')}={error.value}: "
             )
-            raise InputError(field, error.value, error.remedy) from error
+            raise InputError("sft.init_path", start.path, said + error.remedy) from error
     policy_config = check_sft_policy(config.sft)
     kind = check_type(config.sft.policy["type"], "sft.policy.type", "RL needs a likelihood: ")
-    sampler_config(config.policy, kind)
+    sampler = sampler_config(config.policy, kind)
+    override(policy_config, config.policy)
+    sampler.override(policy_config)
     check_observations(policy_config, "sft.policy.n_obs_steps")
     return policy_config
 

@@ -268,6 +268,9 @@ def test_dreams_are_checked_where_there_are_any(capsys: pytest.CaptureFixture[st
     doctor.main([recipe, "--imagination.model=oracle"])
     told = capsys.readouterr().out
     assert "ok    dreams     90% of every batch; what dreams: oracle" in told
-    assert "warn  dreams     are not switched off where they flatter: that takes more real episodes" in told
+    assert (
+        "warn  dreams     are hardly ever switched off where they flatter: that takes more real episodes"
+        in told
+    )
     doctor.main([recipe, "--imagination.model=oracle", "--rollout.episodes=17"])
     assert "where they flatter" not in capsys.readouterr().out

@@ -136,7 +136,7 @@ def rated(group: dict[str, Any]) -> str:
     return f"{rate:.1f} % [{low:.1f}, {high:.1f}] n={group['n']} ({seeds})"
 
 
-INTERVALS = "intervals are 95 %, over seeds"
+INTERVALS = "intervals are 95 %, over seeds where there are several"
 
 
 def tabled(

@@ -167,7 +167,7 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
         remedy = f"its config.json is not one of this LeRobot's policies ({brief(error)})"
         raise InputError("policy.path", config.path, remedy) from error
     lerobot_config.device = str(resolve_device(config.device))
-    _override(lerobot_config, config)
+    override(lerobot_config, config)
     sampler.override(lerobot_config)
     check_observations(lerobot_config, "policy.n_obs_steps")
     use_backbone(lerobot_config, folder, config.path)
@@ -327,7 +327,7 @@ def _load_module(module: nn.Module, path: Path, what: str, otherwise: str) -> No
         logger.warning("the checkpoint's %s not loaded, %s: they are of another shape", what, otherwise)
 
 
-def _override(lerobot_config: Any, config: PolicyConfig) -> None:
+def override(lerobot_config: Any, config: PolicyConfig) -> None:
     """Puts a run's choices of denoising steps, executed rows and precision into the LeRobot config."""
     if hasattr(lerobot_config, "pretrained_backbone_weights"):
         # The checkpoint has them; LeRobot would download torchvision's first, even when told to stay offline.

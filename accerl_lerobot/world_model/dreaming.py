@@ -41,7 +41,7 @@ from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.pool import part
 from accerl_lerobot.world_model.recorded import DREAMS, DreamRecorder
 from accerl_lerobot.world_model.sources import ONLINE, check_apart, named, open_rooms
-from accerl_lerobot.world_model.store import Source, find, load_sources
+from accerl_lerobot.world_model.store import A_RUN, Source, find, load_sources
 from accerl_lerobot.world_model.zoo import make_dreamer
 
 EARLIER = "earlier"
@@ -95,7 +95,7 @@ def _sources(config: RunConfig, spec: WorldModelSpec) -> list[Source]:
             every = tuple(range(meta.total_episodes))
             name = rooms[room].repo_id or ""
             sources.append(Source(repo_id=name, fingerprint=known, learnt=every, held_out=()))
-    return sources
+    return [*sources, A_RUN]
 
 
 def _witnesses(config: RunConfig) -> int:

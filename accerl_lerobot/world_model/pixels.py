@@ -129,7 +129,10 @@ class PixelWorldModel(LearnableWorldModel):
         frames = _to_bytes(image, len(self.spec.cameras))
         robot, doubt = self._robot(state, chunk)
         following = _following(state, frames, robot, actions)
-        return Dream(state=following, frames=frames, robot=robot, uncertainty=doubt / self.doubt)
+        # As bytes, what is no number looks like any other picture.
+        drawn = torch.isfinite(image).flatten(1).all(1)
+        doubt = torch.where(drawn, doubt / self.doubt, torch.inf)
+        return Dream(state=following, frames=frames, robot=robot, uncertainty=doubt)
 
     def loss(self, windows: Windows, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
         """What is minimised, over every valid chunk of the windows; after the first it sees its own dreams.

@@ -59,6 +59,10 @@ class Source:
     """and of those that it was only tried on."""
 
 
+A_RUN = Source(repo_id="the episodes of a run", fingerprint="", learnt=(), held_out=())
+"""Last of the sources of what was promoted in one: in no dataset, and what its threshold was set on."""
+
+
 def save_world_model(
     directory: Path,
     model: PixelWorldModel,

@@ -114,8 +114,8 @@ def test_the_table_and_the_picture(result: dict[str, Any], tmp_path: Path):
     assert lines[2].startswith(
         "| none | 10.0 % [2.8, 30.1] n=20 (10 10), 4 episodes of 100 env steps, 4 updates | 50.0 % ["
     )
-    assert "(80 80), +70.0 points [+70.0, +70.0] over none, 4 episodes" in lines[3]
-    assert lines[5] == "Intervals are 95 %, over seeds."
+    assert "(80 80), +70.0 points [+40.5, +83.9] over none, 4 episodes" in lines[3]
+    assert lines[5] == "Intervals are 95 %, over seeds where there are several."
     assert lines[-1] == "On top, world model: 494 real episodes, 67,551 env steps."
     assert bench.table(result).row_count == 2
     bench.draw(tmp_path / "efficiency.png", result)

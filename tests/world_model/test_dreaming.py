@@ -36,7 +36,7 @@ from accerl_lerobot.world_model.imagination_config import ImaginationConfig, Onl
 from accerl_lerobot.world_model.offline import world_spec
 from accerl_lerobot.world_model.online import Promotion
 from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.store import Source, load_sources, save_world_model
+from accerl_lerobot.world_model.store import A_RUN, Source, load_sources, save_world_model
 from accerl_lerobot.world_model.success import new_success_model
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 from tests.runs import tiny_run
@@ -111,7 +111,7 @@ def test_what_is_promoted_says_what_it_has_learnt_from(
     dreams.save_promoted(tmp_path / "promoted")
     saved = json.loads((tmp_path / "promoted" / "success_model" / "config.json").read_text())
     assert saved["device"] == "cpu" and success.config.device == "cuda:3"
-    assert load_sources(tmp_path / "promoted") == (source, known(rollouts, (0, 1, 2, 3), ()))
+    assert load_sources(tmp_path / "promoted") == (source, known(rollouts, (0, 1, 2, 3), ()), A_RUN)
 
 
 def test_what_would_be_fine_tuned_is_looked_at_before(tiny_checkpoint: Path, tmp_path: Path):
@@ -119,6 +119,9 @@ def test_what_would_be_fine_tuned_is_looked_at_before(tiny_checkpoint: Path, tmp
     path = config.policy.path
     tuned = replace(config, policy=replace(config.policy, path=None), sft=SFTConfig(steps=1, init_path=path))
     check_imagination(tuned)
+    new = {"type": "smolvla", "chunk_size": 8, "n_action_steps": 8}
+    fresh = replace(tuned, sft=SFTConfig(steps=1, policy=new), policy=replace(tuned.policy, n_action_steps=4))
+    check_imagination(fresh)
     two = replace(tuned, policy=replace(tuned.policy, n_action_steps=2))
     with pytest.raises(InputError, match="executes 2 actions per decision"):
         check_imagination(two)

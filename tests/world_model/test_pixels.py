@@ -153,6 +153,21 @@ def test_a_state_is_not_changed_by_going_on_from_it():
     assert torch.equal(first.state["anchor"], state["anchor"]), "the anchor stays"
 
 
+def test_a_picture_that_is_no_number_is_doubted(monkeypatch: pytest.MonkeyPatch):
+    of = windows(dots(1))
+    made = awake(model())
+    state, sample = made.begin(context_of(of), of.task), made._sample
+
+    def broken(*given: object) -> torch.Tensor:
+        image = sample(*given)  # type: ignore[arg-type]
+        image[1, 0, 2, 2] = torch.nan
+        return image
+
+    monkeypatch.setattr(made, "_sample", broken)
+    doubt = made.step(state, torch.from_numpy(of.actions[:, 0]), range(len(of))).uncertainty
+    assert doubt[1] == torch.inf and torch.isfinite(doubt).sum() == len(of) - 1
+
+
 def test_actions_that_are_not_executed_do_not_matter():
     of = windows(dots(2))
     cut_short = replace(of, steps=np.where(np.arange(3) == 0, 1, of.steps))
