@@ -39,6 +39,7 @@ from accerl_lerobot.bench.study import (
     as_markdown,
     draw_lines,
     named,
+    pooled,
     rated,
     tabled,
     together,
@@ -50,7 +51,7 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.dataset_config import DatasetConfig
 from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.stats import Rate, mean_interval
+from accerl_lerobot.evaluation.stats import mean_interval
 
 ARMS = {
     "none": ("--imagination.share=0",),
@@ -179,10 +180,7 @@ def over_none(rows: Sequence[dict[str, Any]], none: Sequence[dict[str, Any]]) ->
     without = {row["seed"]: row["success"] for row in none}
     gains = [row["success"] - without[row["seed"]] for row in rows]
     gain, interval = sum(gains) / len(gains), mean_interval(gains)
-    a, b = (
-        Rate(successes=sum(round(row["success"] * row["n"]) for row in of), n=sum(row["n"] for row in of))
-        for of in (rows, none)
-    )
+    a, b = pooled(rows), pooled(none)
     low = gain - math.hypot(a.value - a.interval().low, b.interval().high - b.value)
     high = gain + math.hypot(a.interval().high - a.value, b.value - b.interval().low)
     return {"gain": gain, "gain_ci95": (min(low, interval.low), max(high, interval.high))}

@@ -41,6 +41,8 @@ from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate, mean_interval
 from accerl_lerobot.resume import locked
 
+INTERVALS = "intervals are 95 %, over seeds where there are several"
+"""For people, see `together`."""
 IN_USE = "a study, or a run of one that was killed, still writes there; wait for it or end it"
 LOG_LINES = 12
 """Of a run that failed, shown in the error."""
@@ -113,6 +115,12 @@ class Results(NamedTuple):
         ]
 
 
+def pooled(rows: Sequence[dict[str, Any]]) -> Rate:
+    """All episodes of some rows of `Results.table`, as if one policy had played them."""
+    successes = sum(round(row["success"] * row["n"]) for row in rows)
+    return Rate(successes=successes, n=sum(row["n"] for row in rows))
+
+
 def together(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Successes and episodes of some rows of `Results.table`, one per seed.
 
@@ -121,11 +129,10 @@ def together(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         `mean_interval` over seeds, where there are several, and never narrower than if one policy had played
         all episodes: seeds may be alike by chance.
     """
-    successes, n = sum(round(row["success"] * row["n"]) for row in rows), sum(row["n"] for row in rows)
-    by_seed = [row["success"] for row in rows]
-    of = [Rate(successes=successes, n=n).interval()] + ([mean_interval(by_seed)] if len(rows) > 1 else [])
+    rate, by_seed = pooled(rows), [row["success"] for row in rows]
+    of = [rate.interval()] + ([mean_interval(by_seed)] if len(rows) > 1 else [])
     ci95 = (max(0.0, min(i.low for i in of)), min(1.0, max(i.high for i in of)))
-    return {"successes": successes, "n": n, "by_seed": by_seed, "ci95": ci95}
+    return {"successes": rate.successes, "n": rate.n, "by_seed": by_seed, "ci95": ci95}
 
 
 def rated(group: dict[str, Any]) -> str:
@@ -134,9 +141,6 @@ def rated(group: dict[str, Any]) -> str:
     low, high = (100 * end for end in group["ci95"])
     rate = 100 * group["successes"] / group["n"]
     return f"{rate:.1f} % [{low:.1f}, {high:.1f}] n={group['n']} ({seeds})"
-
-
-INTERVALS = "intervals are 95 %, over seeds where there are several"
 
 
 def tabled(
