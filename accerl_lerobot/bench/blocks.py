@@ -142,9 +142,9 @@ def _seconds(update: dict[str, float]) -> float:
     return update["wait_s"] + update["update_s"] + update["publish_s"]
 
 
-def _observations(inference: dict[str, float]) -> float:
-    """Of all requests so far; each has one."""
-    return inference["batches"] * inference["batch_size_mean"]
+def _observations(inference: dict[str, float]) -> int:
+    """Of all requests so far; each has one. A count again, which a mean times its divisor is not always."""
+    return round(inference["batches"] * inference["batch_size_mean"])
 
 
 def _waited(inference: dict[str, float]) -> float:

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import pytest
 
-from accerl_lerobot.bench import async_vs_sync
+from accerl_lerobot.bench import async_vs_sync, blocks
 from accerl_lerobot.bench.async_vs_sync import ARMS, BenchAsyncVsSyncConfig, bench_async_vs_sync
 from accerl_lerobot.bench.async_vs_sync import compare as compare_schedules
 from accerl_lerobot.bench.async_vs_sync import table as schedules_table
@@ -126,6 +126,12 @@ def test_books_that_do_not_add_up_are_an_error():
     for inserted in (20.0, 170.0):
         with pytest.raises(RuntimeError, match="missing, or there twice"):
             books(run, rollout, {"inserted_decisions": inserted, "dropped_nonfinite": 0.0})
+
+
+def test_requests_are_counted_whole():
+    mean = 15 / 11
+    assert 11 * mean != 15  # a float's way
+    assert blocks._observations({"batches": 11.0, "batch_size_mean": mean}) == 15
 
 
 def test_a_small_run_of_everything(light_ray: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
