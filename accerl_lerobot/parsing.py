@@ -38,6 +38,7 @@ import yaml
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hints import is_optional, is_union, wanted
+from accerl_lerobot.imports import DISCOVER, discover
 
 TYPE = "type"
 """The key that picks one config of several, as in ``env.type``."""
@@ -234,6 +235,10 @@ def _merged(tree: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
 def _checked(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...], whole: type[Any]) -> dict[str, Any]:
     """`tree` with types filled in where a choice has a default, once all its keys are known to exist."""
     hints, by_name = typing.get_type_hints(cls), {f.name: f for f in dataclasses.fields(cls)}
+    if DISCOVER in by_name and isinstance(package := tree.get(DISCOVER), str):
+        rooms = filter(None, map(room_of, hints.values()))
+        if any(map(choices_of, rooms)):  # what it registers may be the type of one of these
+            discover(package, ".".join(path))
     out: dict[str, Any] = {}
     for key, value in tree.items():
         here = (*path, str(key))
@@ -256,15 +261,17 @@ def _checked(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...], whole:
 def _checked_room(
     room: type[Any], value: dict[str, Any], here: tuple[str, ...], field: Any, whole: type[Any]
 ) -> dict[str, Any]:
-    choices = choices_of(room)
+    choices, usual = choices_of(room), _default_type(field)
     if not choices:
         return _checked(room, _merged(_apart(field, room), value), here, whole)
-    kind = value.get(TYPE, _default_type(field))
+    kind = value.get(TYPE, usual)
     if kind not in choices:
         near = difflib.get_close_matches(str(kind), choices, n=1)
         hint = f"did you mean {near[0]}? Otherwise " if near else ""
         raise InputError(".".join((*here, TYPE)), kind, f"{hint}use one of {', '.join(sorted(choices))}")
     rest = {k: v for k, v in value.items() if k != TYPE}
+    if kind == usual:
+        rest = _merged(_apart(field, choices[kind]), rest)
     return {TYPE: kind} | _checked(choices[kind], rest, here, whole)
 
 

@@ -117,6 +117,8 @@ class WorldModelEvalRun:
 
     path: str | None = None
     """The folder named world_model that ``accerl world-model`` wrote."""
+    discover_packages_path: str | None = None
+    """Package to import that registers the type of the world model, where that is not one of ours."""
     seed: int = 0
     """Of which windows are tried."""
     output_dir: str | None = None

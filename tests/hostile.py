@@ -206,7 +206,7 @@ def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
     from accerl_lerobot.demos.dataset_files import check_data, check_info, check_metadata, check_stats
     from accerl_lerobot.policies import files
     from accerl_lerobot.safety import Origin, check_safetensors, read_json
-    from accerl_lerobot.world_model.bounds import check_pixel_model, check_spec, check_success_model
+    from accerl_lerobot.world_model.bounds import check_model, check_spec, check_success_model
 
     origin = Origin("path", "hostile")
     world, policy, dataset = at["world_model"], at["policy"], at["dataset"]
@@ -215,7 +215,8 @@ def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
     trial.files("safetensors", weights, lambda: check_safetensors(weights, origin), 300 * times)
     content = json.loads((world / "config.json").read_text())
     trial.trees("spec", content["spec"], lambda t: check_spec(t, origin), 60 * times)
-    trial.trees("pixel model", content["model"], lambda t: check_pixel_model(t, origin), 60 * times)
+    known = [content["model"]["type"]]
+    trial.trees("model", content["model"], lambda t: check_model(t, known, origin), 60 * times)
     said = json.loads((world / "success_model" / "config.json").read_text())
     trial.trees("success model", said, lambda t: check_success_model(t, origin), 60 * times)
     config = json.loads((policy / "config.json").read_text())

@@ -70,9 +70,8 @@ def bench_dream(config: BenchDreamConfig) -> dict[str, Any]:
     import torch
 
     from accerl_lerobot.policies.loading import resolve_device
-    from accerl_lerobot.world_model.contract import WorldModelSpec
+    from accerl_lerobot.world_model.contract import WorldModelSpec, new_learnable
     from accerl_lerobot.world_model.learn import Learner
-    from accerl_lerobot.world_model.pixels import PixelWorldModel
     from accerl_lerobot.world_model.replayed import context_of
     from accerl_lerobot.world_model.success import new_success_model, probabilities
 
@@ -88,9 +87,9 @@ def bench_dream(config: BenchDreamConfig) -> dict[str, Any]:
         chunk=of.chunk,
         fps=10,
         context=of.model.context,
-        provides=frozenset({"pixels"}),
+        provides=of.model.provides(config.state_dim),
     )
-    model = PixelWorldModel(spec, of.model).to(device)
+    model = new_learnable(spec, of.model).to(device)
     judge = new_success_model(of.chunk).to(device).eval()
     seconds: dict[str, Any] = {"dream": {}, "judge": {}}
     for batch in config.batches:

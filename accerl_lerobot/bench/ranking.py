@@ -41,6 +41,8 @@ class BenchRankingConfig:
 
     path: str | None = None
     """The folder named world_model that ``accerl world-model`` wrote."""
+    discover_packages_path: str | None = None
+    """Package to import that registers the type of the world model, where that is not one of ours."""
     policies: tuple[str, ...] = ()
     """Checkpoints. One is enough for the threshold by which it succeeds as often in dreams as in reality; 3
     can be ranked, and 12 and more say something."""
@@ -97,7 +99,7 @@ def bench_ranking(config: BenchRankingConfig) -> dict[str, Any]:
 
     torch.set_num_threads(config.num_threads)
     device, console = resolve_device(config.device), Console()
-    model, judge = load_world_model(Path(str(config.path)).expanduser())
+    model, judge = load_world_model(Path(str(config.path)).expanduser(), config.discover_packages_path)
     dreamer = Dreamer(model.to(device), None if judge is None else judge.to(device))
     of = [PolicyConfig(path=path, device=config.device) for path in config.policies]
     worlds = [make_world(config.env) for _ in range(min(config.worlds, config.episodes))]

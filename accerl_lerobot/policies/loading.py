@@ -20,7 +20,6 @@ Everything is LeRobot's: config, weights and processors load through `from_pretr
 
 from __future__ import annotations
 
-import importlib
 import json
 import logging
 from dataclasses import asdict
@@ -34,6 +33,7 @@ from torch import Tensor, nn
 
 from accerl_lerobot.checkpoint import BACKBONE, relocate
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.imports import imported
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Model
@@ -353,9 +353,3 @@ def override(lerobot_config: Any, config: PolicyConfig) -> None:
 def steps_field(lerobot_config: Any) -> str | None:
     """Where a policy type's config has its denoising steps; None if it does not denoise."""
     return next((n for n in ("num_steps", "num_inference_steps") if hasattr(lerobot_config, n)), None)
-
-
-def imported(path: str) -> Any:
-    """What an entry of `POLICIES` or `FAMILIES` names."""
-    module, _, name = path.partition(":")
-    return getattr(importlib.import_module(module), name)

@@ -29,7 +29,15 @@ from torch import Tensor
 
 from accerl_lerobot.envs.base import ChunkResult, World
 from accerl_lerobot.experience import TASK
-from accerl_lerobot.world_model.contract import Context, Dream, History, State, WorldModel, WorldModelSpec
+from accerl_lerobot.world_model.contract import (
+    Context,
+    Dream,
+    History,
+    LearnableWorldModel,
+    State,
+    WorldModel,
+    WorldModelSpec,
+)
 from accerl_lerobot.world_model.frames import seen
 
 
@@ -80,6 +88,13 @@ class ShuffledModel(WorldModel):
         if len(actions) < 2:
             raise ValueError("a dream alone can only be told its own actions")
         return self.model.step(state, actions.roll(1, 0), seeds)
+
+
+def learnt_within(model: WorldModel) -> LearnableWorldModel:
+    """What learns: the model itself, or the one that a `ShuffledModel` tells the wrong actions."""
+    model = model.model if isinstance(model, ShuffledModel) else model
+    assert isinstance(model, LearnableWorldModel)  # `ModelKind.learns` says so of no other
+    return model
 
 
 class OracleModel(WorldModel):

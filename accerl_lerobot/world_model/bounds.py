@@ -15,8 +15,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
+from accerl_lerobot.imports import DISCOVER
 from accerl_lerobot.safety import Origin, check_name, check_number
 
 CONFIG = "config.json"
@@ -28,7 +30,8 @@ SPEC = {
     "context": (1, 64),
 }
 """Field of a `WorldModelSpec` → its smallest and largest value."""
-MODEL = {"steps": (1, 1000), "context": (1, 64), "heads": (2, 64)}
+CONTEXT = {"context": (1, 64)}
+PIXELS = {"steps": (1, 1000), "heads": (2, 64)}
 NETWORK = {"space_to_depth": (1, 64), "blocks": (1, 64), "condition": (1, 16_384), "planes": (0, 1024)}
 CAMERAS_MOST, SIDE_MOST, LEVELS_MOST, WIDTH_MOST = 16, 2048, 8, 16_384
 TASKS_MOST, NAME_MOST = 4096, 200
@@ -56,14 +59,27 @@ def check_spec(spec: Any, origin: Origin) -> None:
     _sides(mapping.get("image_size"), 2, SIDE_MOST, "spec.image_size", origin)
 
 
-def check_pixel_model(model: Any, origin: Origin) -> None:
+def check_model(model: Any, known: Iterable[str], origin: Origin) -> None:
     """The room ``model`` of its ``config.json``; what it leaves out has a default.
 
+    Args:
+        model: what it says; of a class that is not ours, its config has to look at the rest.
+        known: types that are registered.
+        origin: where it came from.
+
     Raises:
-        InputError: it is not one, or asks for more layers than such a model has.
+        InputError: it is not one, of no known type, or asks for more layers than such a model has.
     """
     mapping = _mapping(model, "model", origin)
-    _numbers(mapping, MODEL, "model", origin)
+    kind, names = mapping.get("type"), sorted(known)
+    if kind not in names:
+        remedy = f"{str(kind)[:60]!r}; use one of {', '.join(names)}, or name its package"
+        package = origin.field.removesuffix("path") + DISCOVER
+        raise origin.refuse(f"{CONFIG}: model.type", f"{remedy}: {package}")
+    _numbers(mapping, CONTEXT, "model", origin)
+    if kind != "pixels":
+        return
+    _numbers(mapping, PIXELS, "model", origin)
     network = _mapping(mapping.get("network", {}), "model.network", origin)
     _numbers(network, NETWORK, "model.network", origin)
     if "channels" in network:

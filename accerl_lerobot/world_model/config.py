@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 import draccus
 
@@ -62,16 +62,54 @@ class NetworkConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PixelModelConfig:
+class LearnableModelConfig(draccus.ChoiceRegistry):
+    """A class of world models that learn; each is a `contract.LearnableWorldModel` and a config like this.
+
+    Example:
+        >>> @LearnableModelConfig.register_subclass("mine")
+        ... @dataclass(frozen=True, kw_only=True)
+        ... class MyModelConfig(LearnableModelConfig):
+        ...     make = "my_package.model:MyWorldModel"
+        ...     width: int = 64
+    """
+
+    make: ClassVar[str]
+    """``module:name`` of the class, which is made of a `contract.WorldModelSpec` and this config."""
+
+    context: int = 2
+    """Frames it sees, the newest included, a chunk apart."""
+
+    def __post_init__(self) -> None:
+        if self.context < 1:
+            raise InputError("world_model.model.context", self.context, "use at least 1")
+
+    @property
+    def type(self) -> str:
+        """The registered name."""
+        return str(self.get_choice_name(self.__class__))
+
+    @property
+    def multiple(self) -> int:
+        """What image sides must be a multiple of."""
+        return 1
+
+    def provides(self, state_dim: int) -> frozenset[str]:
+        """See `contract.WorldModelSpec`, of a world whose robot's state has so many dims, maybe 0."""
+        return frozenset({"pixels", "state"} if state_dim else {"pixels"})
+
+
+@LearnableModelConfig.register_subclass("pixels")
+@dataclass(frozen=True, kw_only=True)
+class PixelModelConfig(LearnableModelConfig):
     """How it learns and dreams."""
+
+    make = "accerl_lerobot.world_model.pixels:PixelWorldModel"
 
     objective: Objective = "refiner"
     """refiner: predict the change, then refine it. edm: denoise the frame, as DIAMOND does. flow: rectified
     flow of the change."""
     steps: int = 1
     """Network passes per chunk, at least 1. One pass of the refiner is regression."""
-    context: int = 2
-    """Frames it sees, the newest included, a chunk apart."""
     context_noise: float = 0.02
     """Largest standard deviation of the noise on context and anchor in training, in units of [−1, 1]; ≥ 0.
     What it dreams is never as clean as what it learns from."""
@@ -86,11 +124,12 @@ class PixelModelConfig:
     network: NetworkConfig = field(default_factory=NetworkConfig)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.objective not in get_args(Objective):
             raise InputError(
                 "world_model.model.objective", self.objective, f"use {' or '.join(get_args(Objective))}"
             )
-        for name, least in (("steps", 1), ("context", 1), ("heads", 2), ("state_weight", 0)):
+        for name, least in (("steps", 1), ("heads", 2), ("state_weight", 0)):
             if getattr(self, name) < least:
                 raise InputError(f"world_model.model.{name}", getattr(self, name), f"use at least {least}")
         if not self.context_noise >= 0:
@@ -103,6 +142,15 @@ class PixelModelConfig:
             raise InputError(
                 "world_model.model.sigma_max", self.sigma_max, "use more than 0.002, where it ends"
             )
+
+    @property
+    def multiple(self) -> int:
+        """See the base class."""
+        return self.network.multiple
+
+    def provides(self, state_dim: int) -> frozenset[str]:
+        """See the base class. Where no heads of a state can disagree, it has no doubts."""
+        return super().provides(state_dim) | ({"uncertainty"} if state_dim else set())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -299,7 +347,9 @@ class StandInConfig:
 class WorldModelConfig(draccus.ChoiceRegistry):
     """A world model with its success model; `sizes.py` has those that can be named."""
 
-    model: PixelModelConfig = field(default_factory=PixelModelConfig)
+    model: LearnableModelConfig = field(default_factory=PixelModelConfig)
+    discover_packages_path: str | None = None
+    """Package to import that registers the type of `model`, where that is not one of ours."""
     learn: LearnConfig = field(default_factory=LearnConfig)
     success: SuccessLearnConfig = field(default_factory=SuccessLearnConfig)
     trial: TrialConfig = field(default_factory=TrialConfig)
@@ -322,7 +372,7 @@ class WorldModelConfig(draccus.ChoiceRegistry):
             raise InputError("world_model.held_out", self.held_out, "use a share in (0, 1), e.g. 0.2")
         if self.chunk < 1:
             raise InputError("world_model.chunk", self.chunk, "use at least 1")
-        multiple = math.lcm(2, self.model.network.multiple)  # the success model halves it first
+        multiple = math.lcm(2, self.model.multiple)  # the success model halves it first
         if self.image_size < multiple or self.image_size % multiple:
-            remedy = f"use a multiple of {multiple}, or change world_model.model.network"
+            remedy = f"use a multiple of {multiple}, or change world_model.model"
             raise InputError("world_model.image_size", self.image_size, remedy)

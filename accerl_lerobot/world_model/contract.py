@@ -16,7 +16,8 @@
     state = model.begin(context, tasks)
     dream = model.step(state, actions, seeds)         # dream.frames, dream.robot; go on from dream.state
 
-One that learns has a `loss` too. `kinds.py` has the table of those that a run can name.
+One that learns has a `loss` too; `pixels.py` has ours, and ``docs/world_model.md`` says how to bring another.
+`kinds.py` has the table of what a run can dream with.
 
 States are dicts of tensors with the batch in front, so that rows can be replaced, repeated and sent away. A
 model says in its `spec` what it provides. Whether a frame shows a success is another model's judgement, see
@@ -37,10 +38,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from accerl_lerobot.imports import imported
 from accerl_lerobot.snapshot import kind
 
 if TYPE_CHECKING:
     from accerl_lerobot.envs.base import World
+    from accerl_lerobot.world_model.config import LearnableModelConfig
     from accerl_lerobot.world_model.episodes import Windows
     from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 
@@ -169,7 +172,20 @@ class WorldModel(ABC):
 
 
 class LearnableWorldModel(nn.Module, WorldModel):
-    """One that learns from real experience, see `learn.Learner`; what is saved is its ``state_dict``."""
+    """One that learns from real experience, see `learn.Learner`; what is saved is its ``state_dict``.
+
+    Args:
+        spec: of the world.
+        config: its own, which is saved too.
+    """
+
+    doubt: Tensor
+    """What its uncertainty is to be divided by, a scalar; see `trial.calibrate`."""
+
+    def __init__(self, spec: WorldModelSpec, config: LearnableModelConfig) -> None:
+        super().__init__()
+        self.spec, self.config = spec, config
+        self.register_buffer("doubt", torch.tensor(1.0))
 
     @abstractmethod
     def fit_statistics(self, windows: Windows) -> None:
@@ -186,6 +202,12 @@ class LearnableWorldModel(nn.Module, WorldModel):
         Returns:
             The loss, a scalar, and its parts, by the names that they have in metrics.
         """
+
+
+def new_learnable(spec: WorldModelSpec, config: LearnableModelConfig) -> LearnableWorldModel:
+    """The one that `config` is of, knowing nothing yet."""
+    made: LearnableWorldModel = imported(config.make)(spec, config)
+    return made
 
 
 class Means(NamedTuple):

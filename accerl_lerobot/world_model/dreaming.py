@@ -27,7 +27,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.loading import load_lerobot_config
 from accerl_lerobot.preflight import policy_to_be
-from accerl_lerobot.world_model.baselines import ShuffledModel
+from accerl_lerobot.world_model.baselines import learnt_within
 from accerl_lerobot.world_model.config import TrialConfig
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.dataset import fingerprint, load_episodes
@@ -37,7 +37,6 @@ from accerl_lerobot.world_model.fit import check_fit
 from accerl_lerobot.world_model.imagination_config import FILMS, ImaginationConfig, OnlineLearnConfig
 from accerl_lerobot.world_model.imagine import Dreamer, Imagination
 from accerl_lerobot.world_model.online import OnlineLearner
-from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.pool import part
 from accerl_lerobot.world_model.recorded import DREAMS, DreamRecorder
 from accerl_lerobot.world_model.sources import ONLINE, check_apart, named, open_rooms
@@ -88,7 +87,7 @@ def _sources(config: RunConfig, spec: WorldModelSpec) -> list[Source]:
     """What a world model that goes on learning learns from, beside the run's own episodes."""
     if not config.imagination.learns:
         return []
-    sources = list(load_sources(Path(str(config.imagination.path)), "imagination.path"))
+    sources = list(load_sources(Path(str(config.imagination.path)), "imagination"))
     rooms = _rooms(config.imagination.learn)
     for room, meta in open_rooms(rooms, spec).items():
         if find(sources, known := fingerprint(meta)) is None:  # then it is learnt from whole
@@ -134,12 +133,11 @@ def make_learner(config: RunConfig, dreamer: Dreamer | None = None) -> OnlineLea
     """
     learn = config.imagination.learn
     world = _spec(config)
-    model, success = dreamer or load_dreamer(config, world)
+    dreamer = dreamer or load_dreamer(config, world)
+    model, success = learnt_within(dreamer.model), dreamer.success
     longest = _longest(config, world, model.spec.chunk)
-    if isinstance(model, ShuffledModel):
-        model = model.model
-    assert isinstance(model, PixelWorldModel) and success is not None  # as `check_imagination` has found
-    sources = load_sources(Path(str(config.imagination.path)), "imagination.path")
+    assert success is not None  # as `check_imagination` has found
+    sources = load_sources(Path(str(config.imagination.path)), "imagination")
     offline: list[Episode] = []
     held_out: list[Episode] = []
     rooms = _rooms(learn)

@@ -90,7 +90,7 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
     device = device_named(config.device)
     path = Path(str(config.path)).expanduser()
     success: SuccessModel | None
-    model, success = load_world_model(path)
+    model, success = load_world_model(path, config.discover_packages_path)
     model = model.to(device)
     if config.success.path is not None:
         success = load_stand_in(config.success, model.spec, "success", device)

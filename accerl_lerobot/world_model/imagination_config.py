@@ -106,6 +106,9 @@ class ImaginationConfig:
     path: str | None = None
     """The folder ``world_model`` that ``accerl world-model`` has written; oracle needs none, copy one for its
     success model."""
+    discover_packages_path: str | None = None
+    """Package to import that registers the type of the world model in `path`, where that is not one of ours;
+    every machine of the cluster needs it."""
     success: StandInConfig = field(default_factory=StandInConfig)
     """A reward model that tells successes in place of the one in `path`; it stays as it is, and so does the
     world model."""

@@ -36,13 +36,12 @@ from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.experience import IMAGINED, Decision, Observation, Request, Segment
 from accerl_lerobot.optimizers import copied
 from accerl_lerobot.rollout.segments import SegmentBuilder
-from accerl_lerobot.world_model.baselines import OracleModel, ShuffledModel
+from accerl_lerobot.world_model.baselines import OracleModel, ShuffledModel, learnt_within
 from accerl_lerobot.world_model.calibration import Calibration
 from accerl_lerobot.world_model.contract import Context, Dream, State, WorldModel, replaced
 from accerl_lerobot.world_model.frames import observed
 from accerl_lerobot.world_model.guard import DreamCounters, KillSwitch
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
-from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.stand_in import SuccessModel, device_of
 from accerl_lerobot.world_model.starts import Start, StartPool
 from accerl_lerobot.world_model.store import Source, save_world_model
@@ -180,7 +179,7 @@ class Imagination:
         rows = [None if row is None else vars(row) | {"builder": row.builder.state()} for row in self._rows]
         promoted = None
         if self.version and self._success is not None:
-            models = (copied(self._learned), copied(self._success))
+            models = (copied(learnt_within(self._model)), copied(self._success))
             promoted = (*models, self._success.config.threshold)
         return {
             "counters": replace(self.counters),
@@ -205,7 +204,7 @@ class Imagination:
         self._sequence, self._doubted_in_a_row = state["sequence"]
         if state["promoted"] is not None and self._success is not None:
             model, success, self._success.config.threshold = state["promoted"]
-            self._learned.load_state_dict(model)
+            learnt_within(self._model).load_state_dict(model)
             self._success.load_state_dict(success)
         self._calibration.restore(state["calibration"])
         self._take_over()
@@ -224,14 +223,7 @@ class Imagination:
     def save_promoted(self, directory: Path) -> None:
         """Writes the world model that has passed last, and its success model; nothing if none has."""
         if self.version and self._success is not None:
-            save_world_model(directory, self._learned, self._success, self._sources)
-
-    @property
-    def _learned(self) -> PixelWorldModel:
-        """What has been promoted."""
-        model = self._model.model if isinstance(self._model, ShuffledModel) else self._model
-        assert isinstance(model, PixelWorldModel)
-        return model
+            save_world_model(directory, learnt_within(self._model), self._success, self._sources)
 
     @property
     def on(self) -> bool:

@@ -29,10 +29,9 @@ import torch
 
 from accerl_lerobot.optimizers import copied, optimizer_state, restore_optimizer
 from accerl_lerobot.world_model.config import LearnConfig
-from accerl_lerobot.world_model.contract import WorldModelSpec
+from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModelSpec
 from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, places
 from accerl_lerobot.world_model.judge import shuffled
-from accerl_lerobot.world_model.pixels import PixelWorldModel
 
 STATISTICS = 2048
 """Windows from which means and sizes are taken."""
@@ -55,7 +54,9 @@ class Learner:
         shuffle: learn with the actions of other windows, as a placebo.
     """
 
-    def __init__(self, model: PixelWorldModel, config: LearnConfig, seed: int, shuffle: bool = False) -> None:
+    def __init__(
+        self, model: LearnableWorldModel, config: LearnConfig, seed: int, shuffle: bool = False
+    ) -> None:
         self.model, self.config, self._shuffle = model, config, shuffle
         self.serving = copy.deepcopy(model).requires_grad_(False)
         self.count = 0
@@ -145,14 +146,14 @@ class Validation:
         self._seed = seed
 
     @torch.no_grad()
-    def __call__(self, model: PixelWorldModel) -> dict[str, float]:
+    def __call__(self, model: LearnableWorldModel) -> dict[str, float]:
         """As `Learner.step`'s, without ``grad_norm``."""
         loss, metrics = model.loss(self._windows, torch.Generator().manual_seed(self._seed))
         return metrics | {"loss": loss.item()}
 
 
 def pretrain(
-    model: PixelWorldModel,
+    model: LearnableWorldModel,
     episodes: Sequence[Episode],
     config: LearnConfig,
     seed: int,

@@ -39,11 +39,10 @@ from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model.config import WorldModelConfig
-from accerl_lerobot.world_model.contract import WorldModelSpec
+from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModelSpec, new_learnable
 from accerl_lerobot.world_model.dataset import fingerprint, load_episodes
 from accerl_lerobot.world_model.episodes import Episode, amount, split
 from accerl_lerobot.world_model.learn import pretrain
-from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.sources import (
     HELD_OUT,
     ONLINE,
@@ -81,7 +80,6 @@ def world_spec(config: WorldModelConfig, env: EnvConfig) -> WorldModelSpec:
         seen = world.spec
     finally:
         world.close()
-    provides = {"pixels", "uncertainty", "state"} if seen.state_dim else {"pixels"}
     return WorldModelSpec(
         cameras=tuple(seen.images),
         image_size=(config.image_size, config.image_size),
@@ -90,7 +88,7 @@ def world_spec(config: WorldModelConfig, env: EnvConfig) -> WorldModelSpec:
         chunk=config.chunk,
         context=config.model.context,
         fps=seen.fps,
-        provides=frozenset(provides),
+        provides=config.model.provides(seen.state_dim),
     )
 
 
@@ -157,13 +155,13 @@ def _learn(
     device: torch.device,
     directory: Path,
     console: Console,
-) -> tuple[PixelWorldModel, SuccessPairsRewardModel]:
+) -> tuple[LearnableWorldModel, SuccessPairsRewardModel]:
     """World model and success model of the episodes to `learn` from; those `held` out are only looked at."""
     config, seed = run.world_model, run.seed
     examples, others = (Examples(part, config.chunk) for part in (learn, held))
     torch.manual_seed(seed)
     # Both networks begin on the CPU, and so alike wherever they learn.
-    model = PixelWorldModel(spec, config.model).to(device)
+    model = new_learnable(spec, config.model).to(device)
     with (directory / METRICS).open("w") as log:
 
         def record(kind: str, step: int, metrics: dict[str, float]) -> None:
@@ -203,7 +201,8 @@ def _learn(
 
 
 def _status(metrics: dict[str, float]) -> str:
-    return f"image {metrics['image']:.3f} state {metrics['state']:.3f}"
+    """The first two of them; those of our own models are ``image`` and ``state``."""
+    return " ".join(f"{name} {value:.3f}" for name, value in [*metrics.items()][:2])
 
 
 def _split(

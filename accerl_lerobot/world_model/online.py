@@ -32,13 +32,12 @@ import numpy as np
 
 from accerl_lerobot.experience import REAL, Segment
 from accerl_lerobot.world_model.config import LearnConfig, SuccessLearnConfig, TrialConfig
-from accerl_lerobot.world_model.contract import WorldModelSpec
+from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModelSpec
 from accerl_lerobot.world_model.episodes import Episode, Place
 from accerl_lerobot.world_model.frames import executed, seen
 from accerl_lerobot.world_model.imagination_config import OnlineLearnConfig
 from accerl_lerobot.world_model.learn import Learner
 from accerl_lerobot.world_model.outcomes import Scores, scores, threshold, together
-from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.success import Examples, SuccessLearner
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 from accerl_lerobot.world_model.trial import calibrate, try_out
@@ -50,7 +49,7 @@ ENDLESS = 10**9
 """Steps of a learning rate that never falls."""
 
 
-OnTrial = Callable[[PixelWorldModel, SuccessPairsRewardModel, Episode, int, bool], object]
+OnTrial = Callable[[LearnableWorldModel, SuccessPairsRewardModel, Episode, int, bool], object]
 """Model, success model, the newest episode that was held out, the trial's number, and whether it passed."""
 
 
@@ -105,7 +104,7 @@ class Unfinished:
 class Promotion(NamedTuple):
     """What has become of it, on the CPU, and what its trial found."""
 
-    model: PixelWorldModel
+    model: LearnableWorldModel
     success: SuccessPairsRewardModel
     version: int
     """Gradient steps behind it, those before the run not counted."""
@@ -138,7 +137,7 @@ class OnlineLearner:
 
     def __init__(
         self,
-        model: PixelWorldModel,
+        model: LearnableWorldModel,
         success: SuccessPairsRewardModel,
         config: OnlineLearnConfig,
         trial: TrialConfig,
@@ -286,7 +285,7 @@ class OnlineLearner:
         return Promotion(model.cpu(), success.cpu(), self.version, found)
 
     def _scored(
-        self, model: PixelWorldModel, success: SuccessPairsRewardModel, episodes: list[Episode]
+        self, model: LearnableWorldModel, success: SuccessPairsRewardModel, episodes: list[Episode]
     ) -> list[Scores]:
         if not episodes or self._fixed is not None:
             return []

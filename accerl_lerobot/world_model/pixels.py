@@ -64,12 +64,12 @@ class PixelWorldModel(LearnableWorldModel):
     """
 
     def __init__(self, spec: WorldModelSpec, config: PixelModelConfig) -> None:
-        super().__init__()
-        multiple = config.network.multiple
+        super().__init__(spec, config)
+        self.config: PixelModelConfig = config
+        multiple = config.multiple
         if any(side % multiple for side in spec.image_size):
             remedy = f"use sides that are multiples of {multiple}, or change world_model.model.network"
             raise InputError("world_model.image_size", spec.image_size, remedy)
-        self.spec, self.config = spec, config
         channels = 3 * len(spec.cameras)
         chunk = spec.chunk * (spec.action_dim * spec.context + 1) + spec.action_dim + spec.state_dim
         self.network = Denoiser(
@@ -89,7 +89,6 @@ class PixelWorldModel(LearnableWorldModel):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
         self.register_buffer("change", torch.tensor(0.1))
-        self.register_buffer("doubt", torch.tensor(1.0))
 
     # What it is told.
 

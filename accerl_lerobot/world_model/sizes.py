@@ -22,7 +22,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from accerl_lerobot.world_model.config import LearnConfig, NetworkConfig, PixelModelConfig, WorldModelConfig
+from accerl_lerobot.world_model.config import (
+    LearnableModelConfig,
+    LearnConfig,
+    NetworkConfig,
+    PixelModelConfig,
+    WorldModelConfig,
+)
 
 
 @WorldModelConfig.register_subclass("tiny")
@@ -36,7 +42,7 @@ class TinyConfig(WorldModelConfig):
 class SmallConfig(WorldModelConfig):
     """128 pixels, 19 million weights: for one consumer GPU."""
 
-    model: PixelModelConfig = field(
+    model: LearnableModelConfig = field(
         default_factory=lambda: PixelModelConfig(
             network=NetworkConfig(channels=(96, 192, 288), blocks=2, condition=256)
         )
@@ -53,7 +59,7 @@ class SmallConfig(WorldModelConfig):
 class SeriousConfig(WorldModelConfig):
     """224 pixels, 85 million weights: for a GPU of 80 GB."""
 
-    model: PixelModelConfig = field(
+    model: LearnableModelConfig = field(
         default_factory=lambda: PixelModelConfig(
             network=NetworkConfig(channels=(128, 256, 512, 512), blocks=2, condition=512, planes=16)
         )

@@ -37,9 +37,8 @@ if TYPE_CHECKING:
     from accerl_lerobot.dataset_config import DatasetConfig
     from accerl_lerobot.verb_configs import WorldModelEvalRun, WorldModelRun
     from accerl_lerobot.world_model.config import TrialConfig
-    from accerl_lerobot.world_model.contract import WorldModelSpec
+    from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModelSpec
     from accerl_lerobot.world_model.inverse import InverseProbe
-    from accerl_lerobot.world_model.pixels import PixelWorldModel
     from accerl_lerobot.world_model.stand_in import SuccessModel
 
 HELD_OUT, DATASET, ONLINE = "held out", "dataset", "online"
@@ -48,7 +47,7 @@ PREVIEW = "preview.mp4"
 
 
 def try_sources(
-    model: PixelWorldModel,
+    model: LearnableWorldModel,
     sources: dict[str, list[Episode]],
     config: TrialConfig,
     success: SuccessModel | None,

@@ -31,6 +31,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.imports import DISCOVER, discover
 from accerl_lerobot.policies.files import check_origin, check_policy_config, check_processor
 from accerl_lerobot.policies.guard import Budget, guarded, input_error
 from accerl_lerobot.safety import Origin, brief, checked_weights, file_size, read_json, safe_join
@@ -131,8 +132,7 @@ def load_stand_in(
     from lerobot.configs.rewards import RewardModelConfig
 
     origin = Origin(f"{room}.path", config.path)
-    if config.discover_packages_path is not None:
-        _register(config.discover_packages_path, room)
+    discover(config.discover_packages_path, room)
     folder = _folder(config, origin)
     fetched = not Path(str(config.path)).expanduser().exists()
     content = read_json(safe_join(folder, CONFIG, origin), origin)
@@ -142,9 +142,7 @@ def load_stand_in(
     known = sorted(RewardModelConfig.get_known_choices())
     if content.get("type") not in known:
         remedy = f"{str(content.get('type'))[:60]!r}; use one of {', '.join(known)}"
-        raise origin.refuse(
-            f"{CONFIG}: type", f"{remedy}, or name its package: {room}.discover_packages_path"
-        )
+        raise origin.refuse(f"{CONFIG}: type", f"{remedy}, or name its package: {room}.{DISCOVER}")
     try:
         settings = RewardModelConfig.from_pretrained(folder)
     except Exception as error:  # LeRobot takes the file at its word, and may fail over any of it
@@ -157,14 +155,6 @@ def load_stand_in(
     )
     _try(stand_in.eval().requires_grad_(False), spec, origin)
     return stand_in
-
-
-def _register(package: str, room: str) -> None:
-    try:
-        importlib.import_module(package)
-    except ImportError as error:
-        remedy = f"cannot be imported ({brief(error)})"
-        raise InputError(f"{room}.discover_packages_path", package, remedy) from error
 
 
 def _folder(config: StandInConfig, origin: Origin) -> Path:

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import draccus
@@ -31,12 +31,12 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.guard import Budget, guarded
+from accerl_lerobot.imports import discover
+from accerl_lerobot.policies.guard import Budget, guarded, input_error
 from accerl_lerobot.safety import Origin, brief, checked_weights, file_size, read_json, safe_join
-from accerl_lerobot.world_model.bounds import check_pixel_model, check_spec, check_success_model
-from accerl_lerobot.world_model.config import PixelModelConfig
-from accerl_lerobot.world_model.contract import WorldModelSpec
-from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.bounds import check_model, check_spec, check_success_model
+from accerl_lerobot.world_model.config import LearnableModelConfig
+from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModelSpec, new_learnable
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
 UNREADABLE = (
@@ -65,14 +65,14 @@ A_RUN = Source(repo_id="the episodes of a run", fingerprint="", learnt=(), held_
 
 def save_world_model(
     directory: Path,
-    model: PixelWorldModel,
+    model: LearnableWorldModel,
     success: SuccessPairsRewardModel | None = None,
     sources: Sequence[Source] = (),
 ) -> None:
     """Writes all of it into a folder that does not exist."""
     directory.mkdir(parents=True)
     spec = asdict(model.spec) | {"provides": sorted(model.spec.provides)}
-    content = {"spec": spec, "model": draccus.encode(model.config)}
+    content = {"spec": spec, "model": draccus.encode(model.config, LearnableModelConfig)}
     content["sources"] = [asdict(source) for source in sources]
     (directory / CONFIG).write_text(json.dumps(content, indent=2) + "\n")
     save_file({k: v.contiguous() for k, v in model.state_dict().items()}, directory / WEIGHTS)
@@ -83,14 +83,14 @@ def save_world_model(
         success.config.device = where
 
 
-def load_sources(directory: Path, field: str = "path") -> tuple[Source, ...]:
-    """What a saved world model has learnt from; none if it does not say. `field` is named in the error.
+def load_sources(directory: Path, room: str = "") -> tuple[Source, ...]:
+    """What a saved world model has learnt from; none if it does not say. `room` is of the ``path``.
 
     Raises:
         InputError: it says something else.
     """
+    origin = _origin(directory, room)
     try:
-        origin = Origin(field, str(directory))
         said = read_json(safe_join(directory, CONFIG, origin), origin).get("sources", [])
         return tuple(
             Source(
@@ -104,9 +104,8 @@ def load_sources(directory: Path, field: str = "path") -> tuple[Source, ...]:
     except InputError:
         raise
     except UNREADABLE as error:
-        raise InputError(
-            field, str(directory), f"its {CONFIG} does not say what it learnt ({brief(error)})"
-        ) from error
+        remedy = f"its {CONFIG} does not say what it learnt ({brief(error)})"
+        raise InputError(origin.field, origin.value, remedy) from error
 
 
 def find(sources: Iterable[Source], fingerprint: str) -> Source | None:
@@ -115,41 +114,46 @@ def find(sources: Iterable[Source], fingerprint: str) -> Source | None:
 
 
 def load_world_model(
-    directory: Path, field: str = "path"
-) -> tuple[PixelWorldModel, SuccessPairsRewardModel | None]:
+    directory: Path, package: str | None = None, *, room: str = ""
+) -> tuple[LearnableWorldModel, SuccessPairsRewardModel | None]:
     """Reads what `save_world_model` wrote; both serve, neither is in training.
 
     Args:
         directory: the folder.
-        field: that named it, for the error.
+        package: that registers its type, where that is not one of ours.
+        room: of the fields ``path`` and ``discover_packages_path`` that named them, for the error.
 
     Raises:
-        InputError: it is not there, its weights are not those of its config, or its success model is broken.
+        InputError: it is not there, of a type that is not known, its weights are not those of its config, or
+            its success model is broken.
     """
-    origin = Origin(field, str(directory))
+    origin = _origin(directory, room)
+    discover(package, room)
     content = read_json(safe_join(directory, CONFIG, origin), origin)
     check_spec(content.get("spec"), origin)
-    check_pixel_model(content.get("model"), origin)
+    check_model(content.get("model"), LearnableModelConfig.get_known_choices(), origin)
     weights, _ = checked_weights(directory, WEIGHTS, origin)
     try:
         spec = dict(content["spec"])
         spec |= {k: tuple(spec.get(k, ())) for k in ("cameras", "image_size", "tasks")}
         spec |= {"provides": frozenset(spec["provides"])}
-        with Budget(file_size(weights, origin), field, str(directory)):
-            model = PixelWorldModel(
-                WorldModelSpec(**spec), draccus.decode(PixelModelConfig, content["model"])
-            )
+        with Budget(file_size(weights, origin), origin.field, origin.value):
+            config = draccus.decode(LearnableModelConfig, content["model"])
+            model = new_learnable(WorldModelSpec(**spec), config)
         model.load_state_dict(load_file(weights))
-    except InputError as error:
-        raise origin.refuse(CONFIG, brief(error)) from error
     except (*UNREADABLE, draccus.utils.DraccusException) as error:
-        raise InputError(
-            field, str(directory), f"not a world model of accerl world-model ({brief(error)})"
-        ) from error
+        if (ours := input_error(error)) is not None:  # draccus wraps what a config refuses
+            raise origin.refuse(CONFIG, brief(ours)) from error
+        remedy = f"not a world model of accerl world-model ({brief(error)})"
+        raise InputError(origin.field, origin.value, remedy) from error
     success = None
     if safe_join(directory, SUCCESS, origin).is_dir():
-        success = _success(directory / SUCCESS, Origin(field, str(directory / SUCCESS)))
+        success = _success(directory / SUCCESS, replace(origin, value=str(directory / SUCCESS)))
     return model.requires_grad_(False), success
+
+
+def _origin(directory: Path, room: str) -> Origin:
+    return Origin(f"{room}.path" if room else "path", str(directory))
 
 
 def _success(directory: Path, origin: Origin) -> SuccessPairsRewardModel:

@@ -35,11 +35,10 @@ import numpy as np
 
 from accerl_lerobot.world_model import judge
 from accerl_lerobot.world_model.config import TrialConfig
-from accerl_lerobot.world_model.contract import WorldModel
+from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModel
 from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, held
 from accerl_lerobot.world_model.inverse import InverseProbe
 from accerl_lerobot.world_model.outcomes import drawn, judged, scores, spaced, threshold
-from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.replayed import Dreams, cut_alike, dream, made
 from accerl_lerobot.world_model.stand_in import SuccessModel
 from accerl_lerobot.world_model.success import Examples, probabilities
@@ -83,7 +82,9 @@ def wrong_actions(
     return {"true": actions, "zero": np.zeros_like(actions), "opposite": -actions}[arm]
 
 
-def calibrate(model: PixelWorldModel, episodes: Sequence[Episode], config: TrialConfig, seed: int) -> None:
+def calibrate(
+    model: LearnableWorldModel, episodes: Sequence[Episode], config: TrialConfig, seed: int
+) -> None:
     """Makes an uncertainty of 1 the 95th percentile after one whole chunk of these episodes."""
     windows = trial_windows(episodes, model, config, seed + 1)
     doubts = dream(model, windows, windows.actions[:, :1]).uncertainty[:, 0]

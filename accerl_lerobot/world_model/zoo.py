@@ -19,7 +19,8 @@ from pathlib import Path
 
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.envs.base import WorldSpec
-from accerl_lerobot.policies.loading import imported, resolve_device
+from accerl_lerobot.imports import imported
+from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model.baselines import CopyModel, OracleModel, ShuffledModel
 from accerl_lerobot.world_model.contract import Means, WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
@@ -47,7 +48,9 @@ def make_dreamer(
     learnt = success = None
     if kind.folder:
         assert config.path is not None  # ImaginationConfig has seen to that
-        learnt, success = load_world_model(Path(config.path), "imagination.path")
+        learnt, success = load_world_model(
+            Path(config.path), config.discover_packages_path, room="imagination"
+        )
         learnt.eval().to(where)
     spec = _shown(world, executed) if learnt is None else learnt.spec
     means = Means(config, spec, learnt, lambda: make_world(env), where)

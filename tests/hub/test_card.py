@@ -129,6 +129,18 @@ def test_a_trial_is_told_as_it_went(tmp_path: Path):
     )
 
 
+def test_a_world_model_of_another_class_says_where_that_is(tmp_path: Path):
+    write_json(tmp_path / "world_model" / "config.json", {"spec": {}, "model": {"type": "mine"}})
+    write_json(tmp_path / "trial.json", {"passed": True, "gates": {}})
+    recipe, package = tmp_path / "config.yaml", "--discover_packages_path="
+    recipe.write_text("world_model: {discover_packages_path: my.package}\n")
+    assert f"--dataset.repo_id=USER/DATASET {package}my.package\n" in card_of(
+        tmp_path / "world_model", "world model"
+    )
+    recipe.write_text("world_model: {discover_packages_path: null}\n")
+    assert package not in card_of(tmp_path / "world_model", "world model")
+
+
 def test_the_users_own_card_is_left_alone(tmp_path: Path):
     folder = write_policy_folder(tmp_path / "policy")
     (folder / "README.md").write_text("# mine\n")

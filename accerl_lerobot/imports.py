@@ -1,0 +1,50 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What is imported by name once it is needed: entries of our own tables, and packages that a user names."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.safety import brief
+
+DISCOVER = "discover_packages_path"
+"""LeRobot's name for the field that names a package whose import registers new types."""
+
+
+def imported(path: str) -> Any:
+    """What a table's ``module:name`` stands for."""
+    module, _, name = path.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def discover(package: str | None, room: str = "") -> None:
+    """Imports a package that registers types; None does nothing.
+
+    Args:
+        package: its name, as Python imports it.
+        room: of the field that named it, for the error.
+
+    Raises:
+        InputError: it cannot be imported.
+    """
+    if package is None:
+        return
+    try:
+        importlib.import_module(package)
+    except ImportError as error:
+        field = f"{room}.{DISCOVER}" if room else DISCOVER
+        raise InputError(field, package, f"cannot be imported ({brief(error)})") from error

@@ -1,0 +1,100 @@
+# Copyright 2026 The accerl-lerobot authors.
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A world model that a user might bring: what is seen stays, and the robot moves as a line says.
+
+``--world_model.discover_packages_path=tests.world_model.linear_world --world_model.model.type=linear``
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model.config import LearnableModelConfig
+from accerl_lerobot.world_model.contract import (
+    Context,
+    Dream,
+    History,
+    LearnableWorldModel,
+    State,
+    WorldModelSpec,
+)
+from accerl_lerobot.world_model.episodes import Windows
+
+
+@LearnableModelConfig.register_subclass("linear")
+@dataclass(frozen=True, kw_only=True)
+class LinearModelConfig(LearnableModelConfig):
+    """Of one frame it has all it needs."""
+
+    make = "tests.world_model.linear_world:LinearWorldModel"
+
+    context: int = 1
+    """Frames it sees, the newest included."""
+    gain: float = 1.0
+    """Of its motions; > 0."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.gain > 0:
+            raise InputError("world_model.model.gain", self.gain, "use a positive number")
+
+
+class LinearWorldModel(LearnableWorldModel):
+    """s′ = s + gain · (W a + b), with a all actions of the chunk that are executed."""
+
+    def __init__(self, spec: WorldModelSpec, config: LinearModelConfig) -> None:
+        super().__init__(spec, config)
+        self.gain = config.gain
+        self.motion = nn.Linear(spec.chunk * spec.action_dim, spec.state_dim)
+        self.register_buffer("scale", torch.ones(spec.state_dim))
+
+    def fit_statistics(self, windows: Windows) -> None:
+        """The usual size of a motion."""
+        now = windows.context - 1
+        moved = windows.state[:, now + 1] - windows.state[:, now]
+        self.scale.copy_(torch.from_numpy(moved.std(0)).clamp(min=1e-3))
+
+    def begin(
+        self, context: Context, tasks: Sequence[str], histories: Sequence[History | None] | None = None
+    ) -> State:
+        """See the base class."""
+        return {"frames": context.frames[:, -1], "robot": context.robot[:, -1]}
+
+    @torch.no_grad()
+    def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Dream:
+        """See the base class."""
+        robot = state["robot"] + self._moved(actions)
+        return Dream(
+            state=state | {"robot": robot},
+            frames=state["frames"],
+            robot=robot,
+            uncertainty=torch.full((len(robot),), torch.nan),
+        )
+
+    def loss(self, windows: Windows, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+        """Mean squared error of the first motion."""
+        now = windows.context - 1
+        states = torch.from_numpy(windows.state)
+        error = states[:, now] + self._moved(torch.from_numpy(windows.actions[:, 0])) - states[:, now + 1]
+        loss = (error / self.scale).square().mean()
+        return loss, {"motion": loss.item()}
+
+    def _moved(self, actions: Tensor) -> Tensor:
+        moved: Tensor = self.gain * self.scale * self.motion(actions.flatten(1))
+        return moved
