@@ -235,16 +235,27 @@ def _gates(found: Record) -> list[Block]:
 
 
 def _learning(run: Run) -> list[Chart]:
+    """What was learnt, as lines, and the same on what was held out, as points."""
     charts = []
     for kind, title, names in (
-        ("world_model", "Loss of the world model", ("image", "image_dreamt", "state")),
+        ("world_model", "Loss of the world model", _parts(run.records.get("world_model", []))),
         ("success_model", "Success model", ("loss", "accuracy")),
     ):
-        records = run.records.get(kind, [])
-        series = tuple(
-            line(name.replace("_", " "), column(records, "step"), column(records, name), colour=i)
-            for i, name in enumerate(names)
-            if has(records, name)
-        )
-        charts.append(Chart(title=title, x_label="gradient steps", limits=(0.0, None), series=series))
+        learnt, held = (run.records.get(f"{kind}{which}", []) for which in ("", "_held_out"))
+        series = []
+        for i, name in enumerate(names):
+            shown = name.replace("_", " ")
+            if has(learnt, name):
+                series.append(line(shown, column(learnt, "step"), column(learnt, name), colour=i))
+            if has(held, name):
+                x, y = column(held, "step"), column(held, name)
+                series.append(Series(name=f"{shown}, held out", x=x, y=y, kind="points", colour=i))
+        charts.append(Chart(title=title, x_label="gradient steps", limits=(0.0, None), series=tuple(series)))
     return charts
+
+
+def _parts(records: Sequence[Record]) -> tuple[str, ...]:
+    """Of a world model's loss, by their names, which each class of models has its own; else the loss."""
+    names = dict.fromkeys(name for record in records for name in record)
+    parts = tuple(name for name in names if name not in ("kind", "step", "loss", "grad_norm"))
+    return parts or ("loss",)

@@ -91,7 +91,8 @@ class Learner:
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.grad_clip)
         if not bool(torch.isfinite(norm)):
             raise FloatingPointError(
-                f"the world model's loss or gradient is not finite at step {self.count + 1}; lower its lr"
+                f"the world model's loss or gradient is not finite at step {self.count + 1}; "
+                "lower world_model.learn.lr, or imagination.learn.lr in a run"
             )
         self._optimizer.step()
         self._average()

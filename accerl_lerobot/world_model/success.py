@@ -216,7 +216,8 @@ class SuccessLearner:
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
         if not bool(torch.isfinite(norm)):
             raise FloatingPointError(
-                f"the success model's loss or gradient is not finite at step {self._count}; lower its lr"
+                f"the success model's loss or gradient is not finite at step {self._count}; "
+                "lower world_model.success.lr, or imagination.learn.lr in a run"
             )
         self._optimizer.step()
         return metrics

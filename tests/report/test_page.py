@@ -307,6 +307,9 @@ def test_a_world_model(tmp_path: Path) -> None:
     assert "50 trials on 8 episodes it had not learnt from" in seen.text
     series = {s["name"]: s for chart in seen.charts for s in chart["series"]}
     assert series["where pixels changed"]["y"] == [0.8] * 3 and series["image"]["x"][:2] == [20, 40]
+    held = series["image, held out"]
+    assert held["x"] == [200, 400] and held["y"] == [0.01, 0.005] and "points" in held["style"]
+    assert "state, held out" not in series and "grad norm" not in series
     failed = page_of(write_world_model(tmp_path / "bad", passed=False)).text
     assert "The world model failed its trial: recall" in failed and "recall 0.1 above 0.3 fails" in failed
     begun = page_of(write_world_model(tmp_path / "begun", finished=False)).text

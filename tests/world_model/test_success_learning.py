@@ -52,7 +52,8 @@ def test_a_model_that_diverges_is_an_error_and_stays_as_it_was():
         learner.model.out.bias.fill_(torch.nan)
     before = {k: v.clone() for k, v in learner.model.state_dict().items()}
     with pytest.raises(
-        FloatingPointError, match=r"^the success model's .* not finite at step 2; lower its lr"
+        FloatingPointError,
+        match=r"^the success model's .* not finite at step 2; lower world_model.success.lr",
     ):
         learner.step(of, world)
     now = learner.model.state_dict()
