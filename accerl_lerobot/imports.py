@@ -43,8 +43,11 @@ def discover(package: str | None, room: str = "") -> None:
     """
     if package is None:
         return
+    field = f"{room}.{DISCOVER}" if room else DISCOVER
+    if not all(part.isidentifier() for part in package.split(".")):
+        raise InputError(field, package, "use the name of a package as Python imports it, e.g. my_models")
     try:
         importlib.import_module(package)
-    except ImportError as error:
-        field = f"{room}.{DISCOVER}" if room else DISCOVER
-        raise InputError(field, package, f"cannot be imported ({brief(error)})") from error
+    except (Exception, SystemExit) as error:  # it is somebody's code, which may do anything
+        why = f"{type(error).__name__}: {brief(error)}"
+        raise InputError(field, package, f"cannot be imported ({why})") from error

@@ -38,10 +38,12 @@ import yaml
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hints import is_optional, is_union, wanted
-from accerl_lerobot.imports import DISCOVER, discover
+from accerl_lerobot.imports import discover
 
 TYPE = "type"
 """The key that picks one config of several, as in ``env.type``."""
+REGISTERS = "registers"
+"""In a field's metadata: the package that it names registers types of the room that the field is in."""
 
 
 def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[Any] | None = None) -> Any:
@@ -62,11 +64,12 @@ def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[A
     if recipe_class is not None:
         other = _names(recipe_class) - _names(config_class)
         tree = {key: value for key, value in tree.items() if key not in other}
+    _discover(config_class, _merged(tree, given), ())
     return decode(config_class, _overridden(config_class, tree, given))
 
 
 def decode(config_class: type[Any], tree: dict[str, Any]) -> Any:
-    """Builds a config from plain values.
+    """Builds a config from plain values; imports nothing that they name.
 
     Raises:
         InputError: a key, type or value is wrong; names the field.
@@ -216,11 +219,23 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
         room, over, under = room_of(hints[field.name]), given.get(field.name), tree.get(field.name)
         if room is None or not isinstance(over, dict) or not isinstance(under, dict):
             continue
-        kind = choices_of(room).get(str(over.get(TYPE)))
-        if kind is not None and over[TYPE] != under.get(TYPE, _default_type(field)):
-            kept = {k: v for k, v in under.items() if k in _names(kind)}
-            merged[field.name] = _merged(kept, over)
+        before = under.get(TYPE, _default_type(field))
+        kind = choices_of(room).get(str(over.get(TYPE, before)), room)
+        if over.get(TYPE, before) != before and kind is not room:
+            under = {k: v for k, v in under.items() if k in _names(kind)}
+        merged[field.name] = _overridden(kind, under, over)
     return merged
+
+
+def _discover(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...]) -> None:
+    """Imports the packages that register types of what is to be decoded, as LeRobot's parser does."""
+    hints = typing.get_type_hints(cls)
+    for field in dataclasses.fields(cls):
+        value, room = tree.get(field.name), room_of(hints[field.name])
+        if field.metadata.get(REGISTERS) and value is not None:
+            discover(str(value), ".".join(path))
+        elif room is not None and isinstance(value, dict):
+            _discover(room, value, (*path, field.name))
 
 
 def _merged(tree: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
@@ -235,10 +250,6 @@ def _merged(tree: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
 def _checked(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...], whole: type[Any]) -> dict[str, Any]:
     """`tree` with types filled in where a choice has a default, once all its keys are known to exist."""
     hints, by_name = typing.get_type_hints(cls), {f.name: f for f in dataclasses.fields(cls)}
-    if DISCOVER in by_name and isinstance(package := tree.get(DISCOVER), str):
-        rooms = filter(None, map(room_of, hints.values()))
-        if any(map(choices_of, rooms)):  # what it registers may be the type of one of these
-            discover(package, ".".join(path))
     out: dict[str, Any] = {}
     for key, value in tree.items():
         here = (*path, str(key))
@@ -265,7 +276,7 @@ def _checked_room(
     if not choices:
         return _checked(room, _merged(_apart(field, room), value), here, whole)
     kind = value.get(TYPE, usual)
-    if kind not in choices:
+    if not isinstance(kind, str) or kind not in choices:
         near = difflib.get_close_matches(str(kind), choices, n=1)
         hint = f"did you mean {near[0]}? Otherwise " if near else ""
         raise InputError(".".join((*here, TYPE)), kind, f"{hint}use one of {', '.join(sorted(choices))}")
@@ -332,7 +343,8 @@ def dotted_fields(cls: type[Any], path: tuple[str, ...] = ()) -> Iterator[str]:
 def _unknown(key: str, path: tuple[str, ...], names: list[str], whole: type[Any]) -> str:
     near = [".".join((*path, name)) for name in difflib.get_close_matches(key, names, n=3)]
     everywhere = list(dict.fromkeys(dotted_fields(whole)))
-    near += [f for f in everywhere if f.rpartition(".")[2] == key and f not in near]
+    known = {*near, ".".join((*path, key))}
+    near += [f for f in everywhere if f.rpartition(".")[2] == key and f not in known]
     if near:
         return f"no such field; did you mean {' or '.join(near[:4])}?"
     where = f"{'.'.join(path)} has" if path else "there are"

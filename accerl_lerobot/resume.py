@@ -35,6 +35,7 @@ CHANGEABLE = (
     "save_keep", "trainer.updates", "trainer.num_threads", "trainer.ranks", "trainer.sharding",
     "trainer.cpu_offload", "trainer.activation_checkpointing", "trainer.rank_timeout_s",
     "rollout.max_restarts", "inference", "imagination.record",
+    "imagination.discover_packages_path",
 )  # fmt: skip
 """Fields, and rooms, that may be other than before: what is learnt, and from what, is the same."""
 

@@ -19,7 +19,7 @@ Weights are random and so is what is seen; a model that has learnt costs the sam
 from __future__ import annotations
 
 import platform
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -27,7 +27,8 @@ from rich.table import Table
 
 from accerl_lerobot.bench.measure import Memory, device_name, timed
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.world_model.config import WorldModelConfig
+from accerl_lerobot.parsing import encode
+from accerl_lerobot.world_model.config import PIXELS, WorldModelConfig
 from accerl_lerobot.world_model.sizes import TinyConfig
 
 
@@ -107,7 +108,7 @@ def bench_dream(config: BenchDreamConfig) -> dict[str, Any]:
     seconds["learn"] = timed(lambda: learner.step(windows), config.repeats, device)
     memory.note("learnt")
     return {
-        "config": asdict(config),
+        "config": encode(config),
         "parameters": {
             name: sum(p.numel() for p in net.parameters())
             for name, net in (("world", model), ("success", judge))
@@ -127,7 +128,7 @@ def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
     of, parameters, host = result["config"]["world_model"], result["parameters"], result["host"]
     shown = Table(
-        title=f"{of['model']['objective']}, {of['model']['steps']} step(s), {of['image_size']} px: "
+        title=f"{_called(of['model'])}, {of['image_size']} px: "
         f"{parameters['world'] / 1e6:.1f} M parameters, on {host['device']}, {host['threads']} thread(s)"
     )
     for heading in ("what", "ms", "range", "chunks/s"):
@@ -147,6 +148,13 @@ def table(result: dict[str, Any]) -> Table:
     for stage, size in result["memory_gb"].items():
         shown.add_row(f"memory, {stage}", f"{size:.1f} GB", "", "")
     return shown
+
+
+def _called(model: dict[str, Any]) -> str:
+    """Our own class by what it does; another one has a name only."""
+    if model["type"] != PIXELS:
+        return str(model["type"])
+    return f"{model['objective']}, {model['steps']} step(s)"
 
 
 def _windows(spec: Any, count: int, chunks: int) -> Any:

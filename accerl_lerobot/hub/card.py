@@ -39,6 +39,7 @@ from accerl_lerobot.hub.kinds import (
 from accerl_lerobot.hub.portable import AWAY
 from accerl_lerobot.imports import DISCOVER
 from accerl_lerobot.policies.plugins import discovery
+from accerl_lerobot.world_model.config import PIXELS
 
 MARK = "<!-- Written by accerl push, and anew each time. Delete this line to keep what you change. -->"
 PLUGIN = "accerl_lerobot.world_model.success_plugin"
@@ -76,7 +77,7 @@ def model_card(repo_id: str, kind: str, folder: Path, files: Files, around: Arou
     parts += (
         _use_policy(repo_id, kind, config, around)
         if kind in (POLICY, RUN)
-        else _use_model(repo_id, kind, around)
+        else _use_model(repo_id, kind, config, around)
     )
     recipe = files.get(RECIPE if kind == RUN else f"{FOLDER}/{RECIPE}")
     if isinstance(recipe, bytes):
@@ -263,12 +264,14 @@ def _stock(policy: str, config: Mapping[str, Any], env: Mapping[str, Any]) -> st
     return " \\\n  ".join([*command, "--eval.n_episodes=50 --eval.batch_size=5"])
 
 
-def _use_model(repo_id: str, kind: str, around: Around) -> list[str]:
+def _use_model(repo_id: str, kind: str, config: dict[str, Any], around: Around) -> list[str]:
     here = repo_id.split("/")[1]
     lines = [f"accerl pull --repo_id={repo_id} --output_dir={here}"]
     if kind == WORLD_MODEL:
         lines.append(f"accerl world-model-eval --path={here} --dataset.repo_id=USER/DATASET")
-        if package := (around.recipe.get("world_model") or {}).get(DISCOVER):
+        if (config.get("model") or {}).get("type", PIXELS) != PIXELS:
+            # Of one that was promoted in a run, no recipe is known.
+            package = (around.recipe.get("world_model") or {}).get(DISCOVER) or "PACKAGE"
             lines[-1] += f" --{DISCOVER}={shlex.quote(str(package))}"
     parts = ["## Use", _bash(lines)]
     if kind == SUCCESS_MODEL:

@@ -50,10 +50,12 @@ from accerl_lerobot.resume import LOCK
 
 CACHE = ".cache"
 """Where the client keeps its books while it fetches into a folder."""
+CODE = (".py", ".pyc", ".pyd", ".so")
+"""Endings of what Python imports: a recipe beside it could name it as ``discover_packages_path``."""
 
 
 def pull(config: PullConfig) -> dict[str, Any]:
-    """Pulls; returns which commit it was and what is there now, plain JSON.
+    """Pulls all but Python's code; returns which commit it was and what is there now, plain JSON.
 
     Raises:
         InputError: it is not there, not to be had, or not what was pushed; there is no new folder then.
@@ -70,14 +72,20 @@ def pull(config: PullConfig) -> dict[str, Any]:
             for item in listed
             if isinstance(item, RepoFile)
         }
+        left_out = sorted(name for name in expected if name.endswith(CODE))
+        expected = {name: entry for name, entry in expected.items() if name not in left_out}
         check_names(list(expected), repo_id)
         home.parent.mkdir(parents=True, exist_ok=True)
         # Named after the commit, so that a cut pull goes on and no other one's files are in it.
         temporary = home.parent / f".pulling-{commit[:16]}-{home.name}"
-        api.snapshot_download(repo_id, repo_type=kind_of_repo, revision=commit, local_dir=temporary)
+        api.snapshot_download(
+            repo_id, repo_type=kind_of_repo, revision=commit, local_dir=temporary,
+            ignore_patterns=[f"*{suffix}" for suffix in CODE],
+        )  # fmt: skip
     record = {"repo_id": repo_id, "repo_type": kind_of_repo, "revision": config.revision, "commit": commit}
     try:
         found = _receive(temporary, home, expected, repo_id) | record
+        found |= {"left_out": left_out} if left_out else {}
         (temporary / RECORD).write_text(json.dumps(found, indent=2) + "\n")
         temporary.rename(home)
     except InputError:

@@ -203,7 +203,7 @@ def recipe_blocks(run: Run, config_class: type[Any]) -> list[Block]:
     rows = [(field, shown(v), shown(usual)) for field, v, usual in differences(config_class, run.config)]
     found: list[Block] = [Changes(caption="What this run sets, and what the default would be", rows=rows)]
     if why := unreadable(config_class, run.config):
-        text = f"Another version of accerl wrote this recipe, so what it implies is not known here: {why}."
+        text = f"This accerl cannot read the recipe, so what it implies is not known here: {why}."
         found.append(Words(text=text))
     return [*found, Folded(title="The complete recipe, config.yaml", text=run.config_text)]
 

@@ -20,6 +20,7 @@ from typing import Any
 
 from accerl_lerobot.imports import DISCOVER
 from accerl_lerobot.safety import Origin, check_name, check_number
+from accerl_lerobot.world_model.config import PIXELS
 
 CONFIG = "config.json"
 SPEC = {
@@ -31,7 +32,7 @@ SPEC = {
 }
 """Field of a `WorldModelSpec` → its smallest and largest value."""
 CONTEXT = {"context": (1, 64)}
-PIXELS = {"steps": (1, 1000), "heads": (2, 64)}
+MODEL = {"steps": (1, 1000), "heads": (2, 64)}
 NETWORK = {"space_to_depth": (1, 64), "blocks": (1, 64), "condition": (1, 16_384), "planes": (0, 1024)}
 CAMERAS_MOST, SIDE_MOST, LEVELS_MOST, WIDTH_MOST = 16, 2048, 8, 16_384
 TASKS_MOST, NAME_MOST = 4096, 200
@@ -72,14 +73,16 @@ def check_model(model: Any, known: Iterable[str], origin: Origin) -> None:
     """
     mapping = _mapping(model, "model", origin)
     kind, names = mapping.get("type"), sorted(known)
+    if kind is None:
+        raise origin.refuse(f"{CONFIG}: model.type", "it has none, as earlier versions wrote; learn it again")
     if kind not in names:
         remedy = f"{str(kind)[:60]!r}; use one of {', '.join(names)}, or name its package"
         package = origin.field.removesuffix("path") + DISCOVER
         raise origin.refuse(f"{CONFIG}: model.type", f"{remedy}: {package}")
     _numbers(mapping, CONTEXT, "model", origin)
-    if kind != "pixels":
+    if kind != PIXELS:
         return
-    _numbers(mapping, PIXELS, "model", origin)
+    _numbers(mapping, MODEL, "model", origin)
     network = _mapping(mapping.get("network", {}), "model.network", origin)
     _numbers(network, NETWORK, "model.network", origin)
     if "channels" in network:

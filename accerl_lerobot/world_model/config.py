@@ -28,6 +28,8 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.safety import check_remote_code
 
 Objective = Literal["refiner", "edm", "flow"]
+PIXELS = "pixels"
+"""The type of our own class of world models that learn."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +100,7 @@ class LearnableModelConfig(draccus.ChoiceRegistry):
         return frozenset({"pixels", "state"} if state_dim else {"pixels"})
 
 
-@LearnableModelConfig.register_subclass("pixels")
+@LearnableModelConfig.register_subclass(PIXELS)
 @dataclass(frozen=True, kw_only=True)
 class PixelModelConfig(LearnableModelConfig):
     """How it learns and dreams."""
@@ -348,7 +350,7 @@ class WorldModelConfig(draccus.ChoiceRegistry):
     """A world model with its success model; `sizes.py` has those that can be named."""
 
     model: LearnableModelConfig = field(default_factory=PixelModelConfig)
-    discover_packages_path: str | None = None
+    discover_packages_path: str | None = field(default=None, metadata={"registers": True})
     """Package to import that registers the type of `model`, where that is not one of ours."""
     learn: LearnConfig = field(default_factory=LearnConfig)
     success: SuccessLearnConfig = field(default_factory=SuccessLearnConfig)

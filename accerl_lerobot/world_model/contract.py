@@ -38,7 +38,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.imports import imported
+from accerl_lerobot.safety import brief
 from accerl_lerobot.snapshot import kind
 
 if TYPE_CHECKING:
@@ -174,6 +176,8 @@ class WorldModel(ABC):
 class LearnableWorldModel(nn.Module, WorldModel):
     """One that learns from real experience, see `learn.Learner`; what is saved is its ``state_dict``.
 
+    Where it is, it moves what it is given to: windows are arrays, and states and actions may be on the CPU.
+
     Args:
         spec: of the world.
         config: its own, which is saved too.
@@ -204,10 +208,36 @@ class LearnableWorldModel(nn.Module, WorldModel):
         """
 
 
-def new_learnable(spec: WorldModelSpec, config: LearnableModelConfig) -> LearnableWorldModel:
-    """The one that `config` is of, knowing nothing yet."""
-    made: LearnableWorldModel = imported(config.make)(spec, config)
+def learnable_class(config: LearnableModelConfig) -> type[LearnableWorldModel]:
+    """What `config` is of.
+
+    Raises:
+        InputError: nothing is there, or not what learns.
+    """
+
+    def refuse(why: str) -> InputError:
+        return InputError("world_model.model.type", config.type, why)
+
+    name = getattr(config, "make", "")
+    try:
+        made = imported(name)
+    except (ImportError, AttributeError, ValueError) as error:
+        remedy = f"its config's make is {name!r}, which cannot be imported ({brief(error)}); use module:name"
+        raise refuse(remedy) from error
+    if not (isinstance(made, type) and issubclass(made, LearnableWorldModel)):
+        raise refuse(f"{name} is no subclass of LearnableWorldModel")
+    if lacking := sorted(made.__abstractmethods__):
+        raise refuse(f"{name} lacks {', '.join(lacking)}")
     return made
+
+
+def new_learnable(spec: WorldModelSpec, config: LearnableModelConfig) -> LearnableWorldModel:
+    """The one that `config` is of, knowing nothing yet.
+
+    Raises:
+        InputError: see `learnable_class`; or it does not suit the world.
+    """
+    return learnable_class(config)(spec, config)
 
 
 class Means(NamedTuple):

@@ -58,7 +58,8 @@ class Learner:
         self, model: LearnableWorldModel, config: LearnConfig, seed: int, shuffle: bool = False
     ) -> None:
         self.model, self.config, self._shuffle = model, config, shuffle
-        self.serving = copy.deepcopy(model).requires_grad_(False)
+        self.serving = copy.deepcopy(model).requires_grad_(False).eval()
+        model.train()
         self.count = 0
         self.rng = np.random.default_rng((seed, 1))
         self._generator = torch.Generator().manual_seed(seed)
@@ -123,6 +124,8 @@ class Learner:
         with torch.no_grad():
             for mean, now in zip(self.serving.parameters(), self.model.parameters(), strict=True):
                 mean.lerp_(now, 1 - share)
+            for served, now in zip(self.serving.buffers(), self.model.buffers(), strict=True):
+                served.copy_(now)
 
 
 class Validation:

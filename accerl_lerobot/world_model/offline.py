@@ -39,7 +39,12 @@ from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model.config import WorldModelConfig
-from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModelSpec, new_learnable
+from accerl_lerobot.world_model.contract import (
+    LearnableWorldModel,
+    WorldModelSpec,
+    learnable_class,
+    new_learnable,
+)
 from accerl_lerobot.world_model.dataset import fingerprint, load_episodes
 from accerl_lerobot.world_model.episodes import Episode, amount, split
 from accerl_lerobot.world_model.learn import pretrain
@@ -108,12 +113,13 @@ def learn_world_model(run: WorldModelRun, directory: Path, console: Console) -> 
         were learnt from and held out; also in ``trial.json``.
 
     Raises:
-        InputError: no such device; a dataset is named twice or of another world; nothing can be learnt from
-            it, see `load_episodes`, or nothing would be left to judge; an episode is in both; the world has
-            not the task of one.
+        InputError: no such device or class of world models; a dataset is named twice or of another world;
+            nothing can be learnt from it, see `load_episodes`, or nothing would be left to judge; an episode
+            is in both; the world has not the task of one.
     """
     device = device_named(run.device)
     config, seed = run.world_model, run.seed
+    learnable_class(config.model)
     spec, rng = world_spec(config, run.env), _rng(seed)
     rooms = rooms_of(run)
     metas = open_rooms(rooms, spec)

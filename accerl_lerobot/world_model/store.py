@@ -28,7 +28,7 @@ from pathlib import Path
 
 import draccus
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_model, save_model
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.imports import discover
@@ -75,7 +75,7 @@ def save_world_model(
     content = {"spec": spec, "model": draccus.encode(model.config, LearnableModelConfig)}
     content["sources"] = [asdict(source) for source in sources]
     (directory / CONFIG).write_text(json.dumps(content, indent=2) + "\n")
-    save_file({k: v.contiguous() for k, v in model.state_dict().items()}, directory / WEIGHTS)
+    save_model(model, str(directory / WEIGHTS))
     if success is not None:
         # Whoever loads it says where it is to be; where it was may not exist there.
         where, success.config.device = success.config.device, "cpu"
@@ -140,7 +140,7 @@ def load_world_model(
         with Budget(file_size(weights, origin), origin.field, origin.value):
             config = draccus.decode(LearnableModelConfig, content["model"])
             model = new_learnable(WorldModelSpec(**spec), config)
-        model.load_state_dict(load_file(weights))
+        load_model(model, weights)
     except (*UNREADABLE, draccus.utils.DraccusException) as error:
         if (ours := input_error(error)) is not None:  # draccus wraps what a config refuses
             raise origin.refuse(CONFIG, brief(ours)) from error
@@ -149,7 +149,7 @@ def load_world_model(
     success = None
     if safe_join(directory, SUCCESS, origin).is_dir():
         success = _success(directory / SUCCESS, replace(origin, value=str(directory / SUCCESS)))
-    return model.requires_grad_(False), success
+    return model.requires_grad_(False).eval(), success
 
 
 def _origin(directory: Path, room: str) -> Origin:

@@ -51,7 +51,7 @@ def make_dreamer(
         learnt, success = load_world_model(
             Path(config.path), config.discover_packages_path, room="imagination"
         )
-        learnt.eval().to(where)
+        learnt.to(where)
     spec = _shown(world, executed) if learnt is None else learnt.spec
     means = Means(config, spec, learnt, lambda: make_world(env), where)
     model: WorldModel = imported(kind.make)(means)

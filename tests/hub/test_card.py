@@ -137,7 +137,9 @@ def test_a_world_model_of_another_class_says_where_that_is(tmp_path: Path):
     assert f"--dataset.repo_id=USER/DATASET {package}my.package\n" in card_of(
         tmp_path / "world_model", "world model"
     )
-    recipe.write_text("world_model: {discover_packages_path: null}\n")
+    recipe.unlink()
+    assert f"{package}PACKAGE\n" in card_of(tmp_path / "world_model", "world model")
+    write_json(tmp_path / "world_model" / "config.json", {"spec": {}, "model": {"type": "pixels"}})
     assert package not in card_of(tmp_path / "world_model", "world model")
 
 

@@ -197,6 +197,16 @@ def test_an_edited_card_and_added_files_are_fine(
     assert (tmp_path / "pulled" / "README.md").read_bytes() == b"# edited on the Hub"
 
 
+def test_code_that_a_recipe_could_name_does_not_come(
+    hub: HubServer, policy: Path, pulled: Callable[..., dict[str, Any]], tmp_path: Path
+):
+    hub.plant(NAME, {"evil.py": b"raise SystemExit", "deep/er/x.so": b"\x7fELF", "notes.txt": b"py"})
+    found = pulled()
+    assert found["left_out"] == ["deep/er/x.so", "evil.py"]
+    came = {path.name for path in (tmp_path / "pulled").rglob("*")}
+    assert "notes.txt" in came and not {"evil.py", "x.so", "er"} & came
+
+
 def test_bytes_that_change_on_the_way(hub: HubServer, policy: Path, refused: Callable[..., str]):
     hub.faults.append(Fault("GET", "/model.safetensors", spoil=True))
     assert "model.safetensors is not what was pushed" in refused()

@@ -74,7 +74,8 @@ class LinearWorldModel(LearnableWorldModel):
         self, context: Context, tasks: Sequence[str], histories: Sequence[History | None] | None = None
     ) -> State:
         """See the base class."""
-        return {"frames": context.frames[:, -1], "robot": context.robot[:, -1]}
+        seen = {"frames": context.frames[:, -1], "robot": context.robot[:, -1]}
+        return {name: tensor.to(self.scale.device) for name, tensor in seen.items()}
 
     @torch.no_grad()
     def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Dream:
@@ -84,17 +85,17 @@ class LinearWorldModel(LearnableWorldModel):
             state=state | {"robot": robot},
             frames=state["frames"],
             robot=robot,
-            uncertainty=torch.full((len(robot),), torch.nan),
+            uncertainty=robot.new_full((len(robot),), torch.nan),
         )
 
     def loss(self, windows: Windows, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
         """Mean squared error of the first motion."""
         now = windows.context - 1
-        states = torch.from_numpy(windows.state)
+        states = torch.from_numpy(windows.state).to(self.scale.device)
         error = states[:, now] + self._moved(torch.from_numpy(windows.actions[:, 0])) - states[:, now + 1]
         loss = (error / self.scale).square().mean()
         return loss, {"motion": loss.item()}
 
     def _moved(self, actions: Tensor) -> Tensor:
-        moved: Tensor = self.gain * self.scale * self.motion(actions.flatten(1))
+        moved: Tensor = self.gain * self.scale * self.motion(actions.flatten(1).to(self.scale.device))
         return moved
