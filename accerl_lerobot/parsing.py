@@ -220,8 +220,9 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
         if room is None or not isinstance(over, dict) or not isinstance(under, dict):
             continue
         before = under.get(TYPE, _default_type(field))
-        kind = choices_of(room).get(str(over.get(TYPE, before)), room)
-        if over.get(TYPE, before) != before and kind is not room:
+        now = over.get(TYPE, before)
+        kind = choices_of(room).get(str(now), room)
+        if now != before and kind is not room:
             under = {k: v for k, v in under.items() if k in _names(kind)}
         merged[field.name] = _overridden(kind, under, over)
     return merged
@@ -229,9 +230,8 @@ def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, 
 
 def _discover(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...]) -> None:
     """Imports the packages that register types of what is to be decoded, as LeRobot's parser does."""
-    hints = typing.get_type_hints(cls)
     for field in dataclasses.fields(cls):
-        value, room = tree.get(field.name), room_of(hints[field.name])
+        value, room = tree.get(field.name), room_of(typing.get_type_hints(cls)[field.name])
         if field.metadata.get(REGISTERS) and value is not None:
             discover(str(value), ".".join(path))
         elif room is not None and isinstance(value, dict):
@@ -359,8 +359,7 @@ def _as_input_error(error: BaseException, cls: type[Any], tree: dict[str, Any]) 
     for link in chain:
         if isinstance(link, InputError):
             return link
-    located = [link for link in chain if isinstance(link, draccus.utils.DecodingError)]
-    if not located:
+    if not (located := [link for link in chain if isinstance(link, draccus.utils.DecodingError)]):
         return InputError("config", type(chain[-1]).__name__, str(chain[-1]))
     hint: Any = cls
     value: Any = tree
