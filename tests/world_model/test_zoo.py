@@ -23,10 +23,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from accerl_lerobot.config import RunConfig, parse
 from accerl_lerobot.envs import make_world
@@ -34,21 +33,18 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED
 from accerl_lerobot.field_help import help_text
 from accerl_lerobot.world_model.baselines import CopyModel, OracleModel, ShuffledModel
-from accerl_lerobot.world_model.config import LearnConfig, NetworkConfig, PixelModelConfig, StandInConfig
+from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, StandInConfig
 from accerl_lerobot.world_model.contract import (
     Context,
     Dream,
     History,
-    LearnableWorldModel,
     Means,
     State,
     WorldModel,
 )
-from accerl_lerobot.world_model.episodes import Windows
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 from accerl_lerobot.world_model.imagine import Imagination
 from accerl_lerobot.world_model.kinds import KINDS, ModelKind
-from accerl_lerobot.world_model.learn import pretrain
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.pool import part
 from accerl_lerobot.world_model.store import save_world_model
@@ -56,7 +52,6 @@ from accerl_lerobot.world_model.success import new_success_model
 from accerl_lerobot.world_model.zoo import make_dreamer
 from tests.test_imagining import dreaming, lived
 from tests.world_model import lived as real
-from tests.world_model.test_pixels import SPEC, dots
 
 
 class Snow(WorldModel):
@@ -183,43 +178,6 @@ def test_nobody_who_dreams_with_other_actions_dreams_alone():
                 continue
             with pytest.raises(InputError, match=rf"^imagination\.dreams={dreams}: .* {2 * workers}, or"):
                 ImaginationConfig(model="shuffled", **fields)
-
-
-class Unwilling(LearnableWorldModel):
-    """Begins and goes on, and has nothing to learn by."""
-
-    begin, step = Snow.begin, Snow.step
-
-
-class Mean(Unwilling):
-    """Believes that the robot is where it is on average."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.spec, self.guess = SPEC, nn.Linear(1, SPEC.state_dim)
-        self.register_buffer("scale", torch.zeros(SPEC.state_dim))
-
-    def fit_statistics(self, windows: Windows) -> None:
-        self.scale.copy_(torch.from_numpy(windows.state.std((0, 1))))
-
-    def loss(self, windows: Windows, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-        guess = self.guess(torch.ones(len(windows), 1))[:, None]
-        loss = ((torch.from_numpy(windows.state) - guess) / self.scale).square().mean()
-        return loss, {"state": loss.item()}
-
-
-def test_one_that_learns_needs_no_more_than_the_contract_says():
-    with pytest.raises(TypeError, match="abstract methods 'fit_statistics', 'loss'"):
-        Unwilling()  # type: ignore[abstract]
-    assert issubclass(PixelWorldModel, LearnableWorldModel)
-    told: list[float] = []
-    config = LearnConfig(steps=60, batch=8, lr=0.5, warmup=0)
-    learner = pretrain(
-        Mean(),  # type: ignore[arg-type]
-        dots(4), config, seed=0, held_out=dots(2, seed=1),
-        on_step=lambda step, metrics: told.append(metrics["state"]),
-    )  # fmt: skip
-    assert np.mean(told[-10:]) < 0.3 * told[0] and learner.serving.scale.all()
 
 
 @pytest.mark.parametrize("whole", [True, False])
