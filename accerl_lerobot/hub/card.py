@@ -269,7 +269,8 @@ def _use_model(repo_id: str, kind: str, config: dict[str, Any], around: Around) 
     lines = [f"accerl pull --repo_id={repo_id} --output_dir={here}"]
     if kind == WORLD_MODEL:
         lines.append(f"accerl world-model-eval --path={here} --dataset.repo_id=USER/DATASET")
-        if (config.get("model") or {}).get("type", PIXELS) != PIXELS:
+        model = config.get("model")
+        if isinstance(model, dict) and model.get("type", PIXELS) != PIXELS:
             # Of one that was promoted in a run, no recipe is known.
             package = (around.recipe.get("world_model") or {}).get(DISCOVER) or "PACKAGE"
             lines[-1] += f" --{DISCOVER}={shlex.quote(str(package))}"

@@ -55,7 +55,7 @@ CODE = (".py", ".pyc", ".pyd", ".so")
 
 
 def pull(config: PullConfig) -> dict[str, Any]:
-    """Pulls all but Python's code; returns which commit it was and what is there now, plain JSON.
+    """Pulls, and keeps all but Python's code; returns which commit it was and what is there now, plain JSON.
 
     Raises:
         InputError: it is not there, not to be had, or not what was pushed; there is no new folder then.
@@ -72,20 +72,14 @@ def pull(config: PullConfig) -> dict[str, Any]:
             for item in listed
             if isinstance(item, RepoFile)
         }
-        left_out = sorted(name for name in expected if name.endswith(CODE))
-        expected = {name: entry for name, entry in expected.items() if name not in left_out}
         check_names(list(expected), repo_id)
         home.parent.mkdir(parents=True, exist_ok=True)
         # Named after the commit, so that a cut pull goes on and no other one's files are in it.
         temporary = home.parent / f".pulling-{commit[:16]}-{home.name}"
-        api.snapshot_download(
-            repo_id, repo_type=kind_of_repo, revision=commit, local_dir=temporary,
-            ignore_patterns=[f"*{suffix}" for suffix in CODE],
-        )  # fmt: skip
+        api.snapshot_download(repo_id, repo_type=kind_of_repo, revision=commit, local_dir=temporary)
     record = {"repo_id": repo_id, "repo_type": kind_of_repo, "revision": config.revision, "commit": commit}
     try:
         found = _receive(temporary, home, expected, repo_id) | record
-        found |= {"left_out": left_out} if left_out else {}
         (temporary / RECORD).write_text(json.dumps(found, indent=2) + "\n")
         temporary.rename(home)
     except InputError:
@@ -158,6 +152,7 @@ def _receive(folder: Path, home: Path, expected: dict[str, Entry], repo_id: str)
         check_names(list(manifest.files), repo_id)
     files = manifest.files if manifest is not None else {}
     verify(folder, {**expected, **files}, repo_id)
+    code = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.name.endswith(CODE))
     if manifest is not None:
         (folder / MANIFEST).unlink()  # paths are set below, and then it does not hold any more
     (folder / ".gitattributes").unlink(missing_ok=True)
@@ -171,8 +166,16 @@ def _receive(folder: Path, home: Path, expected: dict[str, Entry], repo_id: str)
         (folder / LOCK).touch()  # so a run is known that can be gone on with
         for checkpoint in (p for p in folder.glob("checkpoints/*") if not p.is_symlink()):
             _arrive(checkpoint, home / CHECKPOINTS / checkpoint.name, repo_id)
+    _drop_code(folder)
     unchecked = expected.keys() - files.keys() - {CARD, MANIFEST, ".gitattributes"}
-    return {"kind": kind, "files": len(expected), "checked": len(files), "unchecked": len(unchecked)}
+    counts = {"files": len(expected), "checked": len(files), "unchecked": len(unchecked)}
+    return {"kind": kind} | counts | ({"left_out": code} if code else {})
+
+
+def _drop_code(folder: Path) -> None:
+    """Once all that came has been checked; see `CODE`."""
+    for path in [p for p in folder.rglob("*") if p.name.endswith(CODE) and p.is_file()]:
+        path.unlink()
 
 
 def _arrive(checkpoint: Path, home: Path, repo_id: str) -> None:
@@ -186,6 +189,7 @@ def _arrive(checkpoint: Path, home: Path, repo_id: str) -> None:
         raise InputError("repo_id", repo_id, f"its checkpoint {checkpoint.name} is broken: {why}")
     if (checkpoint / PRETRAINED).is_dir():
         _move_in(checkpoint / PRETRAINED, home / PRETRAINED, repo_id)
+    _drop_code(checkpoint)
     if own:
         write_manifest(checkpoint)
 

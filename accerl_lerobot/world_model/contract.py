@@ -221,7 +221,7 @@ def learnable_class(config: LearnableModelConfig) -> type[LearnableWorldModel]:
     name = getattr(config, "make", "")
     try:
         made = imported(name)
-    except (ImportError, AttributeError, ValueError) as error:
+    except (Exception, SystemExit) as error:  # it is somebody's code
         remedy = f"its config's make is {name!r}, which cannot be imported ({brief(error)}); use module:name"
         raise refuse(remedy) from error
     if not (isinstance(made, type) and issubclass(made, LearnableWorldModel)):

@@ -27,8 +27,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import draccus
+import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_model, save_model
+from safetensors.torch import load_file, save_file
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.imports import discover
@@ -75,7 +76,9 @@ def save_world_model(
     content = {"spec": spec, "model": draccus.encode(model.config, LearnableModelConfig)}
     content["sources"] = [asdict(source) for source in sources]
     (directory / CONFIG).write_text(json.dumps(content, indent=2) + "\n")
-    save_model(model, str(directory / WEIGHTS))
+    # Copies: layers that it has twice, and views, are not to be saved as they are.
+    weights = {k: v.clone(memory_format=torch.contiguous_format) for k, v in model.state_dict().items()}
+    save_file(weights, directory / WEIGHTS)
     if success is not None:
         # Whoever loads it says where it is to be; where it was may not exist there.
         where, success.config.device = success.config.device, "cpu"
@@ -140,7 +143,7 @@ def load_world_model(
         with Budget(file_size(weights, origin), origin.field, origin.value):
             config = draccus.decode(LearnableModelConfig, content["model"])
             model = new_learnable(WorldModelSpec(**spec), config)
-        load_model(model, weights)
+        model.load_state_dict(load_file(weights))
     except (*UNREADABLE, draccus.utils.DraccusException) as error:
         if (ours := input_error(error)) is not None:  # draccus wraps what a config refuses
             raise origin.refuse(CONFIG, brief(ours)) from error

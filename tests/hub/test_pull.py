@@ -23,8 +23,9 @@ from typing import Any
 import pytest
 
 from accerl_lerobot import cli
+from accerl_lerobot.checkpoint import defect, write_manifest
 from accerl_lerobot.hub.manifest import MANIFEST
-from tests.hub.folders import write_policy_folder
+from tests.hub.folders import write_policy_folder, write_run_folder
 from tests.hub_server import STRANGER, Fault, HubServer
 
 NAME = "alice/door"
@@ -204,7 +205,22 @@ def test_code_that_a_recipe_could_name_does_not_come(
     found = pulled()
     assert found["left_out"] == ["deep/er/x.so", "evil.py"]
     came = {path.name for path in (tmp_path / "pulled").rglob("*")}
-    assert "notes.txt" in came and not {"evil.py", "x.so", "er"} & came
+    assert "notes.txt" in came and not {"evil.py", "x.so"} & came
+
+
+def test_what_was_pushed_with_code_comes_without_it(
+    hub: HubServer, pulled: Callable[..., dict[str, Any]], tmp_path: Path
+):
+    run = write_run_folder(tmp_path / "run")
+    last = (run / "checkpoints" / "last").resolve()
+    (last / "pretrained_model" / "convert.py").write_text("raise SystemExit")
+    write_manifest(last)
+    assert cli.main(["push", f"--path={run}", f"--repo_id={NAME}"]) == 0
+    name = f"checkpoints/{last.name}"
+    found = pulled(to="second")
+    assert found["left_out"] == [f"{name}/pretrained_model/convert.py"] and found["kind"] == "run"
+    assert not list((tmp_path / "second").rglob("*.py"))
+    assert defect(tmp_path / "second" / name) is None, "its own list is of what is there"
 
 
 def test_bytes_that_change_on_the_way(hub: HubServer, policy: Path, refused: Callable[..., str]):

@@ -231,6 +231,7 @@ class BareConfig(LearnableModelConfig):
     [
         (None, "its config's make is '', which cannot be imported"),
         (f"{__name__}:Nothing", "cannot be imported .module .* has no attribute 'Nothing'"),
+        (".mine:Model", "cannot be imported .*; use module:name"),
         ("no.such:Model", "cannot be imported .No module named 'no'"),
         ("accerl_lerobot.world_model.baselines:CopyModel", "CopyModel is no subclass of LearnableWorldModel"),
         (
@@ -311,13 +312,15 @@ def test_what_it_costs_is_measured():
 
 
 class Moody(LearnableWorldModel):
-    """Behaves otherwise in training, counts in a buffer, and has a layer twice."""
+    """Behaves otherwise in training, counts in a buffer, has a layer twice, and views."""
 
     def __init__(self, spec: Any, config: Any) -> None:
         super().__init__(spec, config)
         self.norm, self.drop = nn.BatchNorm1d(spec.action_dim), nn.Dropout()
         self.first = nn.Linear(spec.action_dim, spec.action_dim)
         self.again = self.first
+        self.register_buffer("mask", torch.ones(8, 8).tril()[:4])
+        self.part = nn.Parameter(torch.randn(64)[:4])
 
     def fit_statistics(self, windows: Any) -> None:
         """It has none."""
@@ -333,12 +336,12 @@ class Moody(LearnableWorldModel):
     def loss(self, windows: Any, generator: torch.Generator) -> Any:
         """How far what it makes of the first actions is from nothing."""
         made = self.drop(self.norm(self.again(torch.from_numpy(windows.actions[:, 0, 0]))))
-        loss = (made + 1).square().mean()
+        loss = (made + 1).square().mean() + self.part.square().mean()
         return loss, {"made": loss.item()}
 
 
 def test_it_is_tried_and_saved_as_it_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Not in training; with what it has counted; and with layers that it has twice."""
+    """Not in training; with what it has counted; and with layers that it has twice, and views."""
     monkeypatch.setitem(LearnableModelConfig.get_known_choices(), "bare", BareConfig)
     monkeypatch.setattr(BareConfig, "make", f"{__name__}:Moody", raising=False)
     learner = Learner(new_learnable(SPEC, BareConfig()).eval(), LearnConfig(), seed=0)
