@@ -1,4 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors. SPDX-License-Identifier: Apache-2.0
+# SPDX-License-Identifier: Apache-2.0
 #
 # make quickstart   install what is missing, run recipes/quickstart.yaml
 # make test         install what is missing, run the tests
@@ -22,7 +22,7 @@ help:
 	@echo "make quickstart  demonstrations, SFT, asynchronous RL and evaluation on one MetaWorld task"
 	@echo "make test        the tests"
 	@echo "make check       lint, formatting and types"
-	@echo "make audit       known vulnerabilities of what is installed; asks pypi.org"
+	@echo "make audit       known vulnerabilities of what is installed; asks the Python package index"
 	@echo "make format      rewrite the code as 'make check' wants it"
 	@echo "make setup       only install: .venv, and OpenGL libraries where apt-get and root are at hand"
 
@@ -56,7 +56,7 @@ types: setup
 	.venv/bin/mypy
 
 # Not in .ci/run: it needs a service that not every machine can reach. --strict, or what the service does not know
-# would count as audited; that includes everything where a mirror of PyPI stands in for it.
+# would count as audited; that includes everything where a mirror of the Python package index stands in for it.
 audit: setup
 	@mkdir -p build
 	.venv/bin/python -c "$$LIST_INSTALLED" > build/installed.txt

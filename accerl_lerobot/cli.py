@@ -1,30 +1,22 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The verbs. Answers ``--help`` at once; everything heavy is imported by the verb that needs it."""
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import importlib
 import logging
 import os
+import signal
 import sys
 from collections.abc import Callable
 
 from accerl_lerobot import __version__
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, one_line
+from accerl_lerobot.stopping import TerminatedError, interrupted
 
+LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR")
 VERBS = {
     "train": (
         "verbs:train",
@@ -50,7 +42,7 @@ def usage() -> str:
     lines = [
         f"accerl {__version__}: online reinforcement learning of LeRobot policies",
         "",
-        "usage: accerl VERB [recipe.yaml] [--room.field=value …]",
+        "usage: accerl VERB [recipe.yaml] [--section.field=value …]",
         "",
     ]
     lines += [f"  {verb:16} {what}" for verb, (_, what) in VERBS.items()]
@@ -61,20 +53,27 @@ def usage() -> str:
         "  accerl train --config_path=recipes/quickstart.yaml --trainer.lr=1e-5",
         "  accerl eval --config_path=RUN/config.yaml --policy.path=RUN/checkpoints/last/pretrained_model",
         "",
-        "accerl VERB --help lists the verb's fields. ACCERL_LOG=INFO says more.",
+        "accerl VERB --help lists what people change, --help=all every field. ACCERL_LOG=INFO says more.",
     ]
     return "\n".join(lines)
 
 
-def show_help(verb: str, rest: list[str]) -> int:
-    """``accerl VERB --help``; for bench, of the measurement that is named, or of all."""
+def show_help(verb: str, rest: list[str], section: str) -> int:
+    """``accerl VERB --help``; for bench, of the measurement that is named, or a list of them."""
     from accerl_lerobot.field_help import help_text
     from accerl_lerobot.verbs import CONFIGS
 
     names = [name for name in CONFIGS if name.split()[0] == verb]
-    named = [name for name in names if name.split()[-1] in rest]
-    texts = [help_text(name, CONFIGS[name], VERBS[verb][1]) for name in named or names]
-    sys.stdout.write("\n\n".join(texts) + "\n")
+    named = [name for name in names if len(names) == 1 or name.split()[-1] in rest]
+    if named:
+        text = help_text(named[0], CONFIGS[named[0]], VERBS[verb][1], section)
+    else:
+        docs = (sys.modules[CONFIGS[name].__module__].__doc__ or "" for name in names)
+        briefs = (doc.partition("\n\n")[0].replace("\n", " ")[:90] for doc in docs)
+        lines = [f"  {name.split()[-1]:16} {brief}" for name, brief in zip(names, briefs, strict=True)]
+        usage = [f"usage: accerl {verb} NAME [--field=value …]", "", *lines]
+        text = "\n".join([*usage, "", f"accerl {verb} NAME --help lists its fields."])
+    sys.stdout.write(f"{text}\n")
     return 0
 
 
@@ -93,24 +92,59 @@ def main(arguments: list[str] | None = None) -> int:
         hint = f"did you mean {near[0]}? Otherwise " if near else ""
         sys.stderr.write(f"accerl: no verb {verb!r}; {hint}use one of {', '.join(VERBS)}\n")
         return 2
-    logging.basicConfig(
-        level=os.environ.get("ACCERL_LOG", "WARNING"), format="%(levelname)s %(name)s: %(message)s"
-    )
-    module, _, name = VERBS[verb][0].partition(":")
     try:
-        if "-h" in rest or "--help" in rest:
-            return show_help(verb, rest)
+        code = run(verb, rest)
+        sys.stdout.flush()
+    except InputError as error:
+        # Ray raises a subclass whose text is a whole traceback; the error itself is inside.
+        return _refuse(str(getattr(error, "cause", error)))
+    except KeyboardInterrupt as stop:
+        _refuse("interrupted")
+        return 143 if isinstance(stop, TerminatedError) else 130
+    except Exception as error:
+        if isinstance(error, BrokenPipeError) and not _output_is_open():
+            return 128 + signal.SIGPIPE
+        logging.getLogger(__name__).debug("accerl %s failed", verb, exc_info=error)
+        _refuse(one_line(error))
+        return 1
+    return code
+
+
+def run(verb: str, rest: list[str]) -> int:
+    """Runs a verb, or shows its help."""
+    level = os.environ.get("ACCERL_LOG", "WARNING").upper()
+    if level not in LEVELS:
+        raise InputError("ACCERL_LOG", level, f"use {', '.join(LEVELS)}")
+    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s")
+    for argument in rest:
+        flag, _, section = argument.partition("=")
+        if flag in ("-h", "--help"):
+            return show_help(verb, rest, section)
+    from accerl_lerobot import guardian
+
+    guardian.start()  # before anything that it is to clean up
+    module, _, name = VERBS[verb][0].partition(":")
+    with interrupted():
         function: Callable[[list[str]], int] = getattr(
             importlib.import_module(f"accerl_lerobot.{module}"), name
         )
         return function(rest)
-    except InputError as error:
-        # Ray raises a subclass whose text is a whole traceback; the error itself is inside.
-        sys.stderr.write(f"accerl: {getattr(error, 'cause', error)}\n")
-        return 2
-    except KeyboardInterrupt:
-        sys.stderr.write("accerl: interrupted\n")
-        return 130
+
+
+def _refuse(text: str) -> int:
+    with contextlib.suppress(OSError):  # whoever reads it may be gone
+        sys.stderr.write(f"accerl: {text}\n")
+    return 2
+
+
+def _output_is_open() -> bool:
+    """False if the reader of the standard output has gone, as ``head`` does; then nothing more is written."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return False
+    return True
 
 
 if __name__ == "__main__":

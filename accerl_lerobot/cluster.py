@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The Ray that a run has, a private one or a cluster that it joins, and its nodes before anything is placed.
 
 A cluster is looked at before this process connects, by processes that end: what is at the address, whether it
@@ -30,11 +18,12 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import psutil
 import ray
 from ray._private import services
 from ray._private.state import available_resources_per_node, total_resources_per_node
@@ -42,12 +31,12 @@ from ray.exceptions import AuthenticationError, GetTimeoutError, RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from accerl_lerobot.config import LaunchConfig, RunConfig
-from accerl_lerobot.engine import WorkerError
+from accerl_lerobot.engine import WorkerError, pause_s
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.placement import Node, Place, Plan, asked, candidates, planned
 from accerl_lerobot.placement_config import WHERE
-from accerl_lerobot.ray_environment import check_private, has_token, passed_on, without_token
-from accerl_lerobot.stopping import Stopping
+from accerl_lerobot.ray_environment import check_private, has_token, kind_of, passed_on, without_token
+from accerl_lerobot.stopping import arrived, deferred
 from accerl_lerobot.transport.shared_memory import this_node
 
 logger = logging.getLogger(__name__)
@@ -63,6 +52,10 @@ FREED_S = 20.0
 """How long what ended before this run may take to give back what it had."""
 STRANGE = ("Unauthenticated", "UNAUTHENTICATED", "InvalidAuthToken", "AuthenticationError")
 """One of these is said to who has no token, or a wrong one."""
+STARTS = 4
+"""How often a private Ray is started: it gives up after 30 s, which may be too few on a busy machine."""
+GONE_S = 3.0
+"""How long a killed process may take to be gone."""
 ASK = """
 import sys
 from ray._raylet import GcsClient
@@ -78,19 +71,57 @@ def start_ray(launch: LaunchConfig | None = None) -> None:
 
     Raises:
         InputError: there is no such cluster, or it is none that this run should join.
+        WorkerError: a private Ray has not started, though it was tried `STARTS` times.
     """
-    with Stopping.kept():
+    with deferred():
         if launch is not None and launch.address is not None:
             _join(launch)
             return
         check_private()
-        ray.init(
-            address="local",
-            include_dashboard=False,
-            _node_ip_address="127.0.0.1",
-            log_to_driver=False,
-            configure_logging=False,
-        )
+        for attempt in range(1, STARTS + 1):
+            try:
+                ray.init(
+                    address="local",
+                    include_dashboard=False,
+                    _node_ip_address="127.0.0.1",
+                    log_to_driver=False,
+                    configure_logging=False,
+                )
+                return
+            except Exception as error:  # its own classes, and of its start-up a plain one
+                reason = " ".join(str(error).split())
+                kill_ray()
+                ray.shutdown()
+                if attempt == STARTS or arrived():
+                    raise WorkerError(f"Ray did not start in {attempt} attempts: {reason}") from error
+                logger.warning("Ray did not start and is started again: %s", reason)
+                time.sleep(pause_s(attempt))
+
+
+def ray_processes() -> dict[psutil.Process, str]:
+    """Ray's own processes below this one, by kind."""
+    found = {}
+    for process in psutil.Process().children(recursive=True):
+        with contextlib.suppress(psutil.Error):
+            if kind := kind_of(process.cmdline()):
+                found[process] = kind
+    return found
+
+
+def kill_ray(known: Iterable[psutil.Process] = ()) -> None:
+    """Kills Ray's own processes below this one, and all that they have started.
+
+    Args:
+        known: others, which may have lost their parent.
+    """
+    everyone: set[psutil.Process] = set()
+    for process in [*ray_processes(), *known]:
+        with contextlib.suppress(psutil.Error):
+            everyone |= {process, *process.children(recursive=True)}
+    for process in everyone:
+        with contextlib.suppress(psutil.Error):
+            process.kill()
+    psutil.wait_procs(everyone, timeout=GONE_S)
 
 
 def placed(config: RunConfig) -> Plan:

@@ -1,27 +1,15 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A run is one dataclass per room, composed, checked and saved beside the results.
 
-YAML through ``--config_path``, any field through ``--room.field=value``, as in LeRobot. Nothing is filled in
-later. Each room's config stands beside the class it configures; what concerns two rooms is checked here.
+YAML through ``--config_path``, any field through ``--section.field=value``, as in LeRobot. Nothing is added
+later. Each section stands beside the class it configures; what concerns two sections is checked here.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated, Any, Literal
 
 from accerl_lerobot.algorithms import AlgorithmConfig, GIPOConfig
 from accerl_lerobot.dataset_config import DatasetConfig
@@ -35,12 +23,13 @@ from accerl_lerobot.metrics import WandBConfig
 from accerl_lerobot.parsing import decode, encode, parse
 from accerl_lerobot.placement_config import PlacementConfig
 from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.ranges import NonNegative, Positive, Range, Section, Seed, Steps, check
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline import TIMELINE
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.transport.endpoint import FIELD, Transport
+from accerl_lerobot.transport.endpoint import Transport
 from accerl_lerobot.weights.channel import WAY, Way
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 
@@ -48,10 +37,10 @@ __all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "check_chunk", "decode"
 
 
 @dataclass(frozen=True, kw_only=True)
-class LaunchConfig:
+class LaunchConfig(Section, section="launch"):
     """Where the workers run."""
 
-    engine: str = "ray"
+    engine: Literal["ray", "local"] = "ray"
     """ray: asynchronous workers. local: the same parts in one process, deterministic, for tests."""
     address: str | None = None
     """HOST:PORT of a running Ray cluster that the workers join, or auto: the one that ``ray start`` has
@@ -75,13 +64,13 @@ class LaunchConfig:
     gloo: torch.distributed sends them straight to each inference service, which is faster, and asks for no
     token.
     """
-    stall_s: float = 300.0
-    """How long, in seconds, a worker may owe an answer or a world a step, and a run stand still; > 0.
+    stall_s: Positive = 300.0
+    """How long, in seconds, a worker may owe an answer or a world a step, and a run stand still.
 
     A rollout worker or an inference service is started again then; with any other, and where nothing moves,
     all are.
     """
-    max_recoveries: int = 3
+    max_recoveries: Annotated[int, Range("[0, 1000000]")] = 3
     """How often in a row, no later update or checkpoint having been reached in between, all workers are
     started again from the last checkpoint because one of them was lost that is not started again alone; once
     more ends the run with its error."""
@@ -90,26 +79,15 @@ class LaunchConfig:
     started."""
 
     def __post_init__(self) -> None:
-        if self.engine not in ("ray", "local"):
-            raise InputError("launch.engine", self.engine, "use ray or local")
-        if self.schedule not in get_args(Schedule):
-            raise InputError("launch.schedule", self.schedule, f"use {' or '.join(get_args(Schedule))}")
+        super().__post_init__()
         if self.schedule != ASYNCHRONOUS and self.engine == "local":
             remedy = (
                 "with launch.engine=local all is done in one process, in a schedule of its own; leave it out"
             )
             raise InputError("launch.schedule", self.schedule, remedy)
-        if self.transport not in get_args(Transport):
-            raise InputError(FIELD, self.transport, f"use {' or '.join(get_args(Transport))}")
-        if self.weights not in get_args(Way):
-            raise InputError(WAY, self.weights, f"use {' or '.join(get_args(Way))}")
         if self.weights != "ray" and self.engine == "local":
             raise InputError(WAY, self.weights, "launch.engine=local is one process; leave the field out")
         self._check_cluster()
-        if not self.stall_s > 0:
-            raise InputError("launch.stall_s", self.stall_s, "use a positive number of seconds")
-        if self.max_recoveries < 0:
-            raise InputError("launch.max_recoveries", self.max_recoveries, "use 0 or more")
 
     def _check_cluster(self) -> None:
         if self.engine == "local" and (self.address is not None or self.placement != PlacementConfig()):
@@ -129,15 +107,15 @@ class LaunchConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunConfig:
+class RunConfig(Section):
     """Everything one run needs.
 
     The start is one of: ``policy.path`` (a LeRobot checkpoint); ``sft`` on ``dataset``; ``sft`` on
     demonstrations that the run records itself with ``demos``.
     """
 
-    seed: int = 0
-    """0 to 99; of demonstrations, SFT, exploration and replay. Evaluation episodes do not depend on it."""
+    seed: Seed = 0
+    """Of demonstrations, SFT, exploration, replay and the starts of evaluation."""
     output_dir: str | None = None
     """Folder of the run; must not exist. None: ``outputs/<date>/<time>_<job_name>``."""
     job_name: str = "run"
@@ -156,14 +134,14 @@ class RunConfig:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     launch: LaunchConfig = field(default_factory=LaunchConfig)
     wandb: WandBConfig = field(default_factory=WandBConfig)
-    save_every_updates: int = 0
+    save_every_updates: Steps = 0
     """Checkpoint every so many updates; 0: none by their number."""
-    save_every_s: float = 600.0
+    save_every_s: NonNegative = 600.0
     """Checkpoint at least every so many seconds of training; 0: none by time. There is one at the end in any
     case, and when the run is asked to stop; before the training there is one if there are any by number or
     time."""
-    save_keep: int = 2
-    """Checkpoints that keep what it takes to go on from them, the newest ones, at least 1; the others keep
+    save_keep: Annotated[int, Range("[1, 1000000]")] = 2
+    """Checkpoints that keep what it takes to go on from them, the newest ones; the others keep
     their policies."""
     resume: bool = False
     """Go on with the run whose config is ``--config_path``: ``RUN/config.yaml``, or that of one of its
@@ -175,17 +153,7 @@ class RunConfig:
         return bool(self.save_every_updates or self.save_every_s)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.seed < 100:
-            raise InputError("seed", self.seed, "use 0 to 99")
-        self.dataset.check("dataset")
-        if self.save_every_updates < 0:
-            raise InputError("save_every_updates", self.save_every_updates, "use 0 (none by number) or more")
-        if not self.save_every_s >= 0:
-            raise InputError("save_every_s", self.save_every_s, "use 0 (none by time) or more seconds")
-        if self.save_keep < 1:
-            raise InputError(
-                "save_keep", self.save_keep, "use at least 1, or the run could not be gone on with"
-            )
+        super().__post_init__()
         if self.demos.seed:
             raise InputError(
                 "demos.seed", self.demos.seed, "a run's demonstrations take its own seed; use --seed"
@@ -276,9 +244,7 @@ def check_chunk(policy: dict[str, Any]) -> None:
         InputError: a size is not a whole number above 0, or more is executed than predicted.
     """
     for name in ("chunk_size", "n_action_steps", "num_steps", "max_state_dim", "max_action_dim"):
-        size = policy.get(name, 1)
-        if not isinstance(size, int) or isinstance(size, bool) or size < 1:
-            raise InputError(f"sft.policy.{name}", size, "use a whole number from 1 up")
+        check(Annotated[int, Range("[1, 10000]")], policy.get(name, 1), f"sft.policy.{name}")
     chunk, executed = policy.get("chunk_size"), policy.get("n_action_steps")
     if chunk is not None and executed is not None and executed > chunk:
         raise InputError("sft.policy.n_action_steps", executed, f"use 1 to sft.policy.chunk_size, {chunk}")

@@ -1,20 +1,9 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Progress for people: a bar per stage on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
+import datetime
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -35,6 +24,7 @@ class Stage:
         self._console, self._name, self._total = console, name, total
         self._progress, self._task = progress, task
         self._said = time.monotonic()
+        self._began: tuple[float, int] | None = None
 
     def update(self, done: int, status: str = "") -> None:
         """Moves the bar.
@@ -43,11 +33,22 @@ class Stage:
             done: how far it is.
             status: shown beside it.
         """
-        self._progress.update(self._task, completed=done, status=status)
         now = time.monotonic()
+        self._began = self._began or (now, done)
+        share = f"{done}/{self._total} ({done / self._total:.0%})" if self._total else str(done)
+        text = " · ".join(filter(None, (share, self._left(now, done), status)))
+        self._progress.update(self._task, completed=done, text=text)
         if not self._console.is_terminal and now - self._said > PLAIN_EVERY_S:
             self._said = now
-            self._console.print(f"  {self._name} {done}/{self._total or '?'} {status}", highlight=False)
+            self._console.print(f"  {self._name} {text}", highlight=False)
+
+    def _left(self, now: float, done: int) -> str:
+        """Time that is left at the pace since the first update of the bar."""
+        since, first = self._began or (now, done)
+        if not self._total or done <= first or done >= self._total:
+            return ""
+        seconds = round((now - since) / (done - first) * (self._total - done))
+        return f"{datetime.timedelta(seconds=seconds)} left"
 
 
 class Console:
@@ -76,13 +77,12 @@ class Console:
         columns = (
             TextColumn("{task.description}"),
             BarColumn(),
-            TextColumn("{task.completed:.0f}"),
-            TimeElapsedColumn(),
+            TextColumn("{task.fields[text]}"),
         )
         with Progress(
-            *columns, TextColumn("{task.fields[status]}"), console=self.rich, transient=True,
+            *columns, TimeElapsedColumn(), console=self.rich, transient=True,
             disable=not self.rich.is_terminal,
         ) as progress:  # fmt: skip
-            task = progress.add_task(name, total=total, status="")
+            task = progress.add_task(name, total=total, text="")
             yield Stage(self.rich, name, total, progress, task)
         self.say(f"{name}: {time.monotonic() - started:.1f} s")

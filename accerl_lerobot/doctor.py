@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """``accerl doctor``: will this recipe run on this machine? Every answer that is no comes with its remedy.
 
 Nothing here is guessed: a frame is really drawn, in a process of its own, because a broken OpenGL can take a
@@ -36,18 +24,20 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, expanded
 
 if TYPE_CHECKING:
     from accerl_lerobot.config import RunConfig
 
 OK, WARN, FAIL = "ok", "warn", "FAIL"
+RESOLVED = "--resolved="
 DISTRIBUTION = "accerl-lerobot"
 
 GIB = 2**30
 POLICY_PROCESS_GIB, ROLLOUT_PROCESS_GIB, SIMULATOR_GIB, RAY_GIB = 1.2, 0.4, 0.17, 0.7
-"""Resident memory in the quickstart, with a policy of 0.6 M parameters: a process with torch and LeRobot, a
-rollout process without its worlds, each task of each MetaWorld (renderers included), Ray's own processes."""
+"""Resident memory without a policy's weights, for which see `preflight.policy_gib`: a process with torch and
+LeRobot, a rollout process without its worlds, each task of each MetaWorld (renderers included), Ray's own
+processes."""
 DISK_GIB = 2.0
 """What a run may need for demonstrations, checkpoints and videos."""
 RENDER_TIMEOUT_S = 120
@@ -83,19 +73,29 @@ class Check:
 
 
 def main(arguments: list[str]) -> int:
-    """``accerl doctor``; 0 if everything needed is there, otherwise 1."""
-    config, history, checks = _resolve(arguments) if arguments else (None, 1, [])
-    if config is not None:
-        from accerl_lerobot.config import encode
+    """``accerl doctor``; 0 if everything needed is there, otherwise 1.
 
-        sys.stdout.write(yaml.safe_dump(encode(config), sort_keys=False, allow_unicode=True) + "\n")
-    checks += list(machine(config, history))
+    ``--resolved=FILE`` also writes the whole config to which the recipe resolves.
+    """
+    files = [argument.removeprefix(RESOLVED) for argument in arguments if argument.startswith(RESOLVED)]
+    arguments = [argument for argument in arguments if not argument.startswith(RESOLVED)]
+    config, history, checks = _resolve(arguments) if arguments else (None, 1, [])
+    checks += [*pulled(arguments), *machine(config, history)]
     if config is not None:
         checks += [*pace(config), *dreams(config), *placement(config)]
     for check in checks:
         sys.stdout.write(f"{check.status:5} {check.name:10} {check.text}\n")
     failed = sum(check.status == FAIL for check in checks)
     sys.stdout.write(f"\n{'all good' if not failed else f'{failed} of {len(checks)} checks failed'}\n")
+    if config is not None and files:
+        from accerl_lerobot.config import encode
+
+        path = expanded(files[-1], RESOLVED.strip("-="))
+        try:
+            path.write_text(yaml.safe_dump(encode(config), sort_keys=False, allow_unicode=True))
+        except OSError as error:
+            remedy = f"cannot be written: {error.strerror}; name another file"
+            raise InputError(RESOLVED.strip("-="), str(path), remedy) from error
     return 1 if failed else 0
 
 
@@ -263,7 +263,8 @@ def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
             need = memory_estimate_gib(config, history)
             text += f", about {need:.1f} GiB needed"
             if need > free:
-                status, text = WARN, f"{text}: lower rollout.workers, rollout.worlds or replay.capacity"
+                remedy = "lower rollout.workers, rollout.worlds or replay.capacity, or use a smaller policy"
+                status, text = WARN, f"{text}: {remedy}"
         yield Check(name="memory", status=status, text=text)
     disk = shutil.disk_usage(Path.cwd()).free / GIB
     short = disk < DISK_GIB
@@ -310,19 +311,33 @@ def placement(config: RunConfig) -> Iterator[Check]:
 
 
 def memory_estimate_gib(config: RunConfig, history: int = 1) -> float:
-    """Rough: processes with their libraries, simulators, and replay."""
+    """Rough: processes with their libraries, the policy's weights, simulators, replay and films."""
+    from accerl_lerobot.preflight import policy_gib
+
+    return policy_gib(config) + sum(memory_parts_gib(config, history).values())
+
+
+def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
+    """Field → rough memory of what it sizes."""
     from accerl_lerobot.staleness import under_way
 
+    rollout, films, local = config.rollout, config.evaluation, config.launch.engine == "local"
     tasks = len(getattr(config.env, "tasks", ("one",)))
-    worlds = config.rollout.workers * config.rollout.worlds
-    simulators = worlds * tasks * SIMULATOR_GIB if config.env.type == "metaworld" else 0.0
-    decisions = config.replay.capacity + under_way(config)
-    pictures = decisions * history * observation_bytes(config) / GIB
-    if config.launch.engine == "local":
-        return POLICY_PROCESS_GIB + simulators + pictures
-    # The driver, inference and the trainer each load torch.
-    workers = 3 * POLICY_PROCESS_GIB + config.rollout.workers * ROLLOUT_PROCESS_GIB
-    return RAY_GIB + workers + simulators + pictures
+    simulator = tasks * SIMULATOR_GIB if config.env.type == "metaworld" else 0.0
+    pictures = history * observation_bytes(config) / GIB
+    frames = min(films.videos, films.episodes) * config.env.max_steps / films.video_every
+    return {
+        # The driver, inference and the trainer each load torch.
+        "trainer.ranks": POLICY_PROCESS_GIB
+        if local
+        else RAY_GIB + (2 + config.trainer.ranks) * POLICY_PROCESS_GIB,
+        "inference.workers": 0.0 if local else (config.inference.workers - 1) * POLICY_PROCESS_GIB,
+        "rollout.workers": 0.0 if local else rollout.workers * ROLLOUT_PROCESS_GIB,
+        "rollout.worlds": rollout.workers * rollout.worlds * simulator,
+        "rollout.segment_length": under_way(config) * pictures,
+        "replay.capacity": config.replay.capacity * pictures,
+        "evaluation.videos": frames * 3 * films.video_size**2 / GIB,
+    }
 
 
 def observation_bytes(config: RunConfig) -> int:
@@ -362,28 +377,51 @@ def _resolve(arguments: list[str]) -> tuple[RunConfig | None, int, list[Check]]:
     try:
         config: RunConfig = parse(RunConfig, arguments)
         history = check_start(config)
-        if config.output_dir is not None and Path(config.output_dir).expanduser().exists():
-            raise InputError(
-                "output_dir", config.output_dir, "the folder exists; choose another or remove it"
-            )
     except InputError as error:
         return None, 1, [Check(name="recipe", status=FAIL, text=str(error))]
     return config, history, [Check(name="recipe", status=OK, text="resolves")]
 
 
+def pulled(arguments: list[str]) -> Iterator[Check]:
+    """The fields that `pull` has dropped from the recipe."""
+    from accerl_lerobot.hub.contents import RECORD
+    from accerl_lerobot.hub.kinds import read_json
+    from accerl_lerobot.parsing import read_arguments
+
+    with contextlib.suppress(InputError):
+        recipe = read_arguments(arguments)[0]
+        for folder in recipe.absolute().parents if recipe is not None else ():
+            dropped = read_json(folder / RECORD).get("dropped")
+            name = Path(os.path.relpath(str(recipe), folder)).as_posix()
+            fields = dropped.get(name) if isinstance(dropped, dict) else None
+            if isinstance(fields, dict) and fields:
+                names = ", ".join(map(ascii, fields))
+                text = f"without {names}, which let code run: add them if you trust it"
+                yield Check(name="pulled", status=WARN, text=text)
+
+
+def total_memory_gib() -> float | None:
+    """Memory of this machine, or its container's limit; None where that is unknown."""
+    return _memory_of("MemTotal", 0)
+
+
 def _memory_gib() -> float | None:
     """Memory that can be had, within the container's limit; None where that is unknown."""
+    return _memory_of("MemAvailable", 1)
+
+
+def _memory_of(entry: str, used: int) -> float | None:
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:
         return None
     entries = {line.split(":")[0]: int(line.split()[1]) * 1024 for line in lines}
-    free = float(entries.get("MemAvailable", 0))
+    found = float(entries.get(entry, 0))
     group = Path("/sys/fs/cgroup")
     with contextlib.suppress(OSError, ValueError):  # no such file, or no limit
-        limit, used = (int((group / f"memory.{name}").read_text()) for name in ("max", "current"))
-        free = min(free, limit - used)
-    return free / GIB
+        limit, taken = (int((group / f"memory.{name}").read_text()) for name in ("max", "current"))
+        found = min(found, limit - used * taken)
+    return found / GIB
 
 
 def _backend() -> str:

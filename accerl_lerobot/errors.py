@@ -1,21 +1,15 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The one error a user meets: a field, its value and the remedy, on one line."""
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import os
 import re
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 TOKEN = re.compile(r"\bhf_\w{6,}")
@@ -55,5 +49,89 @@ def check_absent(path: Path) -> None:
     Raises:
         InputError: it does.
     """
+    expanded(str(path), "output_dir")
     if path.exists():
         raise InputError("output_dir", str(path), "the folder exists; choose another or remove it")
+
+
+def is_full(error: BaseException | None) -> bool:
+    """Whether an error is that of a full disk, here or in a worker whose error carries the text."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return True
+        if os.strerror(errno.ENOSPC) in str(error):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def expanded(path: str, field: str) -> Path:
+    """A path in which ``~`` stands for a home folder.
+
+    Raises:
+        InputError: there is no such user, or no file can have such a name.
+    """
+    try:
+        os.fspath(found := Path(path).expanduser()).encode()
+        os.lstat(found)
+    except FileNotFoundError:
+        pass
+    except (OSError, RuntimeError, ValueError) as error:
+        why = getattr(error, "strerror", None) or str(error)
+        raise InputError(field, path, f"cannot be a path: {why}") from error
+    return found
+
+
+def make_folder(path: Path, field: str) -> None:
+    """Creates a folder and those above it.
+
+    Raises:
+        InputError: that is not possible; names `field`.
+    """
+    try:
+        path.mkdir(parents=True)
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or str(error)
+        raise InputError(field, str(path), f"cannot be created: {why}; name another folder") from error
+
+
+@contextmanager
+def kept_traceback(directory: Path) -> Iterator[None]:
+    """Appends the traceback of an unexpected error to ``error.log`` in a run's folder, and adds a note that
+    says so."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        log = directory / "error.log"
+        with contextlib.suppress(OSError):  # the disk may be full
+            with log.open("a") as file:
+                traceback.print_exception(error, file=file)
+            error.add_note(f"the traceback is in {log}")
+        raise
+
+
+def one_line(error: BaseException) -> str:
+    """An unexpected error in one line, with its traceback's place or how to see it."""
+    cause = getattr(error, "cause", error)  # Ray's errors carry a traceback as their text
+    cause = cause if isinstance(cause, BaseException) else error
+    lines = [line.strip() for line in str(cause).splitlines() if line.strip()]
+    words = " … ".join(lines if len(lines) < 2 else [lines[0], lines[-1]])
+    text = f"{type(cause).__name__}: {words}" if words else type(cause).__name__
+    hint = next((hint for kind, hint in HINTS.items() if isinstance(cause, kind)), "")
+    notes = getattr(error, "__notes__", ()) or ("ACCERL_LOG=DEBUG shows the traceback",)
+    text = "; ".join(filter(None, (TOKEN.sub("<token>", text[:MOST_SHOWN]), hint, *notes)))
+    return " ".join(text.split())
+
+
+HINTS: dict[type[BaseException], str] = {
+    MemoryError: "use fewer rollout.workers or rollout.worlds, or a smaller batch or replay",
+    RecursionError: "something is nested too deeply",
+    ModuleNotFoundError: "accerl doctor says which packages are missing",
+    FileNotFoundError: "check the path",
+    PermissionError: "check who owns the path",
+    OSError: "check the path and the free space on its disk",
+}
+"""Kind of error → what to do, the most special first."""
+MOST_SHOWN = 600

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """``accerl VERB --help``: every field with its default and the docstring under it, read from the source."""
 
 from __future__ import annotations
@@ -24,29 +12,103 @@ from typing import Any
 
 import yaml
 
-from accerl_lerobot.parsing import TYPE, choices_of, room_of
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.parsing import TYPE, choices_of, section_of
+from accerl_lerobot.ranges import hints_of, range_in_words
 
 WIDTH = 110
 COLUMN = 44
 """Where explanations begin."""
 
 
-def help_text(verb: str, config_class: type[Any], what: str) -> str:
-    """The whole text.
+PAGE = 60
+"""Lines that are shown at once; what is longer is shown by section."""
+COMMON = (
+    "output_dir", "job_name", "seed", "resume", "path", "repo_id", "env.type", "env.task", "env.image_size",
+    "env.max_steps", "dataset.repo_id", "dataset.root", "demos.episodes", "demos.root", "sft.steps",
+    "sft.batch_size", "sft.lr", "policy.path", "policy.device", "policy.precision", "policy.tuning.mode",
+    "device", "rollout.workers", "rollout.worlds", "rollout.decision_cost", "replay.capacity",
+    "replay.samples_per_insert", "algorithm.type", "algorithm.advantage", "trainer.updates",
+    "trainer.batch_decisions", "trainer.lr", "trainer.value_lr", "evaluation.episodes",
+    "evaluation.every_updates", "launch.engine", "wandb.enable", "save_every_s",
+)  # fmt: skip
+"""Fields that people change."""
+
+
+def help_text(verb: str, config_class: type[Any], what: str, section: str = "") -> str:
+    """The text of ``--help``: all fields if they fit a page, otherwise those that people change.
 
     Args:
         verb: as it is typed.
         config_class: its config.
         what: what it does, one line.
+        section: ``--help=SECTION``: all fields of a section, or ``all``.
+
+    Raises:
+        InputError: there is no such section.
     """
     lines = [
-        f"usage: accerl {verb} {_bare(config_class)} [--room.field=value …]",
+        f"usage: accerl {verb} {_bare(config_class)} [--section.field=value …]",
         "",
         textwrap.fill(f"{what[0].upper()}{what[1:]}. Fields not given keep the value shown.", WIDTH),
         "",
-        *_fields(config_class, ""),
     ]
+    every = _fields(config_class, "")
+    if section not in ("", "all"):
+        return "\n".join(_of_section(every, section, config_class))
+    if section == "all" or len(lines) + len(every) <= PAGE:
+        return "\n".join(lines + every)
+    lines += [line for name in COMMON for line in _brief(config_class, name)]
+    lines += ["", f"more: accerl {verb} --help=all, or --help=SECTION:"]
+    hints = hints_of(config_class)
+    for name, section_class in ((name, section_of(hint)) for name, hint in hints.items()):
+        if section_class is not None:
+            lines.append(f"  {name:12}{_summary(section_class)}"[:WIDTH])
     return "\n".join(lines)
+
+
+def _of_section(every: list[str], section: str, config_class: type[Any]) -> list[str]:
+    """The lines that are about a section, such as ``trainer`` or ``policy.sampler``, and those below it."""
+    chosen, inside = [], False
+    for line in every:
+        if line and not line.startswith(" "):
+            name = line.partition(":")[0].partition(" ")[0].partition("=")[0].removesuffix(f".{TYPE}")
+            inside = name == section or name.startswith(f"{section}.")
+        if inside:
+            chosen.append(line)
+    if not chosen:
+        names = [name for name, hint in hints_of(config_class).items() if section_of(hint) is not None]
+        raise InputError("--help", section, f"use all or one of {', '.join(names)}")
+    return chosen
+
+
+def _brief(config_class: type[Any], dotted: str) -> list[str]:
+    """A field in one line, if the config has it."""
+    cls: type[Any] | None = config_class
+    default: Any = None
+    *sections, last = dotted.split(".")
+    for depth, name in enumerate(sections):
+        field = next((f for f in dataclasses.fields(cls) if f.name == name), None) if cls else None
+        if cls is None or field is None:
+            return []
+        default, cls = _default(field, default), section_of(hints_of(cls)[name])
+        if cls is not None and last == TYPE and depth == len(sections) - 1:
+            return [_one_line(f"--{dotted}={getattr(default, TYPE, '')}", " | ".join(choices_of(cls)))]
+        cls = type(default) if default is not None else cls
+    field = next((f for f in dataclasses.fields(cls) if f.name == last), None) if cls else None
+    if cls is None or field is None:
+        return []
+    choices = range_in_words(hints_of(cls)[last])
+    text = choices if " | " in choices else docstrings(cls)[last]
+    return [_one_line(f"--{dotted}={_shown(_default(field, default))}", text)]
+
+
+def _one_line(flag: str, text: str) -> str:
+    """Its first sentence, shortened to a line."""
+    first = text.partition(". ")[0].removesuffix(".")
+    return textwrap.shorten(first, WIDTH - COLUMN, placeholder=" …").join(
+        [f"  {flag}".ljust(COLUMN - 1) + " ", ""]
+    )
 
 
 def _bare(config_class: type[Any]) -> str:
@@ -77,26 +139,29 @@ def docstrings(cls: type[Any]) -> dict[str, str]:
 
 def _fields(cls: type[Any], prefix: str, usual: Any = None) -> list[str]:
     """Lines of its fields with their defaults: those of `usual`, which is one of it, or its own."""
-    hints, docs = typing.get_type_hints(cls), docstrings(cls)
+    hints, docs = hints_of(cls), docstrings(cls)
     lines: list[str] = []
-    rooms: list[str] = []
+    sections: list[str] = []
     for field in dataclasses.fields(cls):
-        name, room = f"{prefix}{field.name}", room_of(hints[field.name])
-        if room is None:
+        name, section = f"{prefix}{field.name}", section_of(hints[field.name])
+        if section is None:
             text = " ".join([docs[field.name], *_choices(field)])
+            span = range_in_words(hints[field.name])
+            if span and not all(choice in text for choice in span.split(" | ")):
+                text = f"{text} {span[0].upper()}{span[1:]}.".strip()
             lines += _entry(f"--{name}={_shown(_default(field, usual))}", text)
             continue
-        choices, default = choices_of(room), _default(field, usual)
+        choices, default = choices_of(section), _default(field, usual)
         if not choices:
             note = "" if default is not None else " (off unless given)"
-            rooms += ["", f"{name}{note}: {_summary(room)}", *_fields(room, f"{name}.", default)]
+            sections += ["", f"{name}{note}: {_summary(section)}", *_fields(section, f"{name}.", default)]
             continue
         for kind, subclass in choices.items():
             chosen = default if getattr(default, TYPE, None) == kind else None
             note = "" if chosen is None else " (default)"
-            rooms += ["", f"{name}.{TYPE}={kind}{note}: {_summary(subclass)}"]
-            rooms += _fields(subclass, f"{name}.", chosen)
-    return lines + rooms
+            sections += ["", f"{name}.{TYPE}={kind}{note}: {_summary(subclass)}"]
+            sections += _fields(subclass, f"{name}.", chosen)
+    return lines + sections
 
 
 def _entry(flag: str, text: str) -> list[str]:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Places the workers, connects them and watches them.
 
     rollout ×W ──requests──► inference ──decisions──► rollout   micro-asynchrony: others step meanwhile
@@ -149,6 +137,8 @@ class RayEngine(Engine):
         self._inference.lock_step(in_turn)
 
     def poll(self) -> Progress:
+        if lost := self._ray.lost:
+            raise WorkerError(lost)
         self._ask()
         self._await_end()
         for number, endpoint in self._inference.advance():
@@ -195,7 +185,9 @@ class RayEngine(Engine):
             return
         self._closed = True
         try:
-            end(self._everyone())
+            if lost := bool(self._ray.lost):
+                self._ray.close()
+            end(self._everyone(), told=not lost)
             if not self._lasting:
                 self._ray.close()
         except Exception:

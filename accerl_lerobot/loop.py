@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The run once its engine stands: evaluation, training, checkpoints, and what is written of them."""
 
 from __future__ import annotations
@@ -185,7 +173,8 @@ class Loop:
         self._save()
         after, results = self._evaluate("after", evaluation.episodes, self.steps)
         if any(result.frames for result in filmed):
-            before_after(self.directory / "before_after.mp4", filmed, results, fps=20)
+            film = self.directory / "before_after.mp4"
+            before_after(film, (filmed, self.before), (results, after), fps=20)
         success_curve(self.directory / "success_curve.png", self.evaluations, self.curve)
         summary = plain(self._summary(self.before, after, last))
         write_atomically(self.directory / SUMMARY, json.dumps(summary, indent=2) + "\n")
@@ -336,13 +325,15 @@ class Loop:
     def _plan_during(self, number: int) -> None:
         group = f"during-{number}"
         self.during[group] = []
-        self.engine.plan(evaluation_plans(self.tasks, self.config.evaluation.episodes_during, group))
+        episodes = self.config.evaluation.episodes_during
+        self.engine.plan(evaluation_plans(self.tasks, episodes, group, seed=self.config.seed))
 
     def _evaluate(
         self, group: str, episodes: int, steps: float
     ) -> tuple[dict[str, Any], list[EpisodeResult]]:
         self.times.clock.enter(EVALUATION)
-        self.engine.plan(evaluation_plans(self.tasks, episodes, group, self.config.evaluation.videos))
+        film = self.config.evaluation.videos
+        self.engine.plan(evaluation_plans(self.tasks, episodes, group, seed=self.config.seed, film=film))
         # An evaluation planned while training may end only now.
         results = run_plans(self.engine, episodes, group, self.console, self._meanwhile)
         return self._report(group, results, steps, results[0].versions[1]), results
@@ -390,4 +381,10 @@ class Loop:
     def _status(self, progress: Progress) -> str:
         success = f"{np.mean(self.recent):.0%}" if self.recent else "…"
         lag = f"{self.lags[-1]:.0f}" if self.lags else "…"
-        return f"exploring success {success} · lag {lag} · {self._since(progress, 'decisions'):.0f} decisions"
+        words = (
+            f"exploring success {success} · lag {lag} · {self._since(progress, 'decisions'):.0f} decisions"
+        )
+        if self.evaluations:
+            newest = self.evaluations[-1]
+            words += f" · evaluation {newest['success']:.0%} at update {newest['version_max']}"
+        return words

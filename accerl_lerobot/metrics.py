@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Where a run's numbers go: JSON lines always, TensorBoard always, wandb when asked for.
 
 ``metrics.jsonl`` has one object per line, each with ``kind`` (train, rollout, evaluation), ``wall_s`` and
@@ -31,13 +19,14 @@ from typing import Any
 import numpy as np
 
 from accerl_lerobot.fault_points import reach
+from accerl_lerobot.ranges import Section
 
 METRICS = "metrics.jsonl"
 """Name of the file in a run's folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class WandBConfig:
+class WandBConfig(Section, section="wandb"):
     """Weights & Biases, off unless enabled."""
 
     enable: bool = False

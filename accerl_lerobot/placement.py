@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Which worker goes where: nodes and what is asked of them in; out a plan, or the sum that does not work out.
 
     nodes   what each has left: CPUs, GPUs, and whether it sees the run's files
@@ -32,6 +20,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
+from accerl_lerobot.engine import WorkerError
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.placement_config import WHERE, RoleConfig
 from accerl_lerobot.transport.endpoint import FIELD
@@ -125,9 +114,14 @@ class Plan:
         Args:
             name: of the worker.
             alive: keys of the nodes that are there.
+
+        Raises:
+            WorkerError: none of those is, as when Ray itself has been lost.
         """
         used = [place.node for other, place in self.places.items() if other.startswith("rollout ")]
         candidates = {node.number: node for node in [self.nodes[0], *used] if node.key in alive}
+        if not candidates:
+            raise WorkerError(f"{name} worker is lost, and no node is left where another could be started")
         load = {number: sum(n.number == number for n in used) for number in candidates}
         best = min(candidates, key=lambda number: (load[number] + 1) / max(candidates[number].cpus, 1.0))
         return Place(candidates[best], 0.0, 0.0)

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Environment variables that Ray and its workers read, set before Ray is imported: it reads them once.
 
 Every run gets a Ray of its own, which nobody else can talk to: it listens on the loopback interface only, and
@@ -22,14 +10,15 @@ A run that joins a cluster (``launch.address``) takes the user's token and leave
 
 from __future__ import annotations
 
-import atexit
 import functools
 import os
 import secrets
-import shutil
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
+
+from accerl_lerobot import guardian
 
 WORKERS = {
     # Several CPU workers share the cores: spinning threads would cost more than they give.
@@ -49,6 +38,24 @@ _NO_TOKEN = {"HF_TOKEN": "", "HUGGING_FACE_HUB_TOKEN": "", "HF_TOKEN_PATH": os.d
 TOKENLESS = {"runtime_env": {"env_vars": _NO_TOKEN}}
 """Options of an actor that runs other people's environments: the Hub's token is not in its process, and not
 found by the client in it. No wall: what runs as the same user can read what that user can."""
+
+
+RAY_PROCESSES = {
+    "gcs_server": ("/ray/gcs/gcs_server",),
+    "raylet": ("/ray/raylet/raylet",),
+    "dashboard agent": ("/dashboard/agent.py", "ray::DashboardAgent"),
+    "runtime env agent": ("/runtime_env/agent/main.py", "ray::RuntimeEnvAgent"),
+    "log monitor": ("/_private/log_monitor.py",),
+}
+"""Ray's own processes → how their command lines begin, without and with a title of their own."""
+NEEDED = ("gcs_server", "raylet", "dashboard agent", "runtime env agent")
+"""Of these, the ones that Ray does not work without: a raylet ends with its agents."""
+
+
+def kind_of(command: Sequence[str]) -> str | None:
+    """Which of `RAY_PROCESSES` a command line is of."""
+    begin = " ".join(command[:3])
+    return next((kind for kind, words in RAY_PROCESSES.items() if any(w in begin for w in words)), None)
 
 
 PASSED_ON = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
@@ -124,14 +131,9 @@ def write_token() -> Path:
 
 @functools.cache
 def private_folder() -> Path:
-    """A folder of mode 0700 from its beginning, which goes when this process ends."""
+    """A folder of mode 0700 from its beginning, which its guardian removes when this process has ended."""
     temporary = tempfile.gettempdir()
     # A socket's path has 107 bytes at most, and Ray's part of it takes up to 70.
     folder = Path(tempfile.mkdtemp(prefix="accerl-", dir=temporary if len(temporary) <= 16 else "/tmp"))
-    atexit.register(_remove, folder, os.getpid())
+    guardian.remove(folder)
     return folder
-
-
-def _remove(folder: Path, owner: int) -> None:
-    if os.getpid() == owner:  # a forked child that ends must not take it along
-        shutil.rmtree(folder, ignore_errors=True)

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Which run is gone on with, and whether it may be."""
 
 from __future__ import annotations
@@ -25,8 +13,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from accerl_lerobot.checkpoint import CHECKPOINTS, CONFIG, LAST, SUMMARY
-from accerl_lerobot.config import RunConfig, encode, parse
+from accerl_lerobot.config import RunConfig, encode
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.parsing import CONSENT, decode, read_recipe
 from accerl_lerobot.stopping import StoppedError, Stopping
 
 LOCK = ".lock"
@@ -83,13 +72,17 @@ def begun_run(path: Path | None, config: RunConfig) -> Begun:
         directory, checkpoint = folders[2], folders[0].name
     if not (directory / CONFIG).is_file() or not (directory / LOCK).is_file():
         raise InputError("config_path", str(path), f"no run has been begun there; {how}")
-    before: RunConfig = parse(RunConfig, [f"--config_path={directory / CONFIG}"])
+    before: RunConfig = decode(RunConfig, read_recipe(directory / CONFIG))
     for name, (was, now) in _differences(encode(before), encode(config), "").items():
+        if not was and name.rpartition(".")[2] in CONSENT:
+            continue  # a pull has dropped it, and the command line allows it anew
         if not any(name == free or name.startswith(f"{free}.") for free in CHANGEABLE):
             remedy = f"the run was begun with {was!r}; leave it so, or begin a new run with --policy.path"
             raise InputError(name, now, remedy)
-    summary = directory / SUMMARY
-    if summary.is_file() and json.loads(summary.read_text())["updates"] >= config.trainer.updates:
+    summary, checkpoints = directory / SUMMARY, directory / CHECKPOINTS
+    newest = (checkpoints / checkpoint).resolve() == (checkpoints / LAST).resolve()
+    # From an earlier checkpoint there are updates left to make.
+    if newest and summary.is_file() and json.loads(summary.read_text())["updates"] >= config.trainer.updates:
         remedy = f"the run {directory} has made them, and has ended; ask for more"
         raise InputError("trainer.updates", config.trainer.updates, remedy)
     return Begun(directory, checkpoint)

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """One run from start to summary: demonstrations → SFT → evaluation → asynchronous RL → evaluation.
 
 outputs/<run>/
@@ -53,13 +41,12 @@ from accerl_lerobot.checkpoint import (
 from accerl_lerobot.config import LaunchConfig, RunConfig, encode, timeline_folder
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import Engine, WorkerError, pause_s
-from accerl_lerobot.envs import make_world
-from accerl_lerobot.errors import InputError, check_absent
+from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, make_folder
 from accerl_lerobot.hub.portable import AWAY
 from accerl_lerobot.loop import Loop, Times
 from accerl_lerobot.metrics import METRICS, MetricsLog
 from accerl_lerobot.policies.config import Load
-from accerl_lerobot.preflight import check_placement, check_start
+from accerl_lerobot.preflight import check_placement, check_policy, check_start, check_world
 from accerl_lerobot.replay.journal import EPISODES
 from accerl_lerobot.resume import heed_stop
 from accerl_lerobot.stopping import Stopping
@@ -92,15 +79,15 @@ def make_output_dir(config: Placed) -> Path:
     """Creates the folder of a run.
 
     Raises:
-        InputError: it exists.
+        InputError: it exists, or cannot be created.
     """
     if config.output_dir is None:
         now = datetime.datetime.now()
         path = Path("outputs") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}_{config.job_name}"
     else:
-        path = Path(config.output_dir).expanduser()
+        path = expanded(config.output_dir, "output_dir")
     check_absent(path)
-    path.mkdir(parents=True)
+    make_folder(path, "output_dir")
     return path
 
 
@@ -136,7 +123,7 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
     """Records demonstrations and runs SFT where the config asks for it; sets ``policy.path``."""
     from accerl_lerobot.demos.record import record_demos
     from accerl_lerobot.demos.sft import run_sft
-    from accerl_lerobot.demos.windows import check_dataset, task_texts
+    from accerl_lerobot.demos.windows import open_metadata, task_texts
     from accerl_lerobot.policies.loading import resolve_device
 
     if not config.sft.steps:
@@ -148,7 +135,7 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
         with console.stage("demonstrations"):
             record_demos(config.env, replace(config.demos, root=str(root), seed=config.seed))
         dataset = replace(dataset, repo_id=config.demos.repo_id, root=str(root))
-    meta = check_dataset(dataset, config.env, config.policy.rename_map)
+    meta = open_metadata(dataset)
     with console.stage("SFT", total=config.sft.steps) as stage:
         assert dataset.repo_id is not None
         path = run_sft(
@@ -192,7 +179,7 @@ def train(
         check_start(config)
     text = yaml.safe_dump(encode(replace(config, resume=False)), sort_keys=False)
     write_atomically(directory / CONFIG, text)
-    tasks = check_world(config)
+    tasks = check_world(config.env).tasks
     check_placement(replace(config, output_dir=str(directory)))
     if checkpoint is None:
         _check_imagination(config, going_on=False)
@@ -220,10 +207,14 @@ def train(
         while True:
             try:
                 return _attempt(config, directory, checkpoint, console, log, tasks, times, stop, load, own)
-            except WorkerError as error:
+            except Exception as error:
+                lost = "" if own is None else own.lost  # whatever error that has led to
+                loss = WorkerError(lost) if lost else error
+                if not isinstance(loss, WorkerError):
+                    raise
                 times.clock.enter(RECOVERY)
                 heed_stop(stop, directory)
-                checkpoint = recovery.next(directory / CHECKPOINTS, console, error, times.furthest)
+                checkpoint = recovery.next(directory / CHECKPOINTS, console, loss, times.furthest)
                 heed_stop(stop, directory)
                 go_back_to(checkpoint)
                 config = _going_on(config, directory, checkpoint, console)
@@ -249,10 +240,14 @@ def _attempt(
     own: OwnRay | None,
 ) -> dict[str, Any]:
     """The run, or what is left of it, by one set of workers, which have ended when this returns or raises."""
-    history = 1 if load is not None else check_policy(config)
+    history = 1 if load is not None else check_policy(config, own=True)
     state = None if checkpoint is None else checkpoint / TRAINING_STATE
-    with console.stage("starting workers"):
-        engine = make_engine(config, tasks, history, state, load, own)
+    try:
+        with console.stage("starting workers"), stop.at_once():
+            engine = make_engine(config, tasks, history, state, load, own)
+    except KeyboardInterrupt:
+        heed_stop(stop, directory)
+        raise
     with contextlib.closing(engine):
         return Loop(config, directory, console, engine, log, tasks, times, stop).run(state)
 
@@ -293,7 +288,8 @@ class Recovery:
             console.say(f"passed over checkpoint {why}")
         pause = pause_s(self._times - 1)
         when = f" in {pause:.0f} s" if pause else ""
-        console.say(f"{error}\ngoing on from {path}{when} ({self._times} of {self._most} times)")
+        reason = f"the disk of {checkpoints.parent} is full" if is_full(error) else error
+        console.say(f"{reason}\ngoing on from {path}{when} ({self._times} of {self._most} times)")
         time.sleep(pause)
         return path
 
@@ -370,27 +366,3 @@ def _check_imagination(config: RunConfig, going_on: bool) -> None:
 def _improving(config: RunConfig, path: Path | str) -> RunConfig:
     """The run as one that improves a checkpoint."""
     return replace(config, policy=replace(config.policy, path=str(path)), sft=replace(config.sft, steps=0))
-
-
-def check_policy(config: RunConfig) -> int:
-    """Refuses a policy that does not fit the world, before workers are started; gives its ``n_obs_steps``."""
-    from accerl_lerobot.policies.base import check_fit
-    from accerl_lerobot.policies.loading import load_lerobot_config
-
-    world = make_world(config.env)
-    try:
-        policy = load_lerobot_config(config.policy)
-        check_fit(policy, world.spec, config.policy.rename_map)
-    finally:
-        world.close()
-    return int(policy.n_obs_steps)
-
-
-def check_world(config: RunConfig) -> tuple[str, ...]:
-    """Builds the world once, so that a bad environment fails before anything long; returns its tasks."""
-    world = make_world(config.env)
-    try:
-        world.reset(0, world.spec.tasks[0])
-        return world.spec.tasks
-    finally:
-        world.close()

@@ -1,53 +1,37 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
-"""What is looked at before a file from outside is believed: its name, its size, what its header says.
+# SPDX-License-Identifier: Apache-2.0
+"""Validation of files from untrusted sources: names, sizes, JSON and safetensors.
 
-Checkpoints, world models and datasets may be anybody's. Everything here reads little, allocates less than the
-file is long, runs nothing, writes nothing, and either returns or raises an `InputError` that names the file.
-Free of torch and LeRobot.
+Checkpoints, world models and datasets may be anybody's. Everything here reads little, runs nothing, writes
+nothing, and either returns or raises an `InputError` that names the file. Free of torch and LeRobot.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import re
 import stat
 import string
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
+
+from safetensors import SafetensorError, safe_open
 
 from accerl_lerobot.errors import InputError
 
 MIB = 1024**2
 JSON_MOST = 4 * MIB
 """Bytes of a JSON file, unless it is one that is known to be larger."""
-HEADER_MOST = 16 * MIB
-"""Bytes of a safetensors header; the 4 B parameters of π0 need 0.1."""
-TENSORS_MOST, DIMS_MOST, NAME_MOST = 100_000, 8, 512
+READ_MOST = 64 * MIB
+"""Bytes that are read of a safetensors file before it is opened again."""
 PART_MOST, PATH_MOST = 255, 1024
 """Bytes of one part of a file's name, and of all of it."""
 TEMPLATE_MOST = 256
 PICKLES = (".bin", ".pt", ".pth", ".pkl", ".pickle", ".ckpt")
 """Endings of files that PyTorch unpickles, which may run whatever their author wished."""
-BITS = {
-    "F64": 64, "I64": 64, "U64": 64, "C64": 64, "F32": 32, "I32": 32, "U32": 32, "F16": 16, "BF16": 16,
-    "I16": 16, "U16": 16, "I8": 8, "U8": 8, "BOOL": 8, "F8_E4M3": 8, "F8_E5M2": 8,
-}  # fmt: skip
-"""safetensors dtype → bits of a number; those that LeRobot's checkpoints could hold."""
 REVISION = re.compile(r"[0-9a-f]{40}")
 HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}(/[A-Za-z0-9][\w.-]{0,95})?", re.ASCII)
 _DRIVE = re.compile(r"[A-Za-z]:")
@@ -83,7 +67,7 @@ def safe_join(root: Path, name: object, origin: Origin) -> Path:
     Raises:
         InputError: the name is no plain relative one, or leads out of `root`.
     """
-    if why := _unsafe(name):
+    if why := unsafe_name(name):
         raise origin.refuse(str(name)[:PATH_MOST], f"{why}; only files inside the folder are read")
     path = root / str(name)
     try:
@@ -104,7 +88,7 @@ def check_name(name: object, what: str, origin: Origin) -> str:
     Raises:
         InputError: it is no single plain part.
     """
-    why = _unsafe(name) or ("it has a slash in it" if "/" in str(name) else "")
+    why = unsafe_name(name) or ("it has a slash in it" if "/" in str(name) else "")
     if why:
         raise origin.refuse(what, f"the name {_shown(str(name))!r} cannot be part of a path: {why}")
     return str(name)
@@ -137,7 +121,7 @@ def check_template(template: object, fields: Mapping[str, type], what: str, orig
         if not (_WIDTH.fullmatch(spec or "") if fields[name] is int else not spec):
             raise origin.refuse(what, f"{template!r} asks for {spec!r}; use a width such as 03d, or none")
     example = template.format(**{name: 0 if kind is int else "name" for name, kind in fields.items()})
-    if why := _unsafe(example):
+    if why := unsafe_name(example):
         raise origin.refuse(what, f"{template!r} is no path inside the folder: {why}")
 
 
@@ -191,48 +175,61 @@ def read_json(path: Path, origin: Origin, most: int = JSON_MOST) -> dict[str, An
     return content
 
 
-def check_safetensors(path: Path, origin: Origin) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Reads a header and compares it with the file; no tensor is read.
-
-    Returns:
-        Dtype and shape by name.
+@contextlib.contextmanager
+def opened(path: Path, origin: Origin, framework: str = "np") -> Iterator[Any]:
+    """A safetensors file, whose header safetensors itself compares with the file.
 
     Raises:
-        InputError: the header is not one, or promises what is not in the file.
+        InputError: it is none.
     """
-    size = file_size(path, origin)
+    file_size(path, origin)
     try:
-        with path.open("rb") as file:
-            length = int.from_bytes(file.read(8), "little")
-            if size < 8 or not 2 <= length <= min(HEADER_MOST, size - 8):
-                remedy = f"not safetensors: a header of {length} bytes in a file of {size}; get it again"
-                raise origin.refuse(path.name, remedy)
-            header = json.loads(file.read(length).decode())
-    except OSError as error:
-        raise origin.refuse(path.name, f"cannot be read ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise origin.refuse(path.name, "not safetensors: its header is not JSON; get it again") from error
-    if not isinstance(header, dict) or len(header) > TENSORS_MOST:
-        raise origin.refuse(path.name, f"not safetensors with up to {TENSORS_MOST} tensors")
-    header.pop("__metadata__", None)
-    tensors, ranges = {}, []
-    for name, entry in header.items():
-        try:
-            tensors[name], found = _tensor(name, entry)
-        except (TypeError, ValueError, KeyError) as error:
-            raise origin.refuse(path.name, f"tensor {_shown(name)!r} is not whole; get it again") from error
-        ranges.append(found)
-    end = 0
-    for begin, finish in sorted(ranges):
-        if begin != end:
-            raise origin.refuse(path.name, "its tensors overlap or leave gaps; get it again")
-        end = finish
-    if 8 + length + end != size:
-        remedy = f"its tensors end at byte {8 + length + end}, the file at {size}; get it again"
-        raise origin.refuse(path.name, remedy)
-    return tensors
+        with safe_open(path, framework) as file:
+            yield file
+    except (OSError, SafetensorError) as error:
+        raise origin.refuse(path.name, f"not safetensors ({brief(error)}); get it again") from error
+
+
+def tensor_shapes(path: Path, origin: Origin) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """Dtype and shape by name of what a safetensors file holds; no tensor is read.
+
+    Raises:
+        InputError: see `opened`.
+    """
+    with opened(path, origin) as file:
+        slices = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
+        return {name: (one.get_dtype(), tuple(one.get_shape())) for name, one in slices.items()}
+
+
+def read_tensors(path: Path, origin: Origin) -> Iterator[tuple[str, Any]]:
+    """Name and PyTorch tensor, one after the other, of a safetensors file.
+
+    A tensor is a view of the file, so that none is in memory twice. The file is opened again now and then:
+    what has been read of it counts as memory of this process until it is closed.
+
+    Raises:
+        InputError: see `opened`; or a tensor holds NaN or infinity.
+    """
+    shapes, read = tensor_shapes(path, origin), 0
+    with contextlib.ExitStack() as stack:
+        file = stack.enter_context(opened(path, origin, "pt"))
+        for name in shapes:
+            tensor = file.get_tensor(name)
+            if not _finite(tensor):
+                raise origin.refuse(path.name, f"{_shown(name)} holds NaN or infinity; train it again")
+            yield name, tensor
+            read += tensor.nbytes
+            del tensor
+            if read > READ_MOST:
+                stack.close()
+                file, read = stack.enter_context(opened(path, origin, "pt")), 0
+
+
+def _finite(tensor: Any) -> bool:
+    if not tensor.is_floating_point() or not tensor.numel():
+        return True
+    least, most = (tensor.float() if tensor.itemsize == 1 else tensor).aminmax()
+    return math.isfinite(least) and math.isfinite(most)
 
 
 def check_number(value: object, low: float, high: float, what: str, origin: Origin) -> None:
@@ -272,19 +269,6 @@ def check_not_pickled(folder: Path, weights: str, origin: Origin) -> None:
     raise origin.refuse(weights, "is missing; give a folder with the weights as safetensors")
 
 
-def checked_weights(
-    folder: Path, weights: str, origin: Origin
-) -> tuple[Path, dict[str, tuple[str, tuple[int, ...]]]]:
-    """Where a folder's weights are, and what `check_safetensors` says of them.
-
-    Raises:
-        InputError: see there and `check_not_pickled`.
-    """
-    check_not_pickled(folder, weights, origin)
-    path = safe_join(folder, weights, origin)
-    return path, check_safetensors(path, origin)
-
-
 def check_remote_code(trust: bool, revision: str | None, room: str, name: str = "code_revision") -> None:
     """Code from the Hub is run only where it is asked for, and one version of it that is named.
 
@@ -307,8 +291,8 @@ def brief(error: BaseException) -> str:
     return text if len(text) <= 160 else text[:159] + "…"
 
 
-def _unsafe(name: object) -> str:
-    """Why a name must not be joined to a folder; empty if it may."""
+def unsafe_name(name: object) -> str:
+    """The reason why a name must not be joined to a folder; empty if it may."""
     if not isinstance(name, str) or not name:
         return "not a name"
     try:
@@ -327,17 +311,6 @@ def _unsafe(name: object) -> str:
     if ".." in parts or not parts:
         return "it leads out of the folder"
     return ""
-
-
-def _tensor(name: str, entry: Any) -> tuple[tuple[str, tuple[int, ...]], tuple[int, int]]:
-    """Dtype, shape and range of a header's entry; ValueError, TypeError or KeyError if they disagree."""
-    shape, (begin, end), dtype = entry["shape"], entry["data_offsets"], entry["dtype"]
-    numbers = [*shape, begin, end]
-    if any(not isinstance(n, int) or isinstance(n, bool) or not 0 <= n < 2**48 for n in numbers):
-        raise ValueError(numbers)
-    if len(name) > NAME_MOST or len(shape) > DIMS_MOST or math.prod(shape) * BITS[dtype] != 8 * (end - begin):
-        raise ValueError(name)
-    return (dtype, tuple(shape)), (begin, end)
 
 
 def _shown(text: str) -> str:

@@ -1,19 +1,7 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
-"""Which seed is for what: demonstrations, training and evaluation never see the same episode.
+# SPDX-License-Identifier: Apache-2.0
+"""Seeds of demonstrations, training and evaluation, which never share an episode.
 
-MetaWorld and Gymnasium take seeds below 2**32; each use owns one range of them.
+MetaWorld and Gymnasium take seeds below 2**32; each use owns one range of them. A run may have any seed.
 """
 
 from __future__ import annotations
@@ -24,45 +12,41 @@ from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.errors import InputError
-
 DEMO_SEEDS = range(0, 1_000_000_000)
 TRAIN_SEEDS = range(1_000_000_000, 2_000_000_000)
 EVAL_SEEDS = range(2_000_000_000, 3_000_000_000)
 
 _DEMOS_PER_RUN = 1_000_000
 _WORKERS_PER_RUN = 1_000
-_EPISODES_PER_WORKER = 10_000
-_RUNS = 100
+_PRIME = 999_999_937
+"""The largest below 10**9, the size of a range."""
+_EVALUATIONS_PER_RUN = 10_000
 _ALL_SEEDS = 2**32
 _DECISIONS_PER_EPISODE = 1_000_003
 
 
 def demo_seed(run_seed: int, index: int) -> int:
-    """Seed of the `index`-th demonstration tried by a recording with `run_seed`.
-
-    Raises:
-        InputError: `run_seed` is not in 0..999.
-    """
-    if not 0 <= run_seed < len(DEMO_SEEDS) // _DEMOS_PER_RUN:
-        raise InputError("demos.seed", run_seed, "use 0 to 999")
+    """Seed of the `index`-th demonstration tried by a recording with `run_seed`."""
     if not 0 <= index < _DEMOS_PER_RUN:
         raise ValueError(f"demonstration {index}: one recording has at most {_DEMOS_PER_RUN} tries")
-    return DEMO_SEEDS.start + run_seed * _DEMOS_PER_RUN + index
+    return _permuted(DEMO_SEEDS, run_seed, index)
 
 
 def train_seed(run_seed: int, worker: int, episode: int) -> int:
-    """Seed of a training episode; a worker starts over after 10,000 episodes.
-
-    Raises:
-        InputError: `run_seed` is not in 0..99.
-    """
-    if not 0 <= run_seed < _RUNS:
-        raise InputError("seed", run_seed, f"use 0 to {_RUNS - 1}")
+    """Seed of a training episode; no two of a run are equal before a worker's 999,999th."""
     if not 0 <= worker < _WORKERS_PER_RUN:
         raise ValueError(f"worker {worker}: a run has at most {_WORKERS_PER_RUN}")
-    place = run_seed * _WORKERS_PER_RUN + worker
-    return TRAIN_SEEDS.start + place * _EPISODES_PER_WORKER + episode % _EPISODES_PER_WORKER
+    return _permuted(TRAIN_SEEDS, run_seed, episode * _WORKERS_PER_RUN + worker)
+
+
+def _permuted(seeds: range, run_seed: int, index: int) -> int:
+    """The `index`-th of `seeds` in an order of the run's own.
+
+    Indices below the prime p have different seeds, as i → a·i + b mod p is a permutation; a and b are drawn
+    from a hash of the use and the run's seed, so that the orders of different runs have nothing in common.
+    """
+    a, b = np.random.SeedSequence((seeds.start, run_seed)).generate_state(2, np.uint64)
+    return seeds.start + ((1 + int(a) % (_PRIME - 1)) * index + int(b)) % _PRIME
 
 
 def noise_seed(episode_seed: int, member: int, decision: int) -> int:
@@ -76,11 +60,23 @@ def noise_seed(episode_seed: int, member: int, decision: int) -> int:
     return (member * _ALL_SEEDS + episode_seed) * _DECISIONS_PER_EPISODE + decision
 
 
-def eval_seed(index: int) -> int:
-    """Seed of the `index`-th evaluation episode, the same in every run, so that runs are paired."""
-    if not 0 <= index < len(EVAL_SEEDS):
-        raise ValueError(f"evaluation episode {index}: use 0 to {len(EVAL_SEEDS) - 1}")
-    return EVAL_SEEDS.start + index
+def eval_seed(run_seed: int, index: int) -> int:
+    """Seed of the `index`-th evaluation episode of a task.
+
+    Runs of the same seed are evaluated on the same episodes and can be compared by pairs. Runs of different
+    seeds below 100,000 are evaluated on different ones, so that results over seeds do not share their luck.
+    """
+    if not 0 <= index < _EVALUATIONS_PER_RUN:
+        raise ValueError(f"evaluation episode {index}: use 0 to {_EVALUATIONS_PER_RUN - 1}")
+    return EVAL_SEEDS.start + (run_seed * _EVALUATIONS_PER_RUN + index) % len(EVAL_SEEDS)
+
+
+def start_state(seed: int, count: int) -> int:
+    """Index of the recorded start state of an episode, below `count`; evaluation has the first half alone."""
+    first = (count + 1) // 2
+    if seed in EVAL_SEEDS or count == first:
+        return (seed - EVAL_SEEDS.start) % first
+    return first + seed % (count - first)
 
 
 def global_generators() -> dict[str, Any]:

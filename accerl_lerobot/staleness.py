@@ -1,23 +1,10 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """How stale the samples of a recipe can be: the arguments that `replay.pacing` needs, from a run's config."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-import sys
 from typing import TYPE_CHECKING
 
 from accerl_lerobot.replay.pacing import decisions_under_way, lag_bound
@@ -39,7 +26,7 @@ def lag_limits(config: RunConfig) -> tuple[int, int]:
             pickup=ahead + trainer.hold_back,
             prefetch=ahead,
         )
-        for replay in (config.replay, dataclasses.replace(config.replay, max_lag=sys.maxsize))
+        for replay in (config.replay, dataclasses.replace(config.replay, max_lag=10**9))
     )
     return bound, of_pace
 

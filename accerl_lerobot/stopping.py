@@ -1,28 +1,41 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Being asked to stop: SIGTERM, as schedulers send it, or Ctrl-C."""
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
+_pipe: tuple[int, int] | None = None
+"""Where signals are noted by C code, also while the main thread hangs and Python handles none."""
+_arrived = False
+
+
+def arrived() -> bool:
+    """Whether one of these signals has come since a context of this module was entered."""
+    global _arrived
+    with suppress(OSError):  # none has come
+        numbers = b"" if _pipe is None else os.read(_pipe[0], 64)
+        _arrived = _arrived or any(number in numbers for number in SIGNALS)
+    return _arrived
+
+
+def _listen() -> None:
+    """Has signals noted from now on."""
+    global _pipe, _arrived
+    if _pipe is None:
+        _pipe = os.pipe()
+        for end in _pipe:
+            os.set_blocking(end, False)
+    signal.set_wakeup_fd(_pipe[1], warn_on_full_buffer=False)
+    arrived()
+    _arrived = False
 
 
 class StoppedError(Exception):
@@ -38,26 +51,68 @@ class StoppedError(Exception):
         super().__init__(words)
 
 
+class TerminatedError(KeyboardInterrupt):
+    """SIGTERM came; handled like Ctrl-C."""
+
+
 @contextmanager
-def unwound() -> Iterator[None]:
-    """SIGTERM ends what is inside as an error would, so that what it has started is ended, too.
+def interrupted() -> Iterator[None]:
+    """Handles SIGTERM like Ctrl-C: what has been started is ended on the way out.
 
     Raises:
-        SystemExit: it came.
+        TerminatedError: it came.
     """
 
     def end(number: int, frame: FrameType | None) -> None:
         signal.signal(number, signal.SIG_IGN)  # a second one would interrupt what ends the rest
-        raise SystemExit(128 + number)
+        raise TerminatedError
 
     if threading.current_thread() is not threading.main_thread():  # Python allows it nowhere else
         yield
         return
     before = signal.signal(signal.SIGTERM, end)
+    _listen()
     try:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def deferred() -> Iterator[None]:
+    """Handles these signals when the context is left, for the start of a library with handlers of its own.
+
+    Ray's handler in Python exits; its handler in C++ prints a trace and sets an alarm that aborts after 3 s,
+    which can be cancelled only if its C++ code releases the interpreter's lock by then.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    before = {number: signal.signal(number, lambda number, _: came.append(number)) for number in SIGNALS}
+    real, left = signal.signal, threading.Event()
+    signal.signal = lambda number, handler: None if number in SIGNALS else real(number, handler)  # type: ignore[assignment]
+    thread = threading.Thread(target=_cancel_alarms, args=(left,), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        signal.signal = real
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        left.set()
+        thread.join()
+        if came:
+            signal.raise_signal(came[0])
+
+
+def _cancel_alarms(left: threading.Event) -> None:
+    """Cancels the alarm that follows a signal, until and when the context is left."""
+    while not left.wait(1.0):
+        if arrived():
+            signal.alarm(0)
+    if arrived():
+        signal.alarm(0)
 
 
 class Stopping:
@@ -72,28 +127,31 @@ class Stopping:
     def __init__(self) -> None:
         self.asked: int | None = None
         """The signal's number."""
+        self._waits = True
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Stopping:
         if threading.current_thread() is threading.main_thread():  # Python allows it nowhere else
             self._before = {number: signal.signal(number, self._note) for number in SIGNALS}
+            _listen()
         return self
 
     def __exit__(self, *_: object) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
-    @staticmethod
     @contextmanager
-    def kept() -> Iterator[None]:
-        """Puts handlers back that a library replaces by its own inside, as Ray does when it starts."""
-        before = {number: signal.getsignal(number) for number in SIGNALS}
-        yield
-        if threading.current_thread() is threading.main_thread():
-            for number, handler in before.items():
-                signal.signal(number, handler)
+    def at_once(self) -> Iterator[None]:
+        """Has the first signal interrupt what is inside, where there is nothing new to be saved."""
+        self._waits = False
+        try:
+            if self.asked is not None:
+                raise KeyboardInterrupt
+            yield
+        finally:
+            self._waits = True
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        if self.asked is not None:
+        again, self.asked = self.asked is not None, self.asked or number
+        if again or not self._waits:
             raise KeyboardInterrupt
-        self.asked = number

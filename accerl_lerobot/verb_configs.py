@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What the command lines of the verbs are parsed into, where it is not a whole run."""
 
 from __future__ import annotations
@@ -25,6 +13,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.ranges import Device, Section, Seed
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.world_model.config import (
     InverseConfig,
@@ -37,7 +26,7 @@ from accerl_lerobot.world_model.sizes import TinyConfig
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemosRun:
+class DemosRun(Section):
     """``accerl demos``: scripted experts, recorded."""
 
     env: EnvConfig = field(default_factory=MetaWorldConfig)
@@ -45,16 +34,15 @@ class DemosRun:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SFTRun:
+class SFTRun(Section):
     """``accerl sft``: LeRobot's own trainer on a LeRobotDataset."""
 
-    seed: int = 0
-    """0 to 99."""
+    seed: Seed = 0
     output_dir: str | None = None
     """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
     job_name: str = "sft"
     """Last part of the folder's name."""
-    device: str = "auto"
+    device: Device = "auto"
     """cpu, cuda, or auto."""
     env: EnvConfig | None = None
     """When given, the dataset is checked against it first."""
@@ -62,17 +50,17 @@ class SFTRun:
     sft: SFTConfig = field(default_factory=SFTConfig)
 
     def __post_init__(self) -> None:
-        self.dataset.check("dataset")
+        super().__post_init__()
         if self.sft.init_path is None:
             check_chunk(self.sft.policy)
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvalRun:
+class EvalRun(Section):
     """``accerl eval``: a checkpoint on seeds that no run trains on."""
 
-    seed: int = 0
-    """0 to 99; the evaluated episodes do not depend on it."""
+    seed: Seed = 0
+    """Chooses the starts: those of a run with this seed, or others, on which nothing was tuned."""
     output_dir: str | None = None
     """Folder for ``evaluation.json`` and videos; None prints only."""
     env: EnvConfig = field(default_factory=MetaWorldConfig)
@@ -84,16 +72,15 @@ class EvalRun:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorldModelRun:
+class WorldModelRun(Section):
     """``accerl world-model``: a world model, and a success model, from one or two LeRobotDatasets."""
 
-    seed: int = 0
-    """0 to 99."""
+    seed: Seed = 0
     output_dir: str | None = None
     """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
     job_name: str = "world_model"
     """Last part of the folder's name."""
-    device: str = "auto"
+    device: Device = "auto"
     """cpu, cuda, or auto: where both networks learn and are tried."""
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     """The world it is to be a model of: its cameras, sizes, rate and tasks."""
@@ -104,28 +91,22 @@ class WorldModelRun:
     there are none. How a policy fails no demonstration shows."""
     world_model: WorldModelConfig = field(default_factory=TinyConfig)
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.seed < 100:
-            raise InputError("seed", self.seed, "use 0 to 99")
-        self.dataset.check("dataset")
-        self.online.check("online")
-
 
 @dataclass(frozen=True, kw_only=True)
-class WorldModelEvalRun:
+class WorldModelEvalRun(Section):
     """``accerl world-model-eval``: a saved world model on episodes of one or several sources."""
 
     path: str | None = None
     """The folder named world_model that ``accerl world-model`` wrote."""
     discover_packages_path: str | None = None
     """Package to import that registers the type of the world model, where that is not one of ours."""
-    seed: int = 0
+    seed: Seed = 0
     """Of which windows are tried."""
     output_dir: str | None = None
     """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
     job_name: str = "world_model_eval"
     """Last part of the folder's name."""
-    device: str = "auto"
+    device: Device = "auto"
     """cpu, cuda, or auto: where the world model dreams and successes are told. What reads actions off frames
     is small and stays on the CPU; `policies` are on CUDA when there is one."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
@@ -145,11 +126,8 @@ class WorldModelEvalRun:
     """Checkpoints that decide on what is dreamt and on what was seen: do they do the same?"""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.path is None:
             raise InputError("path", None, "name the folder world_model of an accerl world-model run")
         if len(set(self.policies)) < len(self.policies):
             raise InputError("policies", self.policies, "name none of them twice")
-        if self.seed < 0:
-            raise InputError("seed", self.seed, "use 0 or more")
-        self.dataset.check("dataset")
-        self.online.check("online")

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What each verb of ``accerl`` does, once its arguments are parsed.
 
 Results go to the standard output, everything else to the standard error: LeRobot prints while it loads, and
@@ -51,15 +39,23 @@ from accerl_lerobot.checkpoint import CONFIG
 from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.export import ExportConfig
-from accerl_lerobot.errors import InputError, check_absent
+from accerl_lerobot.errors import (
+    InputError,
+    check_absent,
+    expanded,
+    is_full,
+    kept_traceback,
+    make_folder,
+)
 from accerl_lerobot.hub.config import PullConfig, PushConfig
 from accerl_lerobot.parsing import read_arguments
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.report.config import ReportConfig
 from accerl_lerobot.rollout.runner import EpisodeResult
-from accerl_lerobot.stopping import unwound
 from accerl_lerobot.timeline.config import TimelineConfig
 from accerl_lerobot.verb_configs import DemosRun, EvalRun, SFTRun, WorldModelEvalRun, WorldModelRun
+
+NO_DATASET = "name a LeRobotDataset, on the Hub or with dataset.root"
 
 
 def train(arguments: list[str], load: Load | None = None) -> int:
@@ -70,7 +66,8 @@ def train(arguments: list[str], load: Load | None = None) -> int:
         load: makes the policy's adapter; None: of LeRobot's checkpoint.
     """
     config: RunConfig = parse(RunConfig, arguments)
-    from accerl_lerobot import run
+    from accerl_lerobot import guardian, run
+    from accerl_lerobot.engine import WorkerError
     from accerl_lerobot.preflight import check_start
     from accerl_lerobot.resume import begun_run, how_to_go_on, locked
     from accerl_lerobot.stopping import StoppedError
@@ -81,8 +78,13 @@ def train(arguments: list[str], load: Load | None = None) -> int:
     console = Console()
     directory = run.make_output_dir(config) if begun is None else begun.directory
     console.say(f"run {directory}")
+    guardian.explain(remedy=f"to go on: {how_to_go_on(directory)}")
     try:
-        with redirect_stdout(sys.stderr), locked(directory, "config_path", "another process goes on with it"):
+        with (
+            redirect_stdout(sys.stderr),
+            kept_traceback(directory),
+            locked(directory, "config_path", "another process goes on with it"),
+        ):
             wanted = None if begun is None else begun.checkpoint
             summary = run.train(config, directory, console, wanted, load)
     except InputError:
@@ -92,8 +94,15 @@ def train(arguments: list[str], load: Load | None = None) -> int:
     except StoppedError as stopped:
         console.say(str(stopped))
         return 128 + stopped.number
-    except BaseException:
-        console.say(f"failed; what there is may be gone on with: {how_to_go_on(directory)}")
+    except BaseException as error:
+        if is_full(error):
+            console.say(f"the disk of {directory} is full; free some space, then {how_to_go_on(directory)}")
+            return 1
+        if isinstance(error, WorkerError) and "\n" not in str(error):  # without a worker's traceback
+            console.say(f"{error}; to resume: {how_to_go_on(directory)}")
+            return 1
+        how = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+        console.say(f"{how}; to resume from the last checkpoint: {how_to_go_on(directory)}")
         raise
     before = summary["success_before"]
     console.say(
@@ -108,8 +117,10 @@ def demos(arguments: list[str]) -> int:
     """``accerl demos``."""
     config: DemosRun = parse(DemosRun, arguments, recipe_class=RunConfig)
     from accerl_lerobot.demos.record import record_demos
+    from accerl_lerobot.preflight import check_disk, check_world, demos_bytes
 
     with redirect_stdout(sys.stderr):
+        check_disk(config.demos.root, demos_bytes(config.demos, check_world(config.env)), "demos.root")
         path = record_demos(config.env, config.demos)
     sys.stdout.write(f"{path}\n")
     return 0
@@ -119,25 +130,27 @@ def sft(arguments: list[str]) -> int:
     """``accerl sft``."""
     config: SFTRun = parse(SFTRun, arguments, recipe_class=RunConfig)
     if config.dataset.repo_id is None:
-        raise InputError("dataset.repo_id", None, "name a LeRobotDataset, on the Hub or with dataset.root")
+        raise InputError("dataset.repo_id", None, NO_DATASET)
     if config.sft.steps == 0:
         raise InputError("sft.steps", 0, "use at least 1")
     from accerl_lerobot import run
     from accerl_lerobot.demos.sft import run_sft
-    from accerl_lerobot.demos.windows import check_dataset, open_metadata, task_texts
+    from accerl_lerobot.demos.windows import task_texts
     from accerl_lerobot.policies.loading import resolve_device
-    from accerl_lerobot.preflight import check_sft_policy
+    from accerl_lerobot.preflight import check_disk, check_training_data, check_world, sft_policy
 
-    if config.sft.init_path is None:
-        check_sft_policy(config.sft)
-    if config.env is None:
-        meta = open_metadata(config.dataset)
-    else:
-        meta = check_dataset(config.dataset, config.env, {})
-    device = str(resolve_device(config.device))
+    device = str(resolve_device(config.device, "device"))
+    policy = sft_policy(config.sft)
+    spec = None if config.env is None else check_world(config.env)
+    meta = check_training_data(config.sft, config.dataset, policy, spec, {})
+    check_disk(config.output_dir, 0)
     directory = run.make_output_dir(config)
     console = Console()
-    with redirect_stdout(sys.stderr), console.stage("SFT", total=config.sft.steps) as stage:
+    with (
+        redirect_stdout(sys.stderr),
+        kept_traceback(directory),
+        console.stage("SFT", total=config.sft.steps) as stage,
+    ):
         path = run_sft(
             config.sft,
             config.dataset.repo_id,
@@ -156,24 +169,27 @@ def sft(arguments: list[str]) -> int:
 def evaluate(arguments: list[str]) -> int:
     """``accerl eval``."""
     config: EvalRun = parse(EvalRun, arguments, recipe_class=RunConfig)
-    out = Path(config.output_dir).expanduser() if config.output_dir else None
+    out = expanded(config.output_dir, "output_dir") if config.output_dir else None
     if out is not None:
         check_absent(out)
     from accerl_lerobot import run
     from accerl_lerobot.evaluation.config import evaluation_plans
     from accerl_lerobot.evaluation.summary import summarise, table
     from accerl_lerobot.loop import run_plans
+    from accerl_lerobot.preflight import check_machine
 
     rooms = ("seed", "env", "policy", "rollout", "inference", "evaluation", "launch")
     whole = RunConfig(**{name: getattr(config, name) for name in rooms})
+    check_machine(whole)
     film = config.evaluation.videos if out else 0
     console = Console()
     with redirect_stdout(sys.stderr):
-        history = run.check_policy(whole)
-        tasks = run.check_world(whole)
+        spec = run.check_world(whole.env)
+        tasks, history = spec.tasks, run.check_policy(whole, spec)
         engine = run.make_engine(whole, tasks, history)
         try:
-            engine.plan(evaluation_plans(tasks, config.evaluation.episodes, "eval", film))
+            episodes = config.evaluation.episodes
+            engine.plan(evaluation_plans(tasks, episodes, "eval", seed=config.seed, film=film))
             results = run_plans(engine, config.evaluation.episodes, "eval", console)
         finally:
             engine.close()
@@ -189,6 +205,8 @@ def evaluate(arguments: list[str]) -> int:
 def world_model(arguments: list[str]) -> int:
     """``accerl world-model``; 1 if it fails its trial."""
     config: WorldModelRun = parse(WorldModelRun, arguments, recipe_class=RunConfig)
+    if config.dataset.repo_id is None:
+        raise InputError("dataset.repo_id", None, NO_DATASET)
     from accerl_lerobot.world_model.offline import learn_world_model
 
     return _tried(config, lambda directory, console: learn_world_model(config, directory, console))
@@ -213,7 +231,7 @@ def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Cons
     console = Console()
     console.say(f"run {directory}")
     try:
-        with redirect_stdout(sys.stderr):
+        with redirect_stdout(sys.stderr), kept_traceback(directory):
             found = work(directory, console)
     except InputError:
         _discard_unused(directory)
@@ -248,7 +266,10 @@ def pull(arguments: list[str]) -> int:
 
     with redirect_stdout(sys.stderr):
         found = from_hub(config)
-    Console().say(f"{found['kind']} {found['path']} is {found['commit']}, {found['checked']} files checked")
+    console = Console()
+    console.say(f"{found['kind']} {found['path']} is {found['commit']}, {found['checked']} files checked")
+    for name, fields in found.get("dropped", {}).items():
+        console.say(f"dropped from {name}, as it would let code run: {', '.join(fields)}")
     sys.stdout.write(json.dumps(found, indent=2) + "\n")
     return 0
 
@@ -294,7 +315,7 @@ def bench(arguments: list[str]) -> int:
     config = parse(CONFIGS[f"bench {name}"], arguments[1:])
     name = name.replace("-", "_")
     module: Any = importlib.import_module(f"accerl_lerobot.bench.{name}")
-    with redirect_stdout(sys.stderr), unwound():
+    with redirect_stdout(sys.stderr):
         result = getattr(module, f"bench_{name}")(config)
     Console().rich.print(module.table(result))
     sys.stdout.write(json.dumps(result, indent=2) + "\n")
@@ -338,7 +359,7 @@ CONFIGS: dict[str, type[Any]] = {
 def _write_evaluation(out: Path, summary: dict[str, Any], results: list[EpisodeResult]) -> None:
     from accerl_lerobot.evaluation.pictures import write_video
 
-    out.mkdir(parents=True)
+    make_folder(out, "output_dir")
     (out / "evaluation.json").write_text(json.dumps(summary, indent=2) + "\n")
     for result in results:
         if result.frames:

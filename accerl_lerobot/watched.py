@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """An actor as the conductor sees it."""
 
 from __future__ import annotations
@@ -148,16 +136,18 @@ class Watched:
             raise WorkerError(f"{self.name} worker failed in {method}:\n{error}") from error
 
 
-def end(workers: Iterable[Watched]) -> None:
+def end(workers: Iterable[Watched], *, told: bool = True) -> None:
     """Ends them, and waits until they are gone: nobody is to write any more where others begin anew.
 
-    Ray tells a process to go, which one that was stopped does not hear.
+    Args:
+        workers: of this node, and of others if Ray tells them.
+        told: whether Ray tells them to go, which a stopped process does not hear; False: Ray is lost.
     """
     workers = list(workers)
-    for worker in workers:
+    for worker in workers if told else ():
         ray.kill(worker.actor)
     processes = [worker.process for worker in workers if worker.process is not None]
-    left = psutil.wait_procs(processes, timeout=GONE_S)[1]
+    left = psutil.wait_procs(processes, timeout=GONE_S if told else 0.0)[1]
     for process in left:
         with contextlib.suppress(psutil.NoSuchProcess):
             process.kill()

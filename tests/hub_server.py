@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A Hub on 127.0.0.1: as much of its protocol as huggingface_hub 1.33 speaks when it pushes and pulls.
 
 It keeps what a real one keeps apart: blobs, which any upload may leave behind, and commits, which name blobs
@@ -29,7 +17,7 @@ import json
 import re
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -63,6 +51,19 @@ class Fault:
     """One byte of the answer is another."""
     times: int = 1
     """How often."""
+
+
+@dataclass
+class Answer:
+    """What is about to be sent."""
+
+    path: str
+    status: int
+    headers: dict[str, str]
+    pieces: list[bytes]
+    """Of the body;"""
+    pause_s: float = 0.0
+    """after each of them, so long."""
 
 
 @dataclass
@@ -118,6 +119,8 @@ class HubServer(ThreadingHTTPServer):
         self.blobs = folder
         self.repos: dict[tuple[str, str], Repo] = {}
         self.faults: list[Fault] = []
+        self.change: Callable[[Answer], Answer] | None = None
+        """Makes another answer of every answer."""
         self.journal: list[tuple[str, str, int]] = []
         """(method, path, status) of every request that was answered."""
         self.uploaded: list[str] = []
@@ -223,12 +226,21 @@ class Handler(BaseHTTPRequestHandler):
         self._note(unquote(urlsplit(self.path).path), status)
         if self.fault is not None and self.fault.spoil and data:
             data = data[:-1] + bytes([data[-1] ^ 1])
-        self.send_response(status)
-        for key, value in ({"Content-Length": str(len(data))} | headers).items():
+        headers = {"Content-Length": str(len(data))} | headers
+        answer = Answer(unquote(urlsplit(self.path).path), status, headers, [data])
+        if self.server.change is not None:
+            answer = self.server.change(answer)
+            answer.headers["Connection"] = "close"  # its length may be wrong
+            self.close_connection = True
+        self.send_response(answer.status)
+        for key, value in answer.headers.items():
             self.send_header(key, value)
         self.end_headers()
-        if self.command != "HEAD":
-            self.wfile.write(data)
+        for piece in answer.pieces if self.command != "HEAD" else ():
+            self.wfile.write(piece)
+            if answer.pause_s:
+                self.wfile.flush()
+                time.sleep(answer.pause_s)
 
     def _json(self, value: Any, status: int = 200) -> None:
         self._send(status, json.dumps(value).encode(), {"Content-Type": "application/json"})

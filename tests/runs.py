@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Runs small enough for tests."""
 
 from __future__ import annotations
@@ -30,6 +18,12 @@ from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 
 HANGS_S = 240.0
+
+
+def replacing(arguments: list[str], *more: str) -> list[str]:
+    """A command line in which `more` replaces flags of the same names."""
+    names = {argument.partition("=")[0] for argument in more}
+    return [a for a in arguments if a.partition("=")[0] not in names] + list(more)
 
 
 def tiny_run(checkpoint: Path, **rooms: Any) -> RunConfig:

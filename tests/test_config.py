@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Recipes and overrides into configs; every mistake is one line with field, value and remedy, exit code 2."""
 
 from __future__ import annotations
@@ -18,12 +6,12 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import pytest
 import yaml
 
-from accerl_lerobot import cli, parsing
+from accerl_lerobot import cli, parsing, preflight
 from accerl_lerobot.algorithms import GIPOConfig, PPOConfig
 from accerl_lerobot.config import DatasetConfig, RunConfig, check_chunk, encode, parse
 from accerl_lerobot.demos.sft import SFTConfig
@@ -32,6 +20,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.field_help import help_text
 from accerl_lerobot.policies.backbone import BackboneConfig
 from accerl_lerobot.preflight import check_sft_policy, check_start
+from accerl_lerobot.ranges import Positive, Range, Share
 from accerl_lerobot.verb_configs import DemosRun, EvalRun, SFTRun
 
 ROOT = Path(__file__).parents[1]
@@ -71,7 +60,7 @@ class TestOverrides:
         config = parse(RunConfig, ["--imagination.replay.ahead=100", "--imagination.learn.trial.most=7"])
         assert config.imagination.replay == replace(usual.replay, ahead=100)
         assert config.imagination.learn.trial == replace(usual.learn.trial, most=7)
-        text = help_text("train", RunConfig, "train")
+        text = help_text("train", RunConfig, "train", "all")
         assert f"--imagination.replay.capacity={usual.replay.capacity} " in text
         assert f"--imagination.learn.trial.auroc={usual.learn.trial.auroc} " in text
 
@@ -142,47 +131,53 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--traner.lr=1"], "traner={'lr': 1}: no such field; did you mean trainer?"),
     (["--wandb.zzz=1"], "wandb.zzz=1: no such field; wandb has enable, project, entity"),
     (["--trainer.lr=many"], "trainer.lr='many': use a number"),
-    (["--trainer.lr=2"], "trainer.lr=2.0: use a value in [0, 1), e.g. 1e-4"),
-    (["--trainer.lr=-1e-4"], "trainer.lr=-0.0001: use a value in [0, 1), e.g. 1e-4"),
-    (["--trainer.lr=.nan"], "trainer.lr=nan: use a value in [0, 1), e.g. 1e-4"),
+    (["--trainer.lr=2"], "trainer.lr=2.0: use a number in [0, 1)"),
+    (["--trainer.lr=-1e-4"], "trainer.lr=-0.0001: use a number in [0, 1)"),
+    (["--trainer.lr=.nan"], "trainer.lr=nan: use a number in [0, 1)"),
     (["--rollout.decision_cost=nan"], "rollout.decision_cost=nan: use a number"),
     (["--trainer.updates=1.5"], "trainer.updates=1.5: use a whole number"),
     (["--trainer.updates=true"], "trainer.updates=True: use a whole number"),
     (["--trainer.updates=null"], "trainer.updates=None: use a whole number"),
     (["--trainer.updates"], "trainer.updates='': give it a value: --trainer.updates=…"),
-    (["--trainer=3"], "trainer=3: a room, not a value; use --trainer.field=value"),
+    (["--trainer=3"], "trainer=3: a config section; use --trainer.field=value"),
     (["--trainer.betas=[1]"], "trainer.betas=[1]: use a list of 2, each a number"),
     (["--sft.extra_args={a: 1}"], "sft.extra_args={'a': 1}: use a list such as [a, b], each text"),
     (["--trainer.betas=[true, 0.9]"], "trainer.betas=[True, 0.9]: use a list of 2, each a number"),
     (["--trainer.betas=0.9"], "trainer.betas=[0.9]: use a list of 2, each a number"),
     (["--sft.backbone.hidden=x"], "sft.backbone.hidden='x': use a whole number"),
     (["--sft.backbone.hidden=6"], "sft.backbone.heads=4: use a divisor of the width 6"),
-    (["--policy.num_steps=x"], "policy.num_steps='x': use a whole number or null"),
+    (["--policy.num_steps=x"], "policy.num_steps='x': use a whole number from 1 to 10,000 or null"),
     (["--policy.rename_map=3"], "policy.rename_map=3: use a mapping such as {key: value}"),
     (["--wandb.enable=perhaps"], "wandb.enable='perhaps': use true or false"),
     (["--env.task=[a]"], "env.task=['a']: use text"),
-    (["--algorithm.level=row"], "algorithm.level='row': use one of token, action, chunk"),
+    (["--algorithm.level=row"], "algorithm.level='row': use token, action or chunk"),
     (
         ["--algorithm.type=gippo"],
         "algorithm.type='gippo': did you mean gipo? Otherwise use one of awr, decoupled, gipo, is, ppo, sapo",
     ),
-    (["--algorithm.type=is", "--algorithm.cap=0.5"], "algorithm.cap=0.5: use a finite number from 1 up"),
-    (["--algorithm.type=decoupled", "--algorithm.proximal_every=0"], "algorithm.proximal_every=0: use at"),
+    (["--algorithm.type=is", "--algorithm.cap=0.5"], "algorithm.cap=0.5: use a number of at least 1 or null"),
+    (
+        ["--algorithm.type=decoupled", "--algorithm.proximal_every=0"],
+        "algorithm.proximal_every=0: use a",
+    ),
     (["--algorithm.sigma=0"], "algorithm.sigma=0.0: use a number above 0"),
     (["--env.type=mujoco"], "env.type='mujoco': use one of lerobot, metaworld, simulated"),
     (["--env.task=drawer-v3"], "env.task='drawer-v3': 'drawer-v3' is not a MetaWorld task; did you mean"),
-    (["--env.max_steps=0"], "env.max_steps=0: use 1 to 500 env steps"),
-    (["--seed=100"], "seed=100: use 0 to 99"),
+    (["--env.max_steps=0"], "env.max_steps=0: use a whole number from 1 to 500"),
+    (["--seed=-1"], "seed=-1: use a whole number from 0 to 4,294,967,295"),
+    (["--trainer.betas=[0.9, 1.5]"], "trainer.betas=(0.9, 1.5): use a list of 2, each a number in [0, 1)"),
+    (["--rollout.decision_cost=inf"], "rollout.decision_cost=inf: use a number of at least 0"),
+    (["--policy.device=foo"], "policy.device='foo': use auto, cpu, cuda or cuda:0"),
     (["--launch.engine=slurm"], "launch.engine='slurm': use ray or local"),
-    (["--launch.transport=tcp"], "launch.transport='tcp': use one of auto, ray, shared_memory"),
-    (["--launch.weights=mpi"], "launch.weights='mpi': use one of ray, gloo"),
+    (["--launch.transport=tcp"], "launch.transport='tcp': use auto, ray or shared_memory"),
+    (["--launch.weights=mpi"], "launch.weights='mpi': use ray or gloo"),
     (["--launch.weights=gloo", "--launch.engine=local"], "launch.weights='gloo': launch.engine=local is one"),
     (
         ["--launch.weights=gloo", "--launch.transport=shared_memory"],
         "launch.weights='gloo': launch.transport=shared_memory leaves nothing to it; use auto",
     ),
     (["--rollout.group_size=1"], "rollout.group_size=1: groups of one have no comparison; use 0"),
-    (["--rollout.group_advantage=gae"], "rollout.group_advantage='gae': use one of grpo, rloo, grpo_no_std"),
+    (["--rollout.group_advantage=gae"], "rollout.group_advantage='gae': use grpo, rloo or grpo_no_std"),
     (
         ["--trainer.hold_back=50"],
         "replay.max_lag=50: use more than trainer.hold_back, 50, or all is",
@@ -199,16 +194,38 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--sft.policy.chunk_size=5"], "sft.policy={'chunk_size': 5}: name LeRobot's policy type, e.g."),
     (
         ["--sft.steps=5", "--sft.policy.type=smolvla", "--sft.policy.chunk_size=0"],
-        "sft.policy.chunk_size=0: use a whole number from 1 up",
+        "sft.policy.chunk_size=0: use a whole number from 1 to 10,000",
     ),
-    (["here.yaml", "there.yaml"], "argument='there.yaml': write --room.field=value"),
+    (["--steps=3"], "steps=3: the name is LeRobot's; use trainer.updates (RL) or sft.steps (fine-tuning)"),
+    (
+        ["--batch_size=8"],
+        "batch_size=8: the name is LeRobot's; use trainer.batch_decisions",
+    ),
+    (["--eval.n_episodes=3"], "eval.n_episodes=3: the name is LeRobot's; use evaluation.episodes"),
+    (["--policy.push_to_hub=false"], "policy.push_to_hub=False: the name is LeRobot's; a run pushes nothing"),
+    (["--algorithm.type=grpo"], "algorithm.type='grpo': use ppo or gipo with --algorithm.advantage=group"),
+    (["--env.type=vlabench"], "env.type='vlabench': for LeRobot's vlabench use env.type=lerobot --env.name="),
+    (
+        ["--path=x"],
+        "path='x': not a field of this command, but of accerl world-model-eval",
+    ),
+    (["--seed=1", "--seed=2"], "seed=2: it is set to 1 already; give it once"),
+    (["--seed=0x_"], "seed='0x_': use a whole number"),
+    (["--job_name=" + "x" * 5000], "job_name='xxx"),
+    (["--trainer..lr=1"], "argument='--trainer..lr=1': write --section.field=value"),
+    (["--rollout.workers=100000"], "rollout.workers=100000: use a whole number from 1 to 1,000"),
+    (
+        ["--sft.backbone.layers=1000", "--sft.backbone.hidden=65536", "--sft.backbone.heads=8"],
+        "sft.backbone.hidden",
+    ),
+    (["here.yaml", "there.yaml"], "argument='there.yaml': write --section.field=value"),
     (["--config_path=here.yaml", "--config_path=there.yaml"], "config_path='there.yaml': there is here.yaml"),
-    (["--seed=1", "seed=2"], "argument='seed=2': write --room.field=value"),
+    (["--seed=1", "seed=2"], "argument='seed=2': write --section.field=value"),
     (["--seed=1", "--seed.x=2"], "seed.x=2: seed is set to 1 already"),
 ]
 
 
-@pytest.mark.parametrize(("arguments", "message"), MISTAKES, ids=[" ".join(a) for a, _ in MISTAKES])
+@pytest.mark.parametrize(("arguments", "message"), MISTAKES, ids=[" ".join(a)[:80] for a, _ in MISTAKES])
 def test_mistakes(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["train", *arguments]) == 2
     out, err = capsys.readouterr()
@@ -248,7 +265,32 @@ def test_a_mistake_in_a_recipe_is_named_like_one_on_the_command_line(
     path = tmp_path / "recipe.yaml"
     path.write_text("trainer:\n  updates: lots\n")
     assert cli.main(["train", str(path)]) == 2
-    assert capsys.readouterr().err == "accerl: trainer.updates='lots': use a whole number\n"
+    assert (
+        capsys.readouterr().err
+        == "accerl: trainer.updates='lots': use a whole number from 0 to 1,000,000,000\n"
+    )
+
+
+def test_odd_text_stays_text() -> None:
+    for text in ("{[1]: 2}", "[" * 900, "2024-13-45", "!!timestamp x", "&a [*a]", "*x"):
+        assert parse(RunConfig, [f"--job_name={text}"]).job_name == text
+
+
+def test_sizes_far_beyond_the_machine_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("accerl_lerobot.doctor.total_memory_gib", lambda: 16.0)
+    preflight.check_machine(parse(RunConfig, ["--rollout.workers=8"]))
+    with pytest.raises(InputError, match=r"rollout\.worlds=8: the run needs about .* GiB of memory"):
+        preflight.check_machine(parse(RunConfig, ["--rollout.workers=100"]))
+    with pytest.raises(InputError, match=r"replay\.capacity=50000000"):
+        preflight.check_machine(parse(RunConfig, ["--replay.capacity=50000000"]))
+    with pytest.raises(InputError, match=r"evaluation\.videos=1000"):
+        preflight.check_machine(
+            parse(
+                RunConfig,
+                ["--evaluation.videos=1000", "--evaluation.video_size=4096", "--evaluation.episodes=1000"],
+            )
+        )
+    preflight.check_machine(parse(RunConfig, ["--rollout.workers=100", "--launch.address=auto"]))
 
 
 def test_groups_serve_either_kind_of_advantage() -> None:
@@ -264,7 +306,7 @@ def test_long_values_are_shortened() -> None:
 
 @pytest.mark.parametrize("size", [0, -1, 2.0, "2", True, None])
 def test_chunk_sizes_are_whole_and_positive(size: Any) -> None:
-    with pytest.raises(InputError, match="sft.policy.chunk_size=.*: use a whole number from 1 up"):
+    with pytest.raises(InputError, match="sft.policy.chunk_size=.*: use a whole number from 1 to 10,000"):
         check_chunk({"type": "smolvla", "chunk_size": size})
 
 
@@ -272,6 +314,67 @@ def test_no_more_is_executed_than_predicted() -> None:
     check_chunk({"chunk_size": 5, "n_action_steps": 5})
     with pytest.raises(InputError, match=r"sft.policy.n_action_steps=6: use 1 to sft.policy.chunk_size, 5"):
         check_chunk({"chunk_size": 5, "n_action_steps": 6})
+
+
+ARENA = f"them/arena@{'0123456789' * 4}"
+
+
+class TestConsent:
+    """A file cannot let code run, whoever wrote it; the command line can."""
+
+    @pytest.mark.parametrize(
+        ("text", "flag"),
+        [
+            ("policy: {trust_remote_code: true}", "--policy.trust_remote_code=true"),
+            ("policy: {code_revision: abc}", "--policy.code_revision=abc"),
+            ("sft: {trust_remote_code: yes}", "--sft.trust_remote_code=true"),
+            ("sft: {extra_args: [--code_revision=x]}", "'--sft.extra_args=[\"--code_revision=x\"]'"),
+            ("sft: {policy: {discover_packages_path: os}}", "--sft.policy.discover_packages_path=os"),
+            ("sft: {policy: {vision.trust_remote_code: 1}}", "--sft.policy.vision.trust_remote_code=1"),
+            ("env: {type: lerobot, trust_remote_code: true}", "--env.trust_remote_code=true"),
+            (f"env: {{type: lerobot, kwargs: {{hub_path: {ARENA}}}}}", f"--env.kwargs.hub_path={ARENA}"),
+            ("imagination: {discover_packages_path: os}", "--imagination.discover_packages_path=os"),
+            ("imagination: {success: {code_revision: a}}", "--imagination.success.code_revision=a"),
+            ("launch: {address: 'them:6379'}", "--launch.address=them:6379"),
+            ("launch: {open_cluster: true}", "--launch.open_cluster=true"),
+            ("a: &a {trust_remote_code: true}\nsft: *a", "--a.trust_remote_code=true"),
+            ('sft: {extra_args: ["\\e[2J"]}', "\\u001b"),
+        ],
+    )
+    def test_of_a_file_is_none(self, tmp_path: Path, text: str, flag: str) -> None:
+        path = tmp_path / "config.yaml"
+        path.write_text(text)
+        with pytest.raises(InputError) as caught:
+            parse(RunConfig, [str(path)])
+        assert "a file cannot allow this, only the command line can" in str(caught.value)
+        assert flag in str(caught.value) and "\x1b" not in caught.value.remedy
+
+    def test_is_given_again_where_a_file_has_it(self, tmp_path: Path) -> None:
+        path = tmp_path / "config.yaml"
+        env = LeRobotEnvConfig(name="isaaclab_arena", trust_remote_code=True, kwargs={"hub_path": ARENA})
+        path.write_text(yaml.safe_dump(encode(RunConfig(env=env))))
+        with pytest.raises(
+            InputError, match=f"add --env.kwargs.hub_path={ARENA} --env.trust_remote_code=true$"
+        ):
+            parse(RunConfig, [str(path)])
+        flags = [f"--env.kwargs.hub_path={ARENA}", "--env.trust_remote_code=true"]
+        assert parse(RunConfig, [str(path), *flags]).env == env
+        with pytest.raises(InputError, match="^env.kwargs.hub_path="):
+            parse(RunConfig, [str(path), flags[1]])
+        assert (
+            parse(RunConfig, [str(path), "--env.type=simulated", "--env.task=match"]).env.type == "simulated"
+        )
+
+    def test_of_another_verb_does_not_matter(self, tmp_path: Path) -> None:
+        path = tmp_path / "config.yaml"
+        path.write_text("sft: {trust_remote_code: true}\nenv: {type: simulated}")
+        assert parse(EvalRun, [str(path)], recipe_class=RunConfig).env == SimulatedConfig()
+
+    def test_is_looked_for_once_in_what_aliases_repeat(self) -> None:
+        tree: Any = {"x": 1}
+        for _ in range(40):
+            tree = [tree] * 9
+        assert parsing.consents({"a": tree}) == {}
 
 
 class TestPreflight:
@@ -317,7 +420,7 @@ class TestPreflight:
         policy = {"type": "smolvla", "chunk_size": 10, "n_action_steps": 10}
         check_start(RunConfig(sft=SFTConfig(steps=1, policy=policy)))
         check_start(RunConfig(sft=SFTConfig(steps=1, policy=policy | {"type": "act"})))
-        check_start(parse(RunConfig, [f"--policy.path={tiny_checkpoint}"]))
+        check_start(parse(RunConfig, ["--env.type=simulated", f"--policy.path={tiny_checkpoint}"]))
         dataset = DatasetConfig(
             repo_id="accerl/metaworld_tiny", root=str(ROOT / "datasets" / "metaworld_tiny")
         )
@@ -338,7 +441,10 @@ def test_every_field_has_a_name_on_the_command_line() -> None:
         (float | None, "a number or null"),
         (list[str], "a list such as [a, b], each text"),
         (dict[str, int], "a mapping such as {key: value}"),
-        (Literal["a", "b"], "one of a, b"),
+        (Literal["a", "b"], "a or b"),
+        (Share, "a number from 0 to 1"),
+        (Positive | None, "a number above 0 or null"),
+        (Annotated[float, Range("[1, inf]")], "a number of at least 1, or inf"),
         (Path, "Path"),
     ],
 )

@@ -1,22 +1,11 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The doctor: right about this machine, and right about machines that lack something."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+import math
 import os
 import sys
 from pathlib import Path
@@ -25,10 +14,14 @@ from typing import Any
 
 import pytest
 import yaml
+from safetensors import safe_open
 
 from accerl_lerobot import cli, doctor
 from accerl_lerobot.config import RunConfig, decode
 from accerl_lerobot.doctor import FAIL, OK, WARN, Check
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.loading import policy_sizes
+from accerl_lerobot.preflight import check_weights_fit
 
 QUICKSTART = Path(__file__).parents[1] / "recipes" / "quickstart.yaml"
 
@@ -59,10 +52,15 @@ class TestRecipe:
     """`accerl doctor recipe.yaml`."""
 
     @pytest.mark.parametrize("form", ["{}", "--config_path={}", "--config_path {}"])
-    def test_prints_what_it_resolves_to(self, form: str, capsys: pytest.CaptureFixture[str]) -> None:
-        assert cli.main(["doctor", *form.format(QUICKSTART).split(), "--trainer.lr=1e-5"]) == 0
-        resolved, _, found = capsys.readouterr().out.partition("\n\n")
-        config = decode(RunConfig, yaml.safe_load(resolved))
+    def test_writes_what_it_resolves_to(
+        self, form: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        file = tmp_path / "resolved.yaml"
+        arguments = [*form.format(QUICKSTART).split(), "--trainer.lr=1e-5", f"--resolved={file}"]
+        assert cli.main(["doctor", *arguments]) == 0
+        found = capsys.readouterr().out
+        assert found.count("\n") <= 60 and "warn" not in found
+        config = decode(RunConfig, yaml.safe_load(file.read_text()))
         assert config.trainer.lr == 1e-5 and config.job_name == "quickstart"
         assert "ok    recipe     resolves" in found
         assert "lag        at most" in found and "work " in found and "env steps" in found
@@ -207,6 +205,24 @@ class TestResources:
         big = {"image_size": 480}
         memory = checks(self.recipe(env=big, replay={"capacity": 100_000}))["memory"]
         assert memory.status == WARN and "GiB needed: lower" in memory.text
+
+    def test_the_weights_count_in_every_process(
+        self, monkeypatch: pytest.MonkeyPatch, tiny_checkpoint: Path
+    ) -> None:
+        """By hand: weights in the trainer and in inference; the gradient, two moments, one copy, two sent."""
+        policy = {"path": str(tiny_checkpoint), "device": "cpu"}
+        config = self.recipe(policy=policy, inference={"workers": 2}, rollout={"workers": 2})
+        without = doctor.memory_estimate_gib(self.recipe(inference={"workers": 2}, rollout={"workers": 2}))
+        check_weights_fit(config)
+        sizes = policy_sizes(config.policy)
+        with safe_open(tiny_checkpoint / "model.safetensors", "np") as file:
+            stored = sum(math.prod(file.get_slice(name).get_shape()) for name in file.keys())  # noqa: SIM118
+        assert stored <= sizes.policy < 1.2 * stored and sizes.trained > 0
+        need = 4 * (3 * sizes.policy + 6 * sizes.trained) / 2**30
+        assert doctor.memory_estimate_gib(config) - without == pytest.approx(need)
+        monkeypatch.setattr(doctor, "total_memory_gib", lambda: 0.99 * need)
+        with pytest.raises(InputError, match="^policy.path=.*its weights take 0.0 GiB in the processes"):
+            check_weights_fit(config)
 
     def test_a_policy_that_looks_back_keeps_more_pictures(self) -> None:
         config = self.recipe(replay={"capacity": 10_000})

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Runs in which the policy learns from dreams too, through either engine."""
 
 from __future__ import annotations
@@ -18,7 +6,6 @@ from __future__ import annotations
 import os
 import signal
 import threading
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,12 +19,13 @@ from accerl_lerobot.checkpoint import TRAINING_STATE
 from accerl_lerobot.config import DatasetConfig, RunConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.export_dreams import write_dreams
-from accerl_lerobot.demos.windows import check_dataset
+from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.engine import Progress
-from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Segment
 from accerl_lerobot.local import LocalEngine
+from accerl_lerobot.preflight import check_features, dataset_features, env_features
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.run import train
@@ -285,8 +273,9 @@ def test_it_runs_asynchronously_with_two_who_dream(tiny_checkpoint: Path, world_
     assert all(dream.observations.keys() == kept[0].observations.keys() for dream in kept)
     assert all(dream.decisions_per_s == 80 / 4 and 1 <= len(dream) <= 2 for dream in kept)
     write_dreams(kept, tmp_path / "set", "some/dreams", "simulated", Console())
-    with pytest.raises(InputError, match=r"action has shape \(8,\) here and \(2,\) in the world"):
-        check_dataset(DatasetConfig(repo_id="some/dreams", root=str(tmp_path / "set")), ENV, {})
+    made = dataset_features(open_metadata(DatasetConfig(repo_id="some/dreams", root=str(tmp_path / "set"))))
+    with pytest.raises(InputError, match=r"its action is \(8,\), but \(2,\) in the environment"):
+        check_features(made, env_features(make_world(ENV).spec), {}, "dataset.repo_id", "some/dreams")
 
 
 @pytest.mark.parametrize(
@@ -296,15 +285,12 @@ def test_it_runs_asynchronously_with_two_who_dream(tiny_checkpoint: Path, world_
 def test_one_that_hangs_is_found_when_it_is_saved(kind: type, name: str, what: str, tmp_path: Path):
     """And not after the minutes that large files may take; `accerl bench faults` does it to a whole run."""
     worker, held = object.__new__(kind), threading.Lock()
-    worker._limit, worker._promoted = 0.2, "something that nobody takes over"
+    worker._limit, worker._promoted = 1.0, "something that nobody takes over"
     setattr(worker, name, held)
-    with (
-        held,
-        pytest.raises(TimeoutError, match=f"a step of {what} has not ended for .* raise launch.stall_s"),
-    ):
-        began = time.monotonic()
+    message = f"a step of {what} has not ended for 1 s or more; raise launch.stall_s"
+    with held, pytest.raises(TimeoutError, match=message):
         worker.save(tmp_path)
-    assert 0.15 < time.monotonic() - began < 5.0 and not held.locked()
+    assert not held.locked()
 
 
 def test_asynchronously_a_run_ends_when_its_episodes_are_used_up(tiny_checkpoint: Path):

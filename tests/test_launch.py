@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The asynchronous engine with the real workers: one run at learning rate 0 that loses a rollout worker.
 
 At rate 0 every policy is the same policy, so whatever happens to weights, observations and latents on their
@@ -127,7 +115,7 @@ def test_all_updates_are_made_and_reported_once(story: Story):
 
 
 def test_at_learning_rate_zero_every_ratio_is_one(story: Story):
-    assert max(u["ratio_max_dev"] for u in story.updates) <= 1e-5
+    assert max(u["ratio_max_dev"] for u in story.updates) <= 1e-4
     assert max(abs(u["approx_kl"]) for u in story.updates) <= 1e-8
     assert all(u["ess"] > 0.9999 and u["clip_fraction"] == 0 and u["skipped"] == 0 for u in story.updates)
 

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The one-process engine: deterministic, and it learns."""
 
 from __future__ import annotations
@@ -240,7 +228,7 @@ def test_without_learning_success_stays_where_it_was(tiny_checkpoint: Path):
     history = drive(engine)
     assert success(engine) == before
     engine.close()
-    assert max(u["ratio_max_dev"] for u in updates(history)) <= 1e-5
+    assert max(u["ratio_max_dev"] for u in updates(history)) <= 1e-4
     assert any(u["lag_mean"] > 0 for u in updates(history))
 
 

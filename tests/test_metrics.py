@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A run's numbers on disk: one JSON object a line, the same in TensorBoard, nothing JSON cannot hold."""
 
 from __future__ import annotations
@@ -184,6 +172,22 @@ def test_the_summary_is_explained() -> None:
     assert whens <= logged and logged - whens == set(re.findall(r"`([a-z_0-9]+)`", text)) - whens
 
 
+def test_progress_says_how_much_time_is_left(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("accerl_lerobot.console.PLAIN_EVERY_S", -1.0)
+    now = iter(range(0, 10_000, 60))
+    monkeypatch.setattr("accerl_lerobot.console.time.monotonic", lambda: float(next(now)))
+    with Console().stage("RL", total=500) as stage:
+        stage.update(100, "resumed at 100")
+        stage.update(200, "and a minute later")
+        stage.update(500)
+    err = capsys.readouterr().err
+    assert "RL 100/500 (20%) · resumed at 100" in err
+    assert "RL 200/500 (40%) · 0:03:00 left · and a minute later" in err
+    assert "RL 500/500 (100%)\n" in err
+
+
 def test_console_without_a_terminal_prints_lines(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -194,4 +198,4 @@ def test_console_without_a_terminal_prints_lines(
     console.say("success [not markup]")
     out, err = capsys.readouterr()
     assert out == ""
-    assert "SFT …" in err and "SFT 4/10 loss 0.5" in err and "success [not markup]" in err
+    assert "SFT …" in err and "SFT 4/10 (40%) · loss 0.5" in err and "success [not markup]" in err

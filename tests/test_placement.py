@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Which worker goes where, on made-up clusters."""
 
 from __future__ import annotations
@@ -23,8 +11,9 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot.config import LaunchConfig, RunConfig
+from accerl_lerobot.config import LaunchConfig, RunConfig, decode
 from accerl_lerobot.console import Console
+from accerl_lerobot.engine import WorkerError
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.placement import Node, Plan, planned
@@ -223,21 +212,23 @@ def test_a_rollout_worker_whose_node_has_left_goes_to_one_that_is_there():
         plan = plan.moved(name, place)
     assert rollouts_by_node(plan) == {0: 2, 1: 3}
     assert plan.instead("rollout 1", frozenset({"key0"})).node.number == 0
+    with pytest.raises(WorkerError, match="rollout 1 worker is lost, and no node is left"):
+        plan.instead("rollout 1", frozenset())  # a worker's loss may be noticed before its node's
 
 
 @pytest.mark.parametrize(
     ("role", "fields", "match"),
     [
         ("trainer", {"gpus": 1.5}, r"trainer\.gpus=1\.5: use a share in \[0, 1\] or a whole number"),
-        ("inference", {"gpus": -1.0}, r"inference\.gpus=-1\.0: use a share"),
-        ("rollout", {"cpus": -1.0}, r"rollout\.cpus=-1\.0: use 0"),
+        ("inference", {"gpus": -1.0}, r"inference\.gpus=-1\.0: use a number of at least 0"),
+        ("rollout", {"cpus": -1.0}, r"rollout\.cpus=-1\.0: use a number of at least 0"),
         ("rollout", {"gpus": 0.5}, r"rollout\.gpus=0\.5: rollout workers have no network"),
         ("imagination", {"nodes": " "}, r"imagination\.nodes=' ': name a node"),
     ],
 )
 def test_values_that_mean_nothing_are_refused(role: str, fields: dict[str, Any], match: str):
     with pytest.raises(InputError, match=rf"launch\.placement\.{match}"):
-        PlacementConfig(**{role: RoleConfig(**fields)})
+        decode(RunConfig, {"launch": {"placement": {role: fields}}})
 
 
 @pytest.mark.parametrize(

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What must hold of the repository itself, whoever adds a file to it."""
 
 from __future__ import annotations
@@ -35,11 +23,8 @@ from accerl_lerobot.verbs import CONFIGS
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "accerl_lerobot"
 
-HEADER = (
-    "# Copyright 2026 The accerl-lerobot authors.\n#\n"
-    '# Licensed under the Apache License, Version 2.0 (the "License");\n'
-)
-LONGEST_FILE = 400
+HEADER = "# SPDX-License-Identifier: Apache-2.0\n"
+LONGEST_FILE = 600
 WAYS = {"direct.py", "pair.py", "ray_channel.py", "ray_calls.py", "transport_ends.py"}
 RAYS = WAYS | {"peers.py", "weights_readers.py"}
 CONDUCTOR = {"launch.py", "cluster.py", "own_ray.py", "seats.py", "services.py", "watched.py"}

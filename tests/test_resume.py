@@ -1,22 +1,11 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A run that was stopped, or killed, and gone on with by its command line."""
 
 from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -169,6 +158,13 @@ def test_more_updates_may_be_asked_for_and_nothing_else(whole: Path, capsys: pyt
     assert go_on(whole, "--env.type=metaworld") == 2
     assert {path: path.read_bytes() for path in whole.rglob("*") if path.is_file()} == before
     capsys.readouterr()
+
+
+def test_a_finished_run_goes_back_to_an_earlier_checkpoint(whole: Path, tmp_path: Path):
+    run = tmp_path / "run"
+    shutil.copytree(whole, run, symlinks=True)
+    assert go_on(run, config="checkpoints/000010/config.yaml") == 0
+    assert records(run) == records(whole) and summary(run) == summary(whole)
 
 
 def test_what_is_no_run_is_refused(

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A run from its command to its summary, in one process."""
 
 from __future__ import annotations
@@ -144,7 +132,7 @@ def test_the_video_shows_before_and_after(finished: Finished):
     with imageio.get_reader(finished.directory / "before_after.mp4") as reader:
         frames = [frame for frame in reader]  # noqa: C416 - its length is unknown, so `list` fails
     height, width, channels = frames[0].shape
-    assert len(frames) > 10 and channels == 3 and height == 2 * 32 + 4 and width % 2 == 0 and width >= 32
+    assert len(frames) > 10 and channels == 3 and height > 32 and width >= 2 * 32
     assert any((frame != frames[0]).any() for frame in frames)
 
 
@@ -235,7 +223,7 @@ def _succeeded(plan: EpisodePlan) -> EpisodeResult:
 def scripted(monkeypatch: pytest.MonkeyPatch, config: RunConfig) -> Scripted:
     engine = Scripted(config)
     monkeypatch.setattr(run, "make_engine", lambda *_: engine)
-    monkeypatch.setattr(run, "check_policy", lambda config: 1)
+    monkeypatch.setattr(run, "check_policy", lambda config, **_: 1)
     return engine
 
 
@@ -273,7 +261,7 @@ def losing(monkeypatch: pytest.MonkeyPatch, config: RunConfig, lost_at: list[int
         return engine
 
     monkeypatch.setattr(run, "make_engine", make)
-    monkeypatch.setattr(run, "check_policy", lambda config: 1)
+    monkeypatch.setattr(run, "check_policy", lambda config, **_: 1)
     monkeypatch.setattr(run, "pause_s", lambda times: 0.01 * times)
     return made
 

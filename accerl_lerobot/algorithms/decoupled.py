@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Decoupled PPO: the clip measures how far one update moves, not how stale a sample is (Hilton et al., arXiv
 2110.00641; AReaL, arXiv 2505.24298).
 
@@ -32,12 +20,13 @@ Deviations:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput
 from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
 from accerl_lerobot.algorithms.ppo import PPOConfig, clipped_surrogate
 from accerl_lerobot.algorithms.ratio import at_level, ratio
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.ranges import Range
 
 
 @AlgorithmConfig.register_subclass("decoupled")
@@ -45,23 +34,16 @@ from accerl_lerobot.errors import InputError
 class DecoupledConfig(PPOConfig):
     """Settings of decoupled PPO; the clip range is that of π/π_prox."""
 
-    behaviour_cap: float = 2.0
-    """Samples whose w = π_prox/μ is above this are masked, ≥ 1; ``inf`` masks none."""
-    proximal_every: int = 4
-    """Updates for which proximal weights are kept, ≥ 1. Above 1 the trainer holds a copy of the policy's
+    behaviour_cap: Annotated[float, Range("[1, inf]")] = 2.0
+    """Samples whose w = π_prox/μ is above this are masked; ``inf`` masks none."""
+    proximal_every: Annotated[int, Range("[1, 1000000]")] = 4
+    """Updates for which proximal weights are kept. Above 1 the trainer holds a copy of the policy's
     weights and re-scores batches under it."""
 
     @property
     def proximal_updates(self) -> int:
         """See the base class."""
         return self.proximal_every
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.behaviour_cap >= 1.0:
-            raise InputError("algorithm.behaviour_cap", self.behaviour_cap, "use a number from 1 up, or inf")
-        if self.proximal_every < 1:
-            raise InputError("algorithm.proximal_every", self.proximal_every, "use at least 1 update")
 
 
 def decoupled_loss(inputs: LossInputs, config: DecoupledConfig) -> LossOutput:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What is logged about every update, and what each number means.
 
 ``approx_kl``
@@ -34,13 +22,15 @@
 ``lag_mean``, ``lag_p95``, ``lag_max``
     Trainer version − sample version, in updates.
 ``decisions``
-    Valid decisions in the batch.
+    Decisions in the batch.
 
-Nothing here waits for the device: masks are applied by filling, not by indexing. Inputs carry no gradient.
+Masks, of ratios that exist, are applied by filling and not by indexing, so nothing waits for the device.
+Inputs carry no gradient.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from accerl_lerobot.algorithms.ratio import masked_mean, ratio
@@ -83,67 +73,84 @@ def clip_fraction(rho: Tensor, low: float, high: float, mask: Tensor | None = No
 def quantiles(x: Tensor, points: dict[str, float], mask: Tensor | None = None) -> dict[str, Tensor]:
     """Linear-interpolated quantiles of the valid entries, each (); NaN when there is none."""
     if mask is not None:
-        x = x.masked_fill(~_spread(mask, x), float("nan"))
+        x = x.masked_fill(~mask, float("nan"))
     flat = x.flatten()
     return {name: flat.nanquantile(point) for name, point in points.items()}
 
 
-def explained_variance(value: Tensor, returns: Tensor, mask: Tensor | None = None) -> Tensor:
+def explained_variance(value: Tensor, returns: Tensor) -> Tensor:
     """1 − Var(R − V) / Var(R), (), from (N,); 0 where the returns do not vary, as it is undefined there."""
-    spread = _variance(returns, mask)
-    explained = 1.0 - _variance(returns - value, mask) / spread.clamp(min=VARIANCE_FLOOR)
+    spread = returns.var(correction=0)
+    explained = 1.0 - (returns - value).var(correction=0) / spread.clamp(min=VARIANCE_FLOOR)
     return explained.masked_fill(spread <= VARIANCE_FLOOR, 0.0)
 
 
-def ratio_metrics(
-    log_ratio: Tensor,
-    weight: Tensor,
-    mask: Tensor | None = None,
-    *,
-    clip: tuple[float, float],
-    clipped: Tensor | None = None,
-    pull: Tensor | None = None,
-) -> dict[str, Tensor]:
-    """All that is said about ρ and ω; keys are explained at the top.
+@dataclass(frozen=True, kw_only=True)
+class Samples:
+    """What the metrics of one batch are computed from, without gradient; parts of a batch are joined first.
 
-    Args:
-        log_ratio: (N, F), 0 at padding.
-        weight: (N, F), ω.
-        mask: bool (N, F) or (N,), or None.
-        clip: (low, high) of the clip range.
-        clipped: (N, F), log of the ratios that are clipped; None: `log_ratio`.
-        pull: (N, F), what stands before Â∇log π; None: ω·ρ.
+    Quantiles, the effective sample size and explained variance of a batch are not means of those of its
+    micro-batches, so they are computed once, from the samples of all micro-batches and ranks.
     """
-    rho = ratio(log_ratio)
-    points = {"log_ratio_p05": 0.05, "log_ratio_p50": 0.5, "log_ratio_p95": 0.95}
-    return {
-        "approx_kl": approx_kl(log_ratio, mask),
-        "ess": ess_share(weight * rho if pull is None else pull, mask),
-        "low_weight": share_below(weight, LOW_WEIGHT, mask),
-        "clip_fraction": clip_fraction(rho if clipped is None else ratio(clipped), *clip, mask),
-        "ratio_max_dev": (rho - 1.0).abs().max(),
-        **quantiles(log_ratio, points, mask),
-    }
+
+    log_ratio: Tensor
+    """(N, F), 0 where a ratio does not exist."""
+    weight: Tensor
+    """(N, F), ω."""
+    pull: Tensor
+    """(N, F), the factor before Â∇log π."""
+    clipped: Tensor
+    """(N, F), log of the ratios that are clipped."""
+    keep: Tensor
+    """bool (N, F), the ratios that count."""
+    value: Tensor
+    """(N,), V."""
+    returns: Tensor
+    """(N,), R."""
+    clip: tuple[float, float]
+    """(low, high) of the clip range."""
+
+    def rows(self) -> Tensor:
+        """All of it on the CPU, float64 (N, 5F + 2), for `joined`."""
+        import torch
+
+        wide = (self.log_ratio, self.weight, self.pull, self.clipped, self.keep)
+        narrow = (self.value, self.returns)
+        return torch.cat([*(x.double().cpu() for x in wide), *(x.double().cpu()[:, None] for x in narrow)], 1)
+
+    def joined(self, rows: Tensor) -> Samples:
+        """The samples of a whole batch, from the `rows` of its parts in any order, laid end to end."""
+        *wide, narrow = rows.split([*[self.log_ratio.shape[1]] * 5, 2], dim=1)
+        value, returns = narrow.unbind(1)
+        return Samples(
+            **dict(zip(("log_ratio", "weight", "pull", "clipped"), wide, strict=False)),
+            keep=wide[4].bool(),
+            value=value,
+            returns=returns,
+            clip=self.clip,
+        )
+
+    def metrics(self) -> dict[str, Tensor]:
+        """Scalars; keys are explained at the top."""
+        rho = ratio(self.log_ratio)
+        points = {"log_ratio_p05": 0.05, "log_ratio_p50": 0.5, "log_ratio_p95": 0.95}
+        return {
+            "approx_kl": approx_kl(self.log_ratio, self.keep),
+            "ess": ess_share(self.pull, self.keep),
+            "low_weight": share_below(self.weight, LOW_WEIGHT, self.keep),
+            "clip_fraction": clip_fraction(ratio(self.clipped), *self.clip, self.keep),
+            "ratio_max_dev": (rho - 1.0).abs().max(),
+            **quantiles(self.log_ratio, points, self.keep),
+            "explained_variance": explained_variance(self.value, self.returns),
+        }
 
 
-def lag_metrics(version: Tensor, trainer_version: int, mask: Tensor | None = None) -> dict[str, Tensor]:
+def lag_metrics(version: Tensor, trainer_version: int) -> dict[str, Tensor]:
     """How stale a batch is, in updates.
 
     Args:
-        version: int (N,) or (S, T), the weights behind each decision.
+        version: int (N,), the weights behind each decision.
         trainer_version: updates made so far.
-        mask: bool, same shape, or None.
     """
-    lag = (trainer_version - version).flatten().float()
-    if mask is not None:
-        lag = lag.masked_fill(~mask.flatten(), float("nan"))
-    points = {"lag_p95": 0.95, "lag_max": 1.0}
-    return {"lag_mean": lag.nanmean(), **quantiles(lag, points)}
-
-
-def _spread(mask: Tensor, x: Tensor) -> Tensor:
-    return mask[:, None] if x.dim() > mask.dim() else mask
-
-
-def _variance(x: Tensor, mask: Tensor | None) -> Tensor:
-    return masked_mean((x - masked_mean(x, mask)).square(), mask)
+    lag = (trainer_version - version).float()
+    return {"lag_mean": lag.mean(), **quantiles(lag, {"lag_p95": 0.95, "lag_max": 1.0})}

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """GIPO: a Gaussian trust weight on the log-ratio instead of a clip (arXiv 2603.03955, used by AcceRL,
 2603.18464).
 
@@ -31,12 +19,12 @@ Deviations from the paper:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput
 from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
 from accerl_lerobot.algorithms.ratio import at_level, ratio
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.ranges import NonNegative, Range
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -47,19 +35,12 @@ if TYPE_CHECKING:
 class GIPOConfig(AlgorithmConfig):
     """Settings of GIPO; the defaults are the paper's."""
 
-    sigma: float = 1.0
-    """Width of the trust weight in nats of log ρ, > 0; ``inf`` is importance sampling without any clip."""
-    sigma_negative: float | None = None
-    """The width where Â ≤ 0, > 0; None is the paper's symmetric form, a later variant halves `sigma`."""
-    kl_coef: float = 0.1
-    """Weight of KL(μ‖π), the distance from the behaviour policy, ≥ 0."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("sigma", "sigma_negative"):
-            value = getattr(self, name)
-            if value is not None and not value > 0.0:
-                raise InputError(f"algorithm.{name}", value, "use a number above 0")
+    sigma: Annotated[float, Range("(0, inf]")] = 1.0
+    """Width of the trust weight in nats of log ρ; ``inf`` is importance sampling without any clip."""
+    sigma_negative: Annotated[float, Range("(0, inf]")] | None = None
+    """The width where Â ≤ 0; None is the paper's symmetric form, a later variant halves `sigma`."""
+    kl_coef: NonNegative = 0.1
+    """Weight of KL(μ‖π), the distance from the behaviour policy."""
 
 
 def trust_weight(log_ratio: Tensor, advantage: Tensor, config: GIPOConfig) -> Tensor:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Importance sampling without a clip, or truncated: the plain off-policy policy gradient, to compare with.
 
     ρ_c = min(ρ, cap)            cap None: ρ_c = ρ
@@ -26,13 +14,13 @@ sample can do. It equals GIPO with an infinite σ.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from typing import Annotated
 
 from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput
 from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
 from accerl_lerobot.algorithms.ratio import at_level, ratio
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.ranges import Range
 
 
 @AlgorithmConfig.register_subclass("is")
@@ -40,13 +28,8 @@ from accerl_lerobot.errors import InputError
 class ImportanceConfig(AlgorithmConfig):
     """Settings of importance sampling."""
 
-    cap: float | None = None
-    """Largest weight of a sample, ≥ 1; None: unbounded."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.cap is not None and not 1.0 <= self.cap < math.inf:
-            raise InputError("algorithm.cap", self.cap, "use a finite number from 1 up, or null")
+    cap: Annotated[float, Range("[1, inf)")] | None = None
+    """Largest weight of a sample; None: unbounded."""
 
 
 def importance_loss(inputs: LossInputs, config: ImportanceConfig) -> LossOutput:

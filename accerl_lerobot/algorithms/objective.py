@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What all objectives have in common: the critic, the KL penalties, the entropy bonus and the diagnostics.
 
 L = L_policy + value_coef · mean value error + kl_coef · KL(μ‖π) + reference_coef · KL(π‖π_ref)
@@ -22,13 +10,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from accerl_lerobot.algorithms.contract import AlgorithmConfig, Level, LossInputs, LossOutput
-from accerl_lerobot.algorithms.diagnostics import explained_variance, ratio_metrics
+from accerl_lerobot.algorithms.diagnostics import Samples
 from accerl_lerobot.algorithms.ratio import (
     at_level,
     kl_from_behaviour,
     kl_to_reference,
     masked_mean,
     present_in,
+    ratio,
 )
 
 if TYPE_CHECKING:
@@ -39,11 +28,8 @@ USUAL_CLIP = (0.2, 0.2)
 
 
 def advantage_column(inputs: LossInputs) -> Tensor:
-    """(N, 1), without gradient, 0 at padding: broadcasts against the (N, F) ratios, which share it."""
-    advantage = inputs.advantage.detach()
-    if inputs.mask is not None:
-        advantage = advantage.masked_fill(~inputs.mask, 0.0)
-    return advantage[:, None]
+    """(N, 1), without gradient: broadcasts against the (N, F) ratios, which share it."""
+    return inputs.advantage.detach()[:, None]
 
 
 def mean_over_ratios(x: Tensor, inputs: LossInputs, level: Level) -> Tensor:
@@ -56,8 +42,7 @@ def mean_over_ratios(x: Tensor, inputs: LossInputs, level: Level) -> Tensor:
     if inputs.ratios_per_decision is None:
         return masked_mean(x, counts)
     total = (x if counts is None else x.masked_fill(~counts, 0.0)).sum()
-    decisions = len(x) if inputs.mask is None else inputs.mask.sum().clamp(min=1)
-    return total / (decisions * inputs.ratios_per_decision)
+    return total / (len(x) * inputs.ratios_per_decision)
 
 
 def assemble(
@@ -83,8 +68,7 @@ def assemble(
         clipped: (N, F), log of the ratios that are clipped; None: `log_ratio`.
         pull: (N, F), what stands before Â∇log π; None: ω·ρ.
     """
-    mask = inputs.mask
-    value_loss, mean_entropy = masked_mean(inputs.value_error, mask), masked_mean(inputs.entropy, mask)
+    value_loss, mean_entropy = inputs.value_error.mean(), inputs.entropy.mean()
     kl = mean_over_ratios(kl_from_behaviour(log_ratio), inputs, config.level)
 
     loss = policy_loss + config.value_coef * value_loss
@@ -92,26 +76,24 @@ def assemble(
         loss = loss + config.kl_coef * kl
     if config.entropy_coef:  # an entropy that is not used may be non-finite
         loss = loss - config.entropy_coef * mean_entropy
-    metrics = {"policy_loss": policy_loss, "value_loss": value_loss, "kl": kl, "entropy": mean_entropy}
+    means = {"policy_loss": policy_loss, "value_loss": value_loss, "kl": kl, "entropy": mean_entropy}
     if config.reference_coef:
-        metrics["kl_reference"] = _reference_kl(inputs, config, log_ratio)
-        loss = loss + config.reference_coef * metrics["kl_reference"]
+        means["kl_reference"] = _reference_kl(inputs, config, log_ratio)
+        loss = loss + config.reference_coef * means["kl_reference"]
 
-    decisions = mask.sum() if mask is not None else loss.new_tensor(float(len(inputs.value)))
-    metrics |= {
-        "loss": loss,
-        "decisions": decisions.to(loss.dtype),
-        "explained_variance": explained_variance(inputs.value.detach(), inputs.returns, mask),
-    }
-    metrics |= ratio_metrics(
-        log_ratio.detach(),
-        weight.detach(),
-        present_in(inputs, config.level),
+    keep = present_in(inputs, config.level)
+    means |= {"loss": loss, "decisions": loss.new_tensor(float(len(inputs.value)))}
+    samples = Samples(
+        log_ratio=log_ratio.detach(),
+        weight=weight.detach(),
+        pull=(weight * ratio(log_ratio) if pull is None else pull).detach(),
+        clipped=(log_ratio if clipped is None else clipped).detach(),
+        keep=log_ratio.new_ones(log_ratio.shape).bool() if keep is None else keep,
+        value=inputs.value.detach(),
+        returns=inputs.returns.detach(),
         clip=clip,
-        clipped=None if clipped is None else clipped.detach(),
-        pull=None if pull is None else pull.detach(),
     )
-    return LossOutput(loss=loss, metrics={k: v.detach() for k, v in metrics.items()})
+    return LossOutput(loss=loss, means={k: v.detach() for k, v in means.items()}, samples=samples)
 
 
 def _reference_kl(inputs: LossInputs, config: AlgorithmConfig, log_ratio: Tensor) -> Tensor:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """PPO with a clip (Schulman et al., arXiv 1707.06347), asymmetric as in DAPO (arXiv 2503.14476, section 3.1).
 
     L = −E[min(ρ Â, clip(ρ, 1 − low, 1 + high) Â)]  +  the shared terms of `objective`
@@ -22,12 +10,12 @@ budget: at a large lag most samples are outside and their gradient is gone. That
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput
 from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
 from accerl_lerobot.algorithms.ratio import at_level, ratio
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.ranges import Range
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -38,17 +26,10 @@ if TYPE_CHECKING:
 class PPOConfig(AlgorithmConfig):
     """Settings of PPO."""
 
-    clip_low: float = 0.2
-    """How far ρ may fall below 1 before a sample with Â < 0 stops counting, in (0, 1)."""
-    clip_high: float = 0.28
-    """How far ρ may rise above 1 before a sample with Â > 0 stops counting, > 0."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0.0 < self.clip_low < 1.0:
-            raise InputError("algorithm.clip_low", self.clip_low, "use a number between 0 and 1")
-        if not self.clip_high > 0.0:
-            raise InputError("algorithm.clip_high", self.clip_high, "use a number above 0")
+    clip_low: Annotated[float, Range("(0, 1)")] = 0.2
+    """How far ρ may fall below 1 before a sample with Â < 0 stops counting."""
+    clip_high: Annotated[float, Range("(0, inf]")] = 0.28
+    """How far ρ may rise above 1 before a sample with Â > 0 stops counting."""
 
 
 def clipped_surrogate(rho: Tensor, advantage: Tensor, config: PPOConfig) -> tuple[Tensor, Tensor]:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Importance ratios at each level, their numerical guards, and the two KL penalties.
 
 ρ = π(a|o) / μ(a|o). μ is the behaviour policy, the one that acted; its log-prob is stored with the sample.
@@ -70,19 +58,19 @@ def at_level(x: Tensor, inputs: LossInputs, level: Level) -> Tensor:
     Raises:
         InputError: level ``action``, and the factors do not align with actions.
     """
-    if inputs.keep is not None:
-        x = x.masked_fill(~inputs.keep, 0.0)
+    if inputs.factors is not None:
+        x = x.masked_fill(~inputs.factors, 0.0)
     return _grouped(x, level, inputs.actions).sum(dim=-1)
 
 
-def present(keep: Tensor, level: Level, actions: int | None) -> Tensor:
-    """bool (N, F), the ratios that cover at least one of the factors to `keep`, bool (N, L)."""
-    return _grouped(keep, level, actions).any(dim=-1)
+def present(factors: Tensor, level: Level, actions: int | None) -> Tensor:
+    """bool (N, F), the ratios that cover at least one existing factor; `factors` is bool (N, L)."""
+    return _grouped(factors, level, actions).any(dim=-1)
 
 
 def present_in(inputs: LossInputs, level: Level) -> Tensor | None:
     """bool (N, F), the ratios that count; None: all."""
-    return None if inputs.keep is None else present(inputs.keep, level, inputs.actions)
+    return None if inputs.factors is None else present(inputs.factors, level, inputs.actions)
 
 
 def ratio(log_ratio: Tensor) -> Tensor:
@@ -135,17 +123,10 @@ def kl_to_reference(log_ratio: Tensor, log_reference: Tensor) -> Tensor:
 
 
 def masked_mean(x: Tensor, mask: Tensor | None) -> Tensor:
-    """Mean over the valid entries, a scalar; 0 when there is none.
-
-    Args:
-        x: (N,) or (N, F). Padding may be non-finite in value; it must not be so in gradient, so mask
-        earlier as well.
-        mask: bool, same shape as `x` or (N,), or None.
-    """
+    """Mean over the entries where `mask`, bool and of the same shape, is True; a scalar, 0 if none is."""
     if mask is None:
         return x.mean()
-    where = (mask[:, None] if x.dim() > mask.dim() else mask).expand_as(x)
-    return x.masked_fill(~where, 0.0).sum() / where.sum().clamp(min=1)
+    return x.masked_fill(~mask, 0.0).sum() / mask.sum().clamp(min=1)
 
 
 def _grouped(x: Tensor, level: Level, actions: int | None) -> Tensor:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """SAPO, Soft Adaptive Policy Optimization: a sigmoid gate instead of a clip (arXiv 2511.20347).
 
     f(ρ) = (4/τ) · σ(τ (ρ − 1))            τ = tau_positive where Â > 0, tau_negative elsewhere
@@ -26,13 +14,12 @@ Deviation: log ρ is clamped, see `ratio.LOG_RATIO_CLAMP`. The paper's ratio is 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput
 from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
 from accerl_lerobot.algorithms.ratio import at_level, ratio
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.ranges import Positive
 
 
 @AlgorithmConfig.register_subclass("sapo")
@@ -40,16 +27,10 @@ from accerl_lerobot.errors import InputError
 class SAPOConfig(AlgorithmConfig):
     """Settings of SAPO; the defaults are the paper's."""
 
-    tau_positive: float = 1.0
-    """Temperature where Â > 0, finite and > 0: the larger, the sooner a sample fades as ρ leaves 1."""
-    tau_negative: float = 1.05
-    """Temperature where Â ≤ 0, finite and > 0."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("tau_positive", "tau_negative"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise InputError(f"algorithm.{name}", getattr(self, name), "use a finite number above 0")
+    tau_positive: Positive = 1.0
+    """Temperature where Â > 0: the larger, the sooner a sample fades as ρ leaves 1."""
+    tau_negative: Positive = 1.05
+    """Temperature where Â ≤ 0."""
 
 
 def sapo_loss(inputs: LossInputs, config: SAPOConfig) -> LossOutput:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What asynchrony gains: the same workers, asynchronous, overlapped and synchronous, by turns in one run.
 
     S    decisions learned from per second, asynchronous over synchronous
@@ -28,7 +16,7 @@ from __future__ import annotations
 import statistics
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from rich.console import Group
 
@@ -43,6 +31,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate
+from accerl_lerobot.ranges import Positive, Range, Repeats, Seed, Steps
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
 
 ARMS: tuple[Schedule, ...] = (ASYNCHRONOUS, OVERLAP, SYNCHRONOUS)
@@ -56,33 +45,25 @@ TRIALS = 100
 class BenchAsyncVsSyncConfig(MachineryConfig):
     """What is compared, how often."""
 
-    cvs: tuple[float, ...] = (0.0, 0.1, 0.3, 0.5, 1.0)
+    cvs: tuple[Annotated[float, Range("[0, 10]")], ...] = (0.0, 0.1, 0.3, 0.5, 1.0)
     """Laws of latency: standard deviation over mean; takes the place of `latency_cv`."""
     traces: tuple[str, ...] = ()
     """More laws: files of `accerl bench latency`, each a world's own; takes the place of `latency_trace`."""
-    seconds: float = 8.0
-    """Of a block, at least, above 0."""
-    rounds: int = 3
-    """Times each arm is measured twice, forth and back, 1 or more."""
-    learning_updates: int = 18
+    seconds: Positive = 8.0
+    """Of a block, at least."""
+    rounds: Repeats = 3
+    """Times each arm is measured twice, forth and back."""
+    learning_updates: Steps = 18
     """Of each run that learns; 0: none does."""
-    seeds: tuple[int, ...] = (0, 1, 2)
+    seeds: tuple[Seed, ...] = (0, 1, 2)
     """Of those runs."""
     output_dir: str = "outputs/async_vs_sync"
     """Folder for async_vs_sync.json, .md and .png."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if any(not 0 <= cv <= 10 for cv in self.cvs):
-            raise InputError("cvs", self.cvs, "use 0 to 10")
         if not (self.cvs or self.traces):
             raise InputError("cvs", self.cvs, "name at least one law, here or in traces")
-        if not self.seconds > 0:
-            raise InputError("seconds", self.seconds, "use a positive time")
-        if self.rounds < 1:
-            raise InputError("rounds", self.rounds, "use at least 1")
-        if self.learning_updates < 0:
-            raise InputError("learning_updates", self.learning_updates, "use 0 (none) or more")
         for law in laws(self):  # what a run would refuse is refused now
             law.run_config()
         for seed in self.seeds if self.learning_updates else ():
@@ -207,7 +188,7 @@ def _success(updates: int, arm: Schedule, seed: int) -> float:
         engine.train()
         while not engine.poll().done:
             pass
-        engine.plan(evaluation_plans(("match",), TRIALS, "after"))
+        engine.plan(evaluation_plans(("match",), TRIALS, "after", seed=seed))
         results: list[bool] = []
         while len(results) < TRIALS:
             results += [e.success for e in engine.poll().episodes if e.plan.group == "after"]

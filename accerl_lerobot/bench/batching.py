@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What waiting for others does: batches, waits and decisions a second under several rules for batching.
 
 *one at a time* does not batch. *as they come* takes whatever waits when the service is free. The others have
@@ -23,7 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from rich.table import Table
 
@@ -32,8 +20,10 @@ from accerl_lerobot.bench.host import floors, host, ranged, spread
 from accerl_lerobot.bench.machinery import MachineryConfig
 from accerl_lerobot.bench.study import as_markdown, as_table, write
 from accerl_lerobot.console import Console
+from accerl_lerobot.envs.simulated import read_trace
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.batcher import quantile
+from accerl_lerobot.ranges import NonNegative, Positive, Range, Repeats
 from accerl_lerobot.replay.turns import ASYNCHRONOUS
 
 
@@ -41,27 +31,23 @@ from accerl_lerobot.replay.turns import ASYNCHRONOUS
 class BenchBatchingConfig(MachineryConfig):
     """Which rules, for how long."""
 
-    worlds: int = 32
-    latency_ms: float = 50.0
-    update_ms: float = 10.0
+    worlds: Annotated[int, Range("[1, 1000]")] = 32
+    latency_ms: Positive = 50.0
+    update_ms: NonNegative = 10.0
     """Short, so that the trainer is not what is measured."""
-    waits_ms: tuple[float, ...] = (0.0, 2.0, 10.0, 40.0)
+    waits_ms: tuple[Annotated[float, Range("[0, 10000)")], ...] = (0.0, 2.0, 10.0, 40.0)
     """Waits of the oldest request, in milliseconds; 0: as they come. Take the place of `max_wait_ms`."""
-    seconds: float = 5.0
-    """Of a block, at least, above 0."""
-    blocks: int = 3
+    seconds: Positive = 5.0
+    """Of a block, at least."""
+    blocks: Repeats = 3
     """Of each rule, each time it has its turn."""
     output_dir: str = "outputs/batching"
     """Folder for batching.json and .md."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.waits_ms or any(not 0 <= wait < 10_000 for wait in self.waits_ms):
-            raise InputError("waits_ms", self.waits_ms, "name at least one, each from 0 to 10,000")
-        if not self.seconds > 0:
-            raise InputError("seconds", self.seconds, "use a positive time")
-        if self.blocks < 1:
-            raise InputError("blocks", self.blocks, "use at least 1")
+        if not self.waits_ms:
+            raise InputError("waits_ms", self.waits_ms, "name at least one")
 
 
 def bench_batching(config: BenchBatchingConfig) -> dict[str, Any]:
@@ -71,6 +57,8 @@ def bench_batching(config: BenchBatchingConfig) -> dict[str, Any]:
         ``rules``: for each, decisions per second, waits in milliseconds, the batches' sizes and how busy the
         service was; ``config``, ``host`` and ``floors``.
     """
+    if config.latency_trace is not None:
+        read_trace(config.latency_trace)
     console, root = Console(), Path(config.output_dir)
     root.mkdir(parents=True, exist_ok=True)
     result: dict[str, Any] = {"config": asdict(config), "host": host(), "floors": floors()}

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What a world model costs here: dreaming a chunk, judging it, and learning from a batch.
 
 Weights are random and so is what is seen; a model that has learnt costs the same.
@@ -21,42 +9,39 @@ from __future__ import annotations
 import platform
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 from rich.table import Table
 
 from accerl_lerobot.bench.measure import Memory, device_name, timed
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.parsing import encode
+from accerl_lerobot.ranges import Device, Range, Repeats, Section, Threads
 from accerl_lerobot.world_model.config import PIXELS, WorldModelConfig
 from accerl_lerobot.world_model.sizes import TinyConfig
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchDreamConfig:
+class BenchDreamConfig(Section):
     """What is measured."""
 
     world_model: WorldModelConfig = field(default_factory=TinyConfig)
-    cameras: int = 1
+    cameras: Annotated[int, Range("[1, 64]")] = 1
     """Pictures in an observation."""
-    state_dim: int = 4
-    action_dim: int = 4
-    batches: tuple[int, ...] = (1, 8, 32)
+    state_dim: Annotated[int, Range("[0, 65536]")] = 4
+    action_dim: Annotated[int, Range("[1, 65536]")] = 4
+    batches: tuple[Annotated[int, Range("[1, 65536]")], ...] = (1, 8, 32)
     """Dreams at a time."""
-    device: str = "auto"
+    device: Device = "auto"
     """cpu, cuda, or auto."""
-    num_threads: int = 1
+    num_threads: Threads = 1
     """CPU threads."""
-    repeats: int = 5
+    repeats: Repeats = 5
     """Times each part is measured after a first one that does not count."""
 
     def __post_init__(self) -> None:
-        for name in ("cameras", "action_dim", "num_threads", "repeats"):
-            if getattr(self, name) < 1:
-                raise InputError(name, getattr(self, name), "use at least 1")
-        if self.state_dim < 0:
-            raise InputError("state_dim", self.state_dim, "use 0 (none) or more")
-        if not self.batches or min(self.batches) < 1:
+        super().__post_init__()
+        if not self.batches:
             raise InputError("batches", self.batches, "name sizes from 1 up")
 
 
@@ -78,7 +63,7 @@ def bench_dream(config: BenchDreamConfig) -> dict[str, Any]:
 
     torch.set_num_threads(config.num_threads)
     torch.manual_seed(0)
-    device, of = resolve_device(config.device), config.world_model
+    device, of = resolve_device(config.device, "device"), config.world_model
     memory = Memory(device)
     spec = WorldModelSpec(
         cameras=tuple(f"observation.images.{i}" for i in range(config.cameras)),

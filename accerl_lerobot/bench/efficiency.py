@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """How many real episodes a policy needs, with and without a world model.
 
     accerl bench efficiency --recipe=recipes/dreams.yaml --budgets=16,64,256
@@ -26,7 +14,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from rich.table import Table
 
@@ -50,8 +38,8 @@ from accerl_lerobot.config import RunConfig, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.dataset_config import DatasetConfig
 from accerl_lerobot.demos.windows import open_metadata
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.stats import mean_interval
+from accerl_lerobot.ranges import Choice, Range, Seed
 
 ARMS = {
     "none": ("--imagination.share=0",),
@@ -75,27 +63,20 @@ class BenchEfficiencyConfig(StudyConfig):
     """The run that every cell is a variation of; read once, when the study starts."""
     output_dir: str = "outputs/efficiency"
     """Folder of the runs and of efficiency.json, .md and .png; finished cells in it are kept."""
-    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    seeds: tuple[Seed, ...] = (0, 1, 2, 3, 4)
     """Each a warm start of its own."""
-    arms: tuple[str, ...] = tuple(ARMS)
+    arms: tuple[Annotated[str, Choice(ARMS)], ...] = tuple(ARMS)
     """Of none, learned (goes on learning), frozen (does not), oracle (a simulator), and the placebos copy
     (nothing moves) and shuffled (is told other actions)."""
-    budgets: tuple[int, ...] = (16, 64, 256)
+    budgets: tuple[Annotated[int, Range("[1, 1000000]")], ...] = (16, 64, 256)
     """Real episodes of a cell, ``rollout.episodes``."""
-    decisions: int = 15
+    decisions: Annotated[int, Range("[1, 100000]")] = 15
     """Of a real episode, about; from it follows how often each is learnt from, for the updates to be made."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("arms", "budgets"):
             named(self, name)
-        for arm in self.arms:
-            if arm not in ARMS:
-                raise InputError("arms", arm, f"use some of {', '.join(ARMS)}")
-        if min(self.budgets) < 1:
-            raise InputError("budgets", min(self.budgets), "use at least 1 episode")
-        if self.decisions < 1:
-            raise InputError("decisions", self.decisions, "use at least 1")
 
 
 def cells(config: BenchEfficiencyConfig, recipe: RunConfig) -> list[Cell]:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What a run survives: faults of each of its processes, at named points and at any moment, and at what cost.
 
     accerl bench faults                                          # a run made of time: seconds each
@@ -30,7 +18,7 @@ import subprocess
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import yaml
@@ -48,10 +36,12 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate
+from accerl_lerobot.ranges import Range, Repeats, Section, Seed, Steps
+from accerl_lerobot.ray_environment import RAY_PROCESSES
 
 IMAGINING = ("dream", "world learning")
 """Targets that are there where anything is imagined."""
-TARGETS = (*CLASSES, DRIVER, EVERYTHING)
+TARGETS = (*CLASSES, *RAY_PROCESSES, DRIVER, EVERYTHING)
 GRACE_S = 60.0
 """How long a run may take to stop when it is asked to."""
 LATEST = 0.9
@@ -62,7 +52,7 @@ ENDLESS = 1_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchFaultsConfig:
+class BenchFaultsConfig(Section):
     """What is done, and to whom."""
 
     recipe: str | None = None
@@ -79,35 +69,30 @@ class BenchFaultsConfig:
         "driver",
         "everything",
     )
-    """Of these, and, where anything is imagined, dream and world learning. driver: the process of the run
+    """Of these, and of Ray's own processes: gcs_server, raylet, dashboard agent, runtime env agent and log
+    monitor; where anything is imagined, of dream and world learning. driver: the process of the run
     itself, which is gone on with by its command line. everything: it and all below it, at once."""
     faults: tuple[str, ...] = FAULTS
     """kill, stop: SIGKILL and SIGSTOP, at a point or at any moment. exception, exit (with code 0), hang (of
     one thread), nan, nans (in as many updates in a row as end the trainer), full (the disk), torn (a file of
     a checkpoint): at the points of `fault_points` where they can happen."""
-    repeats: int = 5
+    repeats: Repeats = 5
     """Hits of each cell."""
-    stall_s: float = 10.0
+    stall_s: Annotated[float, Range("[5, inf)")] = 10.0
     """``launch.stall_s`` of the runs: how long a process that hangs is waited for."""
-    updates: int = 0
+    updates: Steps = 0
     """Where everything is hit: that happens at random moments of so many updates. When it has, the run goes
     on to the last of them and ends by itself, and so does one that was left alone, to compare what they have
     learnt. 0: hits follow each other, and the run is asked to stop like others."""
-    seed: int = 0
+    seed: Seed = 0
     """Of the order, the places and the moments."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name, names in (("targets", TARGETS), ("faults", FAULTS)):
             given = getattr(self, name)
             if not given or len(set(given)) < len(given) or not set(given) <= set(names):
                 raise InputError(name, given, f"use some of {', '.join(names)}, none twice")
-        if self.updates < 0:
-            raise InputError("updates", self.updates, "use 0 (none) or more")
-        if self.repeats < 1:
-            raise InputError("repeats", self.repeats, "use at least 1")
-        if not self.stall_s >= 5:
-            remedy = "use 5 s or more, or a busy worker is taken for one that hangs"
-            raise InputError("stall_s", self.stall_s, remedy)
         if not any(self.of(target) for target in self.targets):
             remedy = f"none of them can befall {', '.join(self.targets)}; add kill"
             raise InputError("faults", self.faults, remedy)

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """One thing that goes wrong in a run: where, the proof that it did, what became of the run, and how soon.
 
 survived    the run's process went on: the loss was made good below it, or nobody was lost
@@ -32,6 +20,7 @@ from accerl_lerobot.bench.audit import audit_updates
 from accerl_lerobot.bench.study import last_words
 from accerl_lerobot.bench.victims import DRIVER, EVERYTHING, Victim, alive, await_hit, hit
 from accerl_lerobot.fault_points import FULL, NAN, POINTS, TORN, order, proof, withdraw
+from accerl_lerobot.ray_environment import NEEDED, RAY_PROCESSES
 
 SIGNALS = {"kill": signal.SIGKILL, "stop": signal.SIGSTOP}
 """Fault → what is sent from outside, at any moment."""
@@ -178,7 +167,7 @@ def _recover(victim: Victim, target: str, fault: str, pid: int, count: int) -> N
         RuntimeError: its process has ended, or it has not in time.
     """
     last = max(victim.updates(), default=0)
-    if fault == NAN:
+    if fault == NAN or target in RAY_PROCESSES.keys() - set(NEEDED):
         victim.await_update(last + SPARE, START_S)
     elif target in (DRIVER, EVERYTHING):
         try:

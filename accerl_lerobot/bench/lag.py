@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What staleness does to each algorithm: one recipe, with published weights held back on purpose.
 
     accerl bench lag --recipe=recipes/quickstart.yaml --updates=200
@@ -41,6 +29,7 @@ from accerl_lerobot.bench.study import (
     write,
 )
 from accerl_lerobot.console import Console
+from accerl_lerobot.ranges import Steps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +40,7 @@ class BenchLagConfig(StudyConfig):
     """Folder of the runs and of lag.json, lag.md and lag.png; finished cells in it are kept."""
     algorithms: tuple[str, ...] = ("gipo", "ppo", "decoupled", "sapo")
     """Values of ``algorithm.type``; the algorithm's other fields are the recipe's where it has them."""
-    lags: tuple[int, ...] = (0, 4, 16, 64)
+    lags: tuple[Steps, ...] = (0, 4, 16, 64)
     """Values of ``trainer.hold_back``, in updates; what replay adds is reported."""
 
     def __post_init__(self) -> None:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """How long a world takes from a decision to its next observation, and to reset.
 
     accerl bench latency --env.type=metaworld --env.task=door-open-v3
@@ -26,7 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from rich.table import Table
@@ -36,8 +24,8 @@ from accerl_lerobot.bench.study import as_markdown, as_table, write
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, World, make_world
 from accerl_lerobot.envs.simulated import RESET
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.pictures import drawing
+from accerl_lerobot.ranges import Range, Section, Seed
 from accerl_lerobot.seeds import train_seed
 
 TRACE = "trace.txt"
@@ -45,26 +33,19 @@ QUANTILES = (0.5, 0.95, 0.99)
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchLatencyConfig:
+class BenchLatencyConfig(Section):
     """What is timed, for how long."""
 
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     """Any world."""
-    chunk: int = 10
-    """Actions per decision, at least 1."""
-    decisions: int = 600
-    """Timed, at least 2; more than an episode has, or no reset is."""
-    seed: int = 0
-    """Of the actions and episodes, 0 to 99."""
+    chunk: Annotated[int, Range("[1, 100000]")] = 10
+    """Actions per decision."""
+    decisions: Annotated[int, Range("[2, 1000000000]")] = 600
+    """Timed; more than an episode has, or no reset is."""
+    seed: Seed = 0
+    """Of the actions and episodes."""
     output_dir: str = "outputs/latency"
     """Folder for trace.txt (a duration on each line), latency.json, .md and .png."""
-
-    def __post_init__(self) -> None:
-        if self.chunk < 1:
-            raise InputError("chunk", self.chunk, "use at least 1")
-        if self.decisions < 2:
-            raise InputError("decisions", self.decisions, "use at least 2")
-        train_seed(self.seed, 0, 0)
 
 
 def bench_latency(config: BenchLatencyConfig) -> dict[str, Any]:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The asynchronous engine around worlds and a policy that are made of time, measured a block at a time.
 
 Each world is a process of its own, as in a real run, and so are the service, the replay and the trainer; what
@@ -23,6 +11,7 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
@@ -33,6 +22,7 @@ from accerl_lerobot.envs.simulated import read_trace
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import Load
+from accerl_lerobot.ranges import NonNegative, Positive, Range, Section
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
@@ -43,38 +33,35 @@ CHUNK = 4
 
 
 @dataclass(frozen=True, kw_only=True)
-class MachineryConfig:
+class MachineryConfig(Section):
     """Sizes and durations of what is simulated."""
 
-    worlds: int = 64
-    """Worlds, each a process; at least 1."""
-    latency_ms: float = 200.0
-    """Mean time a world takes from a decision to its next observation, in milliseconds; above 0."""
-    latency_cv: float = 0.5
+    worlds: Annotated[int, Range("[1, 1000]")] = 64
+    """Worlds, each a process."""
+    latency_ms: Positive = 200.0
+    """Mean time a world takes from a decision to its next observation, in milliseconds."""
+    latency_cv: Annotated[float, Range("[0, 10]")] = 0.5
     """Standard deviation of that over its mean, lognormal; 0: always the mean."""
     latency_trace: str | None = None
     """File of `accerl bench latency`, for its law in place of the lognormal one; scaled to `latency_ms`."""
-    image_size: int = 64
-    """Height and width of the one image of an observation, 8 to 480; 317 makes it 301 KB."""
-    segment_length: int = 4
+    image_size: Annotated[int, Range("[8, 480]")] = 64
+    """Height and width of the one image of an observation; 317 makes it 301 KB."""
+    segment_length: Annotated[int, Range("[1, 10000]")] = 4
     """Decisions of a segment; 16 is a multiple of it."""
-    decide_ms: float = 8.0
+    decide_ms: NonNegative = 8.0
     """a of t(B) = a + bB, the time of a forward pass for B observations, in milliseconds."""
-    decide_each_ms: float = 0.1
+    decide_each_ms: NonNegative = 0.1
     """b of it."""
-    max_batch: int = 64
+    max_batch: Annotated[int, Range("[1, 65536]")] = 64
     """Largest B."""
-    max_wait_ms: float = 2.0
+    max_wait_ms: Annotated[float, Range("[0, 10000)")] = 2.0
     """How long the oldest request waits for others, in milliseconds."""
-    update_ms: float = 800.0
+    update_ms: NonNegative = 800.0
     """Time of an update, in milliseconds; it learns from one segment of each world."""
 
     def __post_init__(self) -> None:
-        if self.worlds < 1:
-            raise InputError("worlds", self.worlds, "use at least 1")
-        if not self.latency_ms > 0:
-            raise InputError("latency_ms", self.latency_ms, "use a positive time")
-        if self.segment_length < 1 or EPISODE % self.segment_length:
+        super().__post_init__()
+        if EPISODE % self.segment_length:
             raise InputError("segment_length", self.segment_length, f"use a divisor of {EPISODE}")
 
     @property
@@ -154,8 +141,6 @@ class MachineryConfig:
         Raises:
             InputError: `latency_trace` is none.
         """
-        if self.latency_trace is not None:
-            read_trace(self.latency_trace)
         return Measured(self.run_config(), ("match",), load=self.load())
 
     def load(self) -> Load:

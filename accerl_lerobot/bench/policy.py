@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What a policy of full size costs here: memory, decisions, updates, and what rounding does to its log-probs.
 
 Weights are random, sizes those of the published checkpoint, inputs made up: nothing is downloaded. Decisions
@@ -25,48 +13,39 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 from rich.table import Table
 
 from accerl_lerobot.bench.measure import Memory, device_name, timed
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import TuningConfig
+from accerl_lerobot.ranges import Choice, Device, Range, Repeats, Section
 
 STATE_DIM, ACTION_DIM, TOKENS = 8, 7, 48
 """Of LIBERO: end-effector state, end-effector action; length of a padded instruction."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchPolicyConfig:
+class BenchPolicyConfig(Section):
     """What is measured."""
 
-    type: str = "smolvla"
+    type: Annotated[str, Choice(BUILDERS)] = "smolvla"
     """smolvla, pi0 or pi05."""
-    cameras: int = 2
+    cameras: Annotated[int, Range("[1, 64]")] = 2
     """Pictures in an observation."""
-    batch: int = 8
+    batch: Annotated[int, Range("[1, 65536]")] = 8
     """Decisions made at once, and learnt from at once."""
-    num_steps: int | None = None
+    num_steps: Annotated[int, Range("[1, 10000]")] | None = None
     """Denoising steps; None: the published 10."""
-    stochastic: str = "one"
+    stochastic: Literal["last", "all", "one"] = "last"
     """Which denoising steps are random; see ``policy.sampler.stochastic``."""
-    precision: str = "fp32"
+    precision: Literal["fp32", "bf16"] = "fp32"
     """fp32 or bf16; see ``policy.precision``."""
     tuning: TuningConfig = field(default_factory=lambda: TuningConfig(mode="expert"))
-    device: str = "auto"
+    device: Device = "auto"
     """cpu, cuda, or auto."""
-    repeats: int = 3
+    repeats: Repeats = 3
     """Times each part is measured after a first one that does not count."""
-
-    def __post_init__(self) -> None:
-        if self.type not in BUILDERS:
-            raise InputError("type", self.type, f"use one of {', '.join(BUILDERS)}")
-        for name in ("cameras", "batch", "repeats"):
-            if getattr(self, name) < 1:
-                raise InputError(name, getattr(self, name), "use at least 1")
-        if self.precision not in ("fp32", "bf16"):
-            raise InputError("precision", self.precision, "use fp32 or bf16")
 
 
 def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
@@ -83,7 +62,7 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
     from accerl_lerobot.policies.base import stack_observations
     from accerl_lerobot.policies.loading import resolve_device
 
-    device = resolve_device(config.device)
+    device = resolve_device(config.device, "device")
     memory = Memory(device)
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as directory:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Does a world model know which policy is better?
 
     accerl bench ranking --path=outputs/door_model/world_model --env.task=door-open-v3 --env.image_size=64 \\
@@ -24,7 +12,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from rich.table import Table
 
@@ -33,10 +21,11 @@ from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate
+from accerl_lerobot.ranges import Device, Range, Section, Threads
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchRankingConfig:
+class BenchRankingConfig(Section):
     """Which policies, in which world, and in dreams of what."""
 
     path: str | None = None
@@ -48,25 +37,23 @@ class BenchRankingConfig:
     can be ranked, and 12 and more say something."""
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     """The world."""
-    episodes: int = 50
+    episodes: Annotated[int, Range("[1, 1000000]")] = 50
     """Of each policy, in the world and in dreams."""
-    worlds: int = 8
+    worlds: Annotated[int, Range("[1, 1000]")] = 8
     """Episodes at a time in the world."""
-    device: str = "auto"
+    device: Device = "auto"
     """cpu, cuda, or auto."""
-    num_threads: int = 1
+    num_threads: Threads = 1
     """CPU threads."""
     output_dir: str | None = None
     """Folder to create, for ranking.json and ranking.png. None: only prints."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if len(set(self.policies)) < max(1, len(self.policies)):
             raise InputError("policies", self.policies, "name at least one checkpoint, none of them twice")
         if self.path is None:
             raise InputError("path", None, "give the folder world_model that accerl world-model has written")
-        for name in ("episodes", "worlds", "num_threads"):
-            if getattr(self, name) < 1:
-                raise InputError(name, getattr(self, name), "use at least 1")
         if self.output_dir is not None and Path(self.output_dir).expanduser().exists():
             raise InputError("output_dir", self.output_dir, "the folder exists; choose another or remove it")
 
@@ -90,23 +77,25 @@ def bench_ranking(config: BenchRankingConfig) -> dict[str, Any]:
     from accerl_lerobot.envs import make_world
     from accerl_lerobot.evaluation.config import evaluation_plans
     from accerl_lerobot.policies.config import PolicyConfig
-    from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, resolve_device
+    from accerl_lerobot.policies.loading import load_adapter, rehearsed_config, resolve_device
     from accerl_lerobot.world_model.agreement import agreement, even_threshold
     from accerl_lerobot.world_model.fit import check_fit
     from accerl_lerobot.world_model.imagine import Dreamer
     from accerl_lerobot.world_model.side_by_side import dreamt, lived
-    from accerl_lerobot.world_model.store import load_world_model
+    from accerl_lerobot.world_model.store import load_world_model, rehearse_world_model
 
     torch.set_num_threads(config.num_threads)
-    device, console = resolve_device(config.device), Console()
-    model, judge = load_world_model(Path(str(config.path)).expanduser(), config.discover_packages_path)
+    device, console = resolve_device(config.device, "device"), Console()
+    path = Path(str(config.path)).expanduser()
+    rehearse_world_model(path, config.discover_packages_path)
+    model, judge = load_world_model(path, config.discover_packages_path)
     dreamer = Dreamer(model.to(device), None if judge is None else judge.to(device))
     of = [PolicyConfig(path=path, device=config.device) for path in config.policies]
     worlds = [make_world(config.env) for _ in range(min(config.worlds, config.episodes))]
     try:
         spec = worlds[0].spec
         for policy in of:
-            settings = load_lerobot_config(policy)
+            settings = rehearsed_config(policy)
             executed = getattr(settings, "n_action_steps", 1)
             check_fit(model.spec, spec, executed, settings.n_obs_steps, judge is not None)
         starts = [(plan.task, plan.seed) for plan in evaluation_plans(spec.tasks, config.episodes, "ranking")]

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What the replay costs: storing, drawing, the journal and a checkpoint, in one process and without waiting.
 
 Per decision, as that is what everything else is counted in. With and without the journal by turns; the share
@@ -25,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from rich.table import Table
@@ -36,6 +24,7 @@ from accerl_lerobot.bench.study import as_table
 from accerl_lerobot.checkpoint import save_checkpoint
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Origin, Segment
+from accerl_lerobot.ranges import Range, Repeats, Section
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.replay.mixed import MixedReplay
@@ -46,26 +35,24 @@ SAVED = "checkpoint"
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchReplayConfig:
+class BenchReplayConfig(Section):
     """Sizes."""
 
-    image_size: int = 64
-    """Height and width of an observation's one image, at least 1; 317 makes it 301 KB."""
-    segment_length: int = 16
-    """Decisions of a segment, at least 1."""
-    chunk: int = 10
-    """Actions of a decision, at least 1."""
-    capacity: int = 2048
+    image_size: Annotated[int, Range("[1, 4096]")] = 64
+    """Height and width of an observation's one image; 317 makes it 301 KB."""
+    segment_length: Annotated[int, Range("[1, 10000]")] = 16
+    """Decisions of a segment."""
+    chunk: Annotated[int, Range("[1, 100000]")] = 10
+    """Actions of a decision."""
+    capacity: Annotated[int, Range("[1, 10000000]")] = 2048
     """Decisions that the replay holds, as many as a batch at least."""
-    batch: int = 256
+    batch: Annotated[int, Range("[1, 1000000]")] = 256
     """Decisions of a batch, as many as a segment at least."""
-    repeats: int = 5
-    """Times that everything is measured, at least 1."""
+    repeats: Repeats = 5
+    """Times that everything is measured."""
 
     def __post_init__(self) -> None:
-        for name in ("image_size", "segment_length", "chunk", "repeats"):
-            if getattr(self, name) < 1:
-                raise InputError(name, getattr(self, name), "use at least 1")
+        super().__post_init__()
         if self.batch < self.segment_length:
             raise InputError("batch", self.batch, f"use at least segment_length, {self.segment_length}")
         if self.capacity < self.batch + self.segment_length:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """How collecting grows with the number of worlds: R(N) decisions a second of N worlds, through all workers.
 
     E(N) = R(N) / (N · R(1))
@@ -24,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from rich.table import Table
 
@@ -33,8 +21,10 @@ from accerl_lerobot.bench.host import floors, host, ranged, spread
 from accerl_lerobot.bench.machinery import MachineryConfig
 from accerl_lerobot.bench.study import as_markdown, as_table, write
 from accerl_lerobot.console import Console
+from accerl_lerobot.envs.simulated import read_trace
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.pictures import drawing
+from accerl_lerobot.ranges import NonNegative, Positive, Range, Repeats
 from accerl_lerobot.replay.turns import ASYNCHRONOUS
 
 
@@ -42,28 +32,24 @@ from accerl_lerobot.replay.turns import ASYNCHRONOUS
 class BenchScalingConfig(MachineryConfig):
     """How many worlds, for how long."""
 
-    counts: tuple[int, ...] = (1, 2, 4, 8, 16, 32, 64)
+    counts: tuple[Annotated[int, Range("[1, 1000]")], ...] = (1, 2, 4, 8, 16, 32, 64)
     """Worlds; takes the place of `worlds`. The first is what the others are compared with."""
-    image_size: int = 317
-    latency_ms: float = 200.0
-    latency_cv: float = 0.0
-    update_ms: float = 10.0
+    image_size: Annotated[int, Range("[8, 480]")] = 317
+    latency_ms: Positive = 200.0
+    latency_cv: Annotated[float, Range("[0, 10]")] = 0.0
+    update_ms: NonNegative = 10.0
     """Short, so that the trainer is not what is measured."""
-    seconds: float = 6.0
-    """Of a block, at least, above 0."""
-    blocks: int = 5
-    """At each count, at least 1."""
+    seconds: Positive = 6.0
+    """Of a block, at least."""
+    blocks: Repeats = 5
+    """At each count."""
     output_dir: str = "outputs/scaling"
     """Folder for scaling.json, .md and .png."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.counts or any(n < 1 for n in self.counts) or len(set(self.counts)) < len(self.counts):
-            raise InputError("counts", self.counts, "name numbers of worlds from 1 up, none of them twice")
-        if not self.seconds > 0:
-            raise InputError("seconds", self.seconds, "use a positive time")
-        if self.blocks < 1:
-            raise InputError("blocks", self.blocks, "use at least 1")
+        if not self.counts or len(set(self.counts)) < len(self.counts):
+            raise InputError("counts", self.counts, "name numbers of worlds, none of them twice")
 
 
 def bench_scaling(config: BenchScalingConfig) -> dict[str, Any]:
@@ -73,6 +59,8 @@ def bench_scaling(config: BenchScalingConfig) -> dict[str, Any]:
         ``counts``: for each, decisions per second, E(N), the bound, their share of it, and whether the
         processors were busy; ``config``, ``host`` and ``floors``.
     """
+    if config.latency_trace is not None:
+        read_trace(config.latency_trace)
     console, root = Console(), Path(config.output_dir)
     root.mkdir(parents=True, exist_ok=True)
     result: dict[str, Any] = {"config": asdict(config), "host": host(), "floors": floors()}

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """How a run bears up: a fault in every other minute, and what of its throughput is left in that minute.
 
     accerl bench soak --minutes=10
@@ -28,7 +16,7 @@ import tempfile
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import psutil
 from rich.console import Group
@@ -42,6 +30,7 @@ from accerl_lerobot.bench.victims import DRIVER, EVERYTHING, Victim
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.metrics import METRICS, MetricsLog, WandBConfig
+from accerl_lerobot.ranges import Positive, Range, Section, Seed
 from accerl_lerobot.replay.journal import EPISODES
 from accerl_lerobot.timeline.read import shares
 
@@ -51,29 +40,28 @@ ORDER = (QUIET, STRUCK, STRUCK, QUIET)
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchSoakConfig:
+class BenchSoakConfig(Section):
     """How long, how often, and what."""
 
     recipe: str | None = None
     """See ``bench faults``."""
     output_dir: str = "outputs/soak"
     """Folder of the run and of soak.json and .md; must not exist."""
-    minutes: float = 8.0
+    minutes: Positive = 8.0
     """In all, beside the start; at least four blocks."""
-    block_s: float = 60.0
+    block_s: Annotated[float, Range("[20, inf)")] = 60.0
     """Seconds of a block; in every other one there is one fault. At least 20."""
     targets: tuple[str, ...] = ("rollout", "inference", "replay", "trainer")
     """See ``bench faults``; not of the run's own process, which is not gone on with by itself."""
     faults: tuple[str, ...] = ("kill", "exception", "exit")
     """See ``bench faults``."""
-    stall_s: float = 10.0
+    stall_s: Annotated[float, Range("[5, inf)")] = 10.0
     """See ``bench faults``."""
-    seed: int = 0
+    seed: Seed = 0
     """Of faults, places and moments."""
 
     def __post_init__(self) -> None:
-        if not self.block_s >= 20:
-            raise InputError("block_s", self.block_s, "use 20 or more, in which a run can recover")
+        super().__post_init__()
         if not self.blocks >= len(ORDER):
             least = len(ORDER) * self.block_s / 60
             raise InputError("minutes", self.minutes, f"use at least {least:g}: both kinds, forth and back")

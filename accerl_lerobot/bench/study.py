@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Many runs of one recipe, to be compared: every seed is warm-started once, and each cell begins there.
 
 Runs are in the single-process engine, each on one thread, where lag is what settings make it and not what
@@ -28,7 +16,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import yaml
 from rich.table import Table
@@ -39,6 +27,7 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate, mean_interval
+from accerl_lerobot.ranges import Range, Section, Seed, Steps
 from accerl_lerobot.resume import locked
 
 INTERVALS = "intervals are 95 %, over seeds where there are several"
@@ -49,27 +38,25 @@ LOG_LINES = 12
 
 
 @dataclass(frozen=True, kw_only=True)
-class StudyConfig:
+class StudyConfig(Section):
     """What all studies have."""
 
     recipe: str = "recipes/quickstart.yaml"
     """The run that every cell is a variation of; read once, when the study starts."""
     output_dir: str = "outputs/study"
     """Folder of the runs and of what they say together; finished runs in it are kept."""
-    seeds: tuple[int, ...] = (0, 1, 2)
+    seeds: tuple[Seed, ...] = (0, 1, 2)
     """Each a warm start of its own."""
-    updates: int | None = None
+    updates: Steps | None = None
     """Of each cell; None: the recipe's."""
-    episodes: int = 100
+    episodes: Annotated[int, Range("[1, 1000000]")] = 100
     """Of the evaluation after each cell."""
-    jobs: int = 2
+    jobs: Annotated[int, Range("[1, 1024]")] = 2
     """Cells that run at the same time, each on one thread."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         named(self, "seeds")
-        for name in ("episodes", "jobs"):
-            if getattr(self, name) < 1:
-                raise InputError(name, getattr(self, name), "use at least 1")
 
 
 def named(config: Any, name: str) -> None:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """How fast a recipe collects and learns on this machine, under each schedule, and where everything goes.
 
 Real worlds, a real policy, the real engine. What is generated is accounted for: each decision is in the
@@ -34,12 +22,13 @@ from accerl_lerobot.config import RunConfig, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.pictures import drawing
+from accerl_lerobot.ranges import Positive, Repeats, Section
 from accerl_lerobot.replay.pacing import decisions_under_way
 from accerl_lerobot.replay.turns import Schedule
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchThroughputConfig:
+class BenchThroughputConfig(Section):
     """What is measured, for how long."""
 
     recipe: str = "recipes/quickstart.yaml"
@@ -48,23 +37,20 @@ class BenchThroughputConfig:
     """The LeRobot checkpoint that acts and learns."""
     schedules: tuple[Schedule, ...] = ARMS
     """Which ones, by turns in one run."""
-    seconds: float = 20.0
-    """Of a block, at least, above 0."""
-    rounds: int = 3
-    """Times each schedule is measured twice, forth and back, 1 or more."""
+    seconds: Positive = 20.0
+    """Of a block, at least."""
+    rounds: Repeats = 3
+    """Times each schedule is measured twice, forth and back."""
     output_dir: str = "outputs/throughput"
     """Folder for throughput.json, .md and .png."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.policy_path is None:
             remedy = "name a LeRobot checkpoint, such as RUN/checkpoints/last/pretrained_model"
             raise InputError("policy_path", None, remedy)
-        if not self.schedules or any(name not in ARMS for name in self.schedules):
+        if not self.schedules:
             raise InputError("schedules", self.schedules, f"name some of {', '.join(ARMS)}")
-        if not self.seconds > 0:
-            raise InputError("seconds", self.seconds, "use a positive time")
-        if self.rounds < 1:
-            raise InputError("rounds", self.rounds, "use at least 1")
 
 
 def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
@@ -78,7 +64,7 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
         InputError: the recipe or the checkpoint cannot be used.
         RuntimeError: the books do not add up.
     """
-    from accerl_lerobot.run import check_policy, check_world
+    from accerl_lerobot.preflight import check_policy, check_world
 
     console, root = Console(), Path(config.output_dir).expanduser()
     run: RunConfig = parse(
@@ -93,8 +79,8 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
     )
     for schedule in config.schedules:  # what cannot be under one of them is refused
         replace(run, launch=replace(run.launch, schedule=schedule))
-    tasks = check_world(run)
-    history = check_policy(run)
+    spec = check_world(run.env)
+    tasks, history = spec.tasks, check_policy(run, spec)
     root.mkdir(parents=True, exist_ok=True)
     result: dict[str, Any] = {"config": asdict(config), "host": host()}
     order = config.rounds * (*config.schedules, *reversed(config.schedules))

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What recording the timeline costs.
 
     accerl bench timeline --run=RUN
@@ -27,13 +15,14 @@ import tempfile
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from rich.table import Table
 
 from accerl_lerobot.bench.host import host, spread
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.ranges import Range, Repeats, Section
 from accerl_lerobot.timeline.clock import Clock, NoClock
 from accerl_lerobot.timeline.parts import Parts
 from accerl_lerobot.timeline.states import COMPUTE, WAIT_IN
@@ -42,13 +31,13 @@ ON, OFF, FLOOR = "on", "off", "floor"
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchTimelineConfig:
+class BenchTimelineConfig(Section):
     """What is measured, for how long."""
 
-    entries: int = 100_000
+    entries: Annotated[int, Range("[2, 100000000]")] = 100_000
     """Of one block, 2 or more."""
-    repeats: int = 5
-    """Times each arm is measured twice, 1 or more."""
+    repeats: Repeats = 5
+    """Times each arm is measured twice."""
     folder: str | None = None
     """Where the clock that is on writes, in a folder of its own that is removed; None: the system's for
     temporary files."""
@@ -56,10 +45,7 @@ class BenchTimelineConfig:
     """A run whose workers' entries are counted; None: the cost of an entry is all that is said."""
 
     def __post_init__(self) -> None:
-        if self.entries < 2:
-            raise InputError("entries", self.entries, "use 2 or more")
-        if self.repeats < 1:
-            raise InputError("repeats", self.repeats, "use at least 1")
+        super().__post_init__()
         if self.folder is not None and not Path(self.folder).expanduser().is_dir():
             raise InputError("folder", self.folder, "no such folder; make it first")
 

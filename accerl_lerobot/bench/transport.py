@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What it costs to ask inference for a decision: Ray, shared memory, and what no transport can beat.
 
     accerl bench transport --output_dir=outputs/transport
@@ -33,7 +21,7 @@ import json
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from rich.table import Table
@@ -44,6 +32,7 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.experience import Decision, Request
+from accerl_lerobot.ranges import Choice, Range, Repeats, Section, Seed
 
 RAY, RAY_PUT, SHARED_MEMORY = "ray", "ray_put", "shared_memory"
 PIPE, SLOT, MEMCPY = "pipe", "slot", "memcpy"
@@ -55,32 +44,27 @@ CHUNK, ACTIONS, LATENT = 50, 7, 32
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchTransportConfig:
+class BenchTransportConfig(Section):
     """What is measured, how often."""
 
-    sizes: tuple[str, ...] = tuple(IMAGES)
+    sizes: tuple[Annotated[str, Choice(IMAGES)], ...] = tuple(IMAGES)
     """Observations: ``12 KB`` (64 pixels, one camera) and ``301 KB`` (224 pixels, two cameras)."""
-    callers: tuple[int, ...] = (1, 8)
+    callers: tuple[Annotated[int, Range("[1, 1000]")], ...] = (1, 8)
     """Processes that ask at a time."""
-    calls: int = 400
-    """Of each caller in a block, 10 or more."""
-    rounds: int = 3
-    """Times each arm is measured twice, 1 or more."""
-    seed: int = 0
+    calls: Annotated[int, Range("[10, 100000000]")] = 400
+    """Of each caller in a block."""
+    rounds: Repeats = 3
+    """Times each arm is measured twice."""
+    seed: Seed = 0
     """Of what is in the images."""
     output_dir: str | None = None
     """Folder to create, for transport.json and transport.png; None prints only."""
 
     def __post_init__(self) -> None:
-        for size in self.sizes or ("",):
-            if size not in IMAGES:
-                raise InputError("sizes", size, f"use {' and '.join(IMAGES)}")
-        if not self.callers or min(self.callers) < 1:
-            raise InputError("callers", self.callers, "name numbers from 1 up")
-        if self.calls < 10:
-            raise InputError("calls", self.calls, "use at least 10")
-        if self.rounds < 1:
-            raise InputError("rounds", self.rounds, "use at least 1")
+        super().__post_init__()
+        for name in ("sizes", "callers"):
+            if not getattr(self, name):
+                raise InputError(name, (), "name at least one")
 
 
 def request_of(size: str, seed: int) -> Request:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A run in a process of its own, to be done harm to and watched: its workers, its updates, its books.
 
 Everything is seen from outside: workers are found among the run's descendants by the names that Ray gives
@@ -33,6 +21,7 @@ from accerl_lerobot.bench.study import last_words
 from accerl_lerobot.checkpoint import CONFIG
 from accerl_lerobot.fault_points import VARIABLE
 from accerl_lerobot.metrics import METRICS
+from accerl_lerobot.ray_environment import RAY_PROCESSES, kind_of
 
 CLASSES = {
     "rollout": "RolloutWorker",
@@ -91,6 +80,8 @@ class Victim:
         """Processes of a target, as they are now."""
         if target in (DRIVER, EVERYTHING):
             return [self.process.pid] if self.process.poll() is None else []
+        if target in RAY_PROCESSES:
+            return [p for p in descendants(self.process.pid) if kind_of(_command(p)) == target]
         name = f"ray::{CLASSES[target]}"
         found = {pid for pid in descendants(self.process.pid) if title(pid).startswith(name)}
         # What a worker forks has its name, too, until it becomes something else.
@@ -142,8 +133,11 @@ class Victim:
         return self.process.wait(grace), below
 
     def kill(self) -> list[int]:
-        """Ends it and all below it, whatever they do; who they were."""
-        everyone = [self.process.pid, *descendants(self.process.pid)]
+        """Ends it and all below it, whatever they do, but for guardians, which clean up; who they were."""
+        below = [
+            pid for pid in descendants(self.process.pid) if "accerl_lerobot/guardian.py" not in title(pid)
+        ]
+        everyone = [self.process.pid, *below]
         for pid in everyone:
             hit(pid, signal.SIGKILL)
         self.process.wait()
@@ -215,10 +209,15 @@ def descendants(pid: int) -> list[int]:
 
 def title(pid: int) -> str:
     """How a process is called; empty if there is none."""
+    return " ".join(_command(pid))
+
+
+def _command(pid: int) -> list[str]:
+    """Command line of a process; empty if there is none."""
     try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        return Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
     except OSError:
-        return ""
+        return []
 
 
 def _stat(pid: int) -> tuple[str, int] | None:

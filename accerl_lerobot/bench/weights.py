@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """``accerl bench weights``: from an optimiser step to the weights that act, against copying memory.
 
     accerl bench weights --output_dir=outputs/weights
@@ -30,7 +18,7 @@ from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from rich.table import Table
@@ -41,6 +29,7 @@ from accerl_lerobot.bench.study import as_markdown, as_table, named, write
 from accerl_lerobot.checkpoint import TRAINING_STATE, WEIGHTS
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, check_absent
+from accerl_lerobot.ranges import Range, Repeats, Section, Seed
 from accerl_lerobot.weights.channel import Way
 
 ARMS: dict[str, tuple[str, Way, bool, float]] = {
@@ -60,19 +49,19 @@ Tensors = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchWeightsConfig:
+class BenchWeightsConfig(Section):
     """What is published, to how many."""
 
-    sizes_mb: tuple[int, ...] = (1, 16, 256, 1024)
+    sizes_mb: tuple[Annotated[int, Range("[1, 1048576]")], ...] = (1, 16, 256, 1024)
     """Sizes of a set of float32 weights, in MiB. With two readers the largest needs about 15 times
     its size in memory."""
-    readers: tuple[int, ...] = (1, 2)
+    readers: tuple[Annotated[int, Range("[1, 1000]")], ...] = (1, 2)
     """How many processes read; each at least 1."""
-    tensors: int = 64
+    tensors: Annotated[int, Range("[1, 1000000]")] = 64
     """Into how many equal tensors a set falls."""
-    repeats: int = 5
+    repeats: Repeats = 5
     """Publications of each arm that count, each in a block of its own."""
-    seed: int = 0
+    seed: Seed = 0
     """Of the values, and of which ones change."""
     apart: bool = False
     """Readers are on a Ray node of their own, with an object store of its own, and share no memory: what lies
@@ -84,13 +73,9 @@ class BenchWeightsConfig:
     each other, in float32 and rounded to bfloat16, is told too."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("sizes_mb", "readers"):
             named(self, name)
-            if min(getattr(self, name)) < 1:
-                raise InputError(name, getattr(self, name), "use 1 or more")
-        for name in ("tensors", "repeats"):
-            if getattr(self, name) < 1:
-                raise InputError(name, getattr(self, name), "use at least 1")
 
 
 def bench_weights(config: BenchWeightsConfig) -> dict[str, Any]:

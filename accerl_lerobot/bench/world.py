@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """How fast our MetaWorld is next to LeRobot's: both step random actions, in turns, on the same machine.
 
 Three arms: ``ours`` (a picture per decision), ``ours_every_step`` (chunks of one, so a picture per step) and
@@ -22,21 +10,21 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import multiprocessing
 import os
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from rich.table import Table
 
 from accerl_lerobot.bench.host import host, spread
+from accerl_lerobot.demos.writing import simulators
 from accerl_lerobot.envs.gl import import_mujoco
 from accerl_lerobot.envs.metaworld import ACTION_DIM, MetaWorld, MetaWorldConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.ranges import Positive, Range, Repeats, Section
 from accerl_lerobot.seeds import train_seed
 
 OURS, EVERY_STEP, STOCK = "ours", "ours_every_step", "stock"
@@ -46,29 +34,24 @@ Decide = Callable[[], int]
 
 
 @dataclass(frozen=True, kw_only=True)
-class BenchWorldConfig:
+class BenchWorldConfig(Section):
     """What is measured, for how long."""
 
     task: str = "drawer-open-v3"
     """One MetaWorld task."""
-    chunk: int = 10
-    """Actions per decision, 1 to 500."""
-    image_size: int = 64
+    chunk: Annotated[int, Range("[1, 500]")] = 10
+    """Actions per decision."""
+    image_size: Annotated[int, Range("[64, 480]")] = 64
     """Our pictures' height and width in pixels; LeRobot's wrapper always draws 480."""
-    seconds: float = 4.0
-    """Length of one block, above 0."""
-    rounds: int = 2
-    """Times each arm is measured twice, 1 or more."""
+    seconds: Positive = 4.0
+    """Length of one block."""
+    rounds: Repeats = 2
+    """Times each arm is measured twice."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if len(self.env.tasks) != 1:
             raise InputError("task", self.task, "name one task")
-        if not 1 <= self.chunk <= 500:
-            raise InputError("chunk", self.chunk, "use 1 to 500")
-        if not self.seconds > 0:
-            raise InputError("seconds", self.seconds, "use a positive time")
-        if self.rounds < 1:
-            raise InputError("rounds", self.rounds, "use at least 1")
 
     @property
     def env(self) -> MetaWorldConfig:
@@ -85,15 +68,9 @@ def bench_world(config: BenchWorldConfig) -> dict[str, Any]:
         ``config`` and ``host``.
     """
     blocks: dict[str, list[tuple[float, float]]] = {name: [] for name in _ARMS}
-    context = multiprocessing.get_context("spawn")
     with contextlib.ExitStack() as stack:
         # A process for each arm: two OpenGL contexts in one process get in each other's way.
-        pools = {
-            name: stack.enter_context(
-                ProcessPoolExecutor(1, context, initializer=_start, initargs=(name, config))
-            )
-            for name in _ARMS
-        }
+        pools = {name: stack.enter_context(simulators(1, _start, name, config)) for name in _ARMS}
         for name in (*_ARMS, *config.rounds * (*_ARMS, *reversed(_ARMS))):
             blocks[name].append(pools[name].submit(_measure, config.seconds).result())
         machine = pools[OURS].submit(_host).result()

@@ -1,31 +1,23 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What a LeRobotDataset's files say is checked before LeRobot believes it.
 
 LeRobot fills the templates of ``meta/info.json`` in with `str.format` and joins the outcome to the folder.
 Where an image's ``bytes`` are missing, Hugging Face's `datasets` opens what its ``path`` names, a file of
-this machine or an address. Parquet stores a million equal rows in a few bytes. While `checked` lasts,
-LeRobot's own classes look at the files first, wherever they come from, the Hub included.
+this machine or an address, and Pillow has Ghostscript draw what is PostScript. Parquet stores a million equal
+rows in a few bytes. While `checked` lasts, LeRobot's own classes look at the files first, wherever they come
+from, the Hub included.
 """
 
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.safety import (
@@ -62,6 +54,10 @@ DTYPES = {
     "image", "video", "string", "bool", "language", "int8", "int16", "int32", "int64", "uint8", "uint16",
     "uint32", "uint64", "float16", "float32", "float64",
 }  # fmt: skip
+IMAGES = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")
+"""First bytes of PNG and JPEG, which LeRobot writes; for one of the others Pillow runs a program."""
+LEARNT = ("action", "observation", "next.reward", "timestamp")
+"""What names of features begin with in which a number that is not finite would be learnt from."""
 PLAIN = {"Value", "Sequence", "List", "LargeList"}
 """Kinds of columns that `datasets` reads without opening other files."""
 DATA_PLACES: dict[str, type] = {"chunk_index": int, "file_index": int}
@@ -104,19 +100,28 @@ def check_info(info: dict[str, Any], origin: Origin) -> None:
         raise origin.refuse(INFO, "splits is a mapping and tools a list; record the dataset again")
 
 
-def check_stats(stats: dict[str, Any], origin: Origin) -> None:
-    """The content of ``meta/stats.json``: feature → statistic → numbers, nested as they like.
+def check_stats(stats: dict[str, Any], features: dict[str, Any], origin: Origin) -> None:
+    """The content of ``meta/stats.json``: feature → statistic → numbers, as many as the feature has.
 
     Raises:
-        InputError: it is something else.
+        InputError: it is something else, or a policy would be normalised by a number that is not finite.
     """
     for name, statistics in stats.items():
         if not isinstance(statistics, dict):
             raise origin.refuse(f"{STATS}: {name}", "a mapping from statistics to numbers is wanted")
+        feature = features.get(name, {"dtype": "image"})
         for statistic, values in statistics.items():
-            if _regular(values) is None:
-                remedy = "numbers in lists of equal lengths are wanted; compute the statistics again"
-                raise origin.refuse(f"{STATS}: {name}.{statistic}", remedy)
+            where, again = f"{STATS}: {name}.{statistic}", "compute the statistics again"
+            if (shape := _regular(values)) is None:
+                raise origin.refuse(where, f"numbers in lists of equal lengths are wanted; {again}")
+            if not name.startswith(LEARNT):
+                continue
+            plain = feature["dtype"] not in ("image", "video") and statistic != "count"
+            if plain and shape and list(shape) != list(feature["shape"]):
+                remedy = f"shape {list(shape)}, and the feature has {list(feature['shape'])}; {again}"
+                raise origin.refuse(where, remedy)
+            if not np.isfinite(np.asarray(values, np.float64)).all():
+                raise origin.refuse(where, f"a number that is not finite; {again}")
 
 
 def check_metadata(root: Path, origin: Origin, whole: bool = False) -> None:
@@ -135,11 +140,14 @@ def check_metadata(root: Path, origin: Origin, whole: bool = False) -> None:
     info = read_json(root / INFO, origin)
     check_info(info, origin)
     if safe_join(root, STATS, origin).exists():
-        check_stats(read_json(root / STATS, origin, STATS_MOST), origin)
+        check_stats(read_json(root / STATS, origin, STATS_MOST), info["features"], origin)
     if safe_join(root, TASKS, origin).exists() or (whole and info.get("total_tasks", 0)):
         with _parquet(root / TASKS, origin) as tasks:
             _check_plain(tasks, TASKS, origin)
             _check_texts(tasks, TASKS, origin)
+            if (count := tasks.metadata.num_rows) != info.get("total_tasks", 0):
+                remedy = f"{count} tasks, and {INFO} says {info.get('total_tasks', 0)}; get the dataset again"
+                raise origin.refuse(TASKS, remedy)
     rows = 0
     files = _files(root, EPISODES, origin)
     for path in files:
@@ -152,13 +160,20 @@ def check_metadata(root: Path, origin: Origin, whole: bool = False) -> None:
         raise origin.refuse(EPISODES, remedy)
 
 
-def check_data(root: Path, info: dict[str, Any], origin: Origin) -> None:
-    """The parquet files of ``data/`` and the folders of videos, before anything of them is read.
+def check_data(root: Path, info: dict[str, Any], origin: Origin, whole: bool = False) -> None:
+    """The parquet files of ``data/`` and the folders of videos, before LeRobot reads them.
+
+    Args:
+        root: the dataset's folder.
+        info: content of its ``meta/info.json``, checked.
+        origin: who named it.
+        whole: whether fewer rows than frames are an error; otherwise LeRobot fetches the others.
 
     Raises:
-        InputError: there are more rows than frames, or an image that is not inside its row.
+        InputError: there are other rows than frames, a column is not what its feature says, a number cannot
+            be learnt from, or an image is no PNG or JPEG inside its row.
     """
-    images = [name for name, feature in info["features"].items() if feature["dtype"] == "image"]
+    features = {name: feature for name, feature in info["features"].items() if feature["dtype"] != "video"}
     rows = 0
     for path in _files(root, DATA, origin):
         name = f"{DATA}/{path.parent.name}/{path.name}"
@@ -167,11 +182,18 @@ def check_data(root: Path, info: dict[str, Any], origin: Origin) -> None:
             if rows > info.get("total_frames", 0):
                 remedy = f"more rows than the {info.get('total_frames', 0)} frames that {INFO} says"
                 raise origin.refuse(name, f"{remedy}; get the dataset again")
-            for image in images:
-                _check_images(file, image, name, origin)
+            _check_columns(file, features, info, name, origin)
+            for feature in (f for f in features if features[f]["dtype"] == "image"):
+                _check_images(file, feature, list(features[feature]["shape"]), name, origin)
+    if whole and rows < info.get("total_frames", 0):
+        raise origin.refuse(DATA, _fewer(rows, info["total_frames"]))
     videos = root / "videos"
     for path in videos.rglob("*") if videos.is_dir() else ():
         safe_join(root, path.relative_to(root).as_posix(), origin)
+
+
+def _fewer(rows: int, frames: int) -> str:
+    return f"{rows} rows, fewer than the {frames} frames that {INFO} says; get the dataset again"
 
 
 @contextlib.contextmanager
@@ -186,7 +208,11 @@ def checked(origin: Origin, whole: bool = False) -> Iterator[None]:
     from lerobot.datasets.dataset_reader import DatasetReader
     from PIL import Image
 
+    from accerl_lerobot.hub.trouble import guard_client
+    from datasets import Image as ImageFeature
+
     load_metadata, load_data = LeRobotDatasetMetadata._load_metadata, DatasetReader._load_hf_dataset
+    index, decode = DatasetReader._build_index_mapping, ImageFeature.decode_example
     pixels = Image.MAX_IMAGE_PIXELS
 
     def checked_metadata(self: Any) -> None:
@@ -195,17 +221,33 @@ def checked(origin: Origin, whole: bool = False) -> Iterator[None]:
 
     def checked_data(self: Any) -> Any:
         root = Path(self.root)
-        check_data(root, read_json(root / INFO, origin), origin)
+        check_data(root, read_json(root / INFO, origin), origin, whole and self.episodes is None)
         return load_data(self)
 
+    def checked_index(self: Any) -> None:
+        if self.episodes is None and len(self.hf_dataset) < self._meta.total_frames:
+            raise origin.refuse(DATA, _fewer(len(self.hf_dataset), self._meta.total_frames))
+        index(self)
+
+    def checked_decode(self: Any, value: Any, token_per_repo_id: Any = None) -> Any:
+        try:
+            return decode(self, value, token_per_repo_id)
+        except Exception as error:
+            raise _undecodable(error, DATA, origin) from error
+
+    guard_client()
+    ImageFeature.decode_example = checked_decode
     LeRobotDatasetMetadata._load_metadata = checked_metadata
     DatasetReader._load_hf_dataset = checked_data
+    DatasetReader._build_index_mapping = checked_index
     Image.MAX_IMAGE_PIXELS = PIXELS_MOST // 2  # Pillow refuses what is twice as large
     try:
         yield
     finally:
         LeRobotDatasetMetadata._load_metadata = load_metadata
         DatasetReader._load_hf_dataset = load_data
+        DatasetReader._build_index_mapping = index
+        ImageFeature.decode_example = decode
         Image.MAX_IMAGE_PIXELS = pixels
 
 
@@ -355,9 +397,76 @@ def _check_episodes(file: pq.ParquetFile, info: dict[str, Any], name: str, origi
     return count
 
 
-def _check_images(file: pq.ParquetFile, image: str, name: str, origin: Origin) -> None:
-    """Its bytes lie in the row, and what it says of a path names no other file."""
+def _check_columns(
+    file: pq.ParquetFile, features: dict[str, Any], info: dict[str, Any], name: str, origin: Origin
+) -> None:
+    """Columns are what features say: all of them, of such numbers, as many in each row."""
+    columns = set(file.schema_arrow.names)
+    if missing := sorted(features.keys() - columns) or sorted(columns - features.keys()):
+        which = "is no column" if missing[0] in features else f"is no feature of {INFO}"
+        raise origin.refuse(name, f"{missing[0][:60]} {which}; get the dataset again")
+    below = {"task_index": info.get("total_tasks", 0), "episode_index": info.get("total_episodes", 0)}
+    numbers = [f for f in features if features[f]["dtype"] not in ("image", "string", "language")]
+    for feature in numbers:
+        dtype = features[feature]["dtype"]
+        if _family(file.schema_arrow.field(feature).type) != _FAMILIES[dtype.rstrip("0123468")]:
+            raise origin.refuse(name, f"{feature[:60]} holds no numbers of type {dtype}; record it again")
+    for batch in file.iter_batches(batch_size=1024, columns=numbers):
+        for feature, column in zip(batch.schema.names, batch.columns, strict=True):
+            shape = list(features[feature]["shape"])
+            values = _values(column, [] if shape == [1] else shape)
+            if values is None:
+                remedy = f"{feature[:60]} has other numbers than {shape} in a row; record it again"
+                raise origin.refuse(name, remedy)
+            if feature.startswith(LEARNT) and not np.isfinite(values).all():
+                raise origin.refuse(name, f"{feature[:60]} has a number that is not finite; record it again")
+            if feature in below:
+                wrong = values[(values < 0) | (values >= below[feature])]
+                if len(wrong):
+                    remedy = f"{feature}={wrong[0]}, and there are {below[feature]}; get the dataset again"
+                    raise origin.refuse(name, remedy)
+
+
+_FAMILIES = {"bool": "b", "int": "i", "uint": "i", "float": "f"}
+"""dtype of a feature, without its bits, → `_family` of its column."""
+
+
+def _family(kind: Any) -> str:
+    """What a column holds, at the bottom of its lists: b, i, f, or nothing of these."""
     import pyarrow as pa
+
+    kind = getattr(kind, "storage_type", kind)
+    while pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
+        kind = kind.value_type
+    tests = {"b": pa.types.is_boolean, "i": pa.types.is_integer, "f": pa.types.is_floating}
+    return next((family for family, test in tests.items() if test(kind)), "")
+
+
+def _values(column: Any, shape: list[int]) -> np.ndarray | None:
+    """All numbers of a column whose rows have a shape; None if one has another."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    column = getattr(column, "storage", column)
+    for length in shape:
+        if not hasattr(column, "flatten") or not hasattr(column.type, "value_type") or column.null_count:
+            return None
+        if not pc.all(pc.equal(pc.list_value_length(column), length)).as_py():
+            return None
+        column = column.flatten()
+    if column.null_count or pa.types.is_nested(column.type):
+        return None
+    return np.asarray(column.to_numpy(zero_copy_only=False))
+
+
+def _undecodable(error: Exception, name: str, origin: Origin) -> InputError:
+    return origin.refuse(name, f"an image that cannot be read ({brief(error)}); record it again")
+
+
+def _check_images(file: pq.ParquetFile, image: str, shape: list[int], name: str, origin: Origin) -> None:
+    """Its bytes are PNG or JPEG, lie in the row, and what it says of a path names no other file."""
+    import pyarrow as pa
+    from PIL import Image
 
     kinds = {field.name: field.type for field in file.schema_arrow}
     kind = kinds.get(image)
@@ -370,3 +479,16 @@ def _check_images(file: pq.ParquetFile, image: str, name: str, origin: Origin) -
         for path in column.field("path").to_pylist():
             if path is not None:
                 check_name(path, f"{name}: {image[:60]}.path", origin)
+        for cell in column.field("bytes").to_pylist():
+            if not cell.startswith(IMAGES):
+                raise origin.refuse(name, f"{image[:60]}: an image that is no PNG or JPEG; record it again")
+            try:
+                with Image.open(io.BytesIO(cell), formats=("PNG", "JPEG")) as opened:  # reads its header
+                    size = list(opened.size)
+            except Exception as error:  # Pillow's plugins raise what they like
+                raise _undecodable(error, f"{name}: {image[:60]}", origin) from error
+            if size not in (shape[1::-1], shape[:0:-1]):
+                remedy = (
+                    f"an image of {size[0]} x {size[1]} pixels, and its shape is {shape}; record it again"
+                )
+                raise origin.refuse(name, f"{image[:60]}: {remedy}")

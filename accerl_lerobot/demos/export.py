@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The episodes of a run as a LeRobotDataset: real ones, or what it dreamt, for which see `export_dreams`.
 
     accerl export --path=RUN --root=outputs/rollouts
@@ -27,12 +15,12 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from accerl_lerobot.checkpoint import CONFIG
-from accerl_lerobot.config import RunConfig, parse
+from accerl_lerobot.config import RunConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.expert import Episode
 from accerl_lerobot.demos.export_dreams import write_dreams
@@ -51,6 +39,8 @@ from accerl_lerobot.envs.base import World
 from accerl_lerobot.envs.config import EnvConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL
+from accerl_lerobot.parsing import decode, drop_consents, read_recipe
+from accerl_lerobot.ranges import Choice, Range, Section, Steps
 from accerl_lerobot.replay.journal import EPISODES, Done, read_journal, whole_episodes
 from accerl_lerobot.world_model.recorded import DREAMS, read_dreams
 
@@ -60,17 +50,15 @@ VERSION = "policy_version"
 """Feature: updates behind the weights that chose the action."""
 TOLERANCE = 1e-4
 """By which the rewards of a decision may differ, which are summed in another order."""
-PICKS = ("all", "successes", "failures")
-SOURCES = (REAL, IMAGINED)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportConfig:
+class ExportConfig(Section):
     """What is taken, and where to."""
 
     path: str | None = None
     """Folder of an ``accerl train`` run."""
-    source: str = REAL
+    source: Annotated[str, Choice((REAL, IMAGINED))] = REAL
     """real: exploring episodes, with a picture at every env step. imagined: dreams, where
     ``imagination.record`` has kept any, with a picture at every decision. Never both: what is done between
     two frames is not the same in them."""
@@ -78,23 +66,20 @@ class ExportConfig:
     """Folder to create; must not exist."""
     repo_id: str = "accerl/rollouts"
     """Name of the dataset, ``owner/name``."""
-    pick: str = "all"
+    pick: Literal["all", "successes", "failures"] = "all"
     """all, successes or failures."""
-    last: int = 0
+    last: Steps = 0
     """So many of the newest of these; 0: all of them."""
-    processes: int = 2
-    """Simulator processes, 1 to 64; does not change the content."""
+    processes: Annotated[int, Range("[1, 64]")] = 2
+    """Simulator processes; does not change the content."""
+    hub_path: str | None = None
+    """``owner/name@COMMIT`` whose code is run with your rights, if the run's environment is on the Hub."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.path is None:
             raise InputError("path", None, "name the folder of an accerl train run")
-        if self.source not in SOURCES:
-            raise InputError("source", self.source, f"use {' or '.join(SOURCES)}")
-        if self.pick not in PICKS:
-            raise InputError("pick", self.pick, f"use {', '.join(PICKS)}")
-        if self.last < 0:
-            raise InputError("last", self.last, "use 0 (all) or more episodes")
-        check_target(self.root, self.repo_id, self.processes)
+        check_target(self.root, self.repo_id)
 
 
 def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
@@ -109,7 +94,7 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
     run, root = Path(str(config.path)).expanduser(), check_free(config.root)
     if not (run / CONFIG).is_file():
         raise InputError("path", str(run), f"no run in it: there is no {CONFIG}")
-    settings: RunConfig = parse(RunConfig, [f"--config_path={run / CONFIG}"])
+    settings = _settings(run, config.hub_path)
     if config.source == IMAGINED:
         return _export_dreams(settings, config, run, root, console)
     chosen = _picked(whole_episodes(read_journal(run / EPISODES)), lambda parts: parts[-1].success, config)
@@ -124,6 +109,26 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
             raise InputError("path", str(run), remedy)
         _say_what_it_is(config, run, settings, tally, partial)
     return tally
+
+
+def _settings(run: Path, hub_path: str | None) -> RunConfig:
+    """The run's config, in which nothing but `hub_path` lets code run.
+
+    Raises:
+        InputError: it cannot be read, or its environment is on the Hub and `hub_path` does not allow that.
+    """
+    tree = read_recipe(run / CONFIG)
+    wanted = drop_consents(tree).get("env.kwargs.hub_path")
+    if wanted is not None and hub_path is None:
+        remedy = (
+            f"the run's environment is code of {wanted}, which would run with your rights: if you trust it, "
+        )
+        raise InputError("hub_path", None, f"{remedy}name that here")
+    if hub_path is not None:
+        env = tree["env"] = dict(tree.get("env") or {})
+        env |= {"trust_remote_code": True, "kwargs": dict(env.get("kwargs") or {}) | {"hub_path": hub_path}}
+    settings: RunConfig = decode(RunConfig, tree)
+    return settings
 
 
 def _export_dreams(

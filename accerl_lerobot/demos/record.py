@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Scripted experts in parallel processes, recorded as one LeRobotDataset.
 
 Worker processes simulate and send arrays; the parent writes. An episode's seed follows from its place in the
@@ -28,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import draccus
 import numpy as np
@@ -48,6 +36,7 @@ from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import World, WorldSpec
 from accerl_lerobot.envs.config import EnvConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.ranges import Range, Section, Seed, Share
 from accerl_lerobot.seeds import demo_seed
 
 SIDECAR = Path("meta") / "accerl_demos.json"
@@ -60,50 +49,40 @@ _VERSIONS = ("lerobot", "metaworld", "mujoco", "numpy")
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemosConfig:
+class DemosConfig(Section, section="demos"):
     """How many demonstrations, how disturbed, written where.
 
     Example:
         >>> record_demos(MetaWorldConfig(), DemosConfig(episodes=25, root="outputs/drawer"))
     """
 
-    episodes: int = 25
-    """Episodes in the dataset, 1 to 10,000; spread evenly over the tasks."""
-    action_noise: float = 0.1
-    """Standard deviation of the Gaussian added to the expert's action before clipping, 0 to 1. The noisy
+    episodes: Annotated[int, Range("[1, 10000]")] = 25
+    """Episodes in the dataset; spread evenly over the tasks."""
+    action_noise: Share = 0.1
+    """Standard deviation of the Gaussian added to the expert's action before clipping. The noisy
     action is executed and recorded, so the dataset also shows how to recover."""
-    push: float = 0.0
+    push: Annotated[float, Range("[0, 2]")] = 0.0
     """Largest length of a constant vector, drawn anew for each episode, that is added to the expert's action
-    before the noise, 0 to 2. An expert that is pushed aside misses narrowly, as a policy does, and drifting
+    before the noise. An expert that is pushed aside misses narrowly, as a policy does, and drifting
     does not; use it with `keep_failures`, for success and world models."""
-    failure_share: float = 0.0
-    """Share of episodes that drift at random from early on and fail, 0 to 1; for success and world models."""
+    failure_share: Share = 0.0
+    """Share of episodes that drift at random from early on and fail; for success and world models."""
     keep_failures: bool = False
     """Whether an expert episode that failed is kept; otherwise it is tried again with another seed."""
-    max_steps: int = 500
+    max_steps: Annotated[int, Range("[1, 1000000]")] = 500
     """Episode limit in env steps; the environment's own limit holds too."""
-    seed: int = 0
-    """0 to 999; disjoint demonstrations for different seeds."""
-    processes: int = 2
-    """Simulator processes, 1 to 64; does not change the content."""
+    seed: Seed = 0
+    """Disjoint demonstrations for different seeds."""
+    processes: Annotated[int, Range("[1, 64]")] = 2
+    """Simulator processes; does not change the content."""
     repo_id: str = "accerl/demos"
     """Name of the dataset, ``owner/name``; also its place on the Hub if it is pushed."""
     root: str = "outputs/demos"
     """Folder to create; must not exist."""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.episodes <= _MAX_EPISODES:
-            raise InputError("demos.episodes", self.episodes, f"use 1 to {_MAX_EPISODES}")
-        if not 0 <= self.action_noise <= 1:
-            raise InputError("demos.action_noise", self.action_noise, "use 0 to 1")
-        if not 0 <= self.push <= 2:
-            raise InputError("demos.push", self.push, "use 0 to 2")
-        if not 0 <= self.failure_share <= 1:
-            raise InputError("demos.failure_share", self.failure_share, "use a share between 0 and 1")
-        if self.max_steps < 1:
-            raise InputError("demos.max_steps", self.max_steps, "use at least 1 env step")
-        check_target(self.root, self.repo_id, self.processes, "demos.")
-        demo_seed(self.seed, 0)
+        super().__post_init__()
+        check_target(self.root, self.repo_id, "demos.")
 
 
 def record_demos(env_config: EnvConfig, config: DemosConfig) -> Path:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Warm start: hands a LeRobotDataset to LeRobot's own trainer and returns a LeRobot checkpoint.
 
 The trainer is stock ``lerobot-train`` in a process of its own, under `guarded_train`; the exact command is
@@ -29,13 +17,14 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from accerl_lerobot.checkpoint import BACKBONE, displaced, relocate
 from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.policies.backbone import BackboneConfig, write_backbone
 from accerl_lerobot.policies.files import fetched_checkpoint
 from accerl_lerobot.policies.plugins import discovery, register_policies
+from accerl_lerobot.ranges import LearningRate, Range, Section, Steps, Threads
 from accerl_lerobot.safety import Origin, check_remote_code, read_json
 
 logger = logging.getLogger(__name__)
@@ -53,22 +42,22 @@ NO_SFT = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class SFTConfig:
+class SFTConfig(Section, section="sft"):
     """Supervised fine-tuning before RL."""
 
-    steps: int = 0
+    steps: Steps = 0
     """Optimiser steps; 0 skips this stage."""
-    batch_size: int = 64
+    batch_size: Annotated[int, Range("[1, 65536]")] = 64
     """Frames per step."""
-    lr: float = 1e-3
+    lr: LearningRate = 1e-3
     """Peak learning rate; LeRobot's preset warms up and decays it over `steps`, if the policy type's does."""
-    warmup_steps: int = 20
+    warmup_steps: Steps = 20
     """Without effect on a policy type whose preset has no warm-up, such as act."""
     cache: bool = True
     """Keep the dataset's items in memory, see `cached_train`; not above 4 GiB nor with image transforms."""
-    num_workers: int = 0
+    num_workers: Annotated[int, Range("[0, 256]")] = 0
     """Data-loading processes; 0 loads in the trainer, which is what `cache` wants."""
-    num_threads: int = 2
+    num_threads: Threads = 2
     """CPU threads of the trainer."""
     init_path: str | None = None
     """LeRobot checkpoint to start from; None starts a new policy from `policy`."""
@@ -85,13 +74,7 @@ class SFTConfig:
     """Further ``lerobot-train`` arguments, e.g. ``--dataset.image_transforms.enable=true``."""
 
     def __post_init__(self) -> None:
-        if self.steps < 0:
-            raise InputError("sft.steps", self.steps, "use 0 (skip) or more")
-        if not 0 < self.lr < 1:
-            raise InputError("sft.lr", self.lr, "use a value in (0, 1)")
-        for name, least in (("batch_size", 1), ("warmup_steps", 0), ("num_workers", 0), ("num_threads", 1)):
-            if getattr(self, name) < least:
-                raise InputError(f"sft.{name}", getattr(self, name), f"use at least {least}")
+        super().__post_init__()
         if self.init_path is None and "type" not in self.policy:
             raise InputError("sft.policy", self.policy, "name LeRobot's policy type, e.g. {type: smolvla}")
         check_remote_code(self.trust_remote_code, self.code_revision, "sft")
@@ -262,6 +245,9 @@ def _stored_config(path: str) -> dict[str, Any]:
     """
     from huggingface_hub import hf_hub_download
 
+    from accerl_lerobot.hub.trouble import guard_client
+
+    guard_client()
     file = Path(path).expanduser() / "config.json"
     if not (local := file.is_file()):
         try:

@@ -1,24 +1,11 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
-"""Opens a LeRobotDataset's metadata and refuses, before any long work, what does not fit a world."""
+# SPDX-License-Identifier: Apache-2.0
+"""Opens a LeRobotDataset's metadata."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 from accerl_lerobot.demos.dataset_files import checked
-from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.safety import Origin, brief
 
@@ -68,30 +55,6 @@ def origin_of(dataset: DatasetConfig) -> Origin:
     if dataset.root is not None:
         return Origin("dataset.root", dataset.root)
     return Origin("dataset.repo_id", dataset.repo_id)
-
-
-def check_dataset(dataset: DatasetConfig, env: EnvConfig, rename_map: dict[str, str]) -> Any:
-    """Compares a dataset with the world its policy will act in; returns LeRobot's metadata.
-
-    Raises:
-        InputError: a camera of the world is missing, or state or action sizes differ.
-    """
-    meta = open_metadata(dataset)
-    world = make_world(env)
-    spec = world.spec
-    world.close()
-    shapes = {k: tuple(f["shape"]) for k, f in meta.features.items()}
-    cameras = [k for k in shapes if k.startswith("observation.images.") or k == "observation.image"]
-    for key in spec.images:
-        if rename_map.get(key, key) not in shapes:
-            remedy = f"the dataset has {', '.join(cameras) or 'no camera'}; choose env.camera accordingly"
-            raise InputError("dataset.repo_id", dataset.repo_id, f"no {rename_map.get(key, key)}: {remedy}")
-    wanted = {"observation.state": (spec.state_dim,), "action": (spec.action_dim,)}
-    for key, shape in wanted.items():
-        if shapes.get(key) != shape:
-            remedy = f"{key} has shape {shapes.get(key)} here and {shape} in the world; they must be equal"
-            raise InputError("dataset.repo_id", dataset.repo_id, remedy)
-    return meta
 
 
 def task_texts(meta: Any) -> list[str]:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A LeRobotDataset from simulated episodes: several processes simulate, the parent writes, in order."""
 
 from __future__ import annotations
@@ -19,22 +7,22 @@ import collections
 import concurrent.futures
 import multiprocessing
 import shutil
+import signal
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from accerl_lerobot import guardian
 from accerl_lerobot.errors import InputError
 
 
-def check_target(root: str, repo_id: str, processes: int, prefix: str = "") -> None:
-    """Refuses what no dataset can be written by; `prefix` begins the names of the fields.
+def check_target(root: str, repo_id: str, prefix: str = "") -> None:
+    """Refuses names under which no dataset can be written; `prefix` begins the names of the fields.
 
     Raises:
-        InputError: a name is not one, or there are no processes, or too many.
+        InputError: a name is not one.
     """
-    if not 1 <= processes <= 64:
-        raise InputError(f"{prefix}processes", processes, "use 1 to 64")
     if len(parts := repo_id.split("/")) != 2 or not all(parts):
         raise InputError(f"{prefix}repo_id", repo_id, "use the form owner/name")
     if not root:
@@ -57,6 +45,7 @@ def appearing(root: Path) -> Iterator[Path]:
     """A folder to be filled, which becomes `root` when the context is left, or goes if there was an error."""
     partial = root.with_name(f"{root.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
+    guardian.remove(partial)
     try:
         yield partial
         partial.rename(root)
@@ -69,12 +58,24 @@ def appearing(root: Path) -> Iterator[Path]:
 def simulators(
     processes: int, start: Callable[..., None], *arguments: Any
 ) -> Iterator[concurrent.futures.ProcessPoolExecutor]:
-    """So many processes, each made ready by `start`."""
+    """So many processes, each made ready by `start`; an error inside ends them at once."""
     context = multiprocessing.get_context("spawn")
+    before = set(multiprocessing.active_children())
     with concurrent.futures.ProcessPoolExecutor(
-        processes, context, initializer=start, initargs=arguments
+        processes, context, initializer=_ready, initargs=(start, *arguments)
     ) as pool:
-        yield pool
+        try:
+            yield pool
+        except BaseException:
+            for process in set(multiprocessing.active_children()) - before:
+                process.kill()
+            raise
+
+
+def _ready(start: Callable[..., None], *arguments: Any) -> None:
+    """Makes a process ready; Ctrl-C on the terminal is for its parent, which ends it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    start(*arguments)
 
 
 def in_order[Item, Result](

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Worlds to act in: one contract, one config choice per world.
 
 Importing this package loads no simulator; a world imports its own when it is made.
@@ -27,6 +15,7 @@ from accerl_lerobot.envs.history import HistoryWorld
 from accerl_lerobot.envs.lerobot_env import LeRobotEnvConfig, LeRobotWorld
 from accerl_lerobot.envs.metaworld import MetaWorld, MetaWorldConfig
 from accerl_lerobot.envs.simulated import SimulatedConfig, SimulatedWorld
+from accerl_lerobot.errors import InputError
 
 __all__ = [
     "ChunkResult",
@@ -56,6 +45,16 @@ def make_world(config: EnvConfig, history: int = 1) -> World:
     Args:
         config: of one of the kinds of world.
         history: how many env steps an observation holds; above 1, arrays begin with that dimension.
+
+    Raises:
+        InputError: its simulator is not installed; what the world itself refuses.
     """
-    world = _WORLDS[type(config)](config)
+    try:
+        world = _WORLDS[type(config)](config)
+    except ModuleNotFoundError as error:
+        name = str(getattr(config, "name", config.type))
+        extra = f"{'accerl-' if name == config.type else ''}lerobot[{name}]"
+        missing = str(error.name or getattr(error.__cause__, "name", None)).partition(".")[0]
+        remedy = f"the package {missing} is not installed; pip install '{extra}'"
+        raise InputError("env.type" if name == config.type else "env.name", name, remedy) from error
     return world if history == 1 else HistoryWorld(world, history)

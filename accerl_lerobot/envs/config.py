@@ -1,29 +1,19 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The root of all environment configs: ``--env.type=metaworld`` picks one."""
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Self
+from typing import Annotated, Self
 
 import draccus
 
+from accerl_lerobot.ranges import Range, Section
+
 
 @dataclass(frozen=True, kw_only=True)
-class EnvConfig(draccus.ChoiceRegistry):
+class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
     """Base of every environment config; subclasses register under the name given on the command line.
 
     Example:
@@ -31,7 +21,7 @@ class EnvConfig(draccus.ChoiceRegistry):
         'metaworld'
     """
 
-    max_steps: int = 500
+    max_steps: Annotated[int, Range("[1, 1000000]")] = 500
     """Episode limit in env steps; reaching it truncates."""
 
     @property

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """An offscreen OpenGL for MuJoCo: pick a backend before the import, and say in one line what is missing.
 
 MuJoCo reads ``MUJOCO_GL`` once, when it is imported: call `import_mujoco` before importing what uses it.
@@ -100,15 +88,24 @@ def new_renderer(model: Any, height: int, width: int) -> Any:
         renderer = mujoco.Renderer(model, height, width)
     except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
         raise InputError("MUJOCO_GL", os.environ.get("MUJOCO_GL", ""), REMEDY) from error
-    _open.add(renderer)
+    close_at_exit(renderer)
     return renderer
 
 
-@atexit.register
+def close_at_exit(drawing: Any) -> None:
+    """Has `drawing` closed when the interpreter ends, unless it is gone by then; call it once it has drawn.
+
+    MuJoCo registers EGL's end with its first context, and `atexit` calls the latest function first: ours has
+    to be registered after it, or contexts are destroyed in a display that is gone, which prints tracebacks.
+    """
+    _open.add(drawing)
+    atexit.unregister(_close_all)
+    atexit.register(_close_all)
+
+
 def _close_all() -> None:
-    """Frees every context while the interpreter still can; otherwise OSMesa complains at exit."""
-    for renderer in tuple(_open):
-        renderer.close()
+    for drawing in tuple(_open):
+        drawing.close()
 
 
 def _headless() -> bool:

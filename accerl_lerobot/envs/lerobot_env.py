@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Any environment LeRobot can make, as a world.
 
 LeRobot's environments disagree on autoreset, truncation and success, so this takes the single environment out
@@ -21,18 +9,27 @@ Importing this file loads no LeRobot; making the world does.
 
 from __future__ import annotations
 
+import io
 import math
+import os
 import re
+from contextlib import redirect_stdout
 from dataclasses import dataclass, field
-from typing import Any
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import yaml
 
+from accerl_lerobot.checkpoint import write_atomically
 from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec, checked_actions
 from accerl_lerobot.envs.config import EnvConfig
-from accerl_lerobot.envs.gl import import_mujoco
+from accerl_lerobot.envs.gl import close_at_exit, import_mujoco
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Observation
+from accerl_lerobot.ranges import Range
+from accerl_lerobot.seeds import start_state
 
 _STATE = "observation.state"
 _IMAGE = "observation.image"
@@ -61,18 +58,15 @@ class LeRobotEnvConfig(EnvConfig):
     camera: str = "image"
     """Name of a lone camera: ``observation.images.<camera>``; if empty, LeRobot's ``observation.image``,
     which policies trained on LeRobot's PushT dataset expect."""
-    max_steps: int = 300
+    max_steps: Annotated[int, Range("[1, 1000000]")] = 300
     """Episode limit in env steps; reaching it truncates."""
-    reward: str = "success"
+    reward: Literal["success", "env"] = "success"
     """``success`` (1.0 at the first success, else 0.0) or ``env`` (the environment's own)."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.name:
             raise InputError("env.name", self.name, "name one of LeRobot's environments, such as pusht")
-        if self.max_steps < 1:
-            raise InputError("env.max_steps", self.max_steps, "use at least 1 env step")
-        if self.reward not in ("success", "env"):
-            raise InputError("env.reward", self.reward, "use success or env")
 
 
 class LeRobotWorld(World):
@@ -88,6 +82,8 @@ class LeRobotWorld(World):
     def __init__(self, config: LeRobotEnvConfig) -> None:
         if config.name in _NEEDS_MUJOCO:
             import_mujoco()
+        if config.name.startswith("libero"):
+            _configure_libero()
         from lerobot.envs.configs import EnvConfig as LeRobotConfig
         from lerobot.envs.factory import make_env
 
@@ -101,24 +97,29 @@ class LeRobotWorld(World):
             raise InputError("env.kwargs", config.kwargs, str(error)) from error
         _check_hub(config, getattr(self._lerobot_config, "hub_path", None))
         self._before, self._after = self._lerobot_config.get_env_processors()
-        self._vectors = make_env(
-            self._lerobot_config,
-            n_envs=1,
-            use_async_envs=False,
-            trust_remote_code=config.trust_remote_code,
-        )
+        with redirect_stdout(io.StringIO()):  # LeRobot prints, and results go there
+            self._vectors = make_env(
+                self._lerobot_config,
+                n_envs=1,
+                use_async_envs=False,
+                trust_remote_code=config.trust_remote_code,
+            )
         self._envs = _single_envs(self._vectors)
         self._task = ""
         self._steps = 0
         self._success = False
         self._done = True
         self.spec = self._look()
+        close_at_exit(self)
 
     def reset(self, seed: int, task: str) -> Observation:
         if task not in self._envs:
             raise InputError("task", task, f"this world has: {', '.join(self._envs)}")
         self._done = True
-        raw, _ = self._envs[task].reset(seed=seed)
+        env = self._envs[task]
+        if (states := getattr(env, "_init_states", None)) is not None:
+            env.init_state_id = start_state(seed, len(states))  # or LeRobot takes the next one at each reset
+        raw, _ = env.reset(seed=seed)
         self._task, self._steps, self._success, self._done = task, 0, False, False
         return self._observe(raw)
 
@@ -189,13 +190,15 @@ class LeRobotWorld(World):
             fps=int(self._lerobot_config.fps),
             max_steps=self.config.max_steps,
             tasks=tuple(self._envs),
+            instructions=tuple(filter(None, map(self._instruction, self._envs))),
         )
 
     def _observe(self, raw: dict[str, Any]) -> Observation:
         from lerobot.envs.utils import preprocess_observation
 
-        batch = self._before({**preprocess_observation(_batched(raw)), TASK: [self._instruction()]})
-        observation: Observation = {TASK: self._instruction()}
+        text = self._instruction(self._task)
+        batch = self._before({**preprocess_observation(_batched(raw)), TASK: [text]})
+        observation: Observation = {TASK: text}
         for key, value in batch.items():
             if key == _STATE:
                 observation[key] = value[0].numpy().astype(np.float32)
@@ -211,12 +214,30 @@ class LeRobotWorld(World):
 
         return self._after({"action": torch.from_numpy(actions)})["action"].numpy()
 
-    def _instruction(self) -> str:
-        env = self._envs[self._task]
+    def _instruction(self, task: str) -> str:
+        env = self._envs[task]
         for name in ("task_description", "task"):
             if isinstance(text := getattr(env, name, None), str) and text:
                 return text
         return self.config.task
+
+
+def _configure_libero() -> None:
+    """Writes the file without which the first import of LIBERO asks the terminal where its data is."""
+    given = Path(os.environ.get("LIBERO_CONFIG_PATH", "~/.libero")).expanduser()
+    if (given / "config.yaml").is_file() or find_spec("libero") is None:
+        return
+    package = find_spec("libero.libero")
+    assert package is not None and package.submodule_search_locations is not None
+    root = Path(package.submodule_search_locations[0])
+    folders = {"bddl_files": "bddl_files", "init_states": "init_files", "assets": "assets"}
+    paths = {"benchmark_root": str(root), "datasets": str(root.parent / "datasets")}
+    paths |= {key: str(root / folder) for key, folder in folders.items()}
+    ours = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "accerl-lerobot" / "libero"
+    ours.mkdir(parents=True, exist_ok=True)
+    if not (file := ours / "config.yaml").is_file() or yaml.safe_load(file.read_text()) != paths:
+        write_atomically(file, yaml.safe_dump(paths))
+    os.environ["LIBERO_CONFIG_PATH"] = str(ours)
 
 
 def _check_hub(config: LeRobotEnvConfig, hub_path: str | None) -> None:

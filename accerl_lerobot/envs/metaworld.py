@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """MetaWorld, stepped a chunk at a time and rendered once per decision.
 
 The same physics, state, camera and instruction as LeRobot's own wrapper, but the image has the size a small
@@ -22,7 +10,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from importlib.util import find_spec
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -32,6 +21,7 @@ from accerl_lerobot.envs.gl import import_mujoco, new_renderer
 from accerl_lerobot.envs.metaworld_tasks import description, resolve
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Observation
+from accerl_lerobot.ranges import Range
 
 CAMERAS = ("topview", "corner", "corner2", "corner3", "corner4", "behindGripper", "gripperPOV")
 STATE_DIM = 4
@@ -55,31 +45,24 @@ class MetaWorldConfig(EnvConfig):
     each task it has played, at about 90 MB a task."""
     camera: str = "corner2"
     """Camera names separated by commas; each becomes ``observation.images.<name>``."""
-    image_size: int = 64
-    """Height and width of every image in pixels, 64 to 480."""
-    max_steps: int = 500
-    """Episode limit in env steps, 1 to 500; reaching it truncates."""
-    lighting: str = "cheap"
+    image_size: Annotated[int, Range("[64, 480]")] = 64
+    """Height and width of every image in pixels."""
+    max_steps: Annotated[int, Range("[1, 500]")] = 500
+    """Episode limit in env steps; reaching it truncates."""
+    lighting: Literal["cheap", "default"] = "cheap"
     """``cheap`` (no shadows, reflections or multisampling: ten times faster in software) or ``default``."""
     terminate_on_success: bool = True
     """Whether the first success ends the episode."""
-    reward: str = "success"
+    reward: Literal["success", "dense"] = "success"
     """``success`` (1.0 at the first success, else 0.0) or ``dense`` (MetaWorld's own, 0 to 10 a step)."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         resolve(self.task)
         if not self.cameras or len(set(self.cameras)) < len(self.cameras):
             raise InputError("env.camera", self.camera, "name each camera once, separated by commas")
         if unknown := [name for name in self.cameras if name not in CAMERAS]:
             raise InputError("env.camera", self.camera, f"{unknown[0]!r} is none of: {', '.join(CAMERAS)}")
-        if not 64 <= self.image_size <= 480:
-            raise InputError("env.image_size", self.image_size, "use 64 to 480 pixels")
-        if not 1 <= self.max_steps <= STEP_LIMIT:
-            raise InputError("env.max_steps", self.max_steps, f"use 1 to {STEP_LIMIT} env steps")
-        if self.lighting not in ("cheap", "default"):
-            raise InputError("env.lighting", self.lighting, "use cheap or default")
-        if self.reward not in ("success", "dense"):
-            raise InputError("env.reward", self.reward, "use success or dense")
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -103,6 +86,9 @@ class MetaWorld(World):
     """
 
     def __init__(self, config: MetaWorldConfig) -> None:
+        for package in ("metaworld", "mujoco"):
+            if find_spec(package) is None:
+                raise ModuleNotFoundError(f"No module named {package!r}", name=package)
         self.config = config
         size = config.image_size
         self.spec = WorldSpec(
@@ -114,6 +100,7 @@ class MetaWorld(World):
             fps=FPS,
             max_steps=config.max_steps,
             tasks=config.tasks,
+            instructions=tuple(map(description, config.tasks)),
         )
         self._sims: dict[str, Any] = {}
         self._eyes: dict[str, Any] = {}

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A world made of nothing but time: known latency, a problem learnt in seconds, and faults on request.
 
 For tests and for measuring the machinery around a world without a simulator's cost or noise.
@@ -23,7 +11,7 @@ import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
@@ -31,6 +19,7 @@ from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec, checked_acti
 from accerl_lerobot.envs.config import EnvConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Observation
+from accerl_lerobot.ranges import NonNegative, Positive, Range, Steps
 
 CAMERA = "front"
 INSTRUCTIONS = {"match": "Match the target", "mirror": "Mirror the target"}
@@ -54,68 +43,51 @@ class SimulatedConfig(EnvConfig):
 
     task: str = "match"
     """``match`` (the action is the target), ``mirror`` (its negative), or both separated by a comma."""
-    action_dim: int = 2
-    """1 to 32."""
-    state_dim: int = 4
+    action_dim: Annotated[int, Range("[1, 32]")] = 2
+    state_dim: Annotated[int, Range("[2, 1024]")] = 4
     """At least twice `action_dim`: the target, the mean of the last actions, then zeros."""
-    image_size: int = 32
-    """Height and width of ``observation.images.front`` in pixels, 8 to 480: target green, mean action red."""
-    max_steps: int = 40
+    image_size: Annotated[int, Range("[8, 480]")] = 32
+    """Height and width of ``observation.images.front`` in pixels: target green, mean action red."""
+    max_steps: Annotated[int, Range("[1, 1000000]")] = 40
     """Episode limit in env steps; reaching it truncates."""
-    hold: int = 4
-    """Number of last actions averaged, 1 or more; no success before so many steps."""
-    tolerance: float = 0.25
-    """Largest distance in any dimension, above 0; targets lie within ±0.8."""
-    reward: str = "success"
+    hold: Annotated[int, Range("[1, 1000000]")] = 4
+    """Number of last actions averaged; no success before so many steps."""
+    tolerance: Positive = 0.25
+    """Largest distance in any dimension; targets lie within ±0.8."""
+    reward: Literal["success", "dense"] = "success"
     """``success`` (1.0 at the first success, else 0.0) or ``dense`` (1 − distance, each step)."""
     terminate_on_success: bool = True
     """Whether the first success ends the episode."""
-    step_ms: float = 0.0
+    step_ms: NonNegative = 0.0
     """Mean time an env step takes, in milliseconds; slept, so it costs no processor."""
-    frame_ms: float = 0.0
+    frame_ms: NonNegative = 0.0
     """Mean time an observation takes, in milliseconds."""
-    latency: str = "constant"
+    latency: Literal["constant", "lognormal", "trace"] = "constant"
     """``constant``, ``lognormal`` or ``trace``; drawn from the episode's seed."""
-    latency_cv: float = 0.5
-    """Standard deviation over mean of the lognormal law, 0 to 10."""
+    latency_cv: Annotated[float, Range("[0, 10]")] = 0.5
+    """Standard deviation over mean of the lognormal law."""
     latency_trace: str | None = None
     """File that `accerl bench latency` has written of another world, scaled so that its decisions take
     `frame_ms` on average: an episode takes a stretch of it, from a moment drawn from its seed. What a reset
     takes is drawn from what resets took there."""
-    crash_after: int = 0
+    crash_after: Steps = 0
     """Env steps of this instance after which it raises; 0 for never."""
-    nan_after: int = 0
+    nan_after: Steps = 0
     """Env steps of this instance after which one state is NaN and its episode ends; 0 for never."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.tasks or any(name not in INSTRUCTIONS for name in self.tasks):
             raise InputError("env.task", self.task, f"use names from: {', '.join(INSTRUCTIONS)}")
-        if not 1 <= self.action_dim <= 32:
-            raise InputError("env.action_dim", self.action_dim, "use 1 to 32")
         if self.state_dim < 2 * self.action_dim:
             raise InputError("env.state_dim", self.state_dim, f"use at least {2 * self.action_dim}")
-        if not 8 <= self.image_size <= 480:
-            raise InputError("env.image_size", self.image_size, "use 8 to 480 pixels")
-        if self.max_steps < 1:
-            raise InputError("env.max_steps", self.max_steps, "use at least 1 env step")
-        if not 1 <= self.hold <= self.max_steps:
+        if self.hold > self.max_steps:
             raise InputError("env.hold", self.hold, f"use 1 to env.max_steps ({self.max_steps})")
-        if not self.tolerance > 0:
-            raise InputError("env.tolerance", self.tolerance, "use a positive distance")
-        if self.reward not in ("success", "dense"):
-            raise InputError("env.reward", self.reward, "use success or dense")
-        if self.latency not in ("constant", "lognormal", "trace"):
-            raise InputError("env.latency", self.latency, "use constant, lognormal or trace")
         if (self.latency == "trace") != (self.latency_trace is not None):
             remedy = "name a file of `accerl bench latency` for env.latency=trace, and for no other"
             raise InputError("env.latency_trace", self.latency_trace, remedy)
         if self.latency == "trace" and self.step_ms:
             raise InputError("env.step_ms", self.step_ms, "a trace is of whole decisions; use env.frame_ms")
-        if not 0 <= self.latency_cv <= 10:
-            raise InputError("env.latency_cv", self.latency_cv, "use 0 to 10")
-        for name in ("step_ms", "frame_ms", "crash_after", "nan_after"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"env.{name}", getattr(self, name), "use 0 or more")
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -142,6 +114,7 @@ class SimulatedWorld(World):
             fps=80,
             max_steps=config.max_steps,
             tasks=config.tasks,
+            instructions=tuple(INSTRUCTIONS[task] for task in config.tasks),
         )
         self._lifetime = 0
         self._task = ""

@@ -1,21 +1,10 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What people look at: the success curve, and the policy before and after."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -83,13 +72,19 @@ def success_curve(
         axes.legend(loc="lower right")
 
 
-def write_video(path: Path, rows: Sequence[Sequence[Sequence[np.ndarray]]], fps: int) -> None:
+def write_video(
+    path: Path,
+    rows: Sequence[Sequence[Sequence[np.ndarray]]],
+    fps: int,
+    above: Callable[[int], np.ndarray] | None = None,
+) -> None:
     """Writes a grid of clips; one that ends early holds its last frame.
 
     Args:
         path: .mp4 to write.
-        rows: rows of clips, as many in each; frames of a clip are uint8 (H, W, 3), all of one size.
+        rows: rows of clips, as many in each; frames of a clip are uint8 (H, W, 3), all of one size in a row.
         fps: frames per second.
+        above: number of a frame → what is put above the grid in it, as wide as that.
 
     Raises:
         ValueError: no clip, one without frames, or rows of unequal length.
@@ -97,7 +92,7 @@ def write_video(path: Path, rows: Sequence[Sequence[Sequence[np.ndarray]]], fps:
     import imageio.v2 as imageio
 
     clips = [clip for row in rows for clip in row]
-    if not clips or not all(clips):
+    if not clips or not all(map(len, clips)):
         raise ValueError("every clip needs a frame")
     if len({len(row) for row in rows}) != 1:
         raise ValueError("every row needs as many clips")
@@ -109,30 +104,82 @@ def write_video(path: Path, rows: Sequence[Sequence[Sequence[np.ndarray]]], fps:
     with writer:
         for i in range(length + fps):
             lines = [_joined([clip[min(i, len(clip) - 1)] for clip in row], axis=1) for row in rows]
-            picture = _joined(lines, axis=0)
+            picture = _joined([*([] if above is None else [above(i)]), *lines], axis=0)
             writer.append_data(picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2])
 
 
 def before_after(
-    path: Path, before: Sequence[EpisodeResult], after: Sequence[EpisodeResult], fps: int
+    path: Path,
+    before: tuple[Sequence[EpisodeResult], dict[str, Any] | None],
+    after: tuple[Sequence[EpisodeResult], dict[str, Any] | None],
+    fps: int,
 ) -> None:
-    """Films the same episodes twice: above before training, below after it; green is success, red failure.
+    """Films the same episodes twice, before training on the left and after it on the right.
+
+    Above each half stand the evaluation's numbers, and how many of the filmed episodes have succeeded so far;
+    the frame of an episode that has ended is green for a success and red for a failure.
 
     Args:
         path: .mp4 to write; nothing is written when no episode was filmed.
-        before: results, of which those with frames count.
-        after: results of the same plans.
+        before: results, of which those with frames are shown, and their summary by `summary.summarise`.
+        after: the same of the same plans.
         fps: frames per second.
     """
-    filmed = [{r.plan.index: r for r in results if r.frames} for results in (before, after)]
+    filmed = [{r.plan.index: r for r in results if r.frames} for results, _ in (before, after)]
     both = sorted(filmed[0].keys() & filmed[1].keys())
-    if both:
-        names = ("before", "after")
-        rows = [
-            [captioned(row[i].frames, name, row[i].success) for i in both]
-            for row, name in zip(filmed, names, strict=True)
-        ]
-        write_video(path, rows, fps)
+    if not both:
+        return
+    columns = math.ceil(math.sqrt(len(both)))
+    blank = np.full_like(filmed[0][both[0]].frames[0], 255)
+    gap = np.full((len(blank), 2 * GAP, 3), 255, np.uint8)
+    halves = [
+        [captioned(half[i].frames, "", half[i].success) for i in both]
+        + [[blank]] * (-len(both) % columns)
+        for half in filmed
+    ]  # fmt: skip
+    left, right = ([half[i : i + columns] for i in range(0, len(half), columns)] for half in halves)
+    rows = [[*one, [gap], *two] for one, two in zip(left, right, strict=True)]
+    width = columns * (blank.shape[1] + GAP) - GAP
+
+    def above(number: int) -> np.ndarray:
+        lines = []
+        for name, half, (_, summary) in zip(("before", "after"), filmed, (before, after), strict=True):
+            ended = sum(half[i].success and number >= len(half[i].frames) for i in both)
+            count = f"{ended} of these {len(both)} succeeded"
+            lines.append([f"{name} RL: {_rate(summary)}", count])
+        return _caption(lines, width, gap.shape[1] + 2 * GAP)
+
+    write_video(path, rows, fps, above)
+
+
+def _rate(summary: dict[str, Any] | None) -> str:
+    if summary is None:
+        return "not evaluated"
+    low, high = summary["ci95"]
+    return f"{summary['success']:.0%} success [{low:.0%}, {high:.0%}], n = {summary['n']}"
+
+
+def _caption(halves: Sequence[Sequence[str]], width: int, gap: int) -> np.ndarray:
+    """Lines of black text over each half of a picture, 8 to 20 pixels high, as large as they fit.
+
+    Args:
+        halves: as many lines for each.
+        width: of a half in pixels.
+        gap: between them.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    longest = max((line for lines in halves for line in lines), key=len)
+    size = 20
+    while size > 8 and ImageFont.load_default(size).getlength(longest) > width - 8:
+        size -= 1
+    step, font = size + 6, ImageFont.load_default(size)
+    image = Image.new("RGB", (len(halves) * (width + gap) - gap, step * len(halves[0]) + 6), "white")
+    draw = ImageDraw.Draw(image)
+    for half, lines in enumerate(halves):
+        for i, line in enumerate(lines):
+            draw.text((half * (width + gap) + 4, 4 + step * i), line, fill="black", font=font)
+    return np.asarray(image)
 
 
 def captioned(frames: Sequence[np.ndarray], name: str, success: bool) -> list[np.ndarray]:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """From finished episodes to numbers, a table and a file."""
 
 from __future__ import annotations
@@ -33,6 +21,8 @@ def outcomes(results: Sequence[EpisodeResult]) -> Outcomes:
 def summarise(results: Sequence[EpisodeResult]) -> dict[str, Any]:
     """Success with its 95 % Wilson interval, in all and per task, as plain JSON types.
 
+    Each task has the first and the last of its ``seeds``, and the ``failed_seeds`` among them.
+
     Raises:
         ValueError: no episodes.
     """
@@ -40,10 +30,16 @@ def summarise(results: Sequence[EpisodeResult]) -> dict[str, Any]:
         raise ValueError("nothing to summarise: no episodes")
     rate = total(outcomes(results))
     interval = rate.interval()
-    tasks = {
-        task: {"success": r.value, "n": r.n, "ci95": [r.interval().low, r.interval().high]}
-        for task, r in sorted(per_task(outcomes(results)).items())
-    }
+    tasks: dict[str, dict[str, Any]] = {}
+    for task, r in sorted(per_task(outcomes(results)).items()):
+        seeds = {e.plan.seed: e.success for e in results if e.plan.task == task}
+        tasks[task] = {
+            "success": r.value,
+            "n": r.n,
+            "ci95": [r.interval().low, r.interval().high],
+            "seeds": [min(seeds), max(seeds)],
+            "failed_seeds": sorted(seed for seed, success in seeds.items() if not success),
+        }
     return {
         "success": rate.value,
         "n": rate.n,

@@ -1,31 +1,22 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What is pushed and pulled, and where; free of the Hub's client."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
+from typing import Literal
 
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.ranges import Section
 
 REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
-REPO_TYPES = ("model", "dataset")
+RepoType = Literal["model", "dataset"]
+REPO_TYPES: tuple[RepoType, ...] = ("model", "dataset")
 
 
 @dataclass(frozen=True, kw_only=True)
-class PushConfig:
+class PushConfig(Section):
     """``accerl push``: a policy, world model, success model, dataset or whole run, as one commit."""
 
     path: str | None = None
@@ -46,6 +37,7 @@ class PushConfig:
     of the run around the policy."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.path is None:
             raise InputError("path", None, "name the folder to push")
         check_repo_id(self.repo_id)
@@ -56,24 +48,23 @@ class PushConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PullConfig:
+class PullConfig(Section):
     """``accerl pull``: what is on the Hub into a new folder, whole and checked or not at all."""
 
     repo_id: str | None = None
     """``user/name`` on the Hub."""
     revision: str | None = None
     """Commit, tag or branch; the commit it stands for is recorded beside the files. None: the branch main."""
-    repo_type: str | None = None
+    repo_type: RepoType | None = None
     """model or dataset. None: whichever of them has this name."""
     output_dir: str | None = None
     """Folder to create."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_repo_id(self.repo_id)
         if self.output_dir is None:
             raise InputError("output_dir", None, "name the folder to create")
-        if self.repo_type not in (None, *REPO_TYPES):
-            raise InputError("repo_type", self.repo_type, f"use {' or '.join(REPO_TYPES)}")
         if self.revision == "":
             raise InputError("revision", "", "name a commit, tag or branch, or leave the field out")
 

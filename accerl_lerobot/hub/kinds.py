@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What a folder is, seen from what is in it."""
 
 from __future__ import annotations
@@ -22,6 +10,7 @@ from typing import Any
 from accerl_lerobot.checkpoint import CHECKPOINTS, PREPROCESSOR, PRETRAINED, SUMMARY
 from accerl_lerobot.checkpoint import CONFIG as RECIPE
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.safety import JSON_MOST
 
 POLICY, WORLD_MODEL, SUCCESS_MODEL = "policy", "world model", "success model"
 DATASET, RUN = "dataset", "run"
@@ -76,8 +65,8 @@ def recognise(folder: Path, field: str = "path") -> str:
 def read_json(path: Path) -> dict[str, Any]:
     """The mapping in a JSON file; empty if there is none."""
     try:
-        content = json.loads(path.read_text())
-    except (OSError, ValueError):
+        content = json.loads(path.read_text()) if path.stat().st_size <= JSON_MOST else None
+    except (OSError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}
 

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The list of files that goes with them, by which a pull knows that it has them all, unchanged.
 
 README.md is not on it: people edit cards on the Hub. The list is no signature: whoever may write to the
@@ -29,6 +17,7 @@ from accerl_lerobot import __version__
 from accerl_lerobot.checkpoint import digest
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.kinds import NEEDED
+from accerl_lerobot.safety import brief
 
 MANIFEST = "accerl_manifest.json"
 CARD = "README.md"
@@ -41,8 +30,9 @@ class Entry:
 
     size: int
     """Bytes."""
-    sha256: str | None
-    """None: only the size is known."""
+    sha256: str | None = None
+    oid: str | None = None
+    """The hash that git has of it."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +72,8 @@ def read_manifest(data: bytes, repo_id: str) -> Manifest:
         if content["kind"] not in NEEDED:
             raise ValueError("no such kind")
         return Manifest(content["kind"], files)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        remedy = f"its {MANIFEST} is broken ({type(error).__name__}: {error}); push it anew"
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        remedy = f"its {MANIFEST} is broken ({type(error).__name__}: {brief(error)}); push it anew"
         raise InputError("repo_id", repo_id, remedy) from error
 
 
@@ -103,3 +93,15 @@ def verify(folder: Path, files: Mapping[str, Entry], repo_id: str) -> None:
         if expected.sha256 is not None and entry_of(path).sha256 != expected.sha256:
             remedy = f"{name} is not what was pushed: its sha256 is another; pull again, or push it anew"
             raise InputError("repo_id", repo_id, remedy)
+        if expected.oid is not None and git_hash(path) != expected.oid:
+            remedy = f"{name} is not what the server lists: its git hash is another; pull again"
+            raise InputError("repo_id", repo_id, remedy)
+
+
+def git_hash(path: Path) -> str:
+    """The hash by which git knows a file."""
+    digest = hashlib.sha1(b"blob %d\0" % path.stat().st_size, usedforsecurity=False)
+    with path.open("rb") as file:
+        while block := file.read(2**20):
+            digest.update(block)
+    return digest.hexdigest()

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The inference process: one device answers many worlds.
 
     consumes    requests from rollout workers; published weights
@@ -35,17 +23,17 @@ import time
 from collections import Counter, deque
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
 from accerl_lerobot import snapshot
 from accerl_lerobot.checkpoint import WEIGHTS
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.fault_points import reach
 from accerl_lerobot.inference.batcher import Batcher, BatcherStats
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
+from accerl_lerobot.ranges import Range, Section, Threads
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.contract import Asked, Server, stopped
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
@@ -61,29 +49,20 @@ LOOK_S = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class InferenceConfig:
+class InferenceConfig(Section, section="inference"):
     """How decisions are batched."""
 
-    workers: int = 1
+    workers: Annotated[int, Range("[1, 1000]")] = 1
     """Inference processes, each with a copy of the policy; rollout workers are dealt out over them."""
-    max_batch: int = 16
+    max_batch: Annotated[int, Range("[1, 65536]")] = 16
     """Observations per forward pass at most."""
-    max_wait_s: float = 0.002
+    max_wait_s: Annotated[float, Range("[0, 10)")] = 0.002
     """How long the oldest request waits for others, seconds."""
-    num_threads: int = 1
+    num_threads: Threads = 1
     """CPU threads of the forward pass."""
-    max_restarts: int = 3
+    max_restarts: Annotated[int, Range("[0, 1000000]")] = 3
     """How often in a row each of them is started again alone after it died or hung, half a minute of service
     making up for what was before; after that all workers are, from the last checkpoint."""
-
-    def __post_init__(self) -> None:
-        for name in ("workers", "max_batch", "num_threads"):
-            if getattr(self, name) < 1:
-                raise InputError(f"inference.{name}", getattr(self, name), "use at least 1")
-        if self.max_restarts < 0:
-            raise InputError("inference.max_restarts", self.max_restarts, "use 0 or more")
-        if not 0 <= self.max_wait_s < 10:
-            raise InputError("inference.max_wait_s", self.max_wait_s, "use seconds in [0, 10)")
 
 
 class InferenceWorker:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A LeRobot policy with its processors, a likelihood and a critic."""
 
 from __future__ import annotations
@@ -25,11 +13,11 @@ import torch
 from torch import Tensor, nn
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import TASK, Decision, Request
+from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.policies.base import Evaluation, PolicyAdapter, stack_observations
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Encoded, Family, Model
-from accerl_lerobot.policies.processing import Processing, example_observations
+from accerl_lerobot.policies.processing import Processing, example_observations, example_requests
 from accerl_lerobot.policies.value_head import Value, ValueHead
 
 SELF_CHECK_TOLERANCE = 1e-5
@@ -128,10 +116,7 @@ class LeRobotAdapter(PolicyAdapter):
     def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
         """See the base class."""
         observations, tasks = example_observations(self.policy.config, self.processing.rename_map)
-        requests = [
-            Request(observation={k: v[i] for k, v in observations.items()} | {TASK: task}, noise_seed=i)
-            for i, task in enumerate(tasks)
-        ]
+        requests = example_requests(self.policy.config, self.processing.rename_map)
         latents = [decision.latent for decision in self.decide(requests, 0)]
         stacked = {k: torch.from_numpy(np.stack([latent[k] for latent in latents])) for k in latents[0]}
         return observations, tasks, stacked

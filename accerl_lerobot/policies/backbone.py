@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A vision-language backbone of any size, with random weights, written offline.
 
 SmolVLA reads its backbone's architecture and tokeniser from a model directory. For policies small enough to
@@ -23,8 +11,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.ranges import Range, Section
 
 SPECIAL_TOKENS = (
     "<|pad|>", "<|im_start|>", "<|im_end|>", "<image>", "<fake_token_around_image>", "<global-img>",
@@ -32,58 +22,45 @@ SPECIAL_TOKENS = (
 )  # fmt: skip
 
 
+LARGEST_BACKBONE = 10
+"""Billions of weights."""
+
+
 @dataclass(frozen=True, kw_only=True)
-class BackboneConfig:
+class BackboneConfig(Section, section="sft.backbone"):
     """Sizes of a random SmolVLM. The defaults give a SmolVLA of about 0.4 M parameters."""
 
-    hidden: int = 96
+    hidden: Annotated[int, Range("[1, 65536]")] = 96
     """Width of the language model; a multiple of 2·`heads`."""
-    layers: int = 2
+    layers: Annotated[int, Range("[1, 1000]")] = 2
     """Language-model layers; the action expert has as many."""
-    heads: int = 4
-    kv_heads: int = 2
+    heads: Annotated[int, Range("[1, 1024]")] = 4
+    kv_heads: Annotated[int, Range("[1, 1024]")] = 2
     """Key and value heads; a divisor of `heads`."""
-    vision_hidden: int = 64
+    vision_hidden: Annotated[int, Range("[1, 65536]")] = 64
     """Width of the image encoder."""
-    vision_layers: int = 2
-    vision_heads: int = 4
-    patch: int = 16
+    vision_layers: Annotated[int, Range("[1, 1000]")] = 2
+    vision_heads: Annotated[int, Range("[1, 1024]")] = 4
+    patch: Annotated[int, Range("[1, 1024]")] = 16
     """Side of an image patch in pixels."""
-    image: int = 64
+    image: Annotated[int, Range("[1, 4096]")] = 64
     """Side of the image the encoder sees; a multiple of `patch` · `shuffle`."""
 
-    vocabulary: int = 512
+    vocabulary: Annotated[int, Range("[264, 1000000]")] = 512
     """Most tokens the tokeniser has; 264 are bytes and special tokens."""
-    embeddings: int = 0
+    embeddings: Annotated[int, Range("[0, 1000000]")] = 0
     """Rows of the embedding table; 0: as many as the tokeniser has tokens."""
-    intermediate: int = 0
+    intermediate: Annotated[int, Range("[0, 262144]")] = 0
     """Width inside the language model's MLPs; 0: twice `hidden`."""
-    vision_intermediate: int = 0
+    vision_intermediate: Annotated[int, Range("[0, 262144]")] = 0
     """Width inside the image encoder's; 0: twice `vision_hidden`."""
-    shuffle: int = 2
+    shuffle: Annotated[int, Range("[1, 64]")] = 2
     """Side of the square of image tokens that become one token of the language model."""
 
     def __post_init__(self) -> None:
-        for name in (
-            "hidden",
-            "layers",
-            "heads",
-            "kv_heads",
-            "vision_hidden",
-            "vision_layers",
-            "vision_heads",
-        ):
-            if getattr(self, name) < 1:
-                raise InputError(f"sft.backbone.{name}", getattr(self, name), "use at least 1")
-        if self.vocabulary < 264:
-            raise InputError("sft.backbone.vocabulary", self.vocabulary, "use at least 264")
-        for name in ("embeddings", "intermediate", "vision_intermediate"):
-            if getattr(self, name) < 0:
-                raise InputError(f"sft.backbone.{name}", getattr(self, name), "use 0 (by itself) or more")
-        if self.shuffle < 1:
-            raise InputError("sft.backbone.shuffle", self.shuffle, "use at least 1")
+        super().__post_init__()
         tile = self.patch * self.shuffle
-        if self.patch < 1 or self.image < 1 or self.image % tile:
+        if self.image % tile:
             remedy = f"use a multiple of {tile}, the patch times the shuffle"
             raise InputError("sft.backbone.image", self.image, remedy)
         for heads, width in (("heads", self.hidden), ("vision_heads", self.vision_hidden)):
@@ -93,6 +70,13 @@ class BackboneConfig:
         if self.hidden % (2 * self.heads):  # rotary embeddings halve a head
             remedy = f"use a multiple of {2 * self.heads}, twice the heads"
             raise InputError("sft.backbone.hidden", self.hidden, remedy)
+        language = self.layers * self.hidden * (self.hidden + (self.intermediate or 2 * self.hidden))
+        vision = self.vision_layers * self.vision_hidden
+        vision *= self.vision_hidden + (self.vision_intermediate or 2 * self.vision_hidden)
+        if (weights := 3 * (language + vision) / 1e9) > LARGEST_BACKBONE:
+            field = "hidden" if language > vision else "vision_hidden"
+            remedy = f"about {weights:,.0f} billion weights; use fewer or narrower layers"
+            raise InputError(f"sft.backbone.{field}", getattr(self, field), remedy)
         if self.heads % self.kv_heads:
             remedy = f"use a divisor of the {self.heads} heads"
             raise InputError("sft.backbone.kv_heads", self.kv_heads, remedy)

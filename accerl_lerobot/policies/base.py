@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What the engine needs of a policy: π(chunk | observation) with a density, and V(observation).
 
 An adapter wraps one LeRobot policy with its processors. `decide` acts, `evaluate` re-scores what was stored;
@@ -29,13 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Decision, Request
 from accerl_lerobot.policies.value_head import Value
 from accerl_lerobot.tensors import in_parts, part_of, whole
 
 if TYPE_CHECKING:
-    from accerl_lerobot.envs.base import WorldSpec
     from accerl_lerobot.policies.config import PolicyConfig
 
 OBS_STATE = "observation.state"
@@ -178,43 +164,3 @@ def stack_observations(requests: Sequence[Request]) -> tuple[dict[str, np.ndarra
     keys = [k for k in requests[0].observation if k != TASK]
     arrays = {k: np.stack([r.observation[k] for r in requests]) for k in keys}
     return arrays, [str(r.observation[TASK]) for r in requests]
-
-
-def check_fit(policy_config: Any, spec: WorldSpec, rename_map: dict[str, str]) -> None:
-    """Refuses a policy that cannot act in a world, before anything is started.
-
-    Raises:
-        InputError: a camera is missing, `rename_map` names a feature the world does not have, or state or
-            action sizes differ.
-    """
-    unknown = sorted(rename_map.keys() - spec.images.keys() - {OBS_STATE})
-    if unknown:
-        names = ", ".join([*spec.images, OBS_STATE])
-        raise InputError("policy.rename_map", unknown[0], f"the world has no such feature; it offers {names}")
-    offered = [rename_map.get(key, key) for key in spec.images]
-    missing = [k for k in policy_config.image_features if ".empty_camera_" not in k and k not in offered]
-    if missing:
-        raise InputError(
-            "policy.path",
-            missing[0],
-            f"the policy wants this camera but the world offers {', '.join(offered) or 'none'}; choose "
-            "env.camera accordingly or map the world's name to the policy's with policy.rename_map",
-        )
-    if policy_config.env_state_feature is not None:
-        remedy = "the policy reads it, and worlds offer images and observation.state only"
-        raise InputError("policy.path", "observation.environment_state", remedy)
-    remedy = "choose a policy trained in this world, or the world it was trained in"
-    state = policy_config.robot_state_feature
-    if state is not None and tuple(state.shape) != (spec.state_dim,):
-        raise InputError(
-            "policy.path",
-            tuple(state.shape),
-            f"the policy's observation.state has this shape, the world's ({spec.state_dim},); {remedy}",
-        )
-    action = tuple(policy_config.action_feature.shape)
-    if action != (spec.action_dim,):
-        raise InputError(
-            "policy.path",
-            action,
-            f"the policy's action has this shape, the world's ({spec.action_dim},); {remedy}",
-        )

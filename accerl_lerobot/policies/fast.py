@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """FAST's action tokeniser (Pertsch et al., arXiv 2501.09747), read from its files without running their code.
 
 A chunk is transformed along time (orthonormal DCT-II), scaled and rounded; the coefficients, row by row of
@@ -59,6 +47,9 @@ class FastTokenizer:
         from huggingface_hub import snapshot_download
         from transformers import PreTrainedTokenizerFast
 
+        from accerl_lerobot.hub.trouble import guard_client
+
+        guard_client()
         folder = Path(name)
         if not folder.is_dir():
             folder = Path(snapshot_download(name, allow_patterns=["*.json"]))

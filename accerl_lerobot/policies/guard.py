@@ -1,17 +1,5 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
-"""Loading what is anybody's: no code of theirs is run, nothing is unpickled, and memory has a bound.
+# SPDX-License-Identifier: Apache-2.0
+"""Loading what is anybody's: no code of theirs is run, and nothing is unpickled.
 
 LeRobot 0.6.1 has transformers run code from the Hub in places (`trust_remote_code=True` without a revision).
 Where transformers is not told, it asks the terminal; without safetensors it unpickles. `guarded` stands at
@@ -21,24 +9,23 @@ the functions through which all of that goes, whoever calls them.
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from torch import nn
 from torch.overrides import TorchFunctionMode
 
 from accerl_lerobot.errors import InputError
 
-SLACK, TIMES = 1024**3, 4
-"""Bytes that a network may take beside `TIMES` those of its file: what is stored in half precision is float32
-here, and some layers are made and thrown away."""
-CALLS_MOST = 200_000
-"""Tensors that are made while it is built; π0 makes some thousands."""
-SIZED = frozenset((torch.empty, torch.zeros, torch.ones, torch.rand, torch.randn, torch.eye, torch.full))
-SPANS = frozenset((torch.arange, torch.linspace, torch.randperm))
-"""What networks make parameters and buffers with: the sizes are the arguments, or the largest of them is."""
+LARGE = 2**16
+"""Numbers of a tensor that is not filled, see `Unfilled`."""
+FILLS = frozenset((
+    "normal_", "uniform_", "zero_", "fill_", "erfinv_", "trunc_normal_", "constant_", "ones_", "zeros_",
+    "kaiming_uniform_", "kaiming_normal_", "xavier_uniform_", "xavier_normal_", "orthogonal_",
+))  # fmt: skip
 
 
 @contextlib.contextmanager
@@ -90,35 +77,23 @@ def guarded(room: str, code_revision: str | None = None) -> Iterator[None]:
         torch.load = load
 
 
-class Budget(TorchFunctionMode):
-    """While it lasts, networks that are built take no more memory than their file could fill.
+class Unfilled(TorchFunctionMode):
+    """While it lasts, large parameters of networks that are built are zeros: that takes no memory or time.
 
-    A config of a hundred bytes can ask for a terabyte. Building comes before any comparison with the file, so
-    this counts the numbers that are asked for.
-
-    Args:
-        stored: bytes of the file with the weights.
-
-    Raises:
-        InputError: see above; also when more than `CALLS_MOST` tensors are made.
+    A checkpoint has all of them, or it is refused.
     """
-
-    def __init__(self, stored: int, field: str, value: str | None) -> None:
-        super().__init__()
-        self.most, self.taken, self.calls = TIMES * stored + SLACK, 0, 0
-        self._field, self._value = field, value
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        if func in SIZED or func in SPANS:
-            self.calls += 1
-            self.taken += 4 * _numbers(func, args, kwargs)
-            if self.taken > self.most or self.calls > CALLS_MOST:
-                remedy = (
-                    f"its config asks for over {self.taken // 2**20} MiB in {self.calls} tensors, which its"
-                )
-                raise InputError(self._field, self._value, f"{remedy} weights cannot fill; get it again")
-        return func(*args, **kwargs)
+        if getattr(func, "__name__", "") in FILLS:
+            tensor = args[0] if args else kwargs["tensor"]
+            if isinstance(tensor, nn.Parameter) and tensor.numel() > LARGE:
+                return tensor
+        made = func(*args, **kwargs)
+        if func is torch.empty and made.numel() > LARGE and made.device.type == "cpu":
+            zeros = np.zeros(made.nbytes, np.uint8)  # pages that nothing is written to are not there
+            return torch.from_numpy(zeros).view(made.dtype).view(made.shape)
+        return made
 
 
 def input_error(error: BaseException) -> InputError | None:
@@ -129,14 +104,3 @@ def input_error(error: BaseException) -> InputError | None:
             return link
         link = link.__cause__ or link.__context__
     return None
-
-
-def _numbers(func: Any, args: Any, kwargs: dict[str, Any]) -> int:
-    """How many are asked for, be it as ``empty(2, 3)``, ``empty((2, 3))`` or ``empty(size=(2, 3))``."""
-    sizes = [
-        *(args[:1] if func is torch.full else args),
-        *(kwargs[k] for k in ("size", "end", "steps") if k in kwargs),
-    ]
-    flat = [n for size in sizes for n in (size if isinstance(size, (tuple, list)) else [size])]
-    whole = [abs(int(n)) for n in flat if isinstance(n, (int, float)) and 1 <= abs(n) < 2**62]
-    return max(whole, default=0) if func in SPANS else math.prod(whole)

@@ -1,20 +1,8 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A LeRobot checkpoint in, a stochastic policy out, and back into LeRobot's own format.
 
-Everything is LeRobot's: config, weights and processors load through `from_pretrained` and are saved with
-`save_pretrained`, so stock `lerobot-eval` runs what we write. What is ours lies in ``accerl.json`` and
+Config and processors load through LeRobot's `from_pretrained`, weights by `verify.load_weights`. All is saved
+with `save_pretrained`, so stock `lerobot-eval` runs what we write. What is ours lies in ``accerl.json`` and
 ``value_head.safetensors`` beside it.
 """
 
@@ -22,31 +10,42 @@ from __future__ import annotations
 
 import json
 import logging
-from dataclasses import asdict
+import string
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import draccus
 import torch
-from safetensors.torch import load_file, save_file
-from torch import Tensor, nn
+from safetensors.torch import save_file
+from torch import Tensor
 
 from accerl_lerobot.checkpoint import BACKBONE, relocate
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import TASK
 from accerl_lerobot.imports import imported
+from accerl_lerobot.isolation import rehearse
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Model
-from accerl_lerobot.policies.files import CONFIG, FAMILY, OURS, VALUE_HEAD, WEIGHTS, fetched_checkpoint
-from accerl_lerobot.policies.guard import Budget, guarded, input_error
+from accerl_lerobot.policies.files import (
+    CONFIG,
+    FAMILY,
+    OURS,
+    VALUE_HEAD,
+    WEIGHTS,
+    check_statistics,
+    fetched_checkpoint,
+)
+from accerl_lerobot.policies.guard import Unfilled, guarded, input_error
 from accerl_lerobot.policies.plugins import register_policies
 from accerl_lerobot.policies.portable import keep_names, save_backbone, tokenizer_overrides, use_backbone
-from accerl_lerobot.policies.processing import Processing, example_observations
+from accerl_lerobot.policies.processing import Processing, example_observations, example_requests
 from accerl_lerobot.policies.samplers import SamplerConfig
 from accerl_lerobot.policies.tuning import merged_state_dict, tune
 from accerl_lerobot.policies.value_head import ValueHead
-from accerl_lerobot.policies.verify import verify_weights
-from accerl_lerobot.safety import Origin, brief
+from accerl_lerobot.policies.verify import load_weights
+from accerl_lerobot.safety import Origin, brief, read_tensors
 from accerl_lerobot.tensors import place, whole
 
 logger = logging.getLogger(__name__)
@@ -72,6 +71,22 @@ FAMILIES = {
 }
 """Family → class; its config is registered under the same name in `samplers`."""
 
+ACTS_MOST = 10**9
+"""Parameters of a policy that acts when its load is rehearsed; π0's four billion would take minutes."""
+TEXT = f"Put the red cube on the plate {string.printable}"
+"""Instruction of that decision: a tokeniser can be slow on some characters only."""
+
+
+class Sizes(NamedTuple):
+    """Numbers of a policy, and those of them that a run trains, the critic's included."""
+
+    policy: int
+    trained: int
+
+
+_rehearsed: dict[str, Sizes] = {}
+"""Checkpoints, and what was asked of them, that need no other rehearsal in this process."""
+
 LOOK_BACK = ("diffusion",)
 """Types that read the observations of ``n_obs_steps`` env steps; the others read one."""
 NO_DENSITY = {
@@ -80,20 +95,26 @@ NO_DENSITY = {
 }
 
 
-def resolve_device(name: str) -> torch.device:
+def resolve_device(name: str, field: str = "policy.device") -> torch.device:
     """``auto`` is CUDA when there is one.
 
     Raises:
-        InputError: no such device.
+        InputError: no such device; the error names `field`.
     """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    if name.startswith("cuda") and not torch.cuda.is_available():
-        raise InputError("policy.device", name, "no CUDA device here; use cpu or auto")
     try:
-        return torch.device(name)
-    except RuntimeError as error:
-        raise InputError("policy.device", name, "use cpu, cuda or auto") from error
+        device = torch.device(name)
+    except RuntimeError:
+        device = torch.device("meta")
+    if device.type not in ("cpu", "cuda"):
+        raise InputError(field, name, "use cpu, cuda or auto")
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise InputError(field, name, "no CUDA device here; use cpu or auto")
+    count = torch.cuda.device_count() if device.type == "cuda" else 1
+    if (device.index or 0) >= count:
+        raise InputError(field, name, f"there are {count} such devices here, numbered from 0")
+    return device
 
 
 def no_tf32(device: torch.device) -> None:
@@ -174,32 +195,77 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     return lerobot_config
 
 
+def rehearsed_config(config: PolicyConfig) -> Any:
+    """`load_lerobot_config` of a checkpoint that has been loaded and has acted once in a child process.
+
+    The child has limits of memory and time (`isolation`), and it does not read the weights. Networks of more
+    than `ACTS_MOST` numbers are built and do not act.
+
+    Raises:
+        InputError: see `load_lerobot_config`, `load_adapter` and `isolation.rehearse`.
+    """
+    register_policies()  # before the fork: it imports all of LeRobot's policies
+    folder = _checkpoint_folder(config)
+    key = _key(config, folder)
+    if key not in _rehearsed:
+        there = replace(config, device="cpu", precision="fp32")
+        found = rehearse(lambda: _sizes(there), folder, Origin("policy.path", config.path))
+        _rehearsed[key] = Sizes(*found)
+    return load_lerobot_config(config)
+
+
+def policy_sizes(config: PolicyConfig) -> Sizes:
+    """`Sizes` of the policy of `rehearsed_config`, which has been called.
+
+    Raises:
+        InputError: there is no checkpoint any more.
+    """
+    return _rehearsed[_key(config, _checkpoint_folder(config))]
+
+
+def _key(config: PolicyConfig, folder: Path) -> str:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return repr((config, [(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in files]))
+
+
+def _sizes(config: PolicyConfig) -> Sizes:
+    adapter = _load(config, rehearsal=True)
+    of = (adapter.policy.parameters(), adapter.trainable().values())
+    return Sizes(*(sum(parameter.numel() for parameter in parameters) for parameters in of))
+
+
 def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
-    """Loads policy, processors and critic; proves that the weights are the file's and the sampler LeRobot's.
+    """Loads policy, processors and critic; proves that the sampler is LeRobot's.
 
     Raises:
         InputError: see `load_lerobot_config`; weights or processors did not load, or do not act as LeRobot's
             own sampler does, see `PolicyAdapter.self_check`.
     """
+    return _load(config)
+
+
+def _load(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAdapter:
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
     lerobot_config = load_lerobot_config(config)
-    folder = _checkpoint_folder(config)
+    folder, origin = _checkpoint_folder(config), Origin("policy.path", config.path)
     model_class: type[Model] = imported(POLICIES[lerobot_config.type][0])
-    budget = Budget((folder / WEIGHTS).stat().st_size, "policy.path", config.path)
     try:
-        with guarded("policy", config.code_revision), model_class.loading(), budget:
-            policy = get_policy_class(lerobot_config.type).from_pretrained(folder, config=lerobot_config)
+        with guarded("policy", config.code_revision), model_class.loading(), Unfilled():
+            policy = get_policy_class(lerobot_config.type)(lerobot_config)
     except Exception as error:
         if (ours := input_error(error)) is not None:
             raise ours from error
-        raise InputError("policy.path", config.path, f"the weights did not load ({brief(error)})") from error
-    verify_weights(policy, model_class, folder / WEIGHTS, config.path)
-    model = model_class(policy)  # type: ignore[call-arg]
+        remedy = f"its network cannot be built as its config.json says ({brief(error)})"
+        raise InputError("policy.path", config.path, remedy) from error
+    load_weights(policy, model_class, folder / WEIGHTS, config.path, read=not rehearsal)
     device = torch.device(lerobot_config.device)
+    policy.to(device).eval()
+    model = model_class(policy)  # type: ignore[call-arg]
     if config.precision == "fp32":
         no_tf32(device)
     overrides = {"device_processor": {"device": str(device)}, **model.processor_overrides}
+    check_statistics(folder, origin)
     try:
         overrides |= tokenizer_overrides(lerobot_config, folder)
         with guarded("policy", config.code_revision), model.loading():
@@ -221,8 +287,12 @@ def load_adapter(config: PolicyConfig) -> LeRobotAdapter:
         critic = ValueHead(model.width, config.value_head)
         adapter = LeRobotAdapter(policy, processing, model, family, critic, config.precision)
         if (folder / OURS).is_file():
-            _load_ours(adapter, folder)
-        adapter.self_check(*example_observations(lerobot_config, config.rename_map))
+            _load_ours(adapter, folder, origin)
+        if not rehearsal:
+            adapter.self_check(*example_observations(lerobot_config, config.rename_map))
+        elif sum(parameter.numel() for parameter in policy.parameters()) <= ACTS_MOST:
+            asked = example_requests(lerobot_config, config.rename_map)[0]
+            adapter.decide([replace(asked, observation=asked.observation | {TASK: TEXT})], 0)
         tune(policy, model, family, config.tuning)
     except InputError:
         raise
@@ -283,7 +353,7 @@ def _checkpoint_folder(config: PolicyConfig) -> Path:
     return fetched_checkpoint(config.path, config.revision, "policy.path")
 
 
-def _load_ours(adapter: LeRobotAdapter, folder: Path) -> None:
+def _load_ours(adapter: LeRobotAdapter, folder: Path, origin: Origin) -> None:
     """Loads critic and family, and says where this run's options differ from those they were made with."""
     ours = json.loads((folder / OURS).read_text())
     there = ours.get("sampler", {})
@@ -294,7 +364,12 @@ def _load_ours(adapter: LeRobotAdapter, folder: Path) -> None:
             "this run explores unlike the one that made the checkpoint (evaluation is not affected): %s",
             ", ".join(f"policy.sampler.{k}={here[k]}, there {there[k]}" for k in differing),
         )
-    _load_module(adapter.family, folder / FAMILY, "sampler's own weights are", "they start anew")
+    state = dict(read_tensors(folder / FAMILY, origin)) if (folder / FAMILY).is_file() else {}
+    mine = adapter.family.state_dict()
+    if {k: v.shape for k, v in state.items()} == {k: v.shape for k, v in mine.items()}:
+        adapter.family.load_state_dict(state)
+    elif state and mine:
+        logger.warning("the checkpoint's weights of the sampler are not loaded: they are of another shape")
     there, here = ours.get("value_head", {}), asdict(adapter.value_head.config)
     differing = [k for k in ("pooling", "hidden", "bins") if there.get(k, here[k]) != here[k]]
     if differing:
@@ -303,11 +378,12 @@ def _load_ours(adapter: LeRobotAdapter, folder: Path) -> None:
             ", ".join(f"policy.value_head.{k}={here[k]}, there {there.get(k)}" for k in differing),
         )
     elif (folder / VALUE_HEAD).is_file():
+        state = dict(read_tensors(folder / VALUE_HEAD, origin))
         try:
-            adapter.value_head.load_state_dict(load_file(folder / VALUE_HEAD))
+            adapter.value_head.load_state_dict(state)
         except RuntimeError as error:
             remedy = f"{OURS} says another critic than it is; remove both to start anew ({brief(error)})"
-            raise Origin("policy.path", str(folder)).refuse(VALUE_HEAD, remedy) from error
+            raise origin.refuse(VALUE_HEAD, remedy) from error
 
 
 def _copied(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -316,15 +392,6 @@ def _copied(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     kept = {places[name]: t for name, t in tensors.items()}
     copies = {at: whole(t.detach()).to("cpu", copy=True).contiguous() for at, t in kept.items()}
     return {name: copies[at] for name, at in places.items()}
-
-
-def _load_module(module: nn.Module, path: Path, what: str, otherwise: str) -> None:
-    state = load_file(path) if path.is_file() else {}
-    mine = module.state_dict()
-    if {k: v.shape for k, v in state.items()} == {k: v.shape for k, v in mine.items()}:
-        module.load_state_dict(state)
-    elif state and mine:
-        logger.warning("the checkpoint's %s not loaded, %s: they are of another shape", what, otherwise)
 
 
 def override(lerobot_config: Any, config: PolicyConfig) -> None:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """LeRobot's own processors around raw observations: they hold the tokeniser and the normalisation."""
 
 from __future__ import annotations
@@ -22,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from accerl_lerobot.experience import TASK, Request
 from accerl_lerobot.policies.base import OBS_STATE
 
 IMAGES = "observation.image"
@@ -88,3 +77,12 @@ def example_observations(
         elif key == OBS_STATE:
             observations[world_name.get(key, key)] = rng.standard_normal((*batch, *shape), dtype=np.float32)
     return observations, ("Go", "Put the red cube on the plate")
+
+
+def example_requests(policy_config: Any, rename_map: dict[str, str]) -> list[Request]:
+    """`example_observations`, as rollout workers send them."""
+    observations, tasks = example_observations(policy_config, rename_map)
+    return [
+        Request(observation={k: v[i] for k, v in observations.items()} | {TASK: task}, noise_seed=i)
+        for i, task in enumerate(tasks)
+    ]

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A policy made of nothing but time: it takes as long as it is told to, and its weights are two numbers.
 
 What a service in front of an accelerator costs is slept, t(B) = a + bB for a batch of B, so that the
@@ -24,44 +12,37 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from accerl_lerobot import snapshot
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.policies.base import OBS_STATE, Evaluation, PolicyAdapter
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.density import normal_entropy, normal_log_prob
 from accerl_lerobot.policies.value_head import Value
+from accerl_lerobot.ranges import NonNegative, Range, Section
 
 STD = 0.3
 
 
 @dataclass(frozen=True, kw_only=True)
-class SimulatedPolicyConfig:
+class SimulatedPolicyConfig(Section, section="policy"):
     """How long it takes."""
 
-    decide_ms: float = 8.0
-    """a: milliseconds of a forward pass, whatever the batch; ≥ 0."""
-    decide_each_ms: float = 0.1
-    """b: milliseconds more for each observation in it; ≥ 0."""
-    update_ms: float = 0.0
-    """Milliseconds of an update; ≥ 0."""
-    chunk: int = 4
-    """Actions of a decision, at least 1."""
-    action_dim: int = 2
+    decide_ms: NonNegative = 8.0
+    """a: milliseconds of a forward pass, whatever the batch."""
+    decide_each_ms: NonNegative = 0.1
+    """b: milliseconds more for each observation in it."""
+    update_ms: NonNegative = 0.0
+    """Milliseconds of an update."""
+    chunk: Annotated[int, Range("[1, 100000]")] = 4
+    """Actions of a decision."""
+    action_dim: Annotated[int, Range("[1, 10000]")] = 2
     """At least 1."""
-
-    def __post_init__(self) -> None:
-        for name in ("decide_ms", "decide_each_ms", "update_ms"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"policy.{name}", getattr(self, name), "use 0 or more milliseconds")
-        for name in ("chunk", "action_dim"):
-            if getattr(self, name) < 1:
-                raise InputError(f"policy.{name}", getattr(self, name), "use at least 1")
 
 
 class SimulatedAdapter(PolicyAdapter):

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """V(observation) from the policy's own features: one number, or a distribution over returns."""
 
 from __future__ import annotations
@@ -60,7 +48,11 @@ def two_hot(x: Tensor, support: Tensor) -> Tensor:
 
 
 class ValueHead(nn.Module):
-    """Pooling, LayerNorm, Linear, ReLU, Linear; starts at V = 0, or at a uniform distribution."""
+    """Pooling, LayerNorm, Linear, ReLU, Linear; starts at V = 0, or at a uniform distribution.
+
+    Initial weights depend on the last `torch.manual_seed` alone, not on what was drawn since: how a policy is
+    loaded must not change its critic.
+    """
 
     def __init__(self, width: int, config: ValueHeadConfig) -> None:
         super().__init__()
@@ -68,6 +60,9 @@ class ValueHead(nn.Module):
         self.query = nn.Parameter(torch.zeros(width)) if config.pooling == "attention" else None
         self.norm = nn.LayerNorm(width)
         self.hidden = nn.Linear(width, config.hidden)
+        bound, generator = width**-0.5, torch.Generator().manual_seed(torch.initial_seed() % 2**63)
+        for parameter in self.hidden.parameters():  # as nn.Linear begins
+            nn.init.uniform_(parameter, -bound, bound, generator=generator)
         self.out = nn.Linear(config.hidden, max(1, config.bins))
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)

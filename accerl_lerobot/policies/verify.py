@@ -1,20 +1,8 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
-"""Proof that a policy's weights are the file's.
+# SPDX-License-Identifier: Apache-2.0
+"""Weights of a policy, read from a checkpoint tensor by tensor.
 
-LeRobot loads non-strictly, and π0's loaders print what went wrong and return whatever did load over random
-weights. So every tensor of the policy is compared with the file once it is there.
+LeRobot's own loaders hold the file beside the network, take what fits and leave the rest at random, some of
+them after printing what went wrong. Here the two have to hold the same tensors, of the same shapes.
 """
 
 from __future__ import annotations
@@ -23,68 +11,75 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file
-from torch import Tensor
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.family import Model
+from accerl_lerobot.safety import Origin, read_tensors, tensor_shapes
 
 NAMED = 3
 """Tensors of a kind that an error names."""
 
 
-def verify_weights(policy: Any, model: type[Model], file: Path, path: str | None) -> None:
-    """Compares all tensors with the file.
+class _Name(str):
+    """The name of a tensor in its place, for LeRobot's functions that rename the keys of a dict."""
+
+    def clone(self) -> _Name:
+        return self
+
+
+@torch.no_grad()
+def load_weights(policy: Any, model: type[Model], file: Path, path: str | None, *, read: bool = True) -> None:
+    """Fills a policy from a file.
 
     Args:
-        policy: LeRobot's, as loaded.
+        policy: LeRobot's, just built.
         model: knows which of its tensors a file may lack.
         file: the safetensors.
         path: what the user called the checkpoint.
+        read: False: only names and shapes are compared.
 
     Raises:
-        InputError: a tensor is missing, unexpected, of another shape, or differs.
+        InputError: a tensor is missing, unexpected, of another shape, or holds NaN or infinity.
     """
-    try:
-        stored = _as_loaded(load_file(file), policy)
-    except (OSError, SafetensorError) as error:
-        remedy = f"the weights did not load ({' '.join(str(error).split())})"
-        raise InputError("policy.path", path, remedy) from error
-    loaded = policy.state_dict()
+    origin = Origin("policy.path", path)
+    shapes = {name: shape for name, (_, shape) in tensor_shapes(file, origin).items()}
+    mine, stored = policy.state_dict(), _names(shapes, policy)
     # Nor is a tensor missing that a policy holds under several names: savers keep one of them.
-    held = {loaded[k].data_ptr() for k in stored.keys() & loaded.keys()}
-    absent = loaded.keys() - stored.keys() - set(model.unread)
-    missing = sorted(k for k in absent if loaded[k].data_ptr() not in held)
-    unexpected = sorted(stored.keys() - loaded.keys())
+    held = {mine[k].data_ptr() for k in stored.keys() & mine.keys()}
+    absent = mine.keys() - stored.keys() - set(model.unread)
+    missing = sorted(k for k in absent if mine[k].data_ptr() not in held)
+    unexpected = sorted(stored.keys() - mine.keys())
     if missing or unexpected:
         counts = f"{len(missing)} tensors missing {missing[:NAMED]}, {len(unexpected)} unexpected "
         remedy = f"{counts}{unexpected[:NAMED]}; config.json and {file.name} disagree"
         raise InputError("policy.path", path, f"the weights did not load: {remedy}")
-    for name, tensor in stored.items():
-        mine = loaded[name].cpu()
-        if mine.shape != tensor.shape:
-            sizes = f"{tuple(tensor.shape)} in the file, {tuple(mine.shape)} in the policy"
+    places: dict[str, list[str]] = {}
+    for name, theirs in stored.items():
+        if mine[name].shape != shapes[theirs]:
+            sizes = f"{shapes[theirs]} in the file, {tuple(mine[name].shape)} in the policy"
             remedy = f"the weights did not load: size mismatch for {name}, {sizes}"
             raise InputError("policy.path", path, remedy)
-        if not torch.equal(mine, tensor.to(mine.dtype)):
-            remedy = f"the weights did not load: {name} differs from the file, or holds a NaN"
-            raise InputError("policy.path", path, remedy)
+        places.setdefault(theirs, []).append(name)
+    if read:
+        for theirs, tensor in read_tensors(file, origin):
+            for name in places.get(theirs, ()):
+                mine[name].copy_(tensor)
 
 
-def _as_loaded(stored: dict[str, Tensor], policy: Any) -> dict[str, Tensor]:
-    """The file's tensors under the names that LeRobot's loader of this policy gives them.
+def _names(shapes: dict[str, Any], policy: Any) -> dict[str, str]:
+    """Name of a policy's tensor → name in the file, as LeRobot's loader of this policy has it.
 
     π0's reads files of openpi as well: without the leading ``model.``, with other names for some layers, and
-    with the input embedding left out where it equals the output layer. It takes the one for the other also
-    where both are there, if they come in the wrong order; such a file is refused.
+    with the input embedding left out where it equals the output layer.
     """
+    stored: dict[str, str] = {name: _Name(name) for name in shapes}
     rename = getattr(policy, "_fix_pytorch_state_dict_keys", None)
     if rename is None:
         return stored
     renamed = _prefixed(rename(stored, policy.config))
+    # What a file has under its own name goes before what is taken for it.
     return renamed | {k: v for k, v in _prefixed(stored).items() if k in renamed}
 
 
-def _prefixed(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {k if k.startswith("model.") else f"model.{k}": v for k, v in tensors.items()}
+def _prefixed(names: dict[str, str]) -> dict[str, str]:
+    return {k if k.startswith("model.") else f"model.{k}": v for k, v in names.items()}

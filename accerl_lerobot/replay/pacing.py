@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """How far rollouts and trainer may run apart: two predicates, and the staleness they imply.
 
 Everything is counted in decisions. On entering the store each segment gets a whole number of draws, ⌊r⌋ or
@@ -36,12 +24,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.ranges import Range, Section, Steps
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayConfig:
+class ReplayConfig(Section, section="replay"):
     """Size and pace of one replay.
 
     Example:
@@ -49,35 +39,28 @@ class ReplayConfig:
         >>> config.check(batch_decisions=256, segment_decisions=16)
     """
 
-    capacity: int = 4096
+    capacity: Annotated[int, Range("[1, 100000000]")] = 4096
     """Decisions held at most; the oldest segments leave first. At least `ahead` plus one segment."""
-    min_decisions: int = 256
+    min_decisions: Annotated[int, Range("[1, 100000000]")] = 256
     """Decisions that must be held before the trainer starts (warm start), from 1 to `capacity`."""
-    samples_per_insert: float = 1.0
-    """How often a decision is trained on, on average; at least 1: collect less rather than throw away."""
-    max_lag: int = 50
+    samples_per_insert: Annotated[float, Range("[1, 1000000]")] = 1.0
+    """How often a decision is trained on, on average: collect less rather than throw away."""
+    max_lag: Steps = 50
     """A segment whose oldest decision is more updates behind the trainer than this is retired, at least 0.
 
     A safety net: choose the pace so that `lag_bound` stays below it, and nothing is thrown away.
     """
-    ahead: int = 512
+    ahead: Annotated[int, Range("[1, 100000000]")] = 512
     """Decisions to learn from, each counted as often as it will be, that the rollouts may be ahead of the
     trainer; from one batch to `capacity`. Where worlds end their segments together, room for all of them
     keeps both sides busy. It costs lag."""
 
     def __post_init__(self) -> None:
-        if self.capacity < 1:
-            raise InputError("replay.capacity", self.capacity, "use at least 1 decision")
-        if not 1 <= self.min_decisions <= self.capacity:
-            raise InputError(
-                "replay.min_decisions", self.min_decisions, f"use 1 to capacity, {self.capacity}"
-            )
-        if not 1.0 <= self.samples_per_insert < math.inf:
-            raise InputError("replay.samples_per_insert", self.samples_per_insert, "use a number from 1 up")
-        if self.max_lag < 0:
-            raise InputError("replay.max_lag", self.max_lag, "use 0 or more updates")
-        if not 1 <= self.ahead <= self.capacity:
-            raise InputError("replay.ahead", self.ahead, f"use 1 to capacity, {self.capacity}")
+        super().__post_init__()
+        for name in ("min_decisions", "ahead"):
+            if getattr(self, name) > self.capacity:
+                remedy = f"use 1 to capacity, {self.capacity}"
+                raise InputError(f"replay.{name}", getattr(self, name), remedy)
 
     def check(self, *, batch_decisions: int, segment_decisions: int, field: str = "replay") -> None:
         """Refuses a pace that could stall or waste, once the batch size and the segment length are known.

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Charts of what the trainer did: how stale its samples were, and what it learnt from them."""
 
 from __future__ import annotations
@@ -97,7 +85,12 @@ def learning_charts(train: Sequence[Record], grad_clip: float | None) -> list[Ch
             of("explained_variance"),
             limits=(-1.0 if worst < -1 else None, None),
         ),
-        chart("Gradient norm", "Before it is clipped.", of("grad_norm") + clip, limits=(0.0, None)),
+        chart(
+            "Gradient norm",
+            "Of the policy and of the critic, before each is clipped.",
+            of("grad_norm", "value_grad_norm") + clip,
+            limits=(0.0, None),
+        ),
         chart(
             "Return",
             "Mean of the returns that the critic is regressed to.",

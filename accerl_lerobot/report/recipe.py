@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What a run was asked for: its recipe as differences from the defaults, and what that implies."""
 
 from __future__ import annotations
@@ -21,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.parsing import TYPE, choices_of, decode, encode, room_of
+from accerl_lerobot.parsing import TYPE, choices_of, decode, encode, section_of
 from accerl_lerobot.staleness import lag_limits
 
 Flat = dict[str, Any]
@@ -92,7 +80,7 @@ def _usual(instance: Any, config_class: type[Any], tree: dict[str, Any]) -> dict
     hints = typing.get_type_hints(config_class)
     for field in dataclasses.fields(config_class):
         name, value = field.name, _default(field) if instance is None else getattr(instance, field.name)
-        room, given = room_of(hints[name]), tree.get(name)
+        room, given = section_of(hints[name]), tree.get(name)
         if room is None or not isinstance(given, dict):
             usual[name] = encode(value) | _type(value) if dataclasses.is_dataclass(value) else encode(value)
             continue

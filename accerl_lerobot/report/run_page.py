@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The page of one run of ``accerl train``."""
 
 from __future__ import annotations
@@ -54,8 +42,8 @@ FEW = 25
 FILMS = {
     "before_after.mp4": (
         "Before and after",
-        "The same episodes before training, above, and after it, below. The frame at the end of a clip says "
-        "how it ended: green is success, red failure.",
+        "The same episodes before training, left, and after it, right, under the success of the whole "
+        "evaluation. The frame at the end of a clip says how it ended: green is success, red failure.",
     ),
     "preview.mp4": (
         "Dreams beside reality",

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """One update: segments in, better weights and numbers about them out.
 
     values of the current critic (bootstraps too) → GAE → advantages normalised over the batch → loss → step
@@ -29,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -92,14 +81,15 @@ class Update:
             self.anchors.take("reference", self.version)
         self._probe = Probe(self.anchors, config, self.ranks)
         named = adapter.trainable()
-        critic = [p for k, p in named.items() if k.startswith(CRITIC)]
-        self._policy_parameters = [p for k, p in named.items() if not k.startswith(CRITIC)]
-        self._parameters = self._policy_parameters + critic
-        groups = [
-            {"params": self._policy_parameters, "lr": config.lr},
-            {"params": critic, "lr": config.value_lr},
+        self._policy = [p for k, p in named.items() if not k.startswith(CRITIC)]
+        self._value = [p for k, p in named.items() if k.startswith(CRITIC)]
+        self._schedule_updates = config.updates
+        groups: list[dict[str, Any]] = [
+            {"params": [p for p in parameters if (p.dim() > 1) is decays], "weight_decay": decay}
+            for parameters in (self._policy, self._value)
+            for decays, decay in ((True, config.weight_decay), (False, 0.0))
         ]
-        self.optimizer = torch.optim.AdamW(groups, betas=config.betas, weight_decay=config.weight_decay)
+        self.optimizer = torch.optim.AdamW(groups, lr=config.lr, betas=config.betas)
 
     def step(self, segments: Sequence[Segment]) -> dict[str, float]:
         """Applies one optimiser step and returns its metrics; the version rises by one.
@@ -112,32 +102,32 @@ class Update:
         mismatch = self._probe.read(batch)
         if self._is_proximal and self.algorithm.proximal_updates > 1:
             self.anchors.take("proximal", self.version)
-        share = self.config.lr_share(self.version)
-        critic_only = self.version < self.config.value_warmup_updates and not self._grouped
-        policy_group, critic_group = self.optimizer.param_groups
-        policy_group["lr"] = 0.0 if critic_only else self.config.lr * share
-        critic_group["lr"] = self.config.value_lr * share
+        lr, value_lr = self._set_rates()
         self.optimizer.zero_grad(set_to_none=True)
         metrics = self._backward(batch)
         reach("trainer.backward")
-        if critic_only:
-            # Before the norm is taken: noise in the policy's gradient must not scale the critic's.
-            for parameter in self._policy_parameters:
+        if self.version < self._policy_start:
+            for parameter in self._policy:  # its moments in the optimiser begin with its learning rate
                 parameter.grad = None
-        norm = whole(torch.nn.utils.clip_grad_norm_(self._parameters, self.config.grad_clip))
-        if bool(torch.isfinite(norm)) and np.isfinite(metrics["loss"]):
+        # Each by itself, or the larger gradient would scale the other one down.
+        norm, value_norm = (
+            float(whole(torch.nn.utils.clip_grad_norm_(parameters, self.config.grad_clip)))
+            for parameters in (self._policy, self._value)
+        )
+        if math.isfinite(metrics["loss"] + norm + value_norm):
             self.optimizer.step()
             self._skipped_in_a_row = 0
         else:
-            self._skip(metrics["loss"], float(norm))
+            self._skip(metrics["loss"], norm, value_norm)
         lag = lag_metrics(torch.from_numpy(batch.version), self.version)
         self.version += 1
         self._probe.renew(self.version)
         metrics |= mismatch | {name: float(value) for name, value in lag.items()}
         return metrics | {
-            "grad_norm": float(norm),
-            "lr": float(policy_group["lr"]),
-            "value_lr": float(critic_group["lr"]),
+            "grad_norm": norm,
+            "value_grad_norm": value_norm,
+            "lr": lr,
+            "value_lr": value_lr,
             "skipped": float(self.skipped),
         }
 
@@ -146,6 +136,7 @@ class Update:
         return {
             "version": self.version,
             "skipped": (self.skipped, self._skipped_in_a_row),
+            "schedule_updates": self._schedule_updates,
             "moments": self._moments.clone(),
             "optimizer": optimizer_state(self.optimizer),
             "anchors": self.anchors.state(),
@@ -156,10 +147,25 @@ class Update:
         """Goes on from what `state` gave; the adapter has its weights already."""
         self.version = state["version"]
         self.skipped, self._skipped_in_a_row = state["skipped"]
+        self._schedule_updates = state["schedule_updates"]
         self._moments = state["moments"]
         restore_optimizer(self.optimizer, state["optimizer"])
         self.anchors.restore(state["anchors"])
         self._probe.restore(state["probe"])
+
+    @property
+    def _policy_start(self) -> int:
+        """First update in which the policy learns; the critic learns from the first of all."""
+        return 0 if self._grouped else self.config.value_warmup_updates
+
+    def _set_rates(self) -> tuple[float, float]:
+        """Sets the learning rates of policy and critic for this update, and returns them."""
+        # A resumed run with more updates keeps the schedule that it began with, so that rates do not jump.
+        share = partial(self.config.lr_share, self.version, updates=self._schedule_updates)
+        lr, value_lr = self.config.lr * share(start=self._policy_start), self.config.value_lr * share()
+        for group, rate in zip(self.optimizer.param_groups, (lr, lr, value_lr, value_lr), strict=True):
+            group["lr"] = rate
+        return lr, value_lr
 
     @property
     def _is_proximal(self) -> bool:
@@ -167,17 +173,18 @@ class Update:
         every = self.algorithm.proximal_updates
         return every > 0 and self.version % every == 0
 
-    def _skip(self, loss: float, norm: float) -> None:
+    def _skip(self, loss: float, norm: float, value_norm: float) -> None:
         self.skipped += 1
         self._skipped_in_a_row += 1
         if self._skipped_in_a_row >= self.config.max_nonfinite:
             raise NonFiniteError(
                 f"{self._skipped_in_a_row} updates in a row had a non-finite loss or gradient (the last one: "
-                f"loss {loss:g}, norm of the gradient {norm:g}); lower trainer.lr"
+                f"loss {loss:g}, gradient norm of the policy {norm:g}, of the critic {value_norm:g}); "
+                "lower trainer.lr"
             )
 
     def _backward(self, batch: Batch) -> dict[str, float]:
-        """Accumulates gradients over micro-batches; returns metrics weighted by their decisions."""
+        """Accumulates gradients over micro-batches; returns metrics of the whole batch."""
         parts = turns(np.arange(len(batch)), self.config.micro_batch, self.ranks.rank, self.ranks.size)
         bootstrap = self._values(batch.last_observations, batch.segment_tasks)
         targets: tuple[Tensor, Tensor] | None = None
@@ -185,7 +192,8 @@ class Update:
             targets = self._targets(batch, self._values(batch.observations, batch.tasks), bootstrap)
         factors = self.adapter.factors(batch.latent)
         ratios = None if factors is None else self._ratios_per_decision(factors)
-        total: dict[str, float] = {}
+        means: dict[str, float] = {}
+        samples: list[Tensor] = []
         for number, turn in enumerate(parts, 1):
             rows, part = turn.rows, batch.part(turn.rows)
             reference = self._under("reference", part)
@@ -218,23 +226,26 @@ class Update:
             synchronise(self.adapter, number == len(parts))
             loss = output.loss * share * self.ranks.size  # a gradient is the mean over ranks
             (loss * math.nan if reach("trainer.loss") else loss).backward()
-            said = {k: float(v) if turn.own else 0.0 for k, v in output.metrics.items()}
-            _merge(total, said, share)
+            _add(means, {k: float(v) if turn.own else 0.0 for k, v in output.means.items()}, share)
+            rows_of_samples = output.samples.rows()
+            samples.append(rows_of_samples if turn.own else rows_of_samples[:0])
         if self.config.sharding == "ddp":
-            self.ranks.average(self._parameters)
+            self.ranks.average(self._policy + self._value)
         assert targets is not None
-        return self._of_all(total) | {
-            "return_mean": float(targets[1].mean()),
-            "reward_mean": float(batch.reward.mean()),
-        }
+        joined = output.samples.joined(self.ranks.gather(torch.cat(samples), len(batch)))
+        return (
+            self._sum(means)
+            | {k: float(v) for k, v in joined.metrics().items()}
+            | {
+                "return_mean": float(targets[1].mean()),
+                "reward_mean": float(batch.reward.mean()),
+            }
+        )
 
-    def _of_all(self, metrics: dict[str, float]) -> dict[str, float]:
-        """Numbers over all ranks, from those over this one's share."""
-        mine = torch.tensor([list(metrics.values())], dtype=torch.float64)
-        total: dict[str, float] = {}
-        for numbers in self.ranks.gather(mine, self.ranks.size).tolist():
-            _merge(total, dict(zip(metrics, numbers, strict=True)), 1.0)
-        return total
+    def _sum(self, means: dict[str, float]) -> dict[str, float]:
+        """Means over all ranks, from each one's share of them."""
+        mine = torch.tensor([list(means.values())], dtype=torch.float64)
+        return dict(zip(means, self.ranks.gather(mine, self.ranks.size).sum(0).tolist(), strict=True))
 
     def _under(self, name: str, part: Part) -> Tensor | None:
         """log-probs (rows, L) under a copy; None if there is none."""
@@ -281,10 +292,7 @@ class Update:
         return self.ranks.each(values, np.arange(len(tasks)), self.config.micro_batch)
 
 
-def _merge(total: dict[str, float], metrics: dict[str, float], share: float) -> None:
-    """Adds a micro-batch's metrics: a maximum, a count, and means weighted by its share of the decisions."""
-    for name, value in metrics.items():
-        if name == "ratio_max_dev":
-            total[name] = max(total.get(name, value), value)
-        else:
-            total[name] = total.get(name, 0.0) + (value if name == "decisions" else share * value)
+def _add(total: dict[str, float], means: dict[str, float], share: float) -> None:
+    """Adds a micro-batch's means, weighted by its share of the decisions; ``decisions`` is a count."""
+    for name, value in means.items():
+        total[name] = total.get(name, 0.0) + (value if name == "decisions" else share * value)

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What a policy would do at a dreamt frame, beside what it would do at the real one.
 
 Pixels may be right where nobody looks. So real episodes are dreamt from beginning to end with the actions
@@ -37,8 +25,9 @@ import numpy as np
 from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
-from accerl_lerobot.policies.base import PolicyAdapter, check_fit
+from accerl_lerobot.policies.base import PolicyAdapter
 from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.preflight import check_features, env_features, policy_features
 from accerl_lerobot.world_model import fit
 from accerl_lerobot.world_model.contract import WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.episodes import Episode, Place, longest
@@ -96,14 +85,14 @@ def check_policies(paths: Sequence[str], spec: WorldModelSpec) -> list[WorldSpec
     Raises:
         InputError: one of them cannot, or is no checkpoint; the field is ``policies``.
     """
-    from accerl_lerobot.policies.loading import load_lerobot_config
+    from accerl_lerobot.policies.loading import rehearsed_config
 
     worlds = []
     for path in paths:
         with _named(path):
-            settings = load_lerobot_config(PolicyConfig(path=path))
+            settings = rehearsed_config(PolicyConfig(path=path))
             worlds.append(as_world(spec, settings))
-            check_fit(settings, worlds[-1], {})
+            check_features(policy_features(settings), env_features(worlds[-1]), {}, "policy.path", path)
             executed = getattr(settings, "n_action_steps", 1)
             fit.check_fit(spec, worlds[-1], executed, settings.n_obs_steps, True)
     return worlds

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Puts together what imagines for a run."""
 
 from __future__ import annotations
@@ -171,7 +159,7 @@ def check_imagination(config: RunConfig) -> None:
     """
     policy = policy_to_be(config)
     executed = getattr(policy, "n_action_steps", 1)
-    dreamer = _dreamer(config, _spec(config), executed, policy.n_obs_steps)
+    dreamer = _dreamer(config, _spec(config), executed, policy.n_obs_steps, first=True)
     learn = config.imagination.learn
     if config.imagination.learns:
         open_rooms(_rooms(learn), dreamer.model.spec)
@@ -210,15 +198,17 @@ def _spec(config: RunConfig) -> WorldSpec:
         world.close()
 
 
-def _dreamer(config: RunConfig, spec: WorldSpec, executed: int, history: int) -> Dreamer:
-    """The one that was asked for, checked."""
+def _dreamer(
+    config: RunConfig, spec: WorldSpec, executed: int, history: int, *, first: bool = False
+) -> Dreamer:
+    """The one that was asked for, checked; `first`: see `make_dreamer`."""
     if (reward := getattr(config.env, "reward", "success")) != "success":
         remedy = "use success with imagination.share: that is what dreams are rewarded for"
         raise InputError("env.reward", reward, remedy)
     if not getattr(config.env, "terminate_on_success", True):
         remedy = "use true with imagination.share: a success ends a dream, and so it must a real episode"
         raise InputError("env.terminate_on_success", False, remedy)
-    dreamer = make_dreamer(config.imagination, config.env, spec, executed, config.policy.device)
+    dreamer = make_dreamer(config.imagination, config.env, spec, executed, config.policy.device, first=first)
     if config.imagination.learns and dreamer.success is None:
         remedy = "it has no success model to go on learning with; use imagination.learn.steps_per_episode=0"
         raise InputError("imagination.path", config.imagination.path, remedy)

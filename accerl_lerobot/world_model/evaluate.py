@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A saved world model on episodes of one or several sources.
 
 <output_dir>/
@@ -33,6 +21,7 @@ from accerl_lerobot.demos.starts import Start, read_starts
 from accerl_lerobot.demos.windows import origin_of
 from accerl_lerobot.envs import World, WorldSpec, make_world
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model.contract import WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.dataset import fingerprint, load_episodes
 from accerl_lerobot.world_model.deciding import (
@@ -45,7 +34,6 @@ from accerl_lerobot.world_model.deciding import (
 )
 from accerl_lerobot.world_model.episodes import Episode
 from accerl_lerobot.world_model.inverse import InverseProbe, learn_probe
-from accerl_lerobot.world_model.offline import device_named
 from accerl_lerobot.world_model.perturbed import SOURCE as PERTURBED
 from accerl_lerobot.world_model.perturbed import check_world, perturbed_episodes
 from accerl_lerobot.world_model.sources import (
@@ -57,8 +45,14 @@ from accerl_lerobot.world_model.sources import (
     rooms_of,
     try_sources,
 )
-from accerl_lerobot.world_model.stand_in import SuccessModel, load_stand_in
-from accerl_lerobot.world_model.store import Source, find, load_sources, load_world_model
+from accerl_lerobot.world_model.stand_in import SuccessModel, load_stand_in, rehearse_stand_in
+from accerl_lerobot.world_model.store import (
+    Source,
+    find,
+    load_sources,
+    load_world_model,
+    rehearse_world_model,
+)
 
 if TYPE_CHECKING:
     from accerl_lerobot.verb_configs import WorldModelEvalRun
@@ -87,12 +81,14 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
         InputError: no such device, no world model there, a dataset or a world of another kind, or nothing was
             held out.
     """
-    device = device_named(config.device)
+    device = resolve_device(config.device, "device")
     path = Path(str(config.path)).expanduser()
     success: SuccessModel | None
+    rehearse_world_model(path, config.discover_packages_path)
     model, success = load_world_model(path, config.discover_packages_path)
     model = model.to(device)
     if config.success.path is not None:
+        rehearse_stand_in(config.success, model.spec, "success")
         success = load_stand_in(config.success, model.spec, "success", device)
     elif success is not None:
         success = success.to(device)

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A world model from a dataset: learnt, tried on episodes it has not seen, filmed and saved.
 
 <output_dir>/
@@ -70,14 +58,6 @@ EVERY = 20
 METRICS = "metrics.jsonl"
 
 
-def device_named(name: str) -> torch.device:
-    """See `resolve_device`; the field is ``device`` here."""
-    try:
-        return resolve_device(name)
-    except InputError as error:
-        raise InputError("device", error.value, error.remedy) from error
-
-
 def world_spec(config: WorldModelConfig, env: EnvConfig) -> WorldModelSpec:
     """What the model is to be of."""
     world = make_world(env)
@@ -117,7 +97,7 @@ def learn_world_model(run: WorldModelRun, directory: Path, console: Console) -> 
             nothing can be learnt from it, see `load_episodes`, or nothing would be left to judge; an episode
             is in both; the world has not the task of one.
     """
-    device = device_named(run.device)
+    device = resolve_device(run.device, "device")
     config, seed = run.world_model, run.seed
     learnable_class(config.model)
     spec, rng = world_spec(config, run.env), _rng(seed)

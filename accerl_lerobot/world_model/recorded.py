@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Dreams on disk: what the policy was shown in them, what it did, and what that was said to be worth.
 
 ``RUN/imagined/`` has one safetensors file for each of the newest ones, named by its number. A run that goes
@@ -34,7 +22,7 @@ from safetensors.numpy import load_file, save_file
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
-from accerl_lerobot.safety import Origin, brief, check_safetensors
+from accerl_lerobot.safety import Origin, brief, tensor_shapes
 
 DREAMS = "imagined"
 """Folder of a run's."""
@@ -136,7 +124,7 @@ def read_dreams(folder: Path, field: str = "path") -> Iterator[Dreamt]:
     origin = Origin(field, str(folder))
     for number in numbers:
         path = _path(folder, number)
-        check_safetensors(path, origin)
+        tensor_shapes(path, origin)
         try:
             with safe_open(path, framework="np") as file:
                 about = json.loads((file.metadata() or {})[ABOUT])

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """World models of three sizes: ``--world_model.type=tiny`` (the default), ``small`` or ``serious``.
 
 A size is a config, not another model: any of its fields can be given beside it. ``tiny`` is what all numbers
@@ -21,7 +9,9 @@ and no run has tuned it.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
+from accerl_lerobot.ranges import Range
 from accerl_lerobot.world_model.config import (
     LearnableModelConfig,
     LearnConfig,
@@ -50,7 +40,7 @@ class SmallConfig(WorldModelConfig):
     learn: LearnConfig = field(
         default_factory=lambda: LearnConfig(steps=20_000, batch=32, lr=3e-4, warmup=500, average=0.999)
     )
-    image_size: int = 128
+    image_size: Annotated[int, Range("[2, 1024]")] = 128
     """Height and width in pixels of the frames it dreams."""
 
 
@@ -67,5 +57,5 @@ class SeriousConfig(WorldModelConfig):
     learn: LearnConfig = field(
         default_factory=lambda: LearnConfig(steps=50_000, batch=64, lr=1e-4, warmup=1000, average=0.9995)
     )
-    image_size: int = 224
+    image_size: Annotated[int, Range("[2, 1024]")] = 224
     """Height and width in pixels of the frames it dreams."""

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A LeRobot reward model that tells successes in place of the one beside a world model.
 
 It is given what a dream has to show, the frames before and after a chunk, by LeRobot's own names and through
@@ -32,9 +20,10 @@ from torch.nn import functional
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.imports import DISCOVER, discover
-from accerl_lerobot.policies.files import check_origin, check_policy_config, check_processor
-from accerl_lerobot.policies.guard import Budget, guarded, input_error
-from accerl_lerobot.safety import Origin, brief, checked_weights, file_size, read_json, safe_join
+from accerl_lerobot.isolation import rehearse
+from accerl_lerobot.policies.files import check_origin, check_processor
+from accerl_lerobot.policies.guard import guarded, input_error
+from accerl_lerobot.safety import Origin, brief, check_not_pickled, read_json, read_tensors, safe_join
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
 if TYPE_CHECKING:
@@ -136,7 +125,6 @@ def load_stand_in(
     folder = _folder(config, origin)
     fetched = not Path(str(config.path)).expanduser().exists()
     content = read_json(safe_join(folder, CONFIG, origin), origin)
-    check_policy_config(content, origin)
     check_origin(content.get(BACKBONE), None, f"{CONFIG}: {BACKBONE}", origin, fetched)
     importlib.import_module("lerobot.rewards.factory")  # registers LeRobot's own
     known = sorted(RewardModelConfig.get_known_choices())
@@ -157,12 +145,31 @@ def load_stand_in(
     return stand_in
 
 
+def rehearse_stand_in(config: StandInConfig, spec: WorldModelSpec, room: str) -> None:
+    """Loads one and has it judge in a child process with limits, see `isolation`; its ``path`` is set.
+
+    Raises:
+        InputError: see `load_stand_in`.
+    """
+    origin = Origin(f"{room}.path", config.path)
+    discover(config.discover_packages_path, room)
+    importlib.import_module("lerobot.rewards.factory")  # before the fork: the caller needs it too
+
+    def load() -> None:
+        load_stand_in(config, spec, room)
+
+    rehearse(load, _folder(config, origin), origin)
+
+
 def _folder(config: StandInConfig, origin: Origin) -> Path:
     path = str(config.path)
     folder = Path(path).expanduser()
     if not folder.exists() and not path.startswith((".", "/", "~")):
         from huggingface_hub import snapshot_download
 
+        from accerl_lerobot.hub.trouble import guard_client
+
+        guard_client()
         try:
             folder = Path(snapshot_download(path, revision=config.revision, allow_patterns=list(FILES)))
         except (OSError, ValueError) as error:
@@ -204,12 +211,10 @@ def _pairs(settings: Any, spec: WorldModelSpec, origin: Origin) -> bool:
 def _load(settings: Any, folder: Path, origin: Origin, code_revision: str | None) -> Any:
     from lerobot.rewards.factory import get_reward_model_class
 
-    weights, stored = checked_weights(folder, WEIGHTS, origin)
+    check_not_pickled(folder, WEIGHTS, origin)
+    stored = [name for name, _ in read_tensors(safe_join(folder, WEIGHTS, origin), origin)]
     try:
-        with (
-            guarded(origin.field.removesuffix(".path"), code_revision),
-            Budget(file_size(weights, origin), origin.field, origin.value),
-        ):
+        with guarded(origin.field.removesuffix(".path"), code_revision):
             made = get_reward_model_class(settings.type).from_pretrained(folder, config=settings)
     except Exception as error:  # whatever its own code does with what its files say
         if (ours := input_error(error)) is not None:

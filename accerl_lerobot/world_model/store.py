@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A world model on disk: configs as JSON, weights as safetensors, the success model in LeRobot's format.
 
 world_model/
@@ -22,22 +10,32 @@ world_model/
 from __future__ import annotations
 
 import json
+from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any, cast
 
 import draccus
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.imports import discover
-from accerl_lerobot.policies.guard import Budget, guarded, input_error
-from accerl_lerobot.safety import Origin, brief, checked_weights, file_size, read_json, safe_join
-from accerl_lerobot.world_model.bounds import check_model, check_spec, check_success_model
+from accerl_lerobot.imports import DISCOVER, discover
+from accerl_lerobot.isolation import rehearse
+from accerl_lerobot.policies.guard import Unfilled, guarded, input_error
+from accerl_lerobot.safety import (
+    Origin,
+    brief,
+    check_name,
+    check_not_pickled,
+    read_json,
+    read_tensors,
+    safe_join,
+)
 from accerl_lerobot.world_model.config import LearnableModelConfig
-from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModelSpec, new_learnable
+from accerl_lerobot.world_model.contract import Context, LearnableWorldModel, WorldModelSpec, new_learnable
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
 UNREADABLE = (
@@ -45,6 +43,8 @@ UNREADABLE = (
     SafetensorError,
 )  # fmt: skip
 CONFIG, WEIGHTS, SUCCESS = "config.json", "model.safetensors", "success_model"
+NAME_MOST = 200
+"""Characters of a task's name."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,20 +133,16 @@ def load_world_model(
     origin = _origin(directory, room)
     discover(package, room)
     content = read_json(safe_join(directory, CONFIG, origin), origin)
-    check_spec(content.get("spec"), origin)
-    check_model(content.get("model"), LearnableModelConfig.get_known_choices(), origin)
-    weights, _ = checked_weights(directory, WEIGHTS, origin)
+    spec = _spec(content.get("spec"), origin)
+    _check_type(content.get("model"), origin)
+    weights = _weights(directory, origin)
     try:
-        spec = dict(content["spec"])
-        spec |= {k: tuple(spec.get(k, ())) for k in ("cameras", "image_size", "tasks")}
-        spec |= {"provides": frozenset(spec["provides"])}
-        with Budget(file_size(weights, origin), origin.field, origin.value):
-            config = draccus.decode(LearnableModelConfig, content["model"])
-            model = new_learnable(WorldModelSpec(**spec), config)
-        model.load_state_dict(load_file(weights))
+        with Unfilled():
+            model = new_learnable(spec, draccus.decode(LearnableModelConfig, content["model"]))
+        model.load_state_dict(dict(read_tensors(weights, origin)))
     except (*UNREADABLE, draccus.utils.DraccusException) as error:
         if (ours := input_error(error)) is not None:  # draccus wraps what a config refuses
-            raise origin.refuse(CONFIG, brief(ours)) from error
+            raise ours if ours.field == origin.field else origin.refuse(CONFIG, brief(ours)) from error
         remedy = f"not a world model of accerl world-model ({brief(error)})"
         raise InputError(origin.field, origin.value, remedy) from error
     success = None
@@ -155,19 +151,90 @@ def load_world_model(
     return model.requires_grad_(False).eval(), success
 
 
+def rehearse_world_model(directory: Path, package: str | None = None, *, room: str = "") -> None:
+    """Loads a world model and imagines a chunk in a child process with limits, see `isolation`.
+
+    Raises:
+        InputError: it cannot be loaded, or does not imagine what its spec says.
+    """
+    origin = _origin(directory, room)
+    discover(package, room)  # before the fork: the caller needs it too
+    read_json(safe_join(directory, CONFIG, origin), origin)
+    rehearse(lambda: _imagine_once(*load_world_model(directory, package, room=room)), directory, origin)
+
+
+@torch.no_grad()
+def _imagine_once(model: LearnableWorldModel, success: SuccessPairsRewardModel | None) -> None:
+    spec = model.spec
+    frames = torch.zeros((1, spec.context, len(spec.cameras), *spec.image_size, 3), dtype=torch.uint8)
+    robot, moved = torch.zeros(1, spec.context, spec.state_dim), torch.zeros(1, spec.action_dim)
+    made = torch.zeros(1, spec.context - 1, spec.chunk, spec.action_dim)
+    tasks = spec.tasks[:1] or ("",)
+    state = model.begin(Context(frames, robot, made, moved, robot[:, -1]), tasks)
+    dream = model.step(state, torch.zeros(1, spec.chunk, spec.action_dim), [0])
+    if success is not None:
+        before, after = (x.movedim(-1, -3).float() / 255 for x in (frames[:, -1], dream.frames))
+        success.said(before, after)
+
+
+def _spec(content: object, origin: Origin) -> WorldModelSpec:
+    """What the file says of itself; cameras' names become parts of paths."""
+    try:
+        said = dict(cast(Any, content))
+        sizes = {name: said[name] for name in ("state_dim", "action_dim", "chunk", "fps", "context")}
+        lists = {name: said.get(name, []) for name in ("cameras", "image_size", "tasks", "provides")}
+        spec = WorldModelSpec(
+            **{name: draccus.decode(int, size) for name, size in sizes.items()},
+            cameras=tuple(draccus.decode(list[str], lists["cameras"])),
+            image_size=draccus.decode(tuple[int, int], lists["image_size"]),
+            tasks=tuple(draccus.decode(list[str], lists["tasks"])),
+            provides=frozenset(draccus.decode(list[str], lists["provides"])),
+        )
+    except (*UNREADABLE, draccus.utils.DraccusException) as error:
+        raise origin.refuse(f"{CONFIG}: spec", f"not one of accerl world-model ({brief(error)})") from error
+    for camera in spec.cameras:
+        check_name(camera, f"{CONFIG}: spec.cameras", origin)
+    if any(not name.isprintable() or len(name) > NAME_MOST for name in spec.tasks):
+        wanted = f"names of at most {NAME_MOST} printable characters are wanted"
+        raise origin.refuse(f"{CONFIG}: spec.tasks", wanted)
+    if min(spec.action_dim, spec.chunk, spec.fps, spec.context, *spec.image_size, len(spec.cameras)) < 1:
+        raise origin.refuse(f"{CONFIG}: spec", "sizes of at least 1, and a camera, are wanted")
+    return spec
+
+
+def _check_type(model: object, origin: Origin) -> None:
+    kind = model.get("type") if isinstance(model, dict) else None
+    if kind is None:
+        raise origin.refuse(f"{CONFIG}: model.type", "it has none, as earlier versions wrote; learn it again")
+    known = sorted(LearnableModelConfig.get_known_choices())
+    if kind not in known:
+        remedy = f"{str(kind)[:60]!r}; use one of {', '.join(known)}, or name its package"
+        package = origin.field.removesuffix("path") + DISCOVER
+        raise origin.refuse(f"{CONFIG}: model.type", f"{remedy}: {package}")
+
+
+def _weights(directory: Path, origin: Origin) -> Path:
+    check_not_pickled(directory, WEIGHTS, origin)
+    return safe_join(directory, WEIGHTS, origin)
+
+
 def _origin(directory: Path, room: str) -> Origin:
     return Origin(f"{room}.path" if room else "path", str(directory))
 
 
 def _success(directory: Path, origin: Origin) -> SuccessPairsRewardModel:
-    check_success_model(read_json(safe_join(directory, CONFIG, origin), origin), origin)
-    weights, _ = checked_weights(directory, WEIGHTS, origin)
+    kind = read_json(safe_join(directory, CONFIG, origin), origin).get("type")
+    if kind != "success_pairs":
+        raise origin.refuse(f"{CONFIG}: type", f"{str(kind)[:60]!r}; use success_pairs")
+    weights = _weights(directory, origin)
     try:
-        with guarded("path"), Budget(file_size(weights, origin), origin.field, origin.value):
-            return SuccessPairsRewardModel.from_pretrained(directory, strict=True).eval()
+        with guarded("path"), Unfilled():
+            success = SuccessPairsRewardModel.from_pretrained(directory, strict=True).eval()
+        deque(read_tensors(weights, origin), maxlen=0)
     except InputError as error:
-        raise origin.refuse(CONFIG, brief(error)) from error
+        raise error if error.field == origin.field else origin.refuse(CONFIG, brief(error)) from error
     except (*UNREADABLE, draccus.utils.DraccusException) as error:
         raise InputError(
             origin.field, origin.value, f"the success model is broken ({brief(error)})"
         ) from error
+    return success

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Makes the world models of `kinds.py`."""
 
 from __future__ import annotations
@@ -25,12 +13,18 @@ from accerl_lerobot.world_model.baselines import CopyModel, OracleModel, Shuffle
 from accerl_lerobot.world_model.contract import Means, WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 from accerl_lerobot.world_model.imagine import Dreamer
-from accerl_lerobot.world_model.stand_in import load_stand_in
-from accerl_lerobot.world_model.store import load_world_model
+from accerl_lerobot.world_model.stand_in import load_stand_in, rehearse_stand_in
+from accerl_lerobot.world_model.store import load_world_model, rehearse_world_model
 
 
 def make_dreamer(
-    config: ImaginationConfig, env: EnvConfig, world: WorldSpec, executed: int, device: str
+    config: ImaginationConfig,
+    env: EnvConfig,
+    world: WorldSpec,
+    executed: int,
+    device: str,
+    *,
+    first: bool = False,
 ) -> Dreamer:
     """The one that `config` names.
 
@@ -40,6 +34,7 @@ def make_dreamer(
         world: what that shows, for those that are made of no other world model.
         executed: actions that the policy executes per decision.
         device: where it dreams, see `PolicyConfig.device`.
+        first: nobody has loaded its files before, so a child process does so first, see `isolation`.
 
     Raises:
         InputError: it cannot be loaded.
@@ -48,6 +43,8 @@ def make_dreamer(
     learnt = success = None
     if kind.folder:
         assert config.path is not None  # ImaginationConfig has seen to that
+        if first:
+            rehearse_world_model(Path(config.path), config.discover_packages_path, room="imagination")
         learnt, success = load_world_model(
             Path(config.path), config.discover_packages_path, room="imagination"
         )
@@ -56,6 +53,8 @@ def make_dreamer(
     means = Means(config, spec, learnt, lambda: make_world(env), where)
     model: WorldModel = imported(kind.make)(means)
     if config.success.path is not None:
+        if first:
+            rehearse_stand_in(config.success, model.spec, "imagination.success")
         return Dreamer(model, load_stand_in(config.success, model.spec, "imagination.success", where))
     if success is not None:
         success.config.device = str(where)

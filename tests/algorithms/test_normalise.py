@@ -1,21 +1,10 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Global advantage normalisation: parts of a batch, merged, equal the whole."""
 
 import torch
 
 from accerl_lerobot.algorithms.normalise import moments, normalise
+from tests.rounding import assert_close
 
 
 def test_parts_of_different_size_equal_the_whole() -> None:
@@ -26,7 +15,7 @@ def test_parts_of_different_size_equal_the_whole() -> None:
     got = torch.cat([normalise(x[:1], total, mask[:1]), normalise(x[1:], total, mask[1:])])
     valid = x[mask].double()
     expected = (valid - valid.mean()) / valid.std(correction=0)
-    torch.testing.assert_close(got[mask].double(), expected, rtol=1e-5, atol=1e-6)
+    assert_close(got[mask], expected)
     assert (got[~mask] == 0).all() and got.dtype == x.dtype
 
 

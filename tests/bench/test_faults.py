@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The bench of faults: what it says of a run's books, and that it hits what it says."""
 
 from __future__ import annotations
@@ -208,7 +196,7 @@ def test_the_table_says_all_of_it():
             {"targets": ("everything",), "faults": ("nan", "torn")},
             "none of them can befall everything",
         ),
-        ({"repeats": 0}, "use at least 1"),
+        ({"repeats": 0}, "use a whole number from 1"),
         ({"stall_s": 1.0}, "use 5 s or more"),
     ],
 )

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What a dataset's files may say, and what LeRobot and `datasets` would have made of it."""
 
 from __future__ import annotations
@@ -37,6 +25,7 @@ from accerl_lerobot.safety import Origin, read_json
 
 ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 CAMERA = "observation.images.corner2"
+PNG = b"\x89PNG\r\n\x1a\n"
 ORIGIN = Origin("dataset.root", "theirs")
 EPISODES, DATA = "meta/episodes/chunk-000/file-000.parquet", "data/chunk-000/file-000.parquet"
 
@@ -213,9 +202,13 @@ def data_with(root: Path, images: list[dict[str, Any]]) -> None:
         ({"bytes": None, "path": "/etc/hostname"}, "an image without its bytes"),
         ({"bytes": None, "path": "http://127.0.0.1:9/x.png"}, "an image without its bytes"),
         (None, "an image without its bytes"),
-        ({"bytes": b"x", "path": "/etc/hostname"}, "cannot be part of a path"),
-        ({"bytes": b"x", "path": "../x.png"}, "cannot be part of a path"),
-        ({"bytes": b"x", "path": "zip://a::b"}, "cannot be part of a path"),
+        ({"bytes": b"%!PS-Adobe-3.0 EPSF-3.0\n", "path": None}, "an image that is no PNG or JPEG"),
+        ({"bytes": b"\xc5\xd0\xd3\xc6\x1e\0\0\0", "path": None}, "an image that is no PNG or JPEG"),
+        ({"bytes": b"GIF89a", "path": None}, "an image that is no PNG or JPEG"),
+        ({"bytes": b"", "path": None}, "an image that is no PNG or JPEG"),
+        ({"bytes": PNG, "path": "/etc/hostname"}, "cannot be part of a path"),
+        ({"bytes": PNG, "path": "../x.png"}, "cannot be part of a path"),
+        ({"bytes": PNG, "path": "zip://a::b"}, "cannot be part of a path"),
     ],
 )
 def test_images_lie_in_their_rows(copied: Path, image: Any, why: str):
@@ -237,6 +230,29 @@ def test_lerobot_would_open_the_file_that_a_row_names(copied: Path, tmp_path: Pa
         LeRobotDataset("a/b", root=copied, video_backend="pyav")
 
 
+def test_a_picture_does_not_start_a_program(copied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Pillow has Ghostscript draw PostScript: here a program of that name that leaves a mark."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from PIL import EpsImagePlugin
+
+    mark = tmp_path / "mark"
+    (tmp_path / "gs").write_text(f"#!/bin/sh\ntouch {mark}\n")
+    (tmp_path / "gs").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    monkeypatch.setattr(EpsImagePlugin, "gs_binary", None)
+    eps = io.BytesIO()
+    Image.new("RGB", (64, 64)).save(eps, "EPS")
+    data_with(copied, [{"bytes": eps.getvalue(), "path": None}])
+    dataset = LeRobotDataset("a/b", root=copied, video_backend="pyav")
+    with pytest.raises(OSError):
+        dataset[0]
+    assert mark.exists(), "as LeRobot alone does"
+    mark.unlink()
+    with checked(ORIGIN), pytest.raises(InputError, match="an image that is no PNG or JPEG"):
+        LeRobotDataset("a/b", root=copied, video_backend="pyav")[0]
+    assert not mark.exists()
+
+
 def test_an_image_that_unpacks_to_gigabytes(copied: Path, monkeypatch: pytest.MonkeyPatch):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -245,11 +261,29 @@ def test_an_image_that_unpacks_to_gigabytes(copied: Path, monkeypatch: pytest.Mo
     Image.new("RGB", (400, 300)).save(packed, "PNG")
     data_with(copied, [{"bytes": packed.getvalue(), "path": None}])
     before = Image.MAX_IMAGE_PIXELS
-    with checked(ORIGIN):
-        dataset = LeRobotDataset("a/b", root=copied, video_backend="pyav")
-        with pytest.raises(Image.DecompressionBombError):
-            dataset[0]
+    with checked(ORIGIN), pytest.raises(InputError, match="an image that cannot be read .Image size .120000"):
+        LeRobotDataset("a/b", root=copied, video_backend="pyav")
     assert before == Image.MAX_IMAGE_PIXELS
+
+
+def test_images_that_cannot_be_decoded(copied: Path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    def png(side: int) -> bytes:
+        packed = io.BytesIO()
+        noise = np.random.default_rng(0).integers(0, 256, (side, side, 3), np.uint8)
+        Image.fromarray(noise).save(packed, "PNG")
+        return packed.getvalue()
+
+    data_with(copied, [{"bytes": png(32), "path": None}])
+    with pytest.raises(InputError, match="an image of 32 x 32 pixels, and its shape is"):
+        check_data(copied, info(), ORIGIN)
+    data_with(copied, [{"bytes": png(64)[:-5000], "path": None}])
+    with (
+        checked(ORIGIN),
+        pytest.raises(InputError, match="data: an image that cannot be read .*record it again"),
+    ):
+        LeRobotDataset("a/b", root=copied, video_backend="pyav")[0]
 
 
 def test_links_out_of_the_folder(copied: Path, tmp_path: Path):
@@ -263,6 +297,68 @@ def test_links_out_of_the_folder(copied: Path, tmp_path: Path):
     (copied / "data/chunk-000").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(InputError, match="a link that leads out of the folder"):
         check_data(copied, info(), ORIGIN)
+
+
+def column(name: str, values: Callable[[list[Any]], Any]) -> Callable[[pa.Table], pa.Table]:
+    """Replaces a column by one made of all its values but the first."""
+
+    def change(table: pa.Table) -> pa.Table:
+        at = table.schema.get_field_index(name)
+        return table.set_column(at, name, values(table.column(name).to_pylist()[1:]))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda t: t.slice(0, 300), "300 rows, fewer than the 365 frames"),
+        (lambda t: t.drop_columns(["action"]), "action is no column"),
+        (lambda t: t.append_column("more", pa.array([0] * len(t))), "more is no feature of meta/info.json"),
+        (column("task_index", lambda v: pa.array([99, *v])), "task_index=99, and there are 1"),
+        (column("task_index", lambda v: pa.array([-1, *v])), "task_index=-1, and there are 1"),
+        (column("episode_index", lambda v: pa.array([4, *v])), "episode_index=4, and there are 4"),
+        (column("action", lambda v: pa.array([[0.0], *v], pa.list_(pa.float32()))), "action has other num"),
+        (column("action", lambda v: pa.array([None, *v], pa.list_(pa.float32(), 4))), "action has other num"),
+        (column("action", lambda v: pa.array(["a", *map(str, v)])), "action holds no numbers of type float"),
+        (
+            column("action", lambda v: pa.array([[float("nan")] * 4, *v])),
+            "action has a number that is not fin",
+        ),
+        (
+            column("observation.state", lambda v: pa.array([[1e999] * 4, *v])),
+            "state has a number that is not",
+        ),
+        (column("frame_index", lambda v: pa.array([None, *v])), "frame_index has other numbers"),
+    ],
+)
+def test_rows_are_what_their_features_say(copied: Path, change: Callable[[pa.Table], pa.Table], why: str):
+    """Before LeRobot loads them, which would not notice, or end in an error of pyarrow or torch."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    rewrite(copied / DATA, change)
+    with checked(ORIGIN, whole=True), pytest.raises(InputError, match=f"^dataset.root='theirs': data.*{why}"):
+        LeRobotDataset("a/b", root=copied, video_backend="pyav")
+
+
+@pytest.mark.parametrize(
+    ("statistic", "value", "why"),
+    [
+        ("mean", [0.0, 0.0, 0.0, float("nan")], "action.mean: a number that is not finite"),
+        ("std", [float("inf")] * 4, "action.std: a number that is not finite"),
+        ("q99", [0.0] * 5, r"action.q99: shape \[5\], and the feature has \[4\]"),
+    ],
+)
+def test_statistics_can_normalise(copied: Path, statistic: str, value: list[float], why: str):
+    stats = json.loads((copied / "meta/stats.json").read_text())
+    stats["action"][statistic] = value
+    (copied / "meta/stats.json").write_text(json.dumps(stats))
+    refused(copied, f"meta/stats.json: {why}; compute the statistics again")
+
+
+def test_fewer_tasks_than_the_metadata_says(copied: Path):
+    edit(copied, total_tasks=2)
+    refused(copied, "meta/tasks.parquet: 1 tasks, and meta/info.json says 2")
 
 
 def test_more_rows_than_frames(copied: Path):

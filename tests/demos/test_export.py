@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A run's episodes as a LeRobotDataset: what was done is done again."""
 
 from __future__ import annotations
@@ -24,9 +12,10 @@ import yaml
 
 from accerl_lerobot.cli import main
 from accerl_lerobot.config import DatasetConfig, LaunchConfig, RunConfig, encode, parse
-from accerl_lerobot.demos.windows import check_dataset
-from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.demos.windows import open_metadata
+from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.evaluation.config import EvaluationConfig
+from accerl_lerobot.preflight import check_features, dataset_features, env_features
 from accerl_lerobot.replay.journal import read_journal, whole_episodes
 from tests.runs import tiny_run
 
@@ -75,7 +64,10 @@ def test_every_whole_episode_is_in_the_dataset_step_by_step(
     about = json.loads((tmp_path / "set" / "meta" / "accerl_rollouts.json").read_text())
     assert about["episodes"] == len(episodes) and about["export"]["path"] == run.name
     settings: RunConfig = parse(RunConfig, [f"--config_path={run / 'config.yaml'}"])
-    check_dataset(DatasetConfig(repo_id="accerl/rollouts", root=str(tmp_path / "set")), settings.env, {})
+    written = dataset_features(
+        open_metadata(DatasetConfig(repo_id="accerl/rollouts", root=str(tmp_path / "set")))
+    )
+    check_features(written, env_features(make_world(settings.env).spec), {}, "dataset.repo_id", "")
 
 
 def test_some_of_them(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -109,10 +101,10 @@ def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     for options, message in (
         (["--root=" + str(tmp_path)], "exists already: remove it or name another folder"),
         (["--path=" + str(tmp_path), "--root=new"], "no run in it: there is no config.yaml"),
-        (["--pick=best"], "pick='best': use all, successes, failures"),
-        (["--last=-1"], "use 0 (all) or more episodes"),
+        (["--pick=best"], "pick='best': use all, successes or failures"),
+        (["--last=-1"], "use a whole number from 0"),
         (["--repo_id=name"], "use the form owner/name"),
-        (["--processes=0"], "use 1 to 64"),
+        (["--processes=0"], "use a whole number from 1 to 64"),
     ):
         arguments = {"--path": str(run), "--root": str(tmp_path / "new")}
         arguments |= dict(option.split("=", 1) for option in options)

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Warm start: LeRobot's own trainer in a process of its own, and its items from memory."""
 
 from __future__ import annotations
@@ -34,6 +22,7 @@ from accerl_lerobot.demos.sft import SFTConfig, run_sft, sft_command
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.backbone import BackboneConfig
 from tests.policies.tiny import adapter_at
+from tests.rounding import assert_close
 
 ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 CAMERA = "observation.images.corner2"
@@ -184,7 +173,7 @@ def test_two_steps_of_lerobot_s_trainer_give_a_checkpoint(tmp_path: Path):
     batch = adapter.processing.prepare(observation, [item["task"]])
     stats = stock_dataset().meta.stats["observation.state"]
     expected = (observation["observation.state"] - stats["mean"]) / (stats["std"] + 1e-8)
-    assert np.allclose(batch["observation.state"], expected, atol=1e-4), "the dataset's normalisation"
+    assert_close(batch["observation.state"], expected)  # the dataset's normalisation
 
 
 def test_act_is_trained_as_well(tmp_path: Path):
@@ -232,7 +221,7 @@ def test_progress_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 def test_an_interrupted_caller_takes_the_trainer_along(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     command_that(
-        monkeypatch, "import os, time\nprint(f'step:{os.getpid()} loss:1', flush=True)\ntime.sleep(60)"
+        monkeypatch, "import os, time\nprint(f'step:{os.getpid()} loss:1', flush=True)\ntime.sleep(600)"
     )
     seen: list[int] = []
 
@@ -243,7 +232,7 @@ def test_an_interrupted_caller_takes_the_trainer_along(tmp_path: Path, monkeypat
     started = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
         run_sft(TINY, "a/b", None, tmp_path / "sft", seed=0, on_step=interrupt)
-    assert time.monotonic() - started < 30
+    assert time.monotonic() - started < 300, "it was not waited for"
     with pytest.raises(ProcessLookupError):
         os.kill(seen[0], 0)
 

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The curve and the video that people look at."""
 
 from __future__ import annotations
@@ -22,6 +10,7 @@ import imageio.v2 as imageio
 import numpy as np
 import pytest
 
+from accerl_lerobot.evaluation import pictures
 from accerl_lerobot.evaluation.pictures import GAP, before_after, success_curve, write_video
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 
@@ -102,7 +91,9 @@ class TestVideo:
         with pytest.raises(ValueError, match="every row needs as many clips"):
             write_video(tmp_path / "film.mp4", grid, fps=4)
 
-    def test_before_above_after_with_the_outcome_around(self, tmp_path: Path) -> None:
+    def test_before_beside_after_with_outcomes_and_numbers(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         def result(index: int, success: bool, frames: list[np.ndarray]) -> EpisodeResult:
             plan = EpisodePlan(task="t", seed=index, explore=False, index=index)
             return EpisodeResult(
@@ -111,20 +102,46 @@ class TestVideo:
             )  # fmt: skip
 
         grey = clip(3, (120, 120, 120), side=64)
-        before = [result(1, False, grey), result(0, True, grey), result(2, True, [])]
-        after = [result(0, True, grey), result(1, True, grey), result(2, True, grey)]
-        before_after(tmp_path / "film.mp4", before, after, fps=4)
+        before = [result(i, i == 0, grey) for i in (1, 0, 2)] + [result(3, True, [])]
+        after = [result(i, i != 2, grey) for i in range(4)]
+        captions: list[Any] = []
+        caption = pictures._caption
+        monkeypatch.setattr(
+            pictures, "_caption", lambda halves, *sizes: captions.append(halves) or caption(halves, *sizes)
+        )
+        numbers = evaluation(0, 46, 100), evaluation(1, 98, 100)
+        before_after(tmp_path / "film.mp4", (before, numbers[0]), (after, numbers[1]), fps=4)
         film = read(tmp_path / "film.mp4").astype(int)
-        assert film.shape[1:] == (2 * 64 + GAP, 2 * 64 + GAP, 3)
+        half = 2 * 64 + GAP
+        head = film.shape[1] - GAP - half
+        assert 20 < head < 60 and film.shape[2] == 2 * half + 4 * GAP
 
         def edge(frame: int, row: int, column: int) -> str:
-            top, left = row * (64 + GAP), column * (64 + GAP)
+            top, left = (
+                head + GAP + row * (64 + GAP),
+                column % 2 * (64 + GAP) + column // 2 * (half + 4 * GAP),
+            )
             red, green, _ = film[frame, top + 61, left + 20 : left + 44].mean(0)
             return "red" if red > green + 60 else "green" if green > red + 60 else "none"
 
-        assert [edge(0, r, c) for r in (0, 1) for c in (0, 1)] == ["none"] * 4
-        assert [edge(-1, r, c) for r in (0, 1) for c in (0, 1)] == ["green", "red", "green", "green"]
+        assert [edge(0, r, c) for r in (0, 1) for c in range(4)] == ["none"] * 8
+        ends = [edge(-1, r, c) for r in (0, 1) for c in range(4)]
+        assert ends == ["green", "red", "green", "green", "red", "none", "red", "none"]
+        assert (film[:, head + GAP + 80 :, 80:half] > 150).all(), "no fourth episode"
+        assert captions[0][0] == ["before RL: 46% success [37%, 56%], n = 100", "0 of these 3 succeeded"]
+        assert captions[-1][0][1] == "1 of these 3 succeeded"
+        assert captions[-1][1] == ["after RL: 98% success [93%, 99%], n = 100", "2 of these 3 succeeded"]
+
+    def test_numbers_of_any_length_over_small_clips(self, tmp_path: Path) -> None:
+        plan = EpisodePlan(task="t", seed=0, explore=False)
+        result = EpisodeResult(
+            plan=plan, success=True, episode_return=0.0, steps=1, decisions=1, versions=(0, 0),
+            frames=clip(2, (9, 9, 9)),
+        )  # fmt: skip
+        numbers = evaluation(0, 0, 1), evaluation(1, 10_000, 10_000)
+        before_after(tmp_path / "film.mp4", ([result], numbers[0]), ([result], numbers[1]), fps=4)
+        assert read(tmp_path / "film.mp4").shape[2] == 2 * 32 + 4 * GAP
 
     def test_without_frames_there_is_no_video(self, tmp_path: Path) -> None:
-        before_after(tmp_path / "film.mp4", [], [], fps=4)
+        before_after(tmp_path / "film.mp4", ([], None), ([], None), fps=4)
         assert list(tmp_path.iterdir()) == []

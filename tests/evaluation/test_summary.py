@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """From finished episodes to numbers, and the plans they came from."""
 
 from __future__ import annotations
@@ -64,6 +52,10 @@ class TestSummarise:
         assert [(t["success"], t["n"]) for t in tasks.values()] == [(0.8, 10), (0.1, 10)]
         assert all(t["ci95"][0] < t["success"] < t["ci95"][1] for t in tasks.values())
 
+    def test_says_which_starts_failed(self) -> None:
+        task = summarise(RESULTS)["tasks"]["door"]
+        assert task["seeds"] == [0, 9] and task["failed_seeds"] == [8, 9]
+
     def test_is_json(self) -> None:
         summary = summarise(RESULTS)
         assert json.loads(json.dumps(summary)) == summary
@@ -100,6 +92,10 @@ class TestPlans:
         after = evaluation_plans(("a", "b"), 10, "after")
         assert [(p.task, p.seed) for p in before] == [(p.task, p.seed) for p in after]
         assert len({(p.task, p.seed) for p in before}) == 10
+
+    def test_another_seed_has_other_starts(self) -> None:
+        seeds = [{p.seed for p in evaluation_plans(("a", "b"), 10, "x", seed=seed)} for seed in (0, 1)]
+        assert len(seeds[0]) == len(seeds[1]) == 5 and not seeds[0] & seeds[1]
 
     def test_smaller_evaluations_are_the_beginning_of_larger_ones(self) -> None:
         few, many = (evaluation_plans(("a", "b"), n, "x") for n in (6, 12))

@@ -1,32 +1,23 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A pull is a whole folder that was checked, or none; what the server says is not taken on trust."""
 
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from accerl_lerobot import cli
+from accerl_lerobot import cli, doctor
 from accerl_lerobot.checkpoint import defect, write_manifest
+from accerl_lerobot.hub import trouble
 from accerl_lerobot.hub.manifest import MANIFEST
 from tests.hub.folders import write_policy_folder, write_run_folder
-from tests.hub_server import STRANGER, Fault, HubServer
+from tests.hub_server import STRANGER, Answer, Fault, HubServer
 
 NAME = "alice/door"
 Files = dict[str, bytes]
@@ -56,10 +47,10 @@ def pulled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., 
 def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
     """The one line of a pull that is refused; there is no folder then, and nothing else new."""
 
-    def do(*more: str) -> str:
+    def do(*more: str, name: str = NAME) -> str:
         before = {p for p in tmp_path.rglob("*") if not {"cache", "hub"} & set(p.relative_to(tmp_path).parts)}
         capsys.readouterr()
-        assert cli.main(["pull", f"--repo_id={NAME}", f"--output_dir={tmp_path / 'pulled'}", *more]) == 2
+        assert cli.main(["pull", f"--repo_id={name}", f"--output_dir={tmp_path / 'pulled'}", *more]) == 2
         out, err = capsys.readouterr()
         (line,) = [line for line in err.splitlines() if line.startswith("accerl: ")]
         after = {p for p in tmp_path.rglob("*") if not {"cache", "hub"} & set(p.relative_to(tmp_path).parts)}
@@ -170,7 +161,7 @@ def test_files_changed_since_the_push(
 @pytest.mark.parametrize(
     ("planted", "words"),
     [
-        ({"policy_preprocessor.json": b"[1]"}, "is not one of LeRobot's"),
+        ({"policy_preprocessor.json": b"[1]"}, "one of its files is not what its name says"),
         ({"config.json": b'{"spec": {}, "model": {}}'}, "says policy, but this is a world model"),
         ({"config.json": b"[]"}, "nothing that we know"),
     ],
@@ -263,6 +254,208 @@ def test_names_that_two_have_or_nobody(
     assert "alice/door is a model and a dataset; say which" in refused()
     assert pulled("--repo_type=model", to="other")["kind"] == "policy"
     monkeypatch.setenv("HF_TOKEN", STRANGER)
-    assert "the token's account may not see it" in refused("--repo_id=alice/nowhere")
+    assert "the token's account may not see it" in refused(name="alice/nowhere")
     monkeypatch.delenv("HF_TOKEN")
-    assert "it is not there, or private; log in" in refused("--repo_id=alice/nowhere")
+    assert "it is not there, or private; log in" in refused(name="alice/nowhere")
+
+
+def altered(where: str, edit: Callable[[Any], Any]) -> Callable[[Answer], Answer]:
+    """Changes the JSON of answers whose path has a part."""
+
+    def change(answer: Answer) -> Answer:
+        if where in answer.path and answer.status == 200:
+            answer.pieces = [json.dumps(edit(json.loads(b"".join(answer.pieces)))).encode()]
+            answer.headers["Content-Length"] = str(len(answer.pieces[0]))
+        return answer
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "commit", ["/../../escaped", "main", "", "A" * 40, "0" * 39, f"{'0' * 40}\n", 7, ["0"]]
+)
+def test_a_commit_is_forty_hexadecimal_digits(
+    hub: HubServer, policy: Path, refused: Callable[..., str], tmp_path: Path, commit: Any
+):
+    hub.change = altered("/api/models/alice/door", lambda c: c | {"sha": commit} if "sha" in c else c)
+    assert "a commit, which has 40 hexadecimal digits" in refused()
+    assert list(tmp_path.glob(".pulling-*")) == []
+
+
+@pytest.mark.parametrize("header", ["X-Repo-Commit", "ETag", "X-Linked-ETag"])
+def test_hashes_in_headers_become_no_paths(
+    hub: HubServer, policy: Path, refused: Callable[..., str], header: str, tmp_path: Path
+):
+    def change(answer: Answer) -> Answer:
+        if "/resolve/" in answer.path:
+            answer.headers[header] = "../../../../escaped"
+        return answer
+
+    hub.change = change
+    line = refused()
+    assert "40 hexadecimal digits" in line or "is no hash" in line
+    assert not list(tmp_path.rglob("*escaped*"))
+
+
+def test_huggingface_hub_alone_writes_where_a_header_says(hub: HubServer, policy: Path, tmp_path: Path):
+    """Why headers are looked at, and that a policy is fetched by a client that does."""
+    from huggingface_hub import hf_hub_download, set_client_factory
+    from huggingface_hub.utils._http import default_client_factory
+
+    from accerl_lerobot.errors import InputError
+    from accerl_lerobot.policies.files import fetched_checkpoint
+
+    def change(answer: Answer) -> Answer:
+        if "/resolve/" in answer.path:
+            answer.headers["ETag"] = "../../../escaped"
+        return answer
+
+    hub.change = change
+    set_client_factory(default_client_factory)
+    hf_hub_download(NAME, "config.json")
+    assert (tmp_path / "escaped").is_file()
+    with pytest.raises(InputError, match="is no hash"):
+        fetched_checkpoint(NAME, None, "policy.path")
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ({"size": float("inf")}, "with size inf and hash"),
+        ({"size": -1}, "with size -1 and hash"),
+        ({"size": True}, "with size True and hash"),
+        ({"size": "9"}, "with size 9 and hash"),
+        ({"size": 10**17}, "with size 100000000000000000 and hash"),
+        ({"size": 10**15}, "GB are to be fetched, and"),
+        ({"oid": "0" * 39}, "and hash '0000"),
+        ({"oid": None}, "and hash None"),
+        ({"lfs": {"oid": "x", "size": 1, "pointerSize": 1}}, "and hash 'x', which no file has"),
+        ({"path": ["x"]}, "['x'] is listed"),
+        ({"path": "x" * 300}, "is not safe to write"),
+    ],
+)
+def test_what_a_server_may_list(
+    hub: HubServer, policy: Path, refused: Callable[..., str], entry: dict[str, Any], words: str
+):
+    entry = {"type": "file", "path": "x", "size": 1, "oid": "0" * 40} | entry
+    hub.change = altered("/tree/", lambda listed: [*listed, entry])
+    assert words in refused()
+    assert not [path for method, path, _ in hub.journal if "/resolve/" in path], "nothing was fetched"
+
+
+@pytest.mark.parametrize(
+    "names", [("a", "a/b"), ("a/b", "a"), ("x/Y", "x/y"), ("X/a", "x/b"), ("\xe9", "e\u0301")]
+)
+def test_names_of_which_one_would_be_written_over_the_other(
+    hub: HubServer, policy: Path, refused: Callable[..., str], names: tuple[str, str]
+):
+    hub.plant(NAME, dict.fromkeys(names, b"x"))
+    assert "and another file of it cannot both be written" in refused()
+
+
+def test_a_small_file_is_what_the_server_lists(
+    hub: HubServer, policy: Path, refused: Callable[..., str], pulled: Callable[..., dict[str, Any]]
+):
+    del hub.repo(NAME).commits[hub.repo(NAME).branches["main"]][MANIFEST]
+    pulled(to="whole")
+    hub.faults.append(Fault("GET", "/accerl.json", spoil=True))
+    assert "accerl.json is not what the server lists: its git hash is another" in refused()
+
+
+@pytest.mark.parametrize("body", [b"[]", b"as it was"])
+def test_pages_without_end(
+    hub: HubServer, policy: Path, refused: Callable[..., str], body: bytes, monkeypatch: Any
+):
+    def change(answer: Answer) -> Answer:
+        if "/tree/" in answer.path:
+            answer.headers["Link"] = f'<{hub.url}{answer.path}?page=1>; rel="next"'
+            if body == b"[]":
+                answer.pieces, answer.headers["Content-Length"] = [body], "2"
+        return answer
+
+    hub.change = change
+    monkeypatch.setattr(trouble, "REQUESTS_MOST", 50)
+    assert "answering takes more requests than what it holds can need" in refused()
+
+
+def test_a_byte_now_and_then(hub: HubServer, policy: Path, refused: Callable[..., str], monkeypatch: Any):
+    def change(answer: Answer) -> Answer:
+        if "/resolve/" in answer.path:
+            answer.pieces = [bytes([byte]) for byte in b"".join(answer.pieces)]
+            answer.pause_s = 0.02
+        return answer
+
+    hub.change = change
+    monkeypatch.setattr(trouble, "WINDOW_S", 0.2)
+    monkeypatch.setattr(trouble, "SLOWEST", 10_000)
+    assert "it sends less than 10000 bytes a second" in refused()
+
+
+def test_redirects_in_a_circle(hub: HubServer, policy: Path, refused: Callable[..., str]):
+    def change(answer: Answer) -> Answer:
+        answer.status, answer.headers["Location"] = 302, f"{hub.url}{answer.path}"
+        return answer
+
+    hub.change = change
+    assert "redirects in a circle" in refused()
+
+
+@pytest.mark.parametrize("body", [b"{", b"[" * 100_000, b"\xff", b'{"sha": 7}', b"null", b"[[1]]"])
+def test_answers_that_are_no_answers(hub: HubServer, policy: Path, refused: Callable[..., str], body: bytes):
+    def change(answer: Answer) -> Answer:
+        if "/api/" in answer.path:
+            answer.pieces, answer.headers["Content-Length"] = [body], str(len(body))
+        return answer
+
+    hub.change = change
+    assert refused().startswith(f"accerl: repo_id='{NAME}': ")
+
+
+ARENA = f"them/arena@{'0123456789' * 4}"
+
+
+def test_no_run_that_was_pulled_lets_code_run(
+    hub: HubServer, pulled: Callable[..., dict[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    run = write_run_folder(tmp_path / "run")
+    recipe = (
+        "env: {type: lerobot, name: isaaclab_arena, trust_remote_code: true,\n"
+        f"  kwargs: {{hub_path: '{ARENA}'}}}}\npolicy: {{path: a/b}}\nsft: {{steps: 0}}\n"
+        "launch: {address: 'them:6379', placement: {rollout: {nodes: all}}}\n"
+    )
+    last = (run / "checkpoints" / "last").resolve()
+    for folder in (run, last):
+        (folder / "config.yaml").write_text(recipe)
+    write_manifest(last)
+    assert cli.main(["push", f"--path={run}", f"--repo_id={NAME}"]) == 0
+    fields = {
+        "env.trust_remote_code": True, "env.kwargs.hub_path": ARENA, "launch.address": "them:6379",
+        "launch.placement": {"rollout": {"nodes": "all"}},
+    }  # fmt: skip
+    found = pulled()
+    files = ["checkpoints/000012/config.yaml", "config.yaml"]
+    assert found["dropped"] == dict.fromkeys(files, fields)
+    assert json.loads((tmp_path / "pulled" / "accerl_pulled.json").read_text())["dropped"] == found["dropped"]
+    for name in files:
+        text = (tmp_path / "pulled" / name).read_text()
+        assert "isaaclab_arena" in text and not any(w in text for w in ("trust", "hub_path", "them:6379"))
+    assert defect(tmp_path / "pulled" / "checkpoints" / "000012") is None
+    doctor.main([str(tmp_path / "pulled" / "config.yaml"), "--policy.path=null"])
+    said = capsys.readouterr().out
+    assert "warn  pulled     without 'env.trust_remote_code', 'env.kwargs.hub_path', 'launch.ad" in said
+    for verb in (["train", "--resume=true"], ["eval"], ["doctor"]):
+        assert cli.main([*verb, f"--config_path={run / 'config.yaml'}"]) in (1, 2)
+        assert "a file cannot allow this, only the command line can" in "".join(capsys.readouterr())
+    assert cli.main(["export", f"--path={run}", f"--root={tmp_path / 'set'}"]) == 2
+    assert f"the run's environment is code of {ARENA}" in capsys.readouterr().err
+
+
+def test_a_hostile_hub_writes_nothing_elsewhere_and_ends_in_one_line(tmp_path: Path):
+    command = [sys.executable, "-m", "tests.hub.hostile_hub", "0", str(tmp_path), "60"]
+    root = Path(__file__).parents[2]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, errors="replace", check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert found["uncaught"] == found["outside"] == [] and found["consented"] == 0
+    assert found["longest_nap_s"] <= 10 and found["memory_mib"] < 1000
+    assert {name.split()[1] for name in found["outcomes"]} == {"good", "refused"}

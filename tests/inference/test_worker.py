@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The inference service on an event loop of the test's own, with an adapter that only counts."""
 
 from __future__ import annotations
@@ -32,6 +20,7 @@ from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from accerl_lerobot.weights import shared_memory
 from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
+from tests.runs import HANGS_S
 
 NAMES = ("a", "b", "c")
 
@@ -52,7 +41,7 @@ class CountingAdapter:
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
         self._enter()
         if self.gate is not None:
-            assert self.gate.wait(10)
+            assert self.gate.wait(HANGS_S)
         if self.broken is not None:
             raise self.broken
         self.batches.append([r.noise_seed for r in requests])
@@ -106,7 +95,7 @@ Scene = Callable[[InferenceWorker, CountingAdapter], Awaitable[Any]]
 
 @pytest.fixture
 def play(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
-    """Runs a scene beside a serving worker; a scene that takes 30 s hangs."""
+    """Runs a scene beside a serving worker; a scene that takes so long hangs."""
 
     def run(scene: Scene, adapter: CountingAdapter | None = None, **config: Any) -> Any:
         adapter = adapter or CountingAdapter()
@@ -116,7 +105,7 @@ def play(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
             worker = InferenceWorker(PolicyConfig(path="nowhere", device="cpu"), InferenceConfig(**config))
             serving = asyncio.create_task(worker.serve())
             try:
-                return await asyncio.wait_for(scene(worker, adapter), 30)
+                return await asyncio.wait_for(scene(worker, adapter), HANGS_S)
             finally:
                 serving.cancel()
                 await asyncio.gather(serving, return_exceptions=True)
@@ -303,7 +292,7 @@ def test_serve_ends_with_the_failure_itself(monkeypatch: pytest.MonkeyPatch):
         worker = InferenceWorker(PolicyConfig(path="nowhere"), InferenceConfig(max_batch=1))
         asking = asyncio.create_task(worker.decide(requests(0)))
         with pytest.raises(ValueError, match="no such weights"):
-            await asyncio.wait_for(worker.serve(), 10)
+            await asyncio.wait_for(worker.serve(), HANGS_S)
         await asyncio.gather(asking, return_exceptions=True)
 
     asyncio.run(main())
@@ -334,7 +323,7 @@ def test_weights_through_shared_memory_are_swapped_in_and_let_go_of(play):
         assert await worker.open_weights(publisher.address)
         for version in range(30):
             publisher.publish(version, weights(version))
-            await asyncio.to_thread(publisher.flush, 20)  # applied, though nobody has asked for a decision
+            await asyncio.to_thread(publisher.flush, HANGS_S)  # applied, though nobody has asked
             (decision,) = await worker.decide(requests(0))
             assert decision.version == version and set(decision.chunk.ravel()) == {version}
         metrics = await worker.metrics()
@@ -363,7 +352,7 @@ def test_a_torn_set_ends_the_service_and_is_never_served(play, monkeypatch: pyte
                 (decision,) = await worker.decide(requests(0))
                 assert decision.version == 0
         assert adapter.loaded == []
-        await asyncio.to_thread(publisher.flush, 20)  # it is a reader no more
+        await asyncio.to_thread(publisher.flush, HANGS_S)  # it is a reader no more
 
     play(scene, max_batch=1, max_wait_s=0.0)
     publisher.close()
@@ -376,7 +365,7 @@ def test_a_service_that_fails_is_let_go_of_by_the_trainer(play):
         assert await worker.open_weights(publisher.address)
         adapter.broken = ValueError("no such weights")
         publisher.publish(1, weights(1))
-        await asyncio.to_thread(publisher.flush, 20)
+        await asyncio.to_thread(publisher.flush, HANGS_S)
         assert publisher._readers == []
         with pytest.raises(ServiceStoppedError, match="no such weights"):
             await worker.decide(requests(0))
@@ -393,7 +382,7 @@ def test_a_service_that_hangs_is_silent(play, monkeypatch: pytest.MonkeyPatch):
         await worker.metrics()
         adapter.gate = threading.Event()
         asked = asyncio.create_task(worker.decide(requests(1)))
-        await asyncio.to_thread(adapter.entered.wait, 10)
+        await asyncio.to_thread(adapter.entered.wait, HANGS_S)
         await asyncio.sleep(0.2)
         answer = asyncio.create_task(worker.metrics())
         await asyncio.sleep(0.3)

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """ACT, in numbers: the stock chunk is the mean, and everything around it is exact."""
 
 from __future__ import annotations
@@ -41,6 +29,7 @@ from accerl_lerobot.trainer.config import TrainerConfig
 from tests.policies.checkpoints import edit_config, stock_chunk, write_act
 from tests.policies.contract import PolicyContract
 from tests.policies.tiny import adapter_at, log_ratio, perturb, requests, stored
+from tests.rounding import assert_close
 from tests.runs import drive
 from tests.test_local import learning_run, success, updates
 
@@ -103,7 +92,8 @@ def slow_std(head: StdHead, row: np.ndarray, dim: int) -> float:
 def test_other_weights_give_the_ratio_of_a_slow_computation(adapter: LeRobotAdapter, path: Path):
     asked = ask(4)
     decisions = adapter.decide(asked, 0)
-    assert all(np.allclose(d.latent["u"] * 0.5, d.chunk, atol=1e-6) for d in decisions), "std 0.5, no squash"
+    for decision in decisions:  # std 0.5, no squash
+        assert_close(decision.chunk, 0.5 * decision.latent["u"])
     perturb(adapter, 0.1)
     seen: list[torch.Tensor] = []
     adapter.policy.model.decoder.register_forward_hook(lambda m, a, out: seen.append(out.double()))
@@ -258,7 +248,7 @@ class TestTuning:
         save_pretrained(adapter, tmp_path / "saved", config)
         rest = ask(1, explore=False)
         chunk = adapter.decide(rest, 0)[0].chunk
-        assert np.abs(stock_chunk(tmp_path / "saved", rest[0])[0, :3] - chunk).max() <= 1e-5
+        assert_close(stock_chunk(tmp_path / "saved", rest[0])[0, :3], chunk)
         assert np.abs(stock_chunk(path, rest[0])[0, :3] - chunk).max() > 1e-3
 
 

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A random backbone: SmolVLM's own files, small, with a tokeniser that has learned the instructions."""
 
 from __future__ import annotations
@@ -74,13 +62,13 @@ def test_the_vision_tower_has_the_sizes_asked_for(tmp_path: Path):
 @pytest.mark.parametrize(
     ("values", "sentence"),
     [
-        ({"vocabulary": 263}, "sft.backbone.vocabulary=263: use at least 264"),
+        ({"vocabulary": 263}, "sft.backbone.vocabulary=263: use a whole number from 264"),
         ({"image": 48}, "sft.backbone.image=48: use a multiple of 32"),
         ({"heads": 5}, "sft.backbone.heads=5: use a divisor of the width 96"),
         ({"vision_heads": 3}, "sft.backbone.vision_heads=3: use a divisor of the width 64"),
         ({"kv_heads": 3}, "sft.backbone.kv_heads=3: use a divisor of the 4 heads"),
         ({"hidden": 12}, "sft.backbone.hidden=12: use a multiple of 8"),
-        ({"layers": 0}, "sft.backbone.layers=0: use at least 1"),
+        ({"layers": 0}, "sft.backbone.layers=0: use a whole number from 1"),
     ],
 )
 def test_impossible_sizes_name_their_field(values: dict, sentence: str):

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The LeRobot plugin ``smolvla_bins``: its network, its loss, and its way through LeRobot's own commands."""
 
 from __future__ import annotations
@@ -40,6 +28,7 @@ from accerl_lerobot.policies.plugins import PLUGINS, discovery, register_policie
 from accerl_lerobot.preflight import check_sft_policy
 from tests.policies.tiny import adapter_at, log_ratio, perturb, requests
 from tests.policies.tiny_bins import write_bins
+from tests.rounding import assert_close
 
 DATASET = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 CHUNK, DIMS, BINS = 3, 2, 8
@@ -153,7 +142,7 @@ def test_the_network_is_the_formulas(loaded: tuple[Any, Any, Any]):
     for i in range(3):
         image, state = batch["observation.images.front"][i], batch["observation.state"][i]
         expected = slow_hidden(policy, image, tokens[i][mask[i]], state)
-        assert (hidden[i] - expected).abs().max() < 1e-4
+        assert_close(hidden[i], expected)
     assert hidden.shape == (3, CHUNK * DIMS, 32) and hidden.std() > 0.1
 
 
@@ -180,7 +169,7 @@ def test_the_loss_by_hand(loaded: tuple[Any, Any, Any]):
     policy, pre, _ = loaded
     raw = observed(3)
     batch = pre(raw)
-    assert np.allclose(batch["action"], (raw["action"] + 1) / 2 - 1, atol=1e-6), "[-1, 3] became [-1, 1]"
+    assert_close(batch["action"], (raw["action"] + 1) / 2 - 1)  # [-1, 3] became [-1, 1]
     with torch.no_grad():
         logits = policy.model.logits(policy.hidden(batch)).view(3, CHUNK, DIMS, BINS).double().numpy()
     sums, distances = np.zeros(3), []
@@ -196,10 +185,10 @@ def test_the_loss_by_hand(loaded: tuple[Any, Any, Any]):
                 distances.append(abs(said - float(batch["action"][b, k, a])))
     counts = DIMS * np.array([3, 1, 2])
     loss, info = policy.forward(batch)
-    assert loss.item() == pytest.approx(sums.sum() / counts.sum(), rel=1e-5)
-    assert info == {"loss": pytest.approx(loss.item()), "l1": pytest.approx(np.mean(distances), rel=1e-5)}
+    assert loss.item() == pytest.approx(sums.sum() / counts.sum(), rel=1e-4)
+    assert info == {"loss": pytest.approx(loss.item()), "l1": pytest.approx(np.mean(distances), rel=1e-4)}
     each, _ = policy.forward(batch, reduction="none")
-    assert np.allclose(each.detach(), sums / counts, rtol=1e-5)
+    assert_close(each, sums / counts)
     del batch["action_is_pad"]
     assert policy.forward(batch)[0].item() != pytest.approx(loss.item(), rel=1e-3)
 
@@ -360,7 +349,7 @@ def test_lerobot_s_trainer_lowers_the_loss(trained: tuple[Path, list[tuple[int, 
     assert adapter.family.model.length == 12 and adapter.actions == 3
     stats = json.loads((DATASET / "meta" / "stats.json").read_text())["action"]
     ends = torch.tensor([-1.0, 1.0])[:, None, None].expand(2, 1, 4)
-    assert np.allclose(adapter.processing.unnormalise(ends)[:, 0], [stats["min"], stats["max"]], atol=1e-5)
+    assert_close(adapter.processing.unnormalise(ends)[:, 0], [stats["min"], stats["max"]])
 
 
 def test_lerobot_eval_runs_the_checkpoint(trained: tuple[Path, list[tuple[int, float]]], tmp_path: Path):

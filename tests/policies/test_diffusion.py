@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The diffusion family, in numbers: on LeRobot's policy, and on a network small enough to sample often."""
 
 from __future__ import annotations
@@ -44,7 +32,8 @@ from accerl_lerobot.trainer.config import TrainerConfig
 from tests.policies import diffusion_oracle
 from tests.policies.checkpoints import edit_config, stock_chunk, write_diffusion
 from tests.policies.contract import PolicyContract
-from tests.policies.tiny import adapter_at, log_ratio, perturb, requests, stored
+from tests.policies.tiny import adapter_at, check_ratio_one, log_ratio, perturb, requests, stored
+from tests.rounding import assert_close
 from tests.runs import drive
 from tests.test_local import learning_run, success, updates
 
@@ -318,7 +307,7 @@ def test_exploration_keeps_to_the_last_steps_and_to_the_least_std():
     assert torch.equal(path[:, 0], mean + std), "the first step is LeRobot's own"
     for k, timestep in ((1, 6), (2, 0)):
         mean, std = plan.step(k, path[:, k - 1], MU(path[:, k - 1], timestep))
-        assert torch.allclose(path[:, k], mean + max(float(std), 0.4)), k
+        assert_close(path[:, k], mean + max(float(std), 0.4))
     assert float(plan.step(1, x, x)[1]) < 0.4 and float(plan.step(2, x, x)[1]) == 0
 
 
@@ -338,7 +327,7 @@ def test_only_executed_rows_of_the_outcome_are_scored(path: Path, config: Diffus
     decisions = adapter.decide(asked, 0)
     for decision in decisions:
         decision.latent["path"][-1, 3:] += 1.0
-    assert log_ratio(adapter, asked, decisions).abs().max() <= 1e-5
+    check_ratio_one(adapter, asked, decisions)
     for decision in decisions:
         decision.latent["path"][-1, 2, 1] += 0.1
     assert log_ratio(adapter, asked, decisions).abs().min() > 1e-3
@@ -466,7 +455,8 @@ class TestTuning:
         again = adapter_at(tmp_path / "saved")
         rest = ask(4, explore=False)
         chunks = [np.stack([d.chunk for d in a.decide(rest, 0)]) for a in (adapter, again, adapter_at(path))]
-        assert np.allclose(chunks[0], chunks[1], atol=1e-4) and np.abs(chunks[0] - chunks[2]).max() > 1e-3
+        assert_close(chunks[1], chunks[0])
+        assert np.abs(chunks[0] - chunks[2]).max() > 1e-3
 
 
 def test_a_random_policy_gets_better_at_the_task(tmp_path: Path):

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A diffusion policy that looks back (LeRobot's default), exact in numbers and in a world."""
 
 from __future__ import annotations
@@ -36,6 +24,7 @@ from accerl_lerobot.trainer.config import TrainerConfig
 from tests.policies.checkpoints import write_diffusion
 from tests.policies.contract import PolicyContract
 from tests.policies.tiny import adapter_at, looking_back, requests
+from tests.rounding import assert_close
 from tests.runs import tiny_run
 from tests.transport.played import played
 
@@ -99,7 +88,7 @@ def test_an_episode_is_the_one_that_stock_lerobot_plays(path: Path):
             arrays = {k: np.asarray(v)[None] for k, v in policy_sees.items() if k != TASK}
             batch = adapter.processing.prepare(arrays, [str(policy_sees[TASK])])
             action = adapter.processing.unnormalise(policy.select_action(batch, noise=noise))[0]
-            assert np.abs(action.numpy() - row).max() < 1e-5, steps
+            assert_close(action, row)
             result = stock.step_chunk(row[None])
             steps += 1
             if result.done:

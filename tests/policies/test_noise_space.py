@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """DSRL: the noise a frozen flow policy starts from is the action."""
 
 from __future__ import annotations
@@ -30,7 +18,8 @@ from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.loading import save_pretrained
 from accerl_lerobot.policies.samplers import NoiseSpaceSamplerConfig
 from tests.conftest import write_smolvla
-from tests.policies.tiny import adapter_at, log_ratio, perturb, requests, stored
+from tests.policies.tiny import adapter_at, check_ratio_one, perturb, requests, stored
+from tests.rounding import assert_close
 
 SAMPLERS = [NoiseSpaceSamplerConfig(per_row=rows, at_rest="sample") for rows in (False, True)]
 
@@ -62,7 +51,7 @@ def test_equal_weights_give_ratio_one(adapter: LeRobotAdapter):
     together = adapter.decide(asked, 0)
     alone = [adapter.decide([request], 0)[0] for request in asked[:6]]
     for decisions in (together, alone + together[6:]):
-        assert log_ratio(adapter, asked, decisions).exp().sub(1).abs().max() <= 1e-5
+        check_ratio_one(adapter, asked, decisions)
     assert together[0].log_prob.shape == (adapter.family.rows,)
     assert together[0].latent["z"].shape == (adapter.family.rows, 4)
 
@@ -79,13 +68,13 @@ def test_a_new_head_with_a_noise_per_row_is_lerobot_s_own_policy(loaded: dict[bo
     expected = np.stack(
         [np.random.default_rng(r.noise_seed).standard_normal((5, 4), dtype=np.float32) for r in asked]
     )
-    assert np.allclose(noise.numpy(), expected, atol=1e-6)
+    assert_close(noise, expected)
 
 
 def test_log_prob_by_hand(adapter: LeRobotAdapter):
     decision = adapter.decide(requests(1), 0)[0]
     z = decision.latent["z"].astype(np.float64)  # a new head is N(0, 1)
-    assert np.allclose(decision.log_prob, (-0.5 * z**2 - 0.5 * np.log(2 * np.pi)).sum(1), atol=1e-5)
+    assert_close(decision.log_prob, (-0.5 * z**2 - 0.5 * np.log(2 * np.pi)).sum(1))
 
 
 def test_at_rest_it_starts_from_the_mean(path: Path):

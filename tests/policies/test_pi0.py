@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """π0 and π0.5, in numbers: what acts and what re-scores are one policy; at rest it is LeRobot's own."""
 
 from __future__ import annotations
@@ -37,8 +25,8 @@ from accerl_lerobot.policies.base import stack_observations
 from accerl_lerobot.policies.samplers import FlowSamplerConfig
 from tests.policies.flow_contract import exploring, name, samplers, slow_log_prob
 from tests.policies.tiny import (
-    TOLERANCE,
     adapter_at,
+    check_batches,
     check_gradient,
     check_journey,
     log_ratio,
@@ -47,8 +35,17 @@ from tests.policies.tiny import (
     stored,
 )
 from tests.policies.tiny_pi import KINDS, small, write_pi
+from tests.rounding import assert_close
 
-SAMPLERS = samplers(0.4)
+COVERING = (
+    "last-euler-joint",
+    "all-flow_sde-joint",
+    "all-euler-analytic",
+    "one-euler-joint",
+    "one-flow_sde-analytic",
+)
+"""Every option in each place; all of their combinations are tried on SmolVLA and in `test_flow`."""
+SAMPLERS = [config for config in samplers(0.4) if name(config) in COVERING]
 LANGUAGE_MODEL = "paligemma.model.language_model"
 
 
@@ -77,16 +74,11 @@ def adapter(loaded: LeRobotAdapter) -> LeRobotAdapter:
 
 
 @pytest.mark.parametrize("config", SAMPLERS, ids=name)
-def test_equal_weights_give_ratio_one_across_batch_sizes(adapter: LeRobotAdapter, config: FlowSamplerConfig):
-    adapter, asked = exploring(adapter, config), requests(32)
-    together = adapter.decide(asked, 0)
-    alone = [adapter.decide([request], 0)[0] for request in asked[:8]]
-    for scored, decisions in (
-        (asked, together),  # the same batch
-        (asked, alone + together[8:]),  # decided alone, re-scored among 32
-        (asked[7:10], together[7:10]),  # the other way round
-    ):
-        assert log_ratio(adapter, scored, decisions).exp().sub(1).abs().max() <= TOLERANCE
+def test_decisions_and_ratio_one_do_not_depend_on_the_batch(
+    adapter: LeRobotAdapter, config: FlowSamplerConfig
+):
+    for one in check_batches(exploring(adapter, config), requests(32), few=8):
+        assert one.chunk.shape == (3, 2) and one.chunk.dtype == one.log_prob.dtype == np.float32
 
 
 @pytest.mark.parametrize("config", SAMPLERS, ids=name)
@@ -101,17 +93,11 @@ def test_other_weights_give_the_oracle_s_ratio(adapter: LeRobotAdapter, config: 
     assert np.abs(change).max() > 0.05, "the weights must have moved the policy"
 
 
-def test_a_decision_does_not_depend_on_its_batch(adapter: LeRobotAdapter):
+def test_the_same_batch_gives_the_same_decisions_to_the_bit(adapter: LeRobotAdapter):
     asked = requests(12)
-    alone = [adapter.decide([request], 7)[0] for request in asked]
     together = adapter.decide(asked, 7)
-    for one, other in zip(alone, together, strict=True):
-        assert np.abs(one.chunk - other.chunk).max() <= TOLERANCE
-        assert np.abs(one.latent["path"] - other.latent["path"]).max() <= TOLERANCE
-        assert abs(one.value - other.value) <= TOLERANCE
-        assert one.chunk.shape == (3, 2) and one.log_prob.shape == (3,)
-        assert one.chunk.dtype == one.log_prob.dtype == np.float32
-    assert pickle.dumps(adapter.decide(asked, 7)) == pickle.dumps(together), "to the bit"
+    assert together[0].log_prob.shape == (3,)
+    assert pickle.dumps(adapter.decide(asked, 7)) == pickle.dumps(together)
 
 
 def others(first: Request) -> list[Request]:
@@ -146,7 +132,7 @@ def test_the_state_counts_in_full_however_the_critic_weights_its_tokens(tmp_path
     encoded = adapter._encode(arrays, tasks)
     weights = torch.softmax(torch.randn(encoded.mask.shape).masked_fill(~encoded.mask, -math.inf), -1)
     pooled = (weights[..., None] * encoded.features).sum(1)
-    assert torch.allclose(pooled[0, -4:], torch.from_numpy(first.observation["observation.state"]) / 0.5)
+    assert_close(pooled[0, -4:], first.observation["observation.state"] / 0.5)
 
 
 @pytest.mark.parametrize("config", [c for c in SAMPLERS if c.padded == "joint"], ids=name)

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """π0-FAST as files: no code that comes with a tokeniser is run, no Hub is needed, and LeRobot runs it."""
 
 from __future__ import annotations
@@ -188,7 +176,7 @@ def test_lerobot_s_checkpoint_needs_the_hub_and_ours_does_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     original = write_pi(tmp_path / "original", "pi0_fast", num_steps=8, whole=False)
-    with pytest.raises(InputError, match="the weights did not load .Failed to load required tokenizers"):
+    with pytest.raises(InputError, match="cannot be built .*Failed to load required tokenizers"):
         adapter_at(original)
     with hub(tmp_path / "original-hub"):
         marker = remote(tmp_path / "original-hub", monkeypatch)

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """π0 and π0.5 as files: what did not load is named; what is saved needs no Hub, and LeRobot runs it."""
 
 from __future__ import annotations
@@ -27,7 +15,6 @@ from safetensors.torch import load_file, save_file
 
 from accerl_lerobot.checkpoint import BACKBONE, PRETRAINED, displaced, relocate, save_checkpoint
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies import verify
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, save_pretrained
 from tests.policies.tiny import adapter_at, perturb, requests
@@ -92,14 +79,14 @@ def with_nan(tensors: Tensors) -> None:
             lambda t: t.update({"model.action_out_proj.bias": torch.zeros(5)}),
             r"size mismatch for model.action_out_proj.bias, \(5,\) in the file, \(2,\) in the policy",
         ),
-        (with_nan, "model.action_out_proj.weight differs from the file, or holds a NaN"),
+        (with_nan, "model.safetensors: model.action_out_proj.weight holds NaN or infinity"),
         (lambda t: {"another": torch.zeros(1)}, r"\d\d tensors missing \['.*', '.*', '.*'\], 1 unexpected"),
     ],
     ids=["missing", "missing-deep", "renamed", "shape", "nan", "another"],
 )  # fmt: skip
 def test_weights_that_did_not_load_are_named(copied: Path, damage: Callable[..., object], detail: str):
     change_weights(copied, damage)
-    with pytest.raises(InputError, match=f"^policy.path=.*the weights did not load: {detail}"):
+    with pytest.raises(InputError, match=f"^policy.path=.*: {detail}"):
         adapter_at(copied)
 
 
@@ -140,22 +127,6 @@ def test_openpi_s_names_are_read_as_lerobot_reads_them(copied: Path):
     assert pickle.dumps(adapter_at(copied).decide(requests(3), 0)) == expected
     change_weights(copied, lambda t: t.pop("action_in_proj.bias"))
     with pytest.raises(InputError, match=r"1 tensors missing \['model.action_in_proj.bias'\]"):
-        adapter_at(copied)
-
-
-def test_an_embedding_that_lerobot_replaces_is_noticed(copied: Path, monkeypatch: pytest.MonkeyPatch):
-    # Its loader copies the output layer over the embedding where the file names them in this order.
-    import safetensors.torch
-
-    adapter_at(copied)
-
-    def embedding_first(*given: object) -> Tensors:
-        tensors = load_file(*given)
-        return {EMBEDDING: tensors.pop(EMBEDDING)} | tensors
-
-    monkeypatch.setattr(safetensors.torch, "load_file", embedding_first)
-    monkeypatch.setattr(verify, "load_file", embedding_first)
-    with pytest.raises(InputError, match="embed_tokens.weight differs from the file"):
         adapter_at(copied)
 
 

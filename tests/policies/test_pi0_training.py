@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """π0 and π0.5 in training: what is tuned, in which precision, and that a policy gets better."""
 
 from __future__ import annotations
@@ -37,8 +25,9 @@ from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.policies.flow_contract import slow_log_prob
-from tests.policies.tiny import TOLERANCE, adapter_at, log_ratio, perturb, requests, stored
+from tests.policies.tiny import adapter_at, check_ratio_one, log_ratio, perturb, requests, stored
 from tests.policies.tiny_pi import KINDS, small, write_pi
+from tests.rounding import assert_close
 from tests.runs import collect, drive, tiny_run
 
 
@@ -89,7 +78,7 @@ def test_low_rank_adapters_where_lerobot_puts_them(path: Path, tmp_path: Path):
     save_pretrained(adapter, tmp_path / "saved", config)
     plain = adapter_at(tmp_path / "saved")
     assert not any(".lora_" in k for k in plain.policy.state_dict())
-    assert log_ratio(plain, asked, decisions).exp().sub(1).abs().max() <= 1e-4, "merged, another rounding"
+    check_ratio_one(plain, asked, decisions)
 
 
 def test_full_trains_all_that_acts(path: Path):
@@ -126,7 +115,7 @@ def test_steered_by_its_noise_the_policy_stays_as_it_is(path: Path, per_row: boo
     perturb(adapter, 0.3)
     together = adapter.decide(asked, 0)
     alone = [adapter.decide([request], 0)[0] for request in asked[:6]]
-    assert log_ratio(adapter, asked, alone + together[6:]).exp().sub(1).abs().max() <= TOLERANCE
+    check_ratio_one(adapter, asked, alone + together[6:])
     latent, old = stored(together)
     adapter.evaluate(*stack_observations(asked), latent).log_prob.sum().backward()
     assert all(p.grad.abs().max() > 0 for k, p in adapter.trainable().items() if k.startswith("family."))
@@ -161,7 +150,7 @@ def test_log_probs_are_float32_where_the_network_is_bfloat16(path: Path, stochas
                 return encoded.context.velocity(whole, torch.full((4,), t))[sample].numpy().astype(float)
 
         expected = slow_log_prob(adapter, asked, latent, velocity)
-    assert np.allclose(old.numpy(), expected, atol=1e-4), "rounded to bfloat16 it would be off by 0.1"
+    assert_close(old, expected)  # rounded to bfloat16 it would be off by 0.1
     alone = [adapter.decide([request], 0)[0] for request in asked]
     assert log_ratio(adapter, asked, alone).abs().max() < 0.5
 
@@ -173,7 +162,7 @@ def test_a_bfloat16_checkpoint_acts_and_is_saved_in_float32(path: Path, tmp_path
     assert {p.dtype for p in adapter.policy.parameters()} == {torch.float32}
     together = adapter.decide(asked, 0)
     alone = [adapter.decide([request], 0)[0] for request in asked]
-    assert log_ratio(adapter, asked, alone).exp().sub(1).abs().max() <= TOLERANCE
+    check_ratio_one(adapter, asked, alone)
     change(adapter, 3)
     save_pretrained(adapter, tmp_path / "saved", PolicyConfig(path=str(origin), device="cpu"))
     again = adapter_at(tmp_path / "saved")
@@ -190,8 +179,8 @@ def test_relative_actions_are_added_to_their_own_state(tmp_path: Path):
         asked = requests(5)
         states = np.stack([r.observation["observation.state"] for r in asked])
         chunks = [np.stack([d.chunk for d in a.decide(asked, 0)]) for a in (absolute, relative)]
-        assert np.allclose(chunks[1], chunks[0] + states[:, None, :2], atol=1e-6)
-        assert log_ratio(relative, asked, relative.decide(asked, 0)).abs().max() <= TOLERANCE
+        assert_close(chunks[1], chunks[0] + states[:, None, :2])
+        check_ratio_one(relative, asked, relative.decide(asked, 0))
 
 
 def test_a_camera_the_world_does_not_have_is_masked(tmp_path: Path):
@@ -200,9 +189,9 @@ def test_a_camera_the_world_does_not_have_is_masked(tmp_path: Path):
         two = adapter_at(write_pi(tmp_path / f"{kind}-two", kind, empty_cameras=1))
         asked = requests(5)
         chunks = [np.stack([d.chunk for d in a.decide(asked, 0)]) for a in (one, two)]
-        assert np.abs(chunks[1] - chunks[0]).max() <= TOLERANCE
+        assert_close(chunks[1], chunks[0])
         values = [a.values(*stack_observations(asked)) for a in (one, two)]
-        assert torch.allclose(values[0], values[1], atol=TOLERANCE)
+        assert_close(values[1], values[0])
 
 
 def run(

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What is trained: LeRobot's choice, everything, the expert, or low-rank adapters that are saved merged."""
 
 from __future__ import annotations
@@ -32,7 +20,8 @@ from accerl_lerobot.policies.loading import load_adapter, save_pretrained
 from accerl_lerobot.weights.reader import Received, SharedMemoryReader
 from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
 from tests.conftest import write_smolvla
-from tests.policies.tiny import adapter_at, log_ratio, perturb, requests, stored
+from tests.policies.tiny import adapter_at, check_ratio_one, perturb, requests, stored
+from tests.rounding import assert_close
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +62,7 @@ def test_they_have_gradients_and_ratio_one(path: Path):
     adapter, asked = tuned(path, mode="lora", rank=2), requests(12)
     perturb(adapter, 0.3)
     decisions = adapter.decide(asked, 0)
-    assert log_ratio(adapter, asked, decisions).exp().sub(1).abs().max() <= 1e-5
+    check_ratio_one(adapter, asked, decisions)
     latent, _ = stored(decisions)
     adapter.evaluate(*stack_observations(asked), latent).log_prob.sum().backward()
     silent = [k for k, p in adapter.trainable().items() if k[0] == "p" and not p.grad.abs().max() > 0]
@@ -98,7 +87,7 @@ def test_they_are_saved_merged_and_stock_lerobot_acts_alike(path: Path, tmp_path
     assert changed == {f"{n}.weight" for n, m in adapter.policy.named_modules() if hasattr(m, "lora_A")}
     again = adapter_at(tmp_path / "saved")
     ours = np.stack([d.chunk for d in adapter.decide(asked, 0)])
-    assert np.abs(np.stack([d.chunk for d in again.decide(asked, 0)]) - ours).max() < 1e-5
+    assert_close(np.stack([d.chunk for d in again.decide(asked, 0)]), ours)
     before = np.stack([d.chunk for d in adapter_at(path).decide(asked, 0)])
     assert np.abs(before - ours).max() > 1e-2, "the adapters must matter"
 
@@ -119,7 +108,7 @@ def test_the_merged_weight_by_hand(path: Path, tmp_path: Path):
     product = layer.lora_B["default"].weight @ layer.lora_A["default"].weight
     expected = layer.base_layer.weight + 6 / 2 * product
     stored_weight = load_file(tmp_path / "saved" / "model.safetensors")["model.action_out_proj.weight"]
-    assert torch.allclose(stored_weight, expected, atol=1e-6)
+    assert_close(stored_weight, expected)
 
 
 @pytest.mark.parametrize(

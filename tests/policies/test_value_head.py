@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The critic: pools real tokens only, starts at zero, can keep its gradient to itself."""
 
 from __future__ import annotations
@@ -23,6 +11,7 @@ import torch
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import ValueHeadConfig
 from accerl_lerobot.policies.value_head import ValueHead, two_hot
+from tests.rounding import assert_close
 
 
 def head(**options: object) -> ValueHead:
@@ -44,6 +33,16 @@ def test_a_new_critic_says_zero():
     assert torch.equal(ValueHead(6, ValueHeadConfig())(*inputs()).mean, torch.zeros(2))
 
 
+def test_initial_weights_depend_on_the_seed_alone_and_not_on_what_was_drawn_before():
+    heads = []
+    for seed, draws in ((3, 0), (3, 1000), (4, 0)):
+        torch.manual_seed(seed)
+        torch.randn(draws)
+        heads.append(ValueHead(6, ValueHeadConfig()).hidden.weight.detach())
+    assert torch.equal(heads[0], heads[1]) and not torch.equal(heads[0], heads[2])
+    assert heads[0].abs().max() <= 6**-0.5 and heads[0].std() == pytest.approx(6**-0.5 / 3**0.5, rel=0.1)
+
+
 @pytest.mark.parametrize("pooling", ["attention", "mean"])
 def test_padding_is_not_read(pooling: str):
     critic, (features, mask) = head(pooling=pooling), inputs()
@@ -52,19 +51,19 @@ def test_padding_is_not_read(pooling: str):
     other = torch.where(mask[..., None], features, 100.0)
     assert torch.equal(critic(other, mask).mean, value)
     alone = critic(features[1:, :2], mask[1:, :2]).mean
-    assert torch.allclose(alone, value[1:], atol=1e-6)
+    assert_close(alone, value[1:])
 
 
 def test_mean_pooling_by_hand_and_attention_that_differs():
     (features, mask), mean, attention = inputs(), head(pooling="mean"), head(pooling="attention")
     pooled = torch.stack([features[0, :3].mean(0), features[1, :2].mean(0)])
     expected = mean.out(torch.relu(mean.hidden(mean.norm(pooled))))[:, 0]
-    assert torch.allclose(mean(features, mask).mean, expected, atol=1e-6)
+    assert_close(mean(features, mask).mean, expected)
     assert attention.query is not None
     scores = features[1, :2] @ attention.query / 6**0.5
     pooled = (torch.softmax(scores, 0)[:, None] * features[1, :2]).sum(0)
     expected = attention.out(torch.relu(attention.hidden(attention.norm(pooled))))[0]
-    assert torch.allclose(attention(features, mask).mean[1], expected, atol=1e-5)
+    assert_close(attention(features, mask).mean[1], expected)
 
 
 @pytest.mark.parametrize("detach", [True, False])
@@ -93,21 +92,10 @@ def test_bad_options_name_their_field(name: str, value: object):
 def test_two_hot_by_hand():
     support = torch.linspace(-1.0, 1.0, 5)
     rows = two_hot(torch.tensor([-1.0, -0.625, 0.0, 1.0, 7.0, -9.0]), support)
-    assert torch.allclose(
-        rows,
-        torch.tensor(
-            [
-                [1.0, 0, 0, 0, 0],
-                [0.25, 0.75, 0, 0, 0],
-                [0, 0, 1.0, 0, 0],
-                [0, 0, 0, 0, 1.0],
-                [0, 0, 0, 0, 1.0],
-                [1.0, 0, 0, 0, 0],
-            ]
-        ),
-    )
+    ends = [[1.0, 0, 0, 0, 0], [0, 0, 0, 0, 1.0]]
+    assert_close(rows, [ends[0], [0.25, 0.75, 0, 0, 0], [0, 0, 1.0, 0, 0], ends[1], ends[1], ends[0]])
     x = torch.rand(100, generator=torch.Generator().manual_seed(0)) * 2 - 1
-    assert torch.allclose(two_hot(x, support) @ support, x, atol=1e-6), "the mean is kept"
+    assert_close(two_hot(x, support) @ support, x)  # the mean is kept
 
 
 def test_a_distribution_over_returns_by_hand():
@@ -115,10 +103,10 @@ def test_a_distribution_over_returns_by_hand():
     value = critic(features, mask)
     assert value.logits is not None and value.logits.shape == (2, 3)
     p = torch.softmax(value.logits, -1)
-    assert torch.allclose(value.mean, -2 * p[:, 0] + 1 * p[:, 1] + 4 * p[:, 2], atol=1e-6)
+    assert_close(value.mean, -2 * p[:, 0] + 1 * p[:, 1] + 4 * p[:, 2])
     error = value.error(torch.tensor([0.0, 4.0]))  # 0 lies two thirds of the way from −2 to 1
     expected = torch.stack([-(p[0, 0].log() / 3 + 2 * p[0, 1].log() / 3), -p[1, 2].log()])
-    assert torch.allclose(error, expected, atol=1e-5)
+    assert_close(error, expected)
 
 
 def test_the_distribution_is_learnt_and_its_mean_with_it():

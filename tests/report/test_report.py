@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """``accerl report`` as it is typed."""
 
 from __future__ import annotations
@@ -45,7 +33,7 @@ def test_runs_are_named_bare_or_not(tmp_path: Path) -> None:
     [
         ([], "runs='': name the folder of a run: accerl report RUN"),
         (["a", "--runs=b"], "runs='b': leave out --runs or a: name them in one way"),
-        (["a", "--video_mb=-1"], "video_mb=-1.0: use 0 (link every video) or more megabytes"),
+        (["a", "--video_mb=-1"], "video_mb=-1.0: use a number of at least 0"),
         (["a", "--vide_mb=1"], "no such field; did you mean video_mb"),
         (["nowhere"], "runs='nowhere': no such folder"),
     ],
@@ -68,13 +56,13 @@ def test_one_run_under_two_names(
 def test_others_still_take_one_recipe() -> None:
     from accerl_lerobot.config import RunConfig
 
-    with pytest.raises(InputError, match="write --room.field=value"):
+    with pytest.raises(InputError, match="write --section.field=value"):
         parse(RunConfig, ["recipes/quickstart.yaml", "another"])
 
 
 def test_help_says_what_stands_bare(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["report", "--help"]) == 0
-    assert capsys.readouterr().out.startswith("usage: accerl report RUN [RUN …] [--room.field=value …]\n")
+    assert capsys.readouterr().out.startswith("usage: accerl report RUN [RUN …] [--section.field=value …]\n")
 
 
 def test_a_page_is_made_without_torch(tmp_path: Path) -> None:

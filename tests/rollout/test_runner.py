@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Worlds between decisions: what becomes a segment, what becomes a result."""
 
 from __future__ import annotations
@@ -26,7 +14,7 @@ from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
 from tests.rollout.worlds import CHUNK, Recorder, ScriptedWorld, evaluate, explore
 
-CONFIG = RolloutConfig(worlds=1, segment_length=3, decision_cost=0.0)
+CONFIG = RolloutConfig(worlds=1, segment_length=3, decision_cost=0.0, time_limit="truncate")
 
 
 def steps_seen(segment) -> list[float]:
@@ -81,6 +69,13 @@ def test_every_decision_costs():
     recorder.play()
     assert np.concatenate([s.reward for s in recorder.segments]).tolist() == [1.75] * 4
     assert recorder.results[0].episode_return == pytest.approx(4 * 1.75)
+
+
+def test_an_evaluation_reports_the_environments_own_return():
+    config = replace(CONFIG, decision_cost=0.25)
+    recorder = Recorder([ScriptedWorld(steps=8)], [replace(explore(), explore=False)], config)
+    recorder.play()
+    assert recorder.results[0].episode_return == 8.0
 
 
 def test_episode_totals_come_with_the_last_segment_only():
@@ -219,12 +214,12 @@ def test_closing_closes_the_worlds():
     ("field", "value", "remedy"),
     [
         ("group_size", 1, "groups of one have no comparison"),
-        ("group_size", -1, "use 0"),
-        ("group_size", 257, "2 to 256"),
-        ("group_advantage", "gae", "use grpo or rloo or grpo_no_std"),
-        ("group_filter", "success", "use outcome or return or none"),
+        ("group_size", -1, "use a whole number from 0 to 256"),
+        ("group_size", 257, "use a whole number from 0 to 256"),
+        ("group_advantage", "gae", "use grpo, rloo or grpo_no_std"),
+        ("group_filter", "success", "use outcome, return or none"),
         ("task_sampling", "random", "use uniform or failures"),
-        ("task_window", 0, "use at least 1"),
+        ("task_window", 0, "use a whole number from 1"),
     ],
 )
 def test_impossible_groups_and_tasks_are_refused(field, value, remedy):

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Groups in a runner: episodes start alike and go on differently, whatever slot and order they run in."""
 
 from __future__ import annotations
@@ -29,7 +17,7 @@ from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig, RolloutRunner
 from tests.rollout.worlds import ScriptedWorld, decide, evaluate
 
-CONFIG = RolloutConfig(segment_length=2, decision_cost=0.25, group_size=3)
+CONFIG = RolloutConfig(segment_length=2, decision_cost=0.25, group_size=3, time_limit="truncate")
 
 
 class Fleet:

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The rollout process's loop, with inference and replay played by the test."""
 
 from __future__ import annotations
@@ -35,6 +23,7 @@ from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutCon
 from accerl_lerobot.rollout.worker import AT_THE_DOOR, RolloutWorker
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from tests.rollout.worlds import evaluate
+from tests.runs import HANGS_S
 from tests.transport.played import played
 
 WORLD = SimulatedConfig(max_steps=8, tolerance=0.05)
@@ -73,13 +62,23 @@ class Stage:
         return [e for e in self.episodes if not e.plan.explore]
 
     def until(self, condition: Callable[[], bool], training: bool = True) -> None:
-        for _ in range(3000):
+        deadline = time.monotonic() + HANGS_S
+        while time.monotonic() < deadline:
             self.order(training)
             if condition():
                 return
             assert self.failure is None
             time.sleep(0.005)
         raise AssertionError("it did not happen")
+
+    def settle(self) -> int:
+        """Waits until nothing more is explored; how much was."""
+        quiet = 0
+        while quiet < 20:
+            before = self.explored
+            time.sleep(0.01)
+            quiet = quiet + 1 if self.explored == before else 0
+        return self.explored
 
     def _decide(self, requests: list[Request]) -> list[Decision] | Future[list[Decision]]:
         if self.over:
@@ -132,7 +131,7 @@ def stage() -> Iterator[Callable[..., Stage]]:
         one.over = True
         one.release()
         one.worker.report(False, planned(8))  # something to ask for, whatever it waits for
-        one.thread.join(timeout=30)
+        one.thread.join(timeout=HANGS_S)
         assert not one.thread.is_alive()
 
 
@@ -167,8 +166,7 @@ def test_exploring_pauses_while_replay_keeps_segments_at_the_door_and_evaluation
     one.hold()
     one.order(True, planned(2))  # two slots evaluate, two explore
     one.until(lambda: len(door) >= AT_THE_DOOR)
-    time.sleep(0.1)  # were exploring to go on, it would now
-    explored = one.explored
+    explored = one.settle()  # were exploring to go on, it would now
     assert explored <= 2 * AT_THE_DOOR and not one.evaluated
     one.release()
     one.until(lambda: len(one.evaluated) == 2)
@@ -219,10 +217,7 @@ def test_exploring_pauses_while_a_group_stands_at_the_door(stage):
     arguments: dict[str, Any] = {"group_size": 3, "group_filter": "none", "segment_length": 1}
     one = stage(lambda segments: door.append(Future()) or door[-1], **arguments)
     one.until(lambda: len(door) >= AT_THE_DOOR)  # six segments, two at a time
-    time.sleep(0.1)
-    explored = one.explored
-    time.sleep(0.1)
-    assert one.explored == explored
+    explored = one.settle()
     while one.explored == explored:
         for future in door:
             if not future.done():
@@ -252,7 +247,7 @@ def test_an_insert_that_fails_ends_the_worker(stage):
 
     one = stage(insert)
     one.order(True)
-    one.thread.join(timeout=10)
+    one.thread.join(timeout=HANGS_S)
     assert isinstance(one.failure, OSError)
 
 
@@ -297,11 +292,11 @@ def test_a_world_that_hangs_shows_in_the_report(stage, monkeypatch: pytest.Monke
     release = threading.Event()
     one = stage(lambda segments: True)
     advance = one.worker._runner.advance
-    monkeypatch.setattr(one.worker._runner, "advance", lambda *a: (release.wait(20), advance(*a))[1])
+    monkeypatch.setattr(one.worker._runner, "advance", lambda *a: (release.wait(HANGS_S), advance(*a))[1])
     one.until(lambda: one.order(True).in_world_s > 0.2)
     release.set()
     one.until(lambda: len(one.episodes) >= 2)
-    assert one.order(True).in_world_s < 0.2
+    one.until(lambda: one.order(True).in_world_s < 0.2)
 
 
 def test_who_has_not_been_set_to_work_is_not_away_from_inference():
@@ -318,7 +313,7 @@ def test_a_thread_that_hangs_outside_of_a_world_shows_in_the_report(stage, monke
 
     def reach(point: str) -> bool:
         if point == "rollout.send" and next(hangs, False):
-            release.wait(20)
+            release.wait(HANGS_S)
         return False
 
     monkeypatch.setattr(module, "reach", reach)

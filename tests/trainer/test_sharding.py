@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Several ranks make the updates that one makes, and go on from each other's checkpoints.
 
 Ranks are processes that talk through gloo on the loopback, one group of 2 and one of 4 for the whole module;
@@ -39,10 +27,11 @@ from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.ranks import Ranks
 from accerl_lerobot.trainer.sharding import Watch, arrange
 from accerl_lerobot.trainer.update import Update
+from tests.rounding import assert_close
 from tests.trainer import sharded
 from tests.trainer.linear import LinearAdapter
 
-TOLERANCE = 1e-5
+TOLERANCE = 1e-4
 SHARDINGS = ("ddp", "zero2", "zero3")
 NAMES = tuple(sharded.cases())
 OF_A_PART = ("ess", "explained_variance", "log_ratio_p05", "log_ratio_p50", "log_ratio_p95")
@@ -86,9 +75,7 @@ def made(request: pytest.FixtureRequest, folder: Path) -> tuple[str, list[dict[s
 
 def assert_same(found: dict[str, Any], expected: dict[str, Any], name: str) -> None:
     for key, tensor in expected["weights"].items():
-        np.testing.assert_allclose(
-            found["weights"][key], tensor, rtol=TOLERANCE, atol=TOLERANCE, err_msg=name
-        )
+        assert_close(found["weights"][key], tensor)
     assert_same_metrics(found["metrics"], expected["metrics"], name)
 
 
@@ -215,7 +202,7 @@ def test_blocks_that_forget_compute_again_and_learn_the_same():
         gradients.append([p.grad for p in adapter.trainable().values() if p.grad is not None])
     assert counts[1] == counts[0] + 1, "once more, for the gradient"
     for mine, theirs in zip(*gradients, strict=True):
-        torch.testing.assert_close(mine, theirs)
+        assert_close(mine, theirs)
 
 
 def test_a_policy_without_blocks_cannot_forget():
@@ -235,14 +222,14 @@ def test_there_is_nothing_to_offload_from_on_a_cpu():
 @pytest.mark.parametrize(
     ("fields", "says"),
     [
-        ({"ranks": 0}, r"trainer\.ranks=0: use at least 1"),
+        ({"ranks": 0}, r"trainer\.ranks=0: use a whole number from 1"),
         ({"sharding": "zero1"}, r"trainer\.sharding='zero1': use none, ddp, zero2 or zero3"),
         ({"ranks": 2}, r"trainer\.sharding='none': say how the 2 ranks share"),
         ({"sharding": "zero3"}, r"trainer\.sharding='zero3': there is one rank"),
         ({"ranks": 2, "sharding": "ddp", "cpu_offload": True}, r"trainer\.cpu_offload=True: .*=ddp keeps"),
         ({"cpu_offload": True}, r"trainer\.cpu_offload=True: trainer\.sharding=none keeps"),
         ({"ranks": 9, "sharding": "ddp", "batch_decisions": 8}, r"trainer\.ranks=9: use at most .*, 8"),
-        ({"rank_timeout_s": 0.0}, r"trainer\.rank_timeout_s=0\.0: use a positive number"),
+        ({"rank_timeout_s": 0.0}, r"trainer\.rank_timeout_s=0\.0: use a number above 0"),
     ],
 )
 def test_what_cannot_be_shared_is_refused(fields: dict[str, Any], says: str):

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Every LeRobot policy type that has a likelihood, in parts: two ranks with zero3 learn what one learns.
 
 Small, offline, on LeRobot's own classes, see `tests.policies.matrix`. One group of two processes for all, as
@@ -39,10 +27,10 @@ from accerl_lerobot.trainer.ranks import Ranks
 from accerl_lerobot.trainer.update import Update
 from tests.policies.matrix import KINDS
 from tests.policies.tiny import adapter_at, as_segment, perturb
+from tests.rounding import assert_close
 from tests.trainer.sharded import joined
 
 DECISIONS = 5
-TOLERANCE = 1e-5
 LEARNING = TrainerConfig(
     updates=10, lr=1e-3, warmup_updates=0, value_warmup_updates=0, micro_batch=2, probe_every=0
 )
@@ -129,14 +117,14 @@ def test_two_ranks_learn_what_one_learns(folder: Path, name: str):
         found = snapshot.load(folder / f"{name}-{rank}")
         for key in ("loss", "value_loss", "grad_norm", "kl_reference", "approx_kl"):
             for mine, theirs in zip(found["metrics"], expected["metrics"], strict=True):
-                assert mine[key] == pytest.approx(theirs[key], rel=10 * TOLERANCE, abs=TOLERANCE), key
+                assert mine[key] == pytest.approx(theirs[key], rel=1e-3, abs=1e-5), key
         for key, gradient in gradients.items():
-            np.testing.assert_allclose(found["gradients"][key], gradient, atol=5 * TOLERANCE * largest)
+            assert_close(found["gradients"][key], gradient, largest=largest)
         for part in ("weights", "saved"):
             assert found[part].keys() == expected[part].keys()
             for key, tensor in expected[part].items():
-                # AdamW makes a whole step of a gradient that is rounding, of a key's bias for instance.
-                clear = np.abs(gradients[key].numpy()) > 1e-3 * largest if key in gradients else slice(None)
-                np.testing.assert_allclose(
-                    found[part][key][clear], tensor[clear], atol=TOLERANCE, err_msg=key
-                )
+                # AdamW makes a whole step of a gradient that is rounding, such as a key's bias has.
+                # Above a hundredth of the largest one, rounding is at most a hundredth of the step.
+                clear = np.abs(gradients[key].numpy()) > 1e-2 * largest if key in gradients else slice(None)
+                off = np.abs(found[part][key][clear] - tensor[clear]).max(initial=0)
+                assert off <= 0.02 * len(expected["metrics"]) * LEARNING.lr, f"{key} is off by {off:.2e}"

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """One update, on a policy small enough to compute by hand."""
 
 from __future__ import annotations
@@ -31,6 +19,7 @@ from accerl_lerobot.trainer.batch import collate
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.nonfinite import NonFiniteError
 from accerl_lerobot.trainer.update import Update
+from tests.rounding import assert_close
 from tests.trainer.linear import STATE, STD, LinearAdapter, make_segments
 
 PLAIN = TrainerConfig(
@@ -110,9 +99,9 @@ def test_micro_batches_give_the_gradient_of_the_whole_batch(micro_batch: int):
     for name, parameter in whole.adapter.trainable().items():
         other = parts.adapter.trainable()[name].grad
         assert parameter.grad is not None and parameter.grad.abs().max() > 1e-3
-        torch.testing.assert_close(other, parameter.grad, rtol=1e-5, atol=1e-6)
-    for name in ("loss", "value_loss", "approx_kl", "ratio_max_dev", "return_mean", "decisions"):
-        assert found[name] == pytest.approx(expected[name], rel=1e-5, abs=1e-6), name
+        assert_close(other, parameter.grad)
+    for name in expected:
+        assert found[name] == pytest.approx(expected[name], rel=1e-4, abs=1e-5), name
     assert found["decisions"] == sum(LENGTHS)
 
 
@@ -124,7 +113,7 @@ def test_micro_batches_add_up_when_decisions_have_different_numbers_of_factors(l
     )
     whole.step(segments)
     parts.step(segments)
-    torch.testing.assert_close(parts.adapter.weight.grad, whole.adapter.weight.grad, rtol=1e-5, atol=1e-6)
+    assert_close(parts.adapter.weight.grad, whole.adapter.weight.grad)
     blind.step(make_segments(LENGTHS))
     assert not torch.allclose(blind.adapter.weight.grad, whole.adapter.weight.grad, rtol=1e-2)
 
@@ -162,7 +151,7 @@ def test_values_are_recomputed_bootstraps_included(micro_batch: int):
     now = critic_values(update, segments)
     stale = [np.append(s.value, s.value[-1]) for s in segments]
     found = update.step(segments)
-    assert found["return_mean"] == pytest.approx(returns_by_hand(segments, now, 0.9, 0.8).mean(), abs=1e-5)
+    assert found["return_mean"] == pytest.approx(returns_by_hand(segments, now, 0.9, 0.8).mean(), abs=1e-4)
     assert found["return_mean"] != pytest.approx(returns_by_hand(segments, stale, 0.9, 0.8).mean(), abs=1.0)
     # The critic's own error is against those returns, so it, too, must be of the current critic.
     mine = np.concatenate([v[:-1] for v in now])
@@ -186,7 +175,7 @@ def test_a_time_limit_is_bootstrapped_and_a_termination_is_not():
         means[name] = update.step([ended])["return_mean"]
     assert means["truncated"] == means["cut"]
     # λ = 1: the bootstrap enters the last return with γ and the first with γ².
-    assert means["cut"] - means["terminated"] == pytest.approx((0.9 + 0.81) / 2 * last, abs=1e-5)
+    assert means["cut"] - means["terminated"] == pytest.approx((0.9 + 0.81) / 2 * last, abs=1e-4)
     assert abs(last) > 0.1
 
 
@@ -202,7 +191,7 @@ def test_advantages_are_normalised_over_the_batch():
         update.step(segments)
         gradients.append(update.adapter.weight.grad)
     assert gradients[0].abs().max() > 1e-3
-    torch.testing.assert_close(gradients[0], gradients[1], rtol=1e-4, atol=1e-6)
+    assert_close(*gradients)
 
 
 # ---- advantages stamped on the segments
@@ -236,14 +225,14 @@ def test_stamped_advantages_are_used_as_they_are():
     advantage = np.concatenate([s.advantage for s in segments if s.advantage is not None])
     # Mean over decisions and the two factors; log π of factor i is −z²/2 and ∂z_i/∂W_i = −state/STD.
     expected = -((advantage[:, None] * z / STD).T @ state) / (2 * len(state))
-    np.testing.assert_allclose(policy_gradient(update, segments).numpy(), expected, rtol=1e-4, atol=1e-6)
+    assert_close(policy_gradient(update, segments), expected)
 
 
 def test_stamped_advantages_are_not_normalised_again_and_gae_does_not_look_at_them():
     one, other = (
         policy_gradient(make_update(advantage="group", kl_coef=0.0), stamped(scale=s)) for s in (1.0, 3.0)
     )
-    torch.testing.assert_close(3 * one, other, rtol=1e-4, atol=1e-6)
+    assert_close(3 * one, other)
     assert make_update().step(stamped()) == make_update().step(make_segments(LENGTHS))
 
 
@@ -253,7 +242,7 @@ def test_stamped_advantages_in_micro_batches(value_coef: float, micro_batch: int
     whole = make_update(advantage="group", value_coef=value_coef)
     parts = make_update(replace(PLAIN, micro_batch=micro_batch), advantage="group", value_coef=value_coef)
     expected = policy_gradient(whole, stamped())
-    torch.testing.assert_close(policy_gradient(parts, stamped()), expected, rtol=1e-4, atol=1e-6)
+    assert_close(policy_gradient(parts, stamped()), expected)
     one, other = (update.step(stamped(1)) for update in (whole, parts))
     for name in ("return_mean", "value_loss", "policy_loss"):
         assert one[name] == pytest.approx(other[name], rel=1e-4, abs=1e-5), name
@@ -274,7 +263,7 @@ def test_a_critic_beside_stamped_advantages_still_learns_its_returns():
     segments = stamped()
     by_hand = returns_by_hand(segments, critic_values(update, segments), 0.9, 0.8)
     before = update.adapter.copy()
-    assert update.step(segments)["return_mean"] == pytest.approx(by_hand.mean(), abs=1e-5)
+    assert update.step(segments)["return_mean"] == pytest.approx(by_hand.mean(), abs=1e-4)
     assert not torch.equal(before["value_head.weight"], update.adapter.copy()["value_head.weight"])
 
 
@@ -298,6 +287,7 @@ def test_a_segment_that_nobody_compared_is_an_error():
 def test_learning_rates_warm_up_and_stay():
     config = replace(PLAIN, warmup_updates=4)
     assert [config.lr_share(i) for i in range(6)] == [0.25, 0.5, 0.75, 1.0, 1.0, 1.0]
+    assert [config.lr_share(i, start=2) for i in range(7)] == [0.0, 0.0, 0.25, 0.5, 0.75, 1.0, 1.0]
 
 
 def test_learning_rates_fall_like_a_cosine():
@@ -311,10 +301,40 @@ def test_learning_rates_fall_like_a_cosine():
 def test_the_optimiser_uses_the_schedule():
     config = replace(PLAIN, lr=0.1, value_lr=0.01, warmup_updates=4, value_warmup_updates=2)
     update = make_update(config)
-    rates = [update.step(make_segments(LENGTHS, seed=i)) for i in range(5)]
-    assert [m["lr"] for m in rates] == pytest.approx([0.0, 0.0, 0.075, 0.1, 0.1])
-    assert [m["value_lr"] for m in rates] == pytest.approx([0.0025, 0.005, 0.0075, 0.01, 0.01])
-    assert [g["lr"] for g in update.optimizer.param_groups] == [0.1, 0.01]
+    rates = [update.step(make_segments(LENGTHS, seed=i)) for i in range(7)]
+    assert [m["lr"] for m in rates] == pytest.approx([0.0, 0.0, 0.025, 0.05, 0.075, 0.1, 0.1])
+    assert [m["value_lr"] for m in rates] == pytest.approx([0.0025, 0.005, 0.0075, 0.01, 0.01, 0.01, 0.01])
+    assert [g["lr"] for g in update.optimizer.param_groups] == [0.1, 0.1, 0.01, 0.01]
+
+
+def test_a_run_that_is_extended_keeps_the_schedule_that_it_began_with():
+    config = replace(PLAIN, lr=0.1, updates=10, warmup_updates=2, schedule="cosine", final_lr_share=0.2)
+    update = make_update(config)
+    rates = [update.step(make_segments(LENGTHS, seed=i))["lr"] for i in range(10)]
+    assert rates[-1] < 0.025
+    longer = make_update(replace(config, updates=1000))
+    longer.restore(update.state())
+    assert [longer.step(make_segments(LENGTHS, seed=i))["lr"] for i in range(3)] == pytest.approx([0.02] * 3)
+
+
+def test_only_matrices_decay():
+    class Biased(LinearAdapter):
+        def __init__(self) -> None:
+            super().__init__()
+            self.bias = torch.nn.Parameter(torch.ones(2))
+
+        def trainable(self) -> dict[str, torch.nn.Parameter]:
+            return super().trainable() | {"policy.bias": self.bias}
+
+    adapter = Biased()
+    update = Update(adapter, GIPOConfig(), replace(PLAIN, lr=0.1, value_lr=0.0, weight_decay=0.5))
+    before = adapter.copy()
+    adapter.bias.grad = torch.zeros(2)
+    adapter.weight.register_hook(torch.zeros_like)
+    update.optimizer.zero_grad = lambda set_to_none: None  # type: ignore[method-assign]
+    update.step(make_segments(LENGTHS))
+    torch.testing.assert_close(adapter.copy()["policy.weight"], before["policy.weight"] * (1 - 0.1 * 0.5))
+    assert torch.equal(adapter.bias, torch.ones(2))
 
 
 def test_at_first_only_the_critic_learns():
@@ -329,14 +349,18 @@ def test_at_first_only_the_critic_learns():
     assert not torch.equal(update.adapter.copy()["policy.weight"], before["policy.weight"])
 
 
-def test_while_only_the_critic_learns_the_policys_gradient_does_not_scale_its_own():
-    config = replace(PLAIN, value_warmup_updates=1, grad_clip=1e-3)
+def test_the_policys_gradient_does_not_scale_the_critics():
+    config = replace(PLAIN, grad_clip=1e-3)
     update, loud = make_update(config), make_update(config)
     segments = make_segments(LENGTHS)
-    norm = update.step(segments)["grad_norm"]
+    first = update.step(segments)
     for segment in segments:
         segment.log_prob -= 3.0  # ratios of e³: another policy gradient, the same critic's
-    assert loud.step(segments)["grad_norm"] == pytest.approx(norm, rel=1e-6)
+    second = loud.step(segments)
+    assert abs(second["grad_norm"] / first["grad_norm"] - 1) > 0.1
+    assert second["value_grad_norm"] == pytest.approx(first["value_grad_norm"], rel=1e-4)
+    critics = [u.adapter.trainable()["value_head.weight"] for u in (update, loud)]
+    assert_close(critics[0].grad, critics[1].grad)
 
 
 def test_at_learning_rate_zero_nothing_of_the_policy_moves():
@@ -352,12 +376,16 @@ def test_at_learning_rate_zero_nothing_of_the_policy_moves():
     assert all(torch.equal(p, before[k]) for k, p in frozen.adapter.copy().items())
 
 
-def test_gradients_are_clipped_to_their_norm():
+def test_gradients_of_policy_and_critic_are_each_clipped_to_their_norm():
     update = make_update(replace(PLAIN, grad_clip=0.01))
-    norm = update.step(make_segments(LENGTHS))["grad_norm"]
-    assert norm > 0.1
-    grads = [p.grad for p in update.adapter.trainable().values()]
-    assert torch.stack([g.norm() for g in grads if g is not None]).norm() == pytest.approx(0.01, rel=1e-3)
+    metrics = update.step(make_segments(LENGTHS))
+    assert metrics["grad_norm"] > 0.1 and metrics["value_grad_norm"] > 0.1
+    for mine in (True, False):
+        named = update.adapter.trainable().items()
+        grads = [
+            p.grad.norm() for k, p in named if k.startswith("value_head.") is mine and p.grad is not None
+        ]
+        assert torch.stack(grads).norm() == pytest.approx(0.01, rel=1e-3)
 
 
 def test_learning_moves_towards_what_was_rewarded():
@@ -477,4 +505,4 @@ def test_the_memory_of_advantages_by_hand():
     bias = float(update.adapter.value_head.bias.detach())
     one, two = (np.asarray(b[0].reward, np.float64) - bias for b in batches)
     expected = [0.5 * one.sum() + two.sum(), 0.5 * (one**2).sum() + (two**2).sum(), 0.5 * 3 + 3]
-    assert np.allclose(update._moments.numpy(), expected, rtol=1e-5)
+    assert_close(update._moments, expected)

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """A connection that outlives its service."""
 
 from __future__ import annotations
@@ -66,7 +54,7 @@ def test_what_was_not_answered_is_asked_of_the_next_in_order_and_under_the_same_
     a, b, c = (caller.send(name) for name in "abc")
     assert caller.away_s == 0.0
     first.answer(1)
-    assert caller.done(5.0) == [(b, "first b")]
+    assert caller.done(60.0) == [(b, "first b")]
     first.stop()
     assert caller.done(0.0) == [] and caller.away_s > 0.0 and caller.why == "the service has stopped"
     d = caller.send("d")  # while nobody is there
@@ -75,7 +63,7 @@ def test_what_was_not_answered_is_asked_of_the_next_in_order_and_under_the_same_
     assert caller.done(0.0) == [] and [message for message, _ in second.held] == ["a", "c", "d"]
     for _ in range(3):
         second.answer()
-    assert sorted(caller.done(5.0)) == [(a, "second a"), (c, "second c"), (d, "second d")]
+    assert sorted(caller.done(60.0)) == [(a, "second a"), (c, "second c"), (d, "second d")]
     assert caller.away_s == 0.0
 
 
@@ -94,7 +82,7 @@ def test_a_service_that_dies_while_it_is_asked_and_one_that_is_gone_when_it_is_c
     caller.move(last.endpoint)
     caller.done(0.0)
     last.answer()
-    assert caller.done(5.0) == [(ticket, "last early")]
+    assert caller.done(60.0) == [(ticket, "last early")]
 
 
 def test_what_is_lost_after_it_was_said_where_the_next_one_is_was_the_one_before():
@@ -107,7 +95,7 @@ def test_what_is_lost_after_it_was_said_where_the_next_one_is_was_the_one_before
     caller.done(0.0)
     assert caller.away_s == 0.0
     second.answer()
-    assert caller.done(5.0) == [(ticket, "second question")]
+    assert caller.done(60.0) == [(ticket, "second question")]
 
 
 def test_what_is_forgotten_is_not_asked_again():
@@ -121,7 +109,7 @@ def test_what_is_forgotten_is_not_asked_again():
     caller.done(0.0)
     assert [message for message, _ in second.held] == ["kept"]
     second.answer()
-    assert caller.done(5.0) == [(kept, "second kept")]
+    assert caller.done(60.0) == [(kept, "second kept")]
     caller.close()
     caller.close()
 
@@ -139,11 +127,11 @@ def test_a_wait_ends_when_the_service_is_there_and_how_long_it_was_away_counts_f
     assert caller.away_s >= 0.3
     threading.Timer(0.1, caller.move, (service.endpoint,)).start()
     started = time.monotonic()
-    assert caller.done(60.0) == []
-    assert time.monotonic() - started < 30.0 and caller.away_s == 0.0
+    assert caller.done(600.0) == []
+    assert time.monotonic() - started < 300.0 and caller.away_s == 0.0
     caller.done(0.0)
     service.answer()
-    assert caller.done(5.0) == [(ticket, "only question")]
+    assert caller.done(60.0) == [(ticket, "only question")]
 
 
 def test_asking_lasts_until_the_next_one_answers_and_no_longer_than_it_may():

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Weights by gloo: the contract; who dies, who is late, what is torn; by loopback and by an address."""
 
 from __future__ import annotations
@@ -292,7 +280,8 @@ def test_a_publisher_that_is_gone_fails_who_waits_for_its_bytes():
         made[0].take(Coming(1, 0.0, Layout.of(filled(1.0)).text), lambda: None)
 
 
-def test_one_that_does_not_come_is_heard_of_at_once(libraries: list[Any]):
+def test_one_that_does_not_come_is_heard_of_at_once(libraries: list[Any], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(direct, "MEET_S", 600.0)
     started = time.monotonic()
     with pytest.raises(ConnectionError, match="no way there"):
         DirectPublisher([Reader(libraries[0], "stranger")])
@@ -300,7 +289,7 @@ def test_one_that_does_not_come_is_heard_of_at_once(libraries: list[Any]):
         dead = library()
         ray.kill(dead)
         DirectPublisher([Reader(dead)])
-    assert time.monotonic() - started < 30
+    assert time.monotonic() - started < 300
 
 
 def bound() -> set[str]:

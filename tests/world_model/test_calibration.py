@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The threshold by which dreams succeed as often as the episodes they begin in."""
 
 from __future__ import annotations
@@ -176,5 +164,5 @@ def test_it_is_of_whole_dreams_and_finds_the_threshold_itself(other: dict[str, A
         InputError, match="^imagination.calibrate=8: leave imagination.horizon and threshold out"
     ):
         ImaginationConfig(path="x", calibrate=8, **other)
-    with pytest.raises(InputError, match="^imagination.calibrate=-1: use 0"):
+    with pytest.raises(InputError, match="^imagination.calibrate=-1: use a whole number from 0"):
         ImaginationConfig(calibrate=-1)

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """``accerl world-model-eval`` on several sources, and episodes that are played again."""
 
 from __future__ import annotations
@@ -47,6 +35,7 @@ from accerl_lerobot.world_model.perturbed import check_world, perturbed, perturb
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.store import Source, save_world_model
 from accerl_lerobot.world_model.success import new_success_model
+from tests.rounding import assert_close
 from tests.world_model.test_learn_device import moved
 
 ENV = SimulatedConfig(max_steps=60, hold=25, image_size=16)
@@ -160,7 +149,7 @@ def test_one_that_does_not_know_the_dataset_is_tried_on_all_of_it(
     ("option", "message"),
     [
         ("--online={repo_id: a/b, root: nowhere}", "online.root='nowhere': no meta/info.json there"),
-        ("--perturbed.noise=0", "perturbed.noise=0.0: use a positive number"),
+        ("--perturbed.noise=0", "perturbed.noise=0.0: use a number above 0"),
         ("--env.state_dim=6", "env=6: the world's state_dim, and the model's is 4"),
         ("--env.image_size=32", "does not begin as it was recorded"),
         ("--env.task=mirror", "env.task='mirror': the dataset's episodes are of match"),
@@ -203,7 +192,7 @@ def test_without_noise_an_episode_is_played_again_as_it_was(folders: tuple[Path,
     for one, other in zip(again, episodes, strict=True):
         assert np.array_equal(one.frames[:-1], other.frames) and len(one) == len(other)
         assert one.success_at == other.success_at and one.source == "perturbed"
-        np.testing.assert_allclose(one.state[:-1], other.state, atol=1e-5)
+        assert_close(one.state[:-1], other.state)
     played: list[int] = []
     config = PerturbedConfig(noise=1.0)
     far = perturbed_episodes(world, starts, episodes, config, spec, 0, played.append)

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Reading actions off frames: worlds whose actions are there to be read, and worlds where they are not."""
 
 from __future__ import annotations
@@ -59,7 +47,7 @@ def test_what_a_world_that_does_not_listen_was_told_cannot_be_read(kind: str, pr
     for row in legible(kind, probe):
         assert row["legible_real"]["low"] > 0.6, "reality is not to blame"
         change = row["legible_change"]
-        assert change == pytest.approx({"value": 0, "low": 0, "high": 0}, abs=1e-5), (
+        assert change == pytest.approx({"value": 0, "low": 0, "high": 0}, abs=1e-4), (
             "it dreams the same twice"
         )
 

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The held-out loss while a world model learns: of what it says it is, and nothing learns from it."""
 
 from __future__ import annotations
@@ -83,7 +71,7 @@ def test_it_is_of_held_out_windows_alone_and_of_the_weights_that_serve(monkeypat
     for (_, windows, value, _), (_, metrics) in zip(looked_at, told, strict=True):
         assert windows.frames.max() == windows.anchor.max() == 110 and len(windows) == VALIDATED
         assert set(metrics) == {"image", "image_dreamt", "state", "loss"} and metrics["loss"] == value
-        assert metrics["loss"] == pytest.approx(metrics["image"] + metrics["state"], rel=1e-5)
+        assert metrics["loss"] == pytest.approx(metrics["image"] + metrics["state"], rel=1e-4)
     (_, first, _, weight), (_, second, _, later) = looked_at
     assert all(np.array_equal(getattr(first, k), getattr(second, k)) for k in ("frames", "anchor", "actions"))
     assert len({w.tobytes() for w in first.frames}) > VALIDATED / 2, "not one and the same window"

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Which device a world model is to learn and to be tried on. Here there is only the CPU."""
 
 from __future__ import annotations
@@ -32,7 +20,7 @@ def moved(monkeypatch: pytest.MonkeyPatch) -> tuple[list[str], list[tuple[str, A
     went: list[tuple[str, Any]] = []
     real = torch.nn.Module.to
 
-    def resolve(name: str) -> torch.device:
+    def resolve(name: str, field: str) -> torch.device:
         asked.append(name)
         return torch.device("cpu", 0)
 
@@ -47,7 +35,7 @@ def moved(monkeypatch: pytest.MonkeyPatch) -> tuple[list[str], list[tuple[str, A
 
 def test_a_device_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert WorldModelRun().device == WorldModelEvalRun(path="x").device == "auto"
-    for name, why in (("tpu", "use cpu, cuda or auto"), ("cuda", "no CUDA device here; use cpu or auto")):
+    for name, why in (("tpu", "use auto, cpu, cuda"), ("cuda", "no CUDA device here; use cpu or auto")):
         if name == "cuda" and torch.cuda.is_available():
             continue
         # The dataset is not there either, and is not looked for.

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The network: starts at nothing, and everything it is told can matter."""
 
 from __future__ import annotations
@@ -22,6 +10,7 @@ from torch import Tensor
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import NetworkConfig
 from accerl_lerobot.world_model.network import Attention, Denoiser
+from tests.rounding import assert_close
 
 SMALL = NetworkConfig(channels=(8, 12), condition=16, planes=4)
 
@@ -81,7 +70,7 @@ def test_rows_of_a_batch_do_not_meet():
         together = made(**one)
         alone = made(**{k: v[1:] for k, v in one.items()})
     for a, b in zip(together, alone, strict=True):
-        assert torch.allclose(a[1:], b, atol=1e-5)
+        assert_close(b, a[1:])
 
 
 @pytest.mark.parametrize(
@@ -117,7 +106,7 @@ def test_attention_is_softmax_attention():
             q, k, v = h[b].view(3, 6, 6)
             mixed = v @ torch.softmax(q.T @ k / 6**0.5, -1).T
             want = x[b] + layer.out(mixed.view(1, 6, 3, 2))[0]
-            assert torch.allclose(got[b], want, atol=1e-5)
+            assert_close(got[b], want)
 
 
 @pytest.mark.parametrize(

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """``accerl world-model`` from a dataset to its trial, saved and loaded again."""
 
 from __future__ import annotations
@@ -23,8 +11,9 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
-from accerl_lerobot import cli, console
+from accerl_lerobot import cli, console, isolation
 from accerl_lerobot.config import DatasetConfig, RunConfig, parse
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.envs import SimulatedConfig
@@ -32,7 +21,12 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.verb_configs import WorldModelRun
 from accerl_lerobot.world_model import learn, offline, sources
 from accerl_lerobot.world_model.config import WorldModelConfig
-from accerl_lerobot.world_model.store import load_sources, load_world_model, save_world_model
+from accerl_lerobot.world_model.store import (
+    load_sources,
+    load_world_model,
+    rehearse_world_model,
+    save_world_model,
+)
 from accerl_lerobot.world_model.success import new_success_model
 from tests.world_model.test_learn_device import moved
 from tests.world_model.test_pixels import awake, dots, dream, model, windows
@@ -139,10 +133,16 @@ def test_what_is_refused_leaves_no_folder(demos: Path, tmp_path: Path, capsys: p
     ("option", "message"),
     [
         ("--world_model.trial.depth=20", "world_model.trial.depth=20: held-out episodes have at most"),
-        ("--world_model.success.weight_decay=-1", "world_model.success.weight_decay=-1.0: use at least 0"),
-        ("--world_model.model.state_weight=-1", "world_model.model.state_weight=-1.0: use at least 0"),
+        (
+            "--world_model.success.weight_decay=-1",
+            "world_model.success.weight_decay=-1.0: use a number",
+        ),
+        (
+            "--world_model.model.state_weight=-1",
+            "world_model.model.state_weight=-1.0: use a number",
+        ),
         ("--world_model.image_size=13", "world_model.image_size=13: use a multiple of 8"),
-        ("--seed=-1", "seed=-1: use 0 to 99"),
+        ("--seed=-1", "seed=-1: use a whole number from 0"),
         ("--env.task=mirror", "env.task='mirror': an episode's task is"),
     ],
 )
@@ -333,10 +333,12 @@ def test_what_is_saved_dreams_the_same(tmp_path: Path):
     ("harm", "why"),
     [
         ("nowhere", "config.json: is missing"),
-        ("config", "config.json: spec: not a world model of accerl world-model"),
+        ("config", "config.json: spec: not one of accerl world-model"),
         ("weights", "model.safetensors: not safetensors"),
         ("size", "not a world model of accerl world-model"),
-        ("tasks", "config.json: spec.tasks: a list of at most 4096 names of at most 200 printable"),
+        ("tasks", "config.json: spec.tasks: names of at most 200 printable characters are wanted"),
+        ("camera", "config.json: spec.cameras: the name '../x' cannot be part of a path"),
+        ("nan", "model.safetensors: doubt holds NaN or infinity; train it again"),
     ],
 )
 def test_what_cannot_be_loaded(tmp_path: Path, harm: str, why: str):
@@ -346,18 +348,47 @@ def test_what_cannot_be_loaded(tmp_path: Path, harm: str, why: str):
         folder = tmp_path / "nowhere"
     if harm == "config":
         (folder / "config.json").write_text("{}")
-    if harm == "tasks":
+    if harm in ("tasks", "camera"):
         content = json.loads((folder / "config.json").read_text())
-        content["spec"]["tasks"] = ["match", "\x1b[2J"]
+        content["spec"] |= {"tasks": ["match", "\x1b[2J"]} if harm == "tasks" else {"cameras": ["../x"]}
         (folder / "config.json").write_text(json.dumps(content))
     if harm == "weights":
         (folder / "model.safetensors").write_bytes(b"\x00" * 64)
+    if harm == "nan":
+        tensors = load_file(folder / "model.safetensors")
+        save_file(tensors | {"doubt": tensors["doubt"] * float("nan")}, folder / "model.safetensors")
     if harm == "size":
         content = json.loads((folder / "config.json").read_text())
         content["spec"]["action_dim"] = 7
         (folder / "config.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match=f"^path=.*{why}"):
         load_world_model(folder)
+
+
+@pytest.mark.parametrize(
+    ("where", "name", "value"),
+    [
+        ("spec", "context", 10**9),
+        ("spec", "image_size", [2**20, 2**20]),
+        ("network", "blocks", 10**9),
+        ("network", "channels", [10**6, 10**6]),
+        ("model", "steps", 10**9),
+    ],
+)
+def test_what_nobody_could_load_is_found_in_a_child_process(
+    tmp_path: Path, where: str, name: str, value: object, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(isolation, "CPU_S", 3)
+    save_world_model(tmp_path / "w", model(), new_success_model(2).eval())
+    rehearse_world_model(tmp_path / "w")
+    file = tmp_path / "w" / "config.json"
+    content = json.loads(file.read_text())
+    part = {"spec": content["spec"], "model": content["model"], "network": content["model"]["network"]}
+    part[where][name] = value
+    file.write_text(json.dumps(content))
+    with pytest.raises(InputError) as caught:
+        rehearse_world_model(tmp_path / "w")
+    assert str(caught.value).startswith("path=") and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Several who dream beside each other: who dreams what, and what they say as one."""
 
 from __future__ import annotations
@@ -65,7 +53,7 @@ def test_going_on_with_another_number_is_refused(tmp_path: Path):
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        (["--imagination.workers=0"], r"imagination\.workers=0: use at least 1"),
+        (["--imagination.workers=0"], r"imagination\.workers=0: use a whole number from 1"),
         (["--imagination.workers=33"], r"imagination\.workers=33: use at most imagination\.dreams, 32"),
         (
             ["--imagination.workers=2", "--launch.engine=local"],

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Dreams on disk, and as a LeRobotDataset."""
 
 from __future__ import annotations
@@ -26,6 +14,7 @@ from accerl_lerobot.cli import main
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, Origin, Segment
 from accerl_lerobot.world_model.recorded import DREAMS, DreamRecorder, read_dreams
+from tests.runs import replacing
 
 CAMERA = "observation.images.top"
 
@@ -114,7 +103,7 @@ def run(tmp_path: Path) -> Path:
 
 
 def exported(run: Path, root: Path, *options: str) -> int:
-    return main(["export", "--source=imagined", f"--path={run}", f"--root={root}", *options])
+    return main(replacing(["export", "--source=imagined", f"--path={run}", f"--root={root}"], *options))
 
 
 def test_a_dataset_of_dreams_loads_in_stock_lerobot(

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The sizes of world models: how large they are, and that each of them learns and dreams."""
 
 from __future__ import annotations
@@ -106,7 +94,7 @@ def test_what_is_written_down_is_what_is_read_again():
 
 
 def test_help_shows_each_with_its_own_numbers():
-    text = help_text("world-model", WorldModelRun, "learn")
+    text = help_text("world-model", WorldModelRun, "learn", "all")
     tiny, small, serious = (text.index(f"world_model.type={name}") for name in ("tiny", "small", "serious"))
     for start, end, channels in ((tiny, small, "[64, 96]"), (small, serious, "[96, 192, 288]")):
         assert f"--world_model.model.network.channels={channels}" in text[start:end]

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 
 from __future__ import annotations
 
@@ -23,6 +11,7 @@ import pytest
 from accerl_lerobot.world_model import starts as starts_module
 from accerl_lerobot.world_model.frames import seen
 from accerl_lerobot.world_model.starts import StartPool
+from tests.rounding import assert_close
 from tests.world_model.lived import SPEC, K, lived
 
 
@@ -44,7 +33,7 @@ def test_a_start_is_a_real_observation_with_what_led_there():
         assert np.array_equal(start.robot, robot[[max(0, t - 1), t]])
         assert np.array_equal(start.actions[0], segment.actions[t - 1] if t else np.zeros((K, 2)))
         assert start.history is not None and start.history[:2] == ("match", 3)
-        assert start.told == pytest.approx(segment.actions[:t].sum((0, 1)), abs=1e-5)
+        assert_close(start.told, segment.actions[:t].sum((0, 1)))
         assert np.array_equal(start.first, robot[0])
         assert np.array_equal(start.history.actions, segment.actions[:t].reshape(-1, 2))
 
@@ -76,12 +65,12 @@ def test_where_a_segment_was_cut_the_outcome_or_the_history_is_not_known():
     assert starts[3].history is None and starts[3].achieved is False
     assert np.array_equal(starts[3].actions[0], second.actions[0])
     told = first.actions.sum((0, 1)) + second.actions[0].sum(0)
-    assert starts[3].told == pytest.approx(told, abs=1e-5), "since the episode began"
+    assert_close(starts[3].told, told)  # since the episode began
     assert np.array_equal(starts[3].first, first.observations["observation.state"][0])
     alone = pool()
     alone.add(second)
     [start] = alone.draw(1, np.random.default_rng(0))
-    assert start.told == pytest.approx(second.actions[0].sum(0), abs=1e-5), "since it is known"
+    assert_close(start.told, second.actions[0].sum(0))  # since it is known
     assert np.array_equal(start.first, second.observations["observation.state"][0])
     whole = pool(whole=True)
     for segment in (first, second):
@@ -98,7 +87,7 @@ def test_what_led_to_a_segment_is_kept_over_several_and_when_a_pool_is_left(monk
         held.add(part)
         [start] = held.draw(1, np.random.default_rng(0))
         assert start.origin.decision == t
-        assert start.told == pytest.approx(whole.actions[:t].sum((0, 1)), abs=1e-5)
+        assert_close(start.told, whole.actions[:t].sum((0, 1)))
         assert np.array_equal(start.first, whole.observations["observation.state"][0])
         again = StartPool(one, memory=1, horizon=None, beginnings=0.0, keyframes=0.0)
         again.restore(held.state())

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """The success model: what it learns, and that stock LeRobot trains, saves and loads it."""
 
 from __future__ import annotations
@@ -28,6 +16,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.judge import auroc
 from accerl_lerobot.world_model.success_plugin import SuccessPairsConfig
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+from tests.rounding import assert_close
 
 ROOT = Path(__file__).parents[2]
 SMALL = {"channels": (8, 16), "hidden": 16, "device": "cpu", "shift": 1}
@@ -77,9 +66,9 @@ def test_successes_and_failures_weigh_the_same():
     good, bad = success > 0.5, success <= 0.5
     by_hand = -(probability[good].log().mean() + (1 - probability[bad]).log().mean()) / 2
     assert 0 < int(good.sum()) < 10
-    assert float(model.loss(before, after, success)[0]) == pytest.approx(float(by_hand), rel=1e-5)
+    assert float(model.loss(before, after, success)[0]) == pytest.approx(float(by_hand), rel=1e-4)
     alone = float(model.loss(before[bad], after[bad], success[bad])[0])
-    assert alone == pytest.approx(float(-(1 - probability[bad]).log().mean()), rel=1e-5)
+    assert alone == pytest.approx(float(-(1 - probability[bad]).log().mean()), rel=1e-4)
 
 
 def test_progress_is_learnt_where_it_is_known():
@@ -90,8 +79,8 @@ def test_progress_is_learnt_where_it_is_known():
     loss, metrics = model.loss(before, after, success, progress)
     known = ~progress.isnan()
     error = (torch.sigmoid(along)[known] - progress[known]).square().mean()
-    assert metrics["progress"] == pytest.approx(float(error), rel=1e-5)
-    assert float(loss) == pytest.approx(float(model.loss(before, after, success)[0]) + float(error), rel=1e-5)
+    assert metrics["progress"] == pytest.approx(float(error), rel=1e-4)
+    assert float(loss) == pytest.approx(float(model.loss(before, after, success)[0]) + float(error), rel=1e-4)
     unknown = torch.full((6,), torch.nan)
     assert "progress" not in model.loss(before, after, success, unknown)[1]
 
@@ -102,11 +91,11 @@ def test_cameras_are_averaged_and_single_frames_are_pairs():
     both = torch.stack([before, after], 1)
     batch = {f"observation.images.{name}": both[:, :, v] for v, name in enumerate("ab")}
     got = model.compute_reward(batch)
-    assert torch.allclose(got, torch.sigmoid(model.logits(before, after)[0]))
+    assert_close(got, torch.sigmoid(model.logits(before, after)[0]))
     as_bytes = {k: (255 * v).round().to(torch.uint8) for k, v in batch.items()}
     assert torch.allclose(model.compute_reward(as_bytes), got, atol=0.02)
     still = model.compute_reward({k: v[:, 0] for k, v in batch.items()})
-    assert torch.allclose(still, torch.sigmoid(model.logits(before, before)[0]))
+    assert_close(still, torch.sigmoid(model.logits(before, before)[0]))
 
 
 def test_only_training_shakes_the_frames():
@@ -129,7 +118,8 @@ def test_rewards_beyond_the_end_of_an_episode_are_no_success():
         "next.reward_is_pad": torch.tensor([[False] * 3, [False, False, True]]),
     }
     loss, _ = model.forward(batch)
-    assert float(loss) == float(model.loss(before, after, torch.tensor([1.0, 0.0]))[0])
+    expected, _ = model.loss(before, after, torch.tensor([1.0, 0.0]))
+    assert float(loss) == pytest.approx(float(expected), rel=1e-4)
 
 
 def test_it_goes_through_lerobot_s_format(tmp_path: Path):

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """What a newcomer's world model needs: a class and a line of the table."""
 
 from __future__ import annotations
@@ -106,7 +94,7 @@ def test_what_is_asked_of_a_config_stands_in_the_table(monkeypatch: pytest.Monke
     def told(**line: Any) -> None:
         monkeypatch.setitem(KINDS, "snow", replace(SNOW, **line))
 
-    with pytest.raises(InputError, match="use learned or shuffled or copy or oracle or snow$"):
+    with pytest.raises(InputError, match="use learned, shuffled, copy, oracle or snow$"):
         parse(RunConfig, ["--imagination.model=magic"])
     config = ImaginationConfig(share=0.5, model="snow")
     assert not config.learns
@@ -134,7 +122,7 @@ def test_the_table_is_read_without_torch():
 
 @pytest.mark.usefixtures("snow")
 def test_help_names_them_all():
-    shown = " ".join(help_text("train", RunConfig, "trains").split())
+    shown = " ".join(help_text("train", RunConfig, "trains", "all").split())
     for name, kind in KINDS.items():
         assert f" {name}: {kind.what} " in shown
 

@@ -1,16 +1,4 @@
-# Copyright 2026 The accerl-lerobot authors.
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
 """Our MetaWorld inside stock LeRobot: ``lerobot-eval`` and ``lerobot-train`` on the world we train in.
 
 A package and not a module, because LeRobot's plugin loader looks for submodules.
@@ -28,7 +16,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -109,7 +97,7 @@ class AccerlMetaWorldEnvConfig(EnvConfig):
     camera: str = "corner2"
     image_size: int = 64
     max_steps: int = 500
-    lighting: str = "cheap"
+    lighting: Literal["cheap", "default"] = "cheap"
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
 

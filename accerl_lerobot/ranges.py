@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ranges of config fields, declared in the annotation: checked in one place, and shown by ``--help``.
+
+Example:
+    >>> @dataclass(frozen=True, kw_only=True)
+    ... class OptimizerConfig(Section, section="trainer"):
+    ...     lr: Annotated[float, Range("[0, 1)")] = 1e-4
+    ...     schedule: Literal["constant", "cosine"] = "constant"
+    >>> OptimizerConfig(lr=2)
+    Traceback (most recent call last):
+    accerl_lerobot.errors.InputError: trainer.lr=2: use a number in [0, 1)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import numbers
+import re
+import types
+import typing
+from collections.abc import Collection, Hashable, Iterable
+from typing import Annotated, Any, ClassVar
+
+from accerl_lerobot.errors import InputError
+
+
+class Range:
+    """An interval of numbers as mathematics writes it: ``Range("[0, 1)")``, ``Range("(0, inf)")``.
+
+    Infinity is a value only where the interval is closed there; NaN never is.
+    """
+
+    def __init__(self, text: str) -> None:
+        match = re.fullmatch(r"([\[(])(\S+), (\S+)([\])])", text)
+        if match is None:
+            raise ValueError(f"{text}: write an interval such as [0, 1)")
+        self.text, self._low_open, self._high_open = text, match[1] == "(", match[4] == ")"
+        self.low, self.high = float(match[2]), float(match[3])
+
+    def __repr__(self) -> str:
+        return f"Range({self.text!r})"
+
+    def __contains__(self, value: Any) -> bool:
+        above = value > self.low if self._low_open else value >= self.low
+        return bool(above and (value < self.high if self._high_open else value <= self.high))
+
+    @property
+    def words(self) -> str:
+        """The interval after the words "a number"."""
+        unbounded = self.high == math.inf
+        if unbounded and self._low_open:
+            words = f" above {self.low:,g}"
+        elif unbounded:
+            words = f" of at least {self.low:,g}"
+        elif self._low_open or self._high_open:
+            return f" in {self.text}"
+        else:
+            return f" from {_plain(self.low)} to {_plain(self.high)}"
+        return words if self._high_open else f"{words}, or inf"
+
+
+class Choice:
+    """One of several texts, where they are known only at run time; otherwise use ``typing.Literal``."""
+
+    def __init__(self, names: Collection[str]) -> None:
+        self.names = names
+
+    def __repr__(self) -> str:
+        return f"Choice({list(self.names)})"
+
+
+class Pattern:
+    """Texts that match a regular expression; `words` says which these are."""
+
+    def __init__(self, pattern: str, words: str) -> None:
+        self.pattern, self.words = re.compile(pattern), words
+
+    def __repr__(self) -> str:
+        return f"Pattern({self.pattern.pattern!r})"
+
+
+Share = Annotated[float, Range("[0, 1]")]
+Positive = Annotated[float, Range("(0, inf)")]
+NonNegative = Annotated[float, Range("[0, inf)")]
+LearningRate = Annotated[float, Range("(0, 1)")]
+Seed = Annotated[int, Range("[0, 4294967295]")]
+"""A seed that Python, NumPy, torch and all simulators accept."""
+Steps = Annotated[int, Range("[0, 1000000000]")]
+"""A number of steps, updates or episodes that may be 0."""
+Device = Annotated[str, Pattern(r"auto|cpu|cuda(:\d{1,2})?", "auto, cpu, cuda or cuda:0")]
+Threads = Annotated[int, Range("[1, 1024]")]
+Repeats = Annotated[int, Range("[1, 100000]")]
+
+
+LONGEST_TEXT = 4096
+"""Characters of a text; no path is longer."""
+
+
+class Section:
+    """Base of every config section: construction checks each field against its annotation.
+
+    A subclass with a ``__post_init__`` of its own, for what concerns several fields, calls this one first.
+    """
+
+    SECTION: ClassVar[str] = ""
+    """Name on the command line, dotted; empty for the config of a whole command."""
+
+    def __init_subclass__(cls, section: str | None = None, **rest: Any) -> None:
+        super().__init_subclass__(**rest)
+        if section is not None:
+            cls.SECTION = section
+
+    def __post_init__(self) -> None:
+        for name, hint in hints_of(type(self)).items():
+            check(hint, getattr(self, name), f"{self.SECTION}.{name}" if self.SECTION else name)
+
+
+def hints_of(cls: type[Any]) -> dict[str, Any]:
+    """Field name → annotation, with its range."""
+    return _hints_of(typing.cast(Hashable, cls))
+
+
+@functools.cache
+def _hints_of(cls: Any) -> dict[str, Any]:
+    hints: dict[str, Any] = {}
+    for base in reversed([base for base in cls.__mro__ if dataclasses.is_dataclass(base)]):
+        for name, hint in typing.get_type_hints(base, include_extras=True).items():
+            # A subclass that gives a field another default need not repeat its range.
+            if name not in hints or hint != unmarked(hints[name]):
+                hints[name] = hint
+    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
+
+
+def check(hint: Any, value: Any, field: str) -> None:
+    """Refuses a value that does not fit an annotation.
+
+    Raises:
+        InputError: names `field` and what fits.
+    """
+    if isinstance(value, str) and (len(value) > LONGEST_TEXT or "\0" in value):
+        raise InputError(field, value, f"use at most {LONGEST_TEXT:,} characters, none of them NUL")
+    if not _fits(hint, value):
+        raise InputError(field, value, f"use {wanted(hint)}")
+
+
+def _fits(hint: Any, value: Any) -> bool:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Annotated:
+        kind, *marks = arguments
+        number = isinstance(value, numbers.Real) and (kind is not int or isinstance(value, numbers.Integral))
+        for mark in marks:
+            if isinstance(mark, Range) and not (number and not isinstance(value, bool) and value in mark):
+                return False
+            if isinstance(mark, Choice) and value not in mark.names:
+                return False
+            if isinstance(mark, Pattern) and not (isinstance(value, str) and mark.pattern.fullmatch(value)):
+                return False
+        return kind in (int, float) or _fits(kind, value)
+    if is_union(hint):
+        return any(_fits(kind, value) for kind in arguments)
+    if origin is typing.Literal:
+        return value in arguments
+    if origin in (list, tuple):
+        if not isinstance(value, (list, tuple)):
+            return False
+        if origin is list or Ellipsis in arguments:
+            return all(_fits(arguments[0], entry) for entry in value)
+        return len(value) == len(arguments) and all(map(_fits, arguments, value))
+    if hint is float:
+        return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+    if hint is int:
+        return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    if hint in (bool, str, type(None)):
+        return isinstance(value, hint)
+    return True
+
+
+def wanted(hint: Any) -> str:
+    """What fits an annotation, in words."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Annotated:
+        for mark in arguments[1:]:
+            if isinstance(mark, Choice):
+                return _either(mark.names)
+            if isinstance(mark, Pattern):
+                return mark.words
+            if isinstance(mark, Range):
+                return f"{wanted(arguments[0])}{mark.words}"
+        return wanted(arguments[0])
+    if is_union(hint):
+        parts = [wanted(kind) for kind in arguments if kind is not type(None)]
+        return " or ".join(parts + (["null"] if is_optional(hint) else []))
+    plain = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+    if hint in plain:
+        return plain[hint]
+    if origin is typing.Literal:
+        return _either(arguments)
+    if origin is tuple and Ellipsis not in arguments:
+        return f"a list of {len(arguments)}, each {wanted(arguments[0])}"
+    if origin in (list, tuple):
+        return f"a list such as [a, b], each {wanted(arguments[0])}"
+    if origin is dict:
+        return "a mapping such as {key: value}"
+    return getattr(hint, "__name__", str(hint))
+
+
+def range_in_words(hint: Any) -> str:
+    """The range of an annotation as ``--help`` shows it; empty where there is none."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    for mark in arguments[1:] if origin is Annotated else ():
+        if isinstance(mark, Range):
+            return mark.words.removeprefix(" of").strip()
+        if isinstance(mark, Choice):
+            return " | ".join(mark.names)
+    if origin is typing.Literal:
+        return " | ".join(map(str, arguments))
+    return next((text for kind in arguments if (text := range_in_words(kind))), "")
+
+
+def is_union(hint: Any) -> bool:
+    """True for ``X | Y``."""
+    return typing.get_origin(hint) in (typing.Union, types.UnionType)
+
+
+def is_optional(hint: Any) -> bool:
+    """True for ``X | None``."""
+    return is_union(hint) and type(None) in typing.get_args(hint)
+
+
+def _either(names: Iterable[Any]) -> str:
+    *others, last = map(str, names)
+    return f"{', '.join(others)} or {last}" if others else last
+
+
+def _plain(number: float) -> str:
+    return f"{int(number):,}" if number == int(number) else f"{number:g}"
+
+
+def unmarked(hint: Any) -> Any:
+    """An annotation without its ranges."""
+    return typing.get_type_hints(type("", (), {"__annotations__": {"x": hint}}))["x"]

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whatever ends a process, nothing that it has started or put anywhere is left."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+
+from accerl_lerobot.demos.writing import simulators
+
+PARENT = """
+import multiprocessing, os, signal, subprocess, sys, time
+from pathlib import Path
+from accerl_lerobot import guardian
+
+def child(semaphore):
+    subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])  # it has no parent soon
+    time.sleep(600)
+
+if __name__ == "__main__":
+    guardian.start()
+    guardian.explain(remedy="begin again")
+    folder = Path(sys.argv[1])
+    folder.mkdir()
+    guardian.remove(folder)
+    context = multiprocessing.get_context("spawn")
+    semaphore = context.Semaphore()
+    context.Process(target=child, args=(semaphore,), daemon=True).start()
+    Path(sys.argv[2]).write_text(semaphore._semlock.name + " " + os.environ[guardian.MARK])
+    guardian._process.terminate()  # as by a scheduler, which asks all processes to stop
+    if sys.argv[3] == "return":
+        sys.exit(0)
+    if sys.argv[3] == "exit":
+        os._exit(7)
+    os.kill(os.getpid(), signal.Signals[sys.argv[3]])
+"""
+
+
+def until(there: Callable[[], bool], seconds: float = 120.0) -> bool:
+    """Whether something comes about, on a machine that may be busy."""
+    deadline = time.monotonic() + seconds
+    while not (done := there()) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return done
+
+
+def below(mark: str) -> list[psutil.Process]:
+    """Processes that have a mark in their environment."""
+    found = []
+    for process in psutil.process_iter():
+        try:
+            if mark in process.environ().get("ACCERL_GUARDED_BY", "").split():
+                found.append(process)
+        except psutil.Error:
+            continue
+    return [p for p in found if p.is_running() and p.status() != psutil.STATUS_ZOMBIE]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /dev/shm")
+@pytest.mark.parametrize("how", ["SIGKILL", "SIGTERM", "SIGHUP", "exit", "return"])
+def test_nothing_is_left_however_a_process_ends(how: str, tmp_path: Path):
+    program, folder, note = tmp_path / "parent.py", tmp_path / "folder", tmp_path / "note"
+    program.write_text(PARENT)
+    command = [sys.executable, str(program), str(folder), str(note), how]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240)  # waits for the guardian, too
+    semaphore, mark = note.read_text().rsplit(" ", 1)
+    assert until(lambda: not below(mark) and not folder.exists())
+    assert until(lambda: not Path(f"/dev/shm/sem.{semaphore.strip('/')}").exists())
+    said = "accerl: the process was killed; begin again"
+    assert done.stderr.splitlines().count(said) == (how != "return")
+
+
+def test_simulators_end_at_once_when_their_parent_is_interrupted():
+    with pytest.raises(KeyboardInterrupt), simulators(1, int) as pool:
+        late = pool.submit(time.sleep, 3600)
+        assert pool.submit(os.getpid) and until(late.running)
+        raise KeyboardInterrupt
+    assert late.done()
+
+
+def test_children_leave_the_end_of_a_run_to_their_parent():
+    with simulators(1, int) as pool:
+        assert pool.submit(signal.getsignal, signal.SIGINT).result() is signal.SIG_IGN

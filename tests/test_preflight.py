@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run whose parts do not fit, or that lacks something here, is refused in one line before any work."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections import namedtuple
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from accerl_lerobot import cli
+from accerl_lerobot.envs import SimulatedConfig, make_world
+from accerl_lerobot.envs.base import WorldSpec
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.preflight import Features, check_features, env_features, policy_features
+from tests.policies.checkpoints import write_act, write_diffusion, write_gaussian_actor
+
+ROOT = Path(__file__).parents[1]
+TINY = ["--dataset.repo_id=accerl/metaworld_tiny", f"--dataset.root={ROOT / 'datasets' / 'metaworld_tiny'}"]
+TINY_ENV = ["--env.type=metaworld", "--env.task=drawer-open-v3"]
+ACT = "--sft.policy={type: act, chunk_size: 4, n_action_steps: 4, pretrained_backbone_weights: null}"
+SIMULATED = ["--env.type=simulated"]
+FRONT, STATE = "observation.images.front", "observation.state"
+OFFERED = env_features(make_world(SimulatedConfig()).spec)
+
+
+def with_shape(features: Features, name: str, shape: tuple[int, ...] | None) -> Features:
+    shapes = {k: v for k, v in features.shapes.items() if k != name}
+    return replace(features, shapes=shapes if shape is None else shapes | {name: shape})
+
+
+def test_an_environment_offers_what_a_policy_of_it_needs():
+    assert OFFERED.shapes == {FRONT: (3, 32, 32), STATE: (4,), "action": (2,)}
+    check_features(OFFERED, OFFERED, {}, "policy.path", "x")
+    check_features(with_shape(OFFERED, STATE, None), OFFERED, {}, "policy.path", "x")
+    other_size = replace(with_shape(OFFERED, FRONT, (3, 64, 48)), any_size=True)
+    check_features(other_size, OFFERED, {}, "policy.path", "x")
+    written = replace(OFFERED, tasks=("match  the TARGET.", "another"), fps=float(OFFERED.fps or 0))
+    check_features(written, OFFERED, {}, "dataset.repo_id", "x")
+
+
+@pytest.mark.parametrize(
+    ("change", "rename_map", "message"),
+    [
+        (
+            {"observation.images.top": (3, 32, 32)},
+            {},
+            "policy.path='x': no observation.images.top in the environment, which offers "
+            "observation.images.front; choose env.camera accordingly, or map names with policy.rename_map",
+        ),
+        ({FRONT: (3, 64, 64)}, {}, "its observation.images.front is (3, 64, 64), but (3, 32, 32) in the env"),
+        ({FRONT: (1, 32, 32)}, {}, "its observation.images.front is (1, 32, 32), but (3, 32, 32) in the env"),
+        ({STATE: (6,)}, {}, "policy.path='x': its observation.state is (6,), but (4,) in the environment"),
+        ({"action": (7,)}, {}, "its action is (7,), but (2,) in the environment"),
+        ({"observation.environment_state": (6,)}, {}, "no observation.environment_state in the environment"),
+        (
+            {},
+            {"observation.images.frnt": FRONT},
+            "policy.rename_map='observation.images.frnt': the environment has no such feature; it offers "
+            "observation.images.front, observation.state",
+        ),
+        ({}, {FRONT: STATE}, "two features of the environment would be observation.state"),
+    ],
+)
+def test_what_does_not_fit(change: dict, rename_map: dict, message: str):
+    needed = replace(OFFERED, shapes=OFFERED.shapes | change)
+    with pytest.raises(InputError) as caught:
+        check_features(needed, OFFERED, rename_map, "policy.path", "x")
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fps": 5}, "recorded at 5 Hz, but the environment runs at"),
+        ({"tasks": ("Dance",)}, "no episode of 'Match the target', the environment's task: it has 'Dance'"),
+    ],
+)
+def test_another_rate_or_task(change: dict[str, Any], message: str):
+    with pytest.raises(InputError, match=message):
+        check_features(replace(OFFERED, **change), OFFERED, {}, "dataset.repo_id", "x")
+
+
+def test_a_task_more_in_the_environment_is_only_warned_about(caplog: pytest.LogCaptureFixture):
+    both = env_features(make_world(SimulatedConfig(task="match,mirror")).spec)
+    check_features(OFFERED, both, {}, "dataset.repo_id", "x")
+    assert "no episode of 'Mirror the target'" in caplog.text
+
+
+def test_renamed_and_empty_cameras():
+    top = with_shape(with_shape(OFFERED, FRONT, None), "observation.images.top", (3, 32, 32))
+    check_features(top, OFFERED, {FRONT: "observation.images.top"}, "policy.path", "x")
+    visual = SimpleNamespace(type=SimpleNamespace(name="VISUAL"), shape=(3, 8, 8))
+    padded = SimpleNamespace(input_features={"observation.images.empty_camera_0": visual}, output_features={})
+    assert policy_features(padded).shapes == {}
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The one line that a command writes before it ends with code 2."""
+    capsys.readouterr()
+    assert cli.main(list(arguments)) == 2
+    out, err = capsys.readouterr()
+    lines = [line for line in err.splitlines() if line.startswith("accerl: ")]
+    assert not out and len(lines) == 1 and "Traceback" not in err and lines[0] == err.splitlines()[-1], err
+    return lines[0]
+
+
+@pytest.mark.parametrize("write", [write_act, write_diffusion, write_gaussian_actor])
+def test_checkpoints_of_another_image_size(write: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """By policies that do not resize: LeRobot takes any picture, and what comes of it is nobody's guess."""
+    path, out = write(tmp_path / "policy", image=48), tmp_path / "out"
+    told = [*SIMULATED, f"--policy.path={path}", f"--output_dir={out}"]
+    for verb, more in (("train", ["--sft.steps=0"]), ("eval", [])):
+        line = refused(capsys, verb, *told, *more)
+        assert line.startswith(
+            f"accerl: policy.path='{path}': its {FRONT} is (3, 48, 48), but (3, 32, 32) in"
+        )
+        assert not out.exists()
+
+
+def test_a_smolvla_of_another_size_fits(tiny_checkpoint: Path):
+    from accerl_lerobot.policies.config import PolicyConfig
+    from accerl_lerobot.policies.loading import load_lerobot_config
+
+    needed = policy_features(load_lerobot_config(PolicyConfig(path=str(tiny_checkpoint))))
+    assert needed.any_size and needed.shapes[FRONT] == (3, 32, 32)
+    check_features(needed, with_shape(OFFERED, FRONT, (3, 480, 640)), {}, "policy.path", "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ([*SIMULATED, *TINY], "no observation.images.corner2 in the environment, which offers " + FRONT),
+        (
+            [*TINY, *TINY_ENV[:1], "--env.task=push-v3"],
+            "dataset.repo_id='accerl/metaworld_tiny': no episode of",
+        ),
+        ([*TINY, *TINY_ENV, "--env.image_size=128"], "is (3, 64, 64), but (3, 128, 128) in the environment"),
+        ([*TINY, *TINY_ENV, "--env.camera=topview"], "no observation.images.corner2 in the environment"),
+        (
+            [*TINY, *TINY_ENV, "--sft.policy={type: diffusion, crop_shape: [84, 84]}"],
+            "LeRobot says: `crop_shape` should fit within the image shapes",
+        ),
+    ],
+)
+@pytest.mark.parametrize("verb", ["train", "sft"])
+def test_a_dataset_of_another_environment(
+    verb: str, arguments: list[str], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    pytest.importorskip("metaworld")
+    out = tmp_path / "out"
+    first = [verb, "--sft.steps=1", ACT, f"--output_dir={out}"]
+    if any("diffusion" in argument for argument in arguments):
+        first.remove(ACT)
+    assert line in refused(capsys, *first, *arguments) and not out.exists()
+
+
+def test_a_dataset_of_another_rate(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    pytest.importorskip("metaworld")
+    root = Path(shutil.copytree(TINY[1].split("=", 1)[1], tmp_path / "slow"))
+    info = root / "meta" / "info.json"
+    info.write_text(info.read_text().replace('"fps": 80', '"fps": 20'))
+    told = [TINY[0], f"--dataset.root={root}", *TINY_ENV, "--sft.steps=1", ACT]
+    for verb in ("train", "sft"):
+        line = refused(capsys, verb, *told, f"--output_dir={tmp_path / 'out'}")
+        assert "recorded at 20 Hz, but the environment runs at 80 Hz" in line
+    assert not (tmp_path / "out").exists()
+
+
+QUICK = ["train", str(ROOT / "recipes" / "quickstart.yaml")]
+NO_GPU = "no CUDA device here; use cpu or auto"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ([*QUICK, "--policy.device=cuda"], f"policy.device='cuda': {NO_GPU}"),
+        ([*QUICK, "--policy.device=cuda:99"], f"policy.device='cuda:99': {NO_GPU}"),
+        (["sft", *TINY, "--sft.steps=1", "--device=cuda"], f"device='cuda': {NO_GPU}"),
+        (["bench", "policy", "--device=cuda"], f"device='cuda': {NO_GPU}"),
+        (
+            [*QUICK, "--wandb.enable=true"],
+            "wandb.enable=True: this machine is not logged in: run wandb login",
+        ),
+        ([*QUICK, "--save_keep=9"], "output_dir='{out}': "),
+        (["demos", f"--config_path={QUICK[1]}"], "demos.root='{out}': "),
+    ],
+)
+def test_what_the_machine_lacks(
+    arguments: list[str],
+    line: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    import torch
+    import wandb
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(type(wandb.api), "api_key", None)
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    if "output_dir" in line or "demos.root" in line:
+        pytest.importorskip("metaworld")
+        usage = namedtuple("usage", "total used free")(2**40, 2**40, 10 * 2**20)
+        monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
+    out = tmp_path / "out"
+    where = f"--{'demos.root' if arguments[0] == 'demos' else 'output_dir'}={out}"
+    given = arguments if arguments[0] == "bench" else [*arguments, where]
+    assert refused(capsys, *given).startswith("accerl: " + line.replace("{out}", str(out)))
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("env", "module", "line"),
+    [
+        (["--env.type=metaworld"], "metaworld", "env.type='metaworld': {}'accerl-lerobot[metaworld]'"),
+        (["--env.type=lerobot", "--env.name=pusht"], "gym_pusht", "env.name='pusht': {}'lerobot[pusht]'"),
+        (["--env.type=lerobot", "--env.name=libero"], "libero", "env.name='libero': {}'lerobot[libero]'"),
+    ],
+)
+def test_a_simulator_that_is_not_installed(
+    env: list[str],
+    module: str,
+    line: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    import gymnasium
+
+    for name in [n for n in sys.modules if n.partition(".")[0] == module]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, module, None)  # an import of it fails, as if it was not there
+    for name in [n for n in gymnasium.registry if n.startswith(module)]:
+        monkeypatch.delitem(gymnasium.registry, name)
+    line = "accerl: " + line.format(f"the package {module} is not installed; pip install ")
+    out = tmp_path / "out"
+    sft = ["--sft.steps=1", ACT]
+    for verb, more in (("train", [*sft, f"--output_dir={out}"]), ("demos", [f"--demos.root={out}"])):
+        assert refused(capsys, verb, *env, *more) == line
+        assert not out.exists()
+
+
+def test_an_environment_has_the_texts_of_its_tasks():
+    spec: WorldSpec = make_world(SimulatedConfig(task="mirror,match")).spec
+    assert spec.instructions == ("Mirror the target", "Match the target") and np.isfinite(spec.fps)

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every number in every config has a declared range, and construction enforces it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import typing
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import pytest
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.parsing import choices_of, section_of
+from accerl_lerobot.ranges import Choice, Device, Positive, Range, Section, Share, check, hints_of
+from accerl_lerobot.verbs import CONFIGS
+
+
+def sections(cls: type[Any]) -> Iterator[type[Any]]:
+    yield cls
+    for hint in hints_of(cls).values():
+        if (below := section_of(hint)) is not None:
+            for kind in choices_of(below).values() or (below,):
+                yield from sections(kind)
+
+
+EVERY = {cls for config in CONFIGS.values() for cls in sections(config)}
+SECTIONS = sorted(EVERY, key=lambda cls: cls.__name__)
+
+
+def ranges(hint: Any) -> Iterator[tuple[Any, Range | None]]:
+    """Each number in an annotation with its range."""
+    if typing.get_origin(hint) is Annotated:
+        kind, *marks = typing.get_args(hint)
+        if kind in (int, float):
+            yield kind, next((mark for mark in marks if isinstance(mark, Range)), None)
+    elif hint in (int, float):
+        yield hint, None
+    elif typing.get_origin(hint) is not Literal:
+        for below in typing.get_args(hint):
+            yield from ranges(below)
+
+
+@pytest.mark.parametrize("cls", SECTIONS, ids=lambda cls: cls.__name__)
+def test_every_field_refuses_a_value_that_is_not_in_its_range(cls: type[Any]):
+    assert issubclass(cls, Section)
+    for name, hint in hints_of(cls).items():
+        for kind, span in ranges(hint):
+            assert kind is float or span is not None, f"{name} needs a Range"
+            outside = [math.nan, *((span.low - 1,) if span is not None else (math.inf,))]
+            outside += [span.high + 1] if span is not None and span.high < math.inf else []
+            for number in outside:
+                value = number if kind is float or math.isnan(number) else int(number)
+                many = typing.get_origin(hint) is tuple
+                entries = 1 if many and Ellipsis in typing.get_args(hint) else len(typing.get_args(hint))
+                given = (value,) * entries if many else value
+                with pytest.raises(InputError) as error:
+                    cls(**{name: given})
+                assert error.value.field == (f"{cls.SECTION}.{name}" if cls.SECTION else name)
+                assert error.value.remedy.startswith("use ")
+
+
+@pytest.mark.parametrize(
+    ("hint", "fits", "does_not"),
+    [
+        (Annotated[int, Range("[0, 2]")], [0, 2], [-1, 3, 1.0, True, "1", None]),
+        (Annotated[float, Range("(0, 1)")], [0.5], [0, 1, 1.0, math.nan, math.inf, "0.5", True]),
+        (Annotated[float, Range("(0, inf]")], [1e300, math.inf], [0.0, -math.inf, math.nan]),
+        (Positive | None, [None, 1], [0, math.inf]),
+        (tuple[Share, Share], [(0, 1), [0.5, 0.5]], [(0.5,), (0.5, 1.5), 0.5, (math.nan, 0)]),
+        (tuple[Share, ...], [(), (1,)], [(2,), ("a",)]),
+        (list[str], [[]], ["ab", [1]]),
+        (float, [1, -1e9], [math.inf, math.nan, "1"]),
+        (Literal["a", "b"] | None, ["a", None], ["c", 1]),
+        (Annotated[str, Choice(["a"])], ["a"], ["b", []]),
+        (Device, ["auto", "cpu", "cuda", "cuda:3"], ["foo", "cuda:999", "cuda:", "CPU", 0, ""]),
+        (dict[str, Any], [{}], []),
+    ],
+    ids=str,
+)
+def test_values_that_fit_an_annotation(hint: Any, fits: list[Any], does_not: list[Any]):
+    for value in fits:
+        check(hint, value, "field")
+    for value in does_not:
+        with pytest.raises(InputError, match=r"^field="):
+            check(hint, value, "field")
+
+
+def test_a_range_is_written_as_an_interval():
+    with pytest.raises(ValueError, match="write an interval"):
+        Range("0..1")
+
+
+def test_a_field_with_another_default_keeps_its_range():
+    @dataclass(frozen=True, kw_only=True)
+    class Base(Section):
+        share: Share = 0.5
+
+    @dataclass(frozen=True, kw_only=True)
+    class Mine(Base):
+        share: float = 0.7
+
+    with pytest.raises(InputError, match=r"^share=2: use a number from 0 to 1$"):
+        Mine(share=2)
+
+
+def test_a_section_of_ones_own_is_checked_too():
+    @dataclass(frozen=True, kw_only=True)
+    class Mine(Section, section="mine"):
+        share: Share = 0.5
+
+    assert dataclasses.asdict(Mine(share=1)) == {"share": 1}
+    with pytest.raises(InputError, match=r"^mine\.share=2: use a number from 0 to 1$"):
+        Mine(share=2)

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SIGTERM and Ctrl-C: noted, heeded at once where nothing is to be saved, and seen in C."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import pytest
+
+from accerl_lerobot.stopping import Stopping, arrived, deferred
+
+
+def test_a_signal_is_noted_first_and_interrupts_when_it_comes_again():
+    with pytest.raises(KeyboardInterrupt), Stopping() as stop:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.asked == signal.SIGTERM
+        os.kill(os.getpid(), signal.SIGTERM)
+        pytest.fail("it goes on")
+
+
+@pytest.mark.parametrize("before", [False, True])
+def test_where_nothing_can_be_saved_the_first_signal_interrupts(before: bool):
+    with Stopping() as stop:
+        if before:
+            os.kill(os.getpid(), signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt), stop.at_once():
+            os.kill(os.getpid(), signal.SIGINT)
+            pytest.fail("it goes on")
+        assert stop.asked == signal.SIGINT
+
+
+def test_a_library_that_starts_is_neither_interrupted_nor_heeds_signals_itself():
+    with Stopping() as stop:
+        with deferred():
+            signal.signal(signal.SIGTERM, lambda number, frame: pytest.fail("a handler of its own"))
+            os.kill(os.getpid(), signal.SIGTERM)
+            assert stop.asked is None and arrived()
+            signal.alarm(600)  # as Ray's C++ code does for 3 s
+        assert signal.alarm(0) == 0
+        assert stop.asked == signal.SIGTERM
+    with pytest.raises(KeyboardInterrupt), deferred():
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_a_signal_is_seen_though_no_handler_of_python_runs():
+    with Stopping() as stop:
+        assert not arrived() and stop.asked is None
+        signal.signal(signal.SIGTERM, lambda number, frame: None)  # as if the main thread hung in C++
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert arrived() and arrived()
+    with Stopping():
+        assert not arrived(), "that was before"
