@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from accerl_lerobot.algorithms import AlgorithmConfig, GIPOConfig
+from accerl_lerobot.algorithms import AlgorithmConfig, ChunkCriticConfig, GIPOConfig, RatioConfig
 from accerl_lerobot.dataset_config import DatasetConfig
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
@@ -163,7 +163,13 @@ class RunConfig(Section):
             raise InputError("policy.path", self.policy.path, remedy)
         if self.sft.steps and self.sft.init_path is None:
             check_chunk(self.sft.policy)
-        if self.algorithm.advantage == "group" and not self.rollout.group_size:
+        if isinstance(self.algorithm, ChunkCriticConfig):
+            self._check_chunk_critic()
+        elif (
+            isinstance(self.algorithm, RatioConfig)
+            and self.algorithm.advantage == "group"
+            and not self.rollout.group_size
+        ):
             raise InputError("algorithm.advantage", "group", "add --rollout.group_size=8, say: 2 or more")
         if self.trainer.hold_back >= self.replay.max_lag:
             remedy = (
@@ -221,6 +227,27 @@ class RunConfig(Section):
                 "leave it out with imagination.share: dreams do not begin alike, so they are not compared"
             )
             raise InputError("rollout.group_size", self.rollout.group_size, remedy)
+
+    def _check_chunk_critic(self) -> None:
+        """Its own memory stands for replay's reuse, and it looks at whole real episodes."""
+        offered = getattr(self.env, "environment_state", None)
+        if not offered:
+            remedy = "its critic reads the simulator's state: " + (
+                f"env.type={self.env.type} does not offer it, use gipo"
+                if offered is None
+                else "add --env.environment_state=true"
+            )
+            raise InputError("algorithm.type", self.algorithm.type, remedy)
+        only = f"algorithm.type={self.algorithm.type}"
+        for name, value, wanted, why in (
+            ("replay.samples_per_insert", self.replay.samples_per_insert, 1.0, "draws from its own memory"),
+            ("trainer.ranks", self.trainer.ranks, 1, "is learnt by one process"),
+            ("imagination.share", self.imagination.share, 0.0, "learns from real episodes only"),
+            ("rollout.group_size", self.rollout.group_size, 0, "compares no episodes"),
+            ("rollout.time_limit", self.rollout.time_limit, "fail", "sees the time that is left"),
+        ):
+            if value != wanted:
+                raise InputError(name, value, f"{only} {why}; use {wanted}")
 
 
 def journal_folder(config: RunConfig) -> Path | None:

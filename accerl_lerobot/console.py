@@ -40,7 +40,7 @@ class Stage:
         self._progress.update(self._task, completed=done, text=text)
         if not self._console.is_terminal and now - self._said > PLAIN_EVERY_S:
             self._said = now
-            self._console.print(f"  {self._name} {text}", highlight=False)
+            self._console.print(f"  {self._name} {text}", highlight=False, soft_wrap=True)
 
     def _left(self, now: float, done: int) -> str:
         """Time that is left at the pace since the first update of the bar."""

@@ -18,12 +18,14 @@ Observation = dict[str, np.ndarray | str]
 """One observation under LeRobot's feature names.
 
 ``observation.images.<camera>`` uint8 (H, W, 3), ``observation.state`` float32 (S,), ``task`` the instruction
-text. Values are raw: scaling and normalisation belong to the policy's own LeRobot processors. Where a policy
-looks back (LeRobot's ``n_obs_steps`` above 1), arrays hold so many env steps, oldest first, in a dimension in
-front.
+text, ``observation.environment_state`` float32 (E,) where the environment offers it and is asked to. Values
+are raw: scaling and normalisation belong to the policy's own LeRobot processors. Where a policy looks back
+(LeRobot's ``n_obs_steps`` above 1), arrays hold so many env steps, oldest first, in a dimension in front.
 """
 
 TASK = "task"
+ENVIRONMENT_STATE = "observation.environment_state"
+"""LeRobot's name for what a simulator says of itself. Ours end it with the share of the time limit gone."""
 REAL, IMAGINED = "real", "imagined"
 """Which worlds a segment can be from."""
 

@@ -66,13 +66,13 @@ class LocalEngine(Engine):
         self._clock = open_clock(timeline_folder(config), LOCAL)
         import torch
 
-        from accerl_lerobot.trainer.update import Update
+        from accerl_lerobot.trainer.update import make_update
 
         torch.manual_seed(config.seed)
         torch.set_num_threads(config.trainer.num_threads)
         self._config = config
         self._adapter = loader(load)(config.policy)
-        self._update = Update(self._adapter, config.algorithm, config.trainer)
+        self._update = make_update(self._adapter, config.algorithm, config.trainer)
         self._held, self._acting, self._acting_version = HeldBack(config.trainer.hold_back), self._adapter, 0
         if config.trainer.hold_back:
             self._acting = loader(load)(config.policy)

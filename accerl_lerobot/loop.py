@@ -281,7 +281,7 @@ class Loop:
         for metrics in updates:
             self.lags.append(metrics["lag_mean"])
             self.lag_max = max(self.lag_max, metrics["lag_max"])
-            self.mismatch_max = max(self.mismatch_max, metrics["ratio_max_dev"])
+            self.mismatch_max = max(self.mismatch_max, metrics.get("ratio_max_dev", 0.0))
             self.log.write("train", int(metrics["update"]), metrics)
             self.times.furthest = max(self.times.furthest, int(metrics["update"]))
 

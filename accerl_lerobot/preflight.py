@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import draccus
 
 from accerl_lerobot import ray_environment
+from accerl_lerobot.algorithms import ChunkCriticConfig, RatioConfig
 from accerl_lerobot.envs import EnvConfig, WorldSpec, make_world
 from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.ranges import Range, check
@@ -221,6 +222,8 @@ def check_start(config: RunConfig) -> int:
     policy = policy_to_be(config)
     check_weights_fit(config)
     spec = check_world(config.env)
+    if isinstance(config.algorithm, ChunkCriticConfig):
+        _check_chunk_critic(config, spec, policy)
     renames, offered = config.policy.rename_map, env_features(spec)
     if config.policy.path is not None:
         check_features(policy_features(policy), offered, renames, "policy.path", config.policy.path)
@@ -391,12 +394,28 @@ def policy_gib(config: RunConfig) -> float:
         return 0.0
     rehearsed_config(config.policy)
     sizes, trainer, algorithm = policy_sizes(config.policy), config.trainer, config.algorithm
-    # The gradient, Adam's two moments, and copies of older weights.
-    copies = 3 + sum(map(bool, (trainer.probe_every, algorithm.reference_coef, algorithm.proximal_updates)))
+    copies = 3  # the gradient and Adam's two moments
+    if isinstance(algorithm, RatioConfig):  # and copies of older weights
+        older = (trainer.probe_every, algorithm.reference_coef, algorithm.proximal_updates)
+        copies += sum(map(bool, older))
     processes = 2 if trainer.hold_back else 1
     if config.launch.engine != "local":
         processes, copies = trainer.ranks + config.inference.workers, copies + 2  # two sets are published
     return 4 * (sizes.policy * processes + sizes.trained * copies) / 2**30
+
+
+def _check_chunk_critic(config: RunConfig, spec: WorldSpec, policy: Any) -> None:
+    """Refuses policies whose chunks have no gradient, and segments that are not whole episodes."""
+    from accerl_lerobot.policies.loading import sampler_config
+
+    sampler = sampler_config(config.policy, policy.type)
+    if sampler.type not in ("flow", "gaussian") or getattr(sampler, "stochastic", "last") == "one":
+        remedy = "use flow (with stochastic=last) or gaussian, or another algorithm.type"
+        raise InputError("policy.sampler.type", sampler.type, f"algorithm.type=chunk_critic: {remedy}")
+    decisions = math.ceil(spec.max_steps / getattr(policy, "n_action_steps", 1))
+    if config.rollout.segment_length < decisions:
+        remedy = f"algorithm.type=chunk_critic looks at whole episodes; use at least {decisions}"
+        raise InputError("rollout.segment_length", config.rollout.segment_length, remedy)
 
 
 def policy_to_be(config: RunConfig) -> Any:

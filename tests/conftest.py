@@ -87,15 +87,3 @@ def write_smolvla(
 def tiny_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A random SmolVLA that fits ``SimulatedConfig()``; about 0.1 M parameters."""
     return write_smolvla(tmp_path_factory.mktemp("tiny") / "pretrained_model")
-
-
-KNOWN_FAILURES = Path(__file__).with_name("known_failures.txt")
-"""Tests, without parameters, that are known to fail; see its first line."""
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    lines = KNOWN_FAILURES.read_text().splitlines()
-    known = {line for line in lines if not line.startswith("#")}
-    for item in items:
-        if item.nodeid.partition("[")[0] in known:
-            item.add_marker(pytest.mark.xfail(reason="see tests/known_failures.txt", run=False))

@@ -134,7 +134,7 @@ def test_without_dreams_a_run_ends_when_its_episodes_are_used_up(tiny_checkpoint
 
 def test_two_runs_are_equal_to_the_last_bit(tiny_checkpoint: Path, world_model: Path):
     learn = OnlineLearnConfig(steps_per_episode=1.0, try_every=2, held_out=0.4, trial=LOOSE, batch=4)
-    config = dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12)
+    config = dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=24)
     runs = [lived(config) for _ in range(2)]
     one, other = ([u for p in history for u in p.updates] for history, _, _ in runs)
     assert len(one) == 12 and one == other
@@ -201,7 +201,7 @@ def test_whole_dreams_of_a_model_that_learns_are_watched(tiny_checkpoint: Path, 
 
 def test_nothing_is_dreamt_before_the_model_has_passed(tiny_checkpoint: Path, world_model: Path):
     learn = OnlineLearnConfig(steps_per_episode=1.0, try_every=2, held_out=0.4, trial=LOOSE, batch=4)
-    history, batches, _ = lived(dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12))
+    history, batches, _ = lived(dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=24))
     dreamt = [p.imagination["dreams"] for p in history]
     passed = [p.imagination["promoted"] for p in history]
     first = next(i for i, n in enumerate(passed) if n)
@@ -287,7 +287,7 @@ def test_one_that_hangs_is_found_when_it_is_saved(kind: type, name: str, what: s
     worker, held = object.__new__(kind), threading.Lock()
     worker._limit, worker._promoted = 1.0, "something that nobody takes over"
     setattr(worker, name, held)
-    message = f"a step of {what} has not ended for 1 s or more; raise launch.stall_s"
+    message = f"a step of {what} has not ended for \\d s or more; raise launch.stall_s"
     with held, pytest.raises(TimeoutError, match=message):
         worker.save(tmp_path)
     assert not held.locked()
@@ -354,7 +354,7 @@ def test_a_real_episode_that_is_lost_is_not_waited_for(tiny_checkpoint: Path, wo
 
 def test_what_a_run_learns_its_world_model_from_is_real(tiny_checkpoint: Path, world_model: Path):
     learn = OnlineLearnConfig(steps_per_episode=1.0, try_every=2, held_out=0.4, trial=LOOSE, batch=4)
-    config = dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12)
+    config = dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=24)
     engine = LocalEngine(config, ("match",))
     assert engine._world_learner is not None
     added, taken = engine._world_learner.add, []

@@ -135,9 +135,11 @@ def test_a_run_that_fell_over_goes_on_from_its_last_whole_checkpoint(
 
     with monkeypatch.context() as context:
         context.setattr(LocalEngine, "poll", falls)
-        with pytest.raises(ArithmeticError):
-            main(["train", str(recipe(tmp_path, tiny_checkpoint)), f"--output_dir={run}"])
-    assert "may be gone on with: accerl train --resume=true" in " ".join(capsys.readouterr().err.split())
+        assert main(["train", str(recipe(tmp_path, tiny_checkpoint)), f"--output_dir={run}"]) == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert "failed; to resume from the last checkpoint: accerl train --resume=true" in said
+    assert f"accerl: ArithmeticError: it fell over; the traceback is in {run / 'error.log'}" in said
+    assert "ArithmeticError: it fell over" in (run / "error.log").read_text()
     newest = run / "checkpoints" / "000010" / "training_state" / "replay.safetensors"
     newest.write_bytes(newest.read_bytes()[:-10])  # torn, as by a full disk
     with (run / "metrics.jsonl").open("a") as file:

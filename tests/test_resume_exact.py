@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.algorithms import ChunkCriticConfig, GIPOConfig
 from accerl_lerobot.algorithms.decoupled import DecoupledConfig
 from accerl_lerobot.checkpoint import TRAINING_STATE
 from accerl_lerobot.config import RunConfig
@@ -34,6 +34,12 @@ CASES: dict[str, dict[str, Any]] = {
     "weights held back": {"trainer": {"hold_back": 3, "probe_every": 4}},
     "copies of weights": {"algorithm": DecoupledConfig(reference_coef=0.1, proximal_every=4, level="chunk")},
     "groups": GROUPS,
+    "chunk critic": {
+        "env": SimulatedConfig(max_steps=16, environment_state=True),
+        "rollout": RolloutConfig(worlds=4, segment_length=4),
+        "replay": ReplayConfig(capacity=64, min_decisions=16, ahead=32, samples_per_insert=1),
+        "algorithm": ChunkCriticConfig(),
+    },
     "counted episodes": {"rollout": RolloutConfig(worlds=4, segment_length=3, episodes=20)},
     "tasks that fail more often": {
         "rollout": RolloutConfig(worlds=4, segment_length=3, task_sampling="failures"),

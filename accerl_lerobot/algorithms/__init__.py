@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The objectives as the papers state them: typed tensors in, loss and diagnostics out.
 
-To add one: write a file with its config (registered under `AlgorithmConfig`) and its function, then add one
-line to `ALGORITHMS`. No file that this package imports pulls in torch, so a run can be parsed before torch
-is loaded.
+To add one: write a file with its config (a `RatioConfig`, registered under `AlgorithmConfig`) and its
+function, then add one line to `ALGORITHMS`. No file that this package imports pulls in torch, so a run can be
+parsed before torch is loaded.
 
 Order of use inside an update::
 
@@ -19,7 +19,15 @@ from collections.abc import Callable
 from typing import Any
 
 from accerl_lerobot.algorithms.awr import AWRConfig, awr_loss
-from accerl_lerobot.algorithms.contract import AlgorithmConfig, Level, LossInputs, LossOutput, check_level
+from accerl_lerobot.algorithms.chunk_critic import ChunkCriticConfig
+from accerl_lerobot.algorithms.contract import (
+    AlgorithmConfig,
+    Level,
+    LossInputs,
+    LossOutput,
+    RatioConfig,
+    check_level,
+)
 from accerl_lerobot.algorithms.decoupled import DecoupledConfig, decoupled_loss
 from accerl_lerobot.algorithms.gipo import GIPOConfig, gipo_loss
 from accerl_lerobot.algorithms.importance import ImportanceConfig, importance_loss
@@ -34,10 +42,11 @@ ALGORITHMS: dict[str, Callable[[LossInputs, Any], LossOutput]] = {
     "ppo": ppo_loss,
     "sapo": sapo_loss,
 }
-"""Name on the command line → loss; the second argument is the config registered under the same name."""
+"""Name on the command line → loss; the second argument is the config registered under the same name.
+``chunk_critic`` is not among them: it weighs no likelihoods, see `trainer.chunk_critic`."""
 
 
-def compute_loss(inputs: LossInputs, config: AlgorithmConfig) -> LossOutput:
+def compute_loss(inputs: LossInputs, config: RatioConfig) -> LossOutput:
     """The loss that belongs to `config`.
 
     Raises:
@@ -50,6 +59,7 @@ __all__ = [
     "ALGORITHMS",
     "AWRConfig",
     "AlgorithmConfig",
+    "ChunkCriticConfig",
     "DecoupledConfig",
     "GIPOConfig",
     "ImportanceConfig",
@@ -57,6 +67,7 @@ __all__ = [
     "LossInputs",
     "LossOutput",
     "PPOConfig",
+    "RatioConfig",
     "SAPOConfig",
     "awr_loss",
     "check_level",

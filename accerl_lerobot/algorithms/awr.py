@@ -21,7 +21,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
-from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput
+from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput, RatioConfig
 from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
 from accerl_lerobot.algorithms.ratio import at_level
 from accerl_lerobot.ranges import Range
@@ -29,7 +29,7 @@ from accerl_lerobot.ranges import Range
 
 @AlgorithmConfig.register_subclass("awr")
 @dataclass(frozen=True, kw_only=True)
-class AWRConfig(AlgorithmConfig):
+class AWRConfig(RatioConfig):
     """Settings of advantage-weighted regression."""
 
     beta: Annotated[float, Range("(0, inf]")] = 1.0

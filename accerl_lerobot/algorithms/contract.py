@@ -33,6 +33,17 @@ class AlgorithmConfig(Section, draccus.ChoiceRegistry, section="algorithm"):
 
     gamma: Share = 0.99
     """Discount per decision (not per env step)."""
+
+    @property
+    def type(self) -> str:
+        """The registered name."""
+        return str(self.get_choice_name(self.__class__))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RatioConfig(AlgorithmConfig):
+    """Base of the objectives that weight decisions by their likelihood under new and old weights."""
+
     lam: Share = 0.95
     """λ of GAE per decision: 0 trusts the critic, 1 the observed rewards."""
     advantage: Literal["gae", "group"] = "gae"
@@ -53,11 +64,6 @@ class AlgorithmConfig(Section, draccus.ChoiceRegistry, section="algorithm"):
     """
     entropy_coef: NonNegative = 0.0
     """Weight of the entropy bonus."""
-
-    @property
-    def type(self) -> str:
-        """The registered name."""
-        return str(self.get_choice_name(self.__class__))
 
     @property
     def proximal_updates(self) -> int:
@@ -114,9 +120,9 @@ class LossInputs:
     this is the whole batch.
     """
     log_prob_reference: Tensor | None = None
-    """(N, L), log π_ref; needed if `AlgorithmConfig.reference_coef` is above 0."""
+    """(N, L), log π_ref; needed if `RatioConfig.reference_coef` is above 0."""
     log_prob_proximal: Tensor | None = None
-    """(N, L), log π_prox; needed if `AlgorithmConfig.proximal_updates` is above 0."""
+    """(N, L), log π_prox; needed if `RatioConfig.proximal_updates` is above 0."""
 
     def __post_init__(self) -> None:
         if self.log_prob_new.dim() != 2 or self.log_prob_new.shape != self.log_prob_old.shape:

@@ -21,7 +21,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
-from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput
+from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput, RatioConfig
 from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
 from accerl_lerobot.algorithms.ratio import at_level, ratio
 from accerl_lerobot.ranges import NonNegative, Range
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @AlgorithmConfig.register_subclass("gipo")
 @dataclass(frozen=True, kw_only=True)
-class GIPOConfig(AlgorithmConfig):
+class GIPOConfig(RatioConfig):
     """Settings of GIPO; the defaults are the paper's."""
 
     sigma: Annotated[float, Range("(0, inf]")] = 1.0

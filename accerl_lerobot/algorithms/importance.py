@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput
+from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput, RatioConfig
 from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
 from accerl_lerobot.algorithms.ratio import at_level, ratio
 from accerl_lerobot.ranges import Range
@@ -25,7 +25,7 @@ from accerl_lerobot.ranges import Range
 
 @AlgorithmConfig.register_subclass("is")
 @dataclass(frozen=True, kw_only=True)
-class ImportanceConfig(AlgorithmConfig):
+class ImportanceConfig(RatioConfig):
     """Settings of importance sampling."""
 
     cap: Annotated[float, Range("[1, inf)")] | None = None

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from accerl_lerobot.algorithms.contract import AlgorithmConfig, Level, LossInputs, LossOutput
+from accerl_lerobot.algorithms.contract import Level, LossInputs, LossOutput, RatioConfig
 from accerl_lerobot.algorithms.diagnostics import Samples
 from accerl_lerobot.algorithms.ratio import (
     at_level,
@@ -47,7 +47,7 @@ def mean_over_ratios(x: Tensor, inputs: LossInputs, level: Level) -> Tensor:
 
 def assemble(
     inputs: LossInputs,
-    config: AlgorithmConfig,
+    config: RatioConfig,
     *,
     policy_loss: Tensor,
     log_ratio: Tensor,
@@ -96,7 +96,7 @@ def assemble(
     return LossOutput(loss=loss, means={k: v.detach() for k, v in means.items()}, samples=samples)
 
 
-def _reference_kl(inputs: LossInputs, config: AlgorithmConfig, log_ratio: Tensor) -> Tensor:
+def _reference_kl(inputs: LossInputs, config: RatioConfig, log_ratio: Tensor) -> Tensor:
     if inputs.log_prob_reference is None:
         raise ValueError("reference_coef is above 0: log_prob_reference is needed")
     apart = at_level(inputs.log_prob_new - inputs.log_prob_reference.detach(), inputs, config.level)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
-from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput
+from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput, RatioConfig
 from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
 from accerl_lerobot.algorithms.ratio import at_level, ratio
 from accerl_lerobot.ranges import Range
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @AlgorithmConfig.register_subclass("ppo")
 @dataclass(frozen=True, kw_only=True)
-class PPOConfig(AlgorithmConfig):
+class PPOConfig(RatioConfig):
     """Settings of PPO."""
 
     clip_low: Annotated[float, Range("(0, 1)")] = 0.2

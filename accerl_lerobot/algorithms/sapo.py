@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput
+from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput, RatioConfig
 from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
 from accerl_lerobot.algorithms.ratio import at_level, ratio
 from accerl_lerobot.ranges import Positive
@@ -24,7 +24,7 @@ from accerl_lerobot.ranges import Positive
 
 @AlgorithmConfig.register_subclass("sapo")
 @dataclass(frozen=True, kw_only=True)
-class SAPOConfig(AlgorithmConfig):
+class SAPOConfig(RatioConfig):
     """Settings of SAPO; the defaults are the paper's."""
 
     tau_positive: Positive = 1.0

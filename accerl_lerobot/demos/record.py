@@ -36,6 +36,7 @@ from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import World, WorldSpec
 from accerl_lerobot.envs.config import EnvConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.ranges import Range, Section, Seed, Share
 from accerl_lerobot.seeds import demo_seed
 
@@ -156,10 +157,14 @@ def features(spec: WorldSpec) -> dict[str, dict[str, Any]]:
 
 
 def frames(episode: Episode) -> Iterator[dict[str, Any]]:
-    """The rows of `episode` as ``LeRobotDataset.add_frame`` takes them."""
+    """The rows of `episode` as ``LeRobotDataset.add_frame`` takes them.
+
+    Without the environment state, which LeRobot would make an input of any policy trained on them.
+    """
+    seen = {key: rows for key, rows in episode.observations.items() if key != ENVIRONMENT_STATE}
     for t in range(len(episode)):
         yield {
-            **{key: rows[t] for key, rows in episode.observations.items()},
+            **{key: rows[t] for key, rows in seen.items()},
             "action": episode.actions[t],
             "next.reward": episode.rewards[t : t + 1],
             "next.done": np.array([episode.done and t == len(episode) - 1]),

@@ -20,7 +20,7 @@ from accerl_lerobot.envs.config import EnvConfig
 from accerl_lerobot.envs.gl import import_mujoco, new_renderer
 from accerl_lerobot.envs.metaworld_tasks import description, resolve
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import TASK, Observation
+from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 from accerl_lerobot.ranges import Range
 
 CAMERAS = ("topview", "corner", "corner2", "corner3", "corner4", "behindGripper", "gripperPOV")
@@ -55,6 +55,10 @@ class MetaWorldConfig(EnvConfig):
     """Whether the first success ends the episode."""
     reward: Literal["success", "dense"] = "success"
     """``success`` (1.0 at the first success, else 0.0) or ``dense`` (MetaWorld's own, 0 to 10 a step)."""
+    environment_state: bool = False
+    """Whether observations hold ``observation.environment_state``: MetaWorld's own 39 numbers, objects and
+    goal included, and the share of `max_steps` gone. For ``algorithm.type=chunk_critic``; a policy that was
+    trained without it never reads it."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -208,6 +212,9 @@ class MetaWorld(World):
             for camera in self.config.cameras
         }
         observation["observation.state"] = self._raw[:STATE_DIM].astype(np.float32)
+        if self.config.environment_state:
+            late = self._steps / self.config.max_steps
+            observation[ENVIRONMENT_STATE] = np.append(self._raw, late).astype(np.float32)
         observation[TASK] = description(self._task)
         return observation
 

@@ -18,7 +18,7 @@ import numpy as np
 from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec, checked_actions
 from accerl_lerobot.envs.config import EnvConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import TASK, Observation
+from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 from accerl_lerobot.ranges import NonNegative, Positive, Range, Steps
 
 CAMERA = "front"
@@ -58,6 +58,9 @@ class SimulatedConfig(EnvConfig):
     """``success`` (1.0 at the first success, else 0.0) or ``dense`` (1 − distance, each step)."""
     terminate_on_success: bool = True
     """Whether the first success ends the episode."""
+    environment_state: bool = False
+    """Whether observations hold ``observation.environment_state``: the state, and the share of `max_steps`
+    gone."""
     step_ms: NonNegative = 0.0
     """Mean time an env step takes, in milliseconds; slept, so it costs no processor."""
     frame_ms: NonNegative = 0.0
@@ -204,11 +207,15 @@ class SimulatedWorld(World):
         state[:dims], state[dims : 2 * dims] = self._target, self._mean()
         if self._nan:
             state[:] = np.nan
-        return {
+        observation: Observation = {
             f"observation.images.{CAMERA}": self.render(size, size),
             "observation.state": state,
             TASK: INSTRUCTIONS[self._task],
         }
+        if self.config.environment_state:
+            late = self._steps / self.config.max_steps
+            observation[ENVIRONMENT_STATE] = np.append(state, late).astype(np.float32)
+        return observation
 
     def _delay(self, mean_ms: float) -> float:
         """Seconds, drawn anew for each step and each observation."""

@@ -52,6 +52,16 @@ class LeRobotAdapter(PolicyAdapter):
         self.precision = precision
         self.policy.eval()
 
+    def encode(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Encoded:
+        """Reads raw observations, each (B, ...), and B instructions, for the family; differentiable."""
+        return self.model.encode(self.processing.prepare(observations, tasks))
+
+    def autocast(self) -> contextlib.AbstractContextManager[Any]:
+        """Surrounds whatever runs the network."""
+        if self.precision == "fp32":
+            return contextlib.nullcontext()
+        return torch.autocast(self.device.type, torch.bfloat16)
+
     @property
     def actions(self) -> int | None:
         """See the base class."""
@@ -65,8 +75,8 @@ class LeRobotAdapter(PolicyAdapter):
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
         """See the base class; each decision's noise is its own request's, whatever batch it lands in."""
         arrays, tasks = stack_observations(requests)
-        with self._autocast():
-            encoded = self._encode(arrays, tasks)
+        with self.autocast():
+            encoded = self.encode(arrays, tasks)
             action = self.family.act(encoded, requests)
         value = self._value(encoded).mean.cpu().numpy()
         chunk = self.processing.unnormalise(action.chunk.float()).cpu().numpy()
@@ -87,8 +97,8 @@ class LeRobotAdapter(PolicyAdapter):
         self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
     ) -> Evaluation:
         """See the base class."""
-        with self._autocast():
-            encoded = self._encode(observations, tasks)
+        with self.autocast():
+            encoded = self.encode(observations, tasks)
             score = self.family.score(encoded, {k: v.to(self.device) for k, v in latent.items()})
         return Evaluation(
             log_prob=score.log_prob,
@@ -99,8 +109,8 @@ class LeRobotAdapter(PolicyAdapter):
     @torch.no_grad()
     def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
         """See the base class."""
-        with self._autocast():
-            encoded = self._encode(observations, tasks)
+        with self.autocast():
+            encoded = self.encode(observations, tasks)
         return self._value(encoded).mean
 
     def trainable(self) -> dict[str, nn.Parameter]:
@@ -150,17 +160,9 @@ class LeRobotAdapter(PolicyAdapter):
             raise self._incompatible(f"differs from its sampler by {difference:.2e}")
         return difference
 
-    def _encode(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Encoded:
-        return self.model.encode(self.processing.prepare(observations, tasks))
-
     def _value(self, encoded: Encoded) -> Value:
         value: Value = self.value_head(encoded.features, encoded.mask)
         return value
-
-    def _autocast(self) -> contextlib.AbstractContextManager[Any]:
-        if self.precision == "fp32":
-            return contextlib.nullcontext()
-        return torch.autocast(self.device.type, torch.bfloat16)
 
     def _incompatible(self, what: str) -> InputError:
         import lerobot

@@ -318,6 +318,8 @@ class FlowFamily(Family):
         sampler: how it explores.
     """
 
+    proposes = True
+
     def __init__(self, model: FlowModel, sampler: FlowSamplerConfig) -> None:
         super().__init__()
         self.model, self.sampler, self.shape = model, sampler, model.shape
@@ -329,7 +331,7 @@ class FlowFamily(Family):
         explore, shape = exploring(requests, x0.device), self.shape
         velocity, std = encoded.context.velocity, self._std(encoded)
         x, latent, log_prob = sample(velocity, x0, eps, index, explore, shape, self.sampler, std)
-        return Action(chunk=x[:, : shape.executed, : shape.action_dim], latent=latent, log_prob=log_prob)
+        return Action(chunk=self._executed_part(x), latent=latent, log_prob=log_prob)
 
     def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
         """See the base class."""
@@ -342,6 +344,37 @@ class FlowFamily(Family):
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
         """See the base class."""
         return difference(self.model, batch, encoded)
+
+    def propose(self, encoded: Encoded, noise: Tensor) -> Tensor:
+        """See the base class; the noise is x₀."""
+        return self._executed_part(integrate(encoded.context.velocity, noise, self.shape))
+
+    def noise_size(self) -> tuple[int, ...]:
+        """See the base class."""
+        return self.shape.chunk_size, self.shape.padded_dim
+
+    def executed(self, latent: dict[str, Tensor]) -> Tensor:
+        """See the base class.
+
+        Raises:
+            NotImplementedError: under ``stochastic=one`` the path's end is not stored.
+        """
+        if self.sampler.stochastic == "one":
+            raise NotImplementedError
+        return self._executed_part(latent["path"][:, -1])
+
+    def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
+        """See the base class: flow matching at a time from LeRobot's Beta(1.5, 1), executed entries only."""
+        target = chunk.new_zeros(len(chunk), *self.noise_size())
+        self._executed_part(target).copy_(chunk)
+        noise = torch.randn_like(target)
+        t = torch.distributions.Beta(1.5, 1.0).sample((len(chunk),)).to(chunk) * 0.999 + 0.001
+        mixed = t[:, None, None] * noise + (1 - t[:, None, None]) * target
+        error = (encoded.context.velocity(mixed, t) - (noise - target)).square()
+        return self._executed_part(error).mean((1, 2))
+
+    def _executed_part(self, x: Tensor) -> Tensor:
+        return x[:, : self.shape.executed, : self.shape.action_dim]
 
     @property
     def actions(self) -> int:

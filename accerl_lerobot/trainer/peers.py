@@ -30,6 +30,7 @@ from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.trainer.config import TrainerConfig
 
 if TYPE_CHECKING:
+    from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
     from accerl_lerobot.trainer.ranks import Ranks
     from accerl_lerobot.trainer.update import Update
     from accerl_lerobot.transport.meeting import Meeting
@@ -74,11 +75,11 @@ class Learner:
         self._algorithm, self._config, self._state = algorithm, config, state
         self.adapter: Any = loader(load)(policy)
 
-    def begin(self, ranks: Ranks) -> Update:
+    def begin(self, ranks: Ranks) -> Update | ChunkCriticUpdate:
         """The updates, from the state on; what ranks share out is shared out then."""
-        from accerl_lerobot.trainer.update import Update
+        from accerl_lerobot.trainer.update import make_update
 
-        update = Update(self.adapter, self._algorithm, self._config, ranks)
+        update = make_update(self.adapter, self._algorithm, self._config, ranks)
         if self._state is not None:
             self.adapter.load_trainable(snapshot.load(self._state / WEIGHTS))
             update.restore(snapshot.load(self._state / "trainer"))
@@ -154,7 +155,7 @@ class Peers:
     def __init__(self, actors: Sequence[Any], config: TrainerConfig) -> None:
         self._actors, self._config = list(actors), config
 
-    def begin(self, learner: Learner) -> Update:
+    def begin(self, learner: Learner) -> Update | ChunkCriticUpdate:
         """Meets them, once they have loaded their policies."""
         from accerl_lerobot.trainer import ranks
         from accerl_lerobot.transport.meeting import LOOPBACK, host, only_at

@@ -18,13 +18,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from accerl_lerobot.algorithms import AlgorithmConfig, LossInputs, check_level, compute_loss
+from accerl_lerobot.algorithms import (
+    AlgorithmConfig,
+    ChunkCriticConfig,
+    LossInputs,
+    RatioConfig,
+    check_level,
+    compute_loss,
+)
 from accerl_lerobot.algorithms.diagnostics import lag_metrics
 from accerl_lerobot.algorithms.gae import decision_mask, gae
 from accerl_lerobot.algorithms.normalise import moments, normalise
@@ -41,6 +48,21 @@ from accerl_lerobot.trainer.nonfinite import NonFiniteError
 from accerl_lerobot.trainer.probe import Probe
 from accerl_lerobot.trainer.ranks import Ranks
 from accerl_lerobot.trainer.sharding import arrange, synchronise
+
+if TYPE_CHECKING:
+    from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
+
+
+def make_update(
+    adapter: Any, algorithm: AlgorithmConfig, config: TrainerConfig, ranks: Ranks | None = None
+) -> Update | ChunkCriticUpdate:
+    """The updates that belong to an algorithm; see `Update` for the arguments."""
+    if isinstance(algorithm, ChunkCriticConfig):
+        from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
+
+        return ChunkCriticUpdate(adapter, algorithm, config)
+    assert isinstance(algorithm, RatioConfig)
+    return Update(adapter, algorithm, config, ranks)
 
 
 class Update:
@@ -61,7 +83,7 @@ class Update:
     def __init__(
         self,
         adapter: PolicyAdapter,
-        algorithm: AlgorithmConfig,
+        algorithm: RatioConfig,
         config: TrainerConfig,
         ranks: Ranks | None = None,
     ) -> None:

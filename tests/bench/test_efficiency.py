@@ -175,10 +175,10 @@ def test_a_world_model_that_is_missing_is_found_before_anything_runs(tmp_path: P
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("arms", ("none", "dreams"), "arms='dreams'.*use some of none, learned"),
+        ("arms", ("none", "dreams"), r"arms=\('none', 'dreams'\): use a list .*, each none, learned"),
         ("arms", (), "arms="),
         ("budgets", (4, 4), "budgets="),
-        ("budgets", (0,), "budgets=0"),
+        ("budgets", (0,), r"budgets=\(0,\): use a list .*, each a whole number from 1"),
         ("decisions", 0, "decisions=0"),
         ("seeds", (), "seeds="),
     ],

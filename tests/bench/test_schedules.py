@@ -211,7 +211,7 @@ def test_the_machine_is_described():
         (lambda: MachineryConfig(latency_trace="/nowhere").open(), "latency_trace"),
         (lambda: BenchAsyncVsSyncConfig(rounds=0), "rounds"),
         (lambda: BenchAsyncVsSyncConfig(cvs=(11.0,)), "cvs"),
-        (lambda: BenchAsyncVsSyncConfig(seeds=(100,)), "seed"),
+        (lambda: BenchAsyncVsSyncConfig(seeds=(-1,)), "seeds"),
         (lambda: BenchAsyncVsSyncConfig(learning_updates=-1), "learning_updates"),
         (lambda: BenchScalingConfig(counts=(0,)), "counts"),
         (lambda: BenchScalingConfig(counts=(2, 2)), "counts"),

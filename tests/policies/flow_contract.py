@@ -54,7 +54,7 @@ def slow_log_prob(
     """The oracle's log-prob (B, L) of stored latents; without `velocity`, each observation is read alone."""
     observations, tasks = stack_observations(asked)
     fields = [
-        adapter._encode({k: v[i : i + 1] for k, v in observations.items()}, [tasks[i]]).context.velocity
+        adapter.encode({k: v[i : i + 1] for k, v in observations.items()}, [tasks[i]]).context.velocity
         for i in range(len(asked))
     ]
 

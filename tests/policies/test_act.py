@@ -135,7 +135,7 @@ def test_the_std_shapes_the_features_only_when_asked(path: Path, detach: bool):
     latent, _ = stored(adapter.decide(asked, 0))
     # Where u is the mean, the log-prob has no gradient but the std's.
     with torch.no_grad():
-        latent["u"] = adapter._encode(*stack_observations(asked)).context.mean[:, :3]
+        latent["u"] = adapter.encode(*stack_observations(asked)).context.mean[:, :3]
     adapter.evaluate(*stack_observations(asked), latent).log_prob.sum().backward()
     reached = {k for k, p in adapter.trainable().items() if p.grad is not None and p.grad.abs().max() > 1e-9}
     head = {k for k in adapter.trainable() if k.startswith("family.")}

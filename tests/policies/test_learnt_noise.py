@@ -54,7 +54,7 @@ def adapter(loaded: dict[str, LeRobotAdapter], request: pytest.FixtureRequest) -
 def widths(adapter: LeRobotAdapter, count: int = 4) -> Tensor:
     """(steps, count, D)."""
     with torch.no_grad():
-        encoded = adapter._encode(*stack_observations(requests(count)))
+        encoded = adapter.encode(*stack_observations(requests(count)))
         std = adapter.family._std(encoded)
         return torch.stack([std(torch.full((count,), flow.step_time(k, 3)))[:, 0] for k in range(3)])
 

@@ -129,7 +129,7 @@ def test_the_state_counts_in_full_however_the_critic_weights_its_tokens(tmp_path
     adapter = adapter_at(write_pi(tmp_path / "pi0", "pi0"))
     first = requests(1)[0]
     arrays, tasks = stack_observations([first])
-    encoded = adapter._encode(arrays, tasks)
+    encoded = adapter.encode(arrays, tasks)
     weights = torch.softmax(torch.randn(encoded.mask.shape).masked_fill(~encoded.mask, -math.inf), -1)
     pooled = (weights[..., None] * encoded.features).sum(1)
     assert_close(pooled[0, -4:], first.observation["observation.state"] / 0.5)

@@ -239,7 +239,7 @@ def test_what_follows_the_terminator_does_not_count(adapter: LeRobotAdapter):
 def test_one_reading_of_the_observations_serves_again_and_again(adapter: LeRobotAdapter):
     asked = requests(6)
     tokens = said(adapter.decide(asked, 0))
-    encoded = adapter._encode(*stack_observations(asked))
+    encoded = adapter.encode(*stack_observations(asked))
     with torch.no_grad():
         first = encoded.context.logits(tokens)
         again = adapter.family.act(encoded, asked)

@@ -141,7 +141,7 @@ def test_log_probs_are_float32_where_the_network_is_bfloat16(path: Path, stochas
     assert torch.equal(evaluation.log_prob, old), "the same batch, the same numbers"
     # In bfloat16 observations alone are not observations in a batch: the oracle reads them as they were.
     with torch.autocast("cpu", torch.bfloat16):
-        encoded = adapter._encode(*stack_observations(asked))
+        encoded = adapter.encode(*stack_observations(asked))
 
         def velocity(x: np.ndarray, t: float, sample: int) -> np.ndarray:
             whole = torch.zeros(4, *x.shape)

@@ -283,7 +283,7 @@ def test_it_learns_by_reinforcement(tmp_path: Path):
         policy=PolicyConfig(path=str(checkpoint), device="cpu"),
         algorithm=GIPOConfig(gamma=0.5),
         trainer=TrainerConfig(
-            updates=80, batch_decisions=256, lr=4e-3, value_lr=3e-3, warmup_updates=3, value_warmup_updates=5
+            updates=100, batch_decisions=256, lr=4e-3, value_lr=3e-3, warmup_updates=3, value_warmup_updates=5
         ),
     )
     engine = LocalEngine(config, ("match",))

@@ -36,6 +36,7 @@ from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.store import Source, save_world_model
 from accerl_lerobot.world_model.success import new_success_model
 from tests.rounding import assert_close
+from tests.runs import replacing
 from tests.world_model.test_learn_device import moved
 
 ENV = SimulatedConfig(max_steps=60, hold=25, image_size=16)
@@ -130,6 +131,7 @@ def test_what_dreams_and_what_judges_go_to_the_device(
         stands_in.append(args[3])
         raise InputError("success.path", "x", "enough")
 
+    monkeypatch.setattr(evaluate, "rehearse_stand_in", lambda *args: None)
     monkeypatch.setattr(evaluate, "load_stand_in", load_stand_in)
     cli.main(told(folders, tmp_path / "again", "--success.path=x"))
     assert asked == ["cuda:3", "auto"] and stands_in == [torch.device("cpu", 0)]
@@ -162,7 +164,7 @@ def test_what_is_refused(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ):
-    assert cli.main(told(folders, tmp_path / "out", "--perturbed.episodes=2", *TOLD, option)) == 2
+    assert cli.main(replacing(told(folders, tmp_path / "out", "--perturbed.episodes=2", *TOLD), option)) == 2
     assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 

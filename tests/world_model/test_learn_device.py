@@ -11,7 +11,7 @@ import torch
 
 from accerl_lerobot import cli
 from accerl_lerobot.verb_configs import WorldModelEvalRun, WorldModelRun
-from accerl_lerobot.world_model import offline
+from accerl_lerobot.world_model import evaluate, offline
 
 
 def moved(monkeypatch: pytest.MonkeyPatch) -> tuple[list[str], list[tuple[str, Any]]]:
@@ -28,7 +28,8 @@ def moved(monkeypatch: pytest.MonkeyPatch) -> tuple[list[str], list[tuple[str, A
         went.append((type(self).__name__, args[0]))
         return real(self, *args, **options)
 
-    monkeypatch.setattr(offline, "resolve_device", resolve)
+    for module in (offline, evaluate):
+        monkeypatch.setattr(module, "resolve_device", resolve)
     monkeypatch.setattr(torch.nn.Module, "to", to)
     return asked, went
 

@@ -28,6 +28,7 @@ from accerl_lerobot.world_model.store import (
     save_world_model,
 )
 from accerl_lerobot.world_model.success import new_success_model
+from tests.runs import replacing
 from tests.world_model.test_learn_device import moved
 from tests.world_model.test_pixels import awake, dots, dream, model, windows
 
@@ -124,7 +125,7 @@ def test_a_saved_one_is_tried_on_another_dataset(
 
 def test_what_is_refused_leaves_no_folder(demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = tmp_path / "out"
-    assert cli.main([*arguments(demos, out), "--env.image_size=16", "--env.state_dim=6"]) == 2
+    assert cli.main([*arguments(demos, out), "--env.state_dim=6"]) == 2
     assert "observation.state has shape (4,), the world's has (6,)" in capsys.readouterr().err
     assert not out.exists()
 
@@ -149,7 +150,7 @@ def test_what_is_refused_leaves_no_folder(demos: Path, tmp_path: Path, capsys: p
 def test_what_is_refused_before_anything_is_learnt(
     option: str, message: str, demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    assert cli.main([*arguments(demos, tmp_path / "out"), option]) == 2
+    assert cli.main(replacing(arguments(demos, tmp_path / "out"), option)) == 2
     assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
@@ -200,10 +201,12 @@ def test_held_out_losses_are_told_and_change_nothing(
         lines = (tmp_path / name / "metrics.jsonl").read_text().splitlines()
         logged[name] = [json.loads(line) for line in lines]
     err = capsys.readouterr().err
-    assert re.search(r"world model 10/25 image \S+ state \S+\n", err)
-    assert re.search(r"world model 11/25 image \S+ state \S+, held out image \S+ state \S+\n", err)
-    assert re.search(r"success model 3/10 loss \S+\n", err)
-    assert re.search(r"success model 4/10 loss \S+, held out \S+\n", err)
+    assert re.search(r"world model 10/25 \(40%\) · \S+ left · image \S+ state \S+\n", err)
+    assert re.search(
+        r"world model 11/25 \(44%\) · \S+ left · image \S+ state \S+, held out image \S+ state \S+\n", err
+    )
+    assert re.search(r"success model 3/10 \(30%\) · \S+ left · loss \S+\n", err)
+    assert re.search(r"success model 4/10 \(40%\) · \S+ left · loss \S+, held out \S+\n", err)
     steps = [(record["kind"], record["step"]) for record in logged["with"]]
     assert steps == [
         ("world_model_held_out", 10), ("world_model", 20), ("world_model_held_out", 20),
@@ -250,7 +253,7 @@ def test_both_networks_learn_on_the_device_and_are_saved_for_any(
 
     monkeypatch.setattr(offline, "pretrain", on("pretrain", offline.pretrain))
     monkeypatch.setattr(offline, "SuccessLearner", on("success", offline.SuccessLearner))
-    cli.main([*arguments(demos, tmp_path / "out"), "--device=cuda:3"])
+    cli.main(replacing(arguments(demos, tmp_path / "out"), "--device=cuda:3"))
     assert asked == ["cuda:3"]
     models = ["PixelWorldModel", "SuccessPairsRewardModel"]
     assert learnt == ["pretrain", models[0], "success", *models], "before the optimisers are made"

@@ -84,14 +84,14 @@ def test_it_is_learnt_and_tried_by_naming_its_package(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(console, "PLAIN_EVERY_S", -1.0)
-    demos, out = recorded(tmp_path / "dataset", 8, 0), tmp_path / "out"
+    demos, out = recorded(tmp_path / "dataset", 24, 0), tmp_path / "out"
     ours = "--world_model.model.network.channels=16,24"
     told = [a for a in arguments(demos, out) if a != ours]
     told = replacing(told, *NAMED, "--world_model.learn.steps=300")
     cli.main([*told, "--world_model.learn.lr=0.03", "--world_model.learn.validate_every=100"])
     stdout, stderr = capsys.readouterr()
     found = json.loads(stdout)
-    assert "world model 300/300 motion 0." in stderr
+    assert "world model 300/300 (100%) · motion 0." in stderr
     losses = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
     held = [row["motion"] for row in losses if row["kind"] == "world_model_held_out"]
     assert len(held) == 3 and 0 < held[-1] < 0.5, (

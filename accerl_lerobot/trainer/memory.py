@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Decisions that an off-policy learner draws again and again: a ring of rows, the oldest leave first.
+
+Shapes: B rows, E numbers of the environment state, K executed actions of A dims.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import numpy as np
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import ENVIRONMENT_STATE, Segment
+
+CODE = 16
+"""Numbers that stand for a task."""
+FIRST = 1024
+"""Rows that memory is asked for at first; doubled when they are full."""
+
+
+class Memory:
+    """Rows of whole episodes.
+
+    Args:
+        capacity: rows.
+        gamma: discount per decision.
+        n_step: decisions ahead that `following` points to.
+
+    Example:
+        >>> memory = Memory(capacity=100_000, gamma=0.98, n_step=4)
+        >>> rows = memory.add(segment, chunk)
+        >>> memory["reward"][rows], memory["following"][rows]
+    """
+
+    def __init__(self, capacity: int, gamma: float, n_step: int) -> None:
+        self.capacity, self.gamma, self.n_step = capacity, gamma, n_step
+        self.total = 0
+        """Rows ever added."""
+        self._columns: dict[str, np.ndarray] = {}
+        self._codes: dict[str, np.ndarray] = {}
+        self.tasks: list[str] = []
+
+    def __len__(self) -> int:
+        return min(self.total, self.capacity)
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """A column, (len, ...).
+
+        ``state`` float32 (E + 16), the environment's and what stands for the task; ``chunk`` float32 (K, A);
+        ``following``, the row `n_step` decisions on; ``reward``, discounted, of the decisions before that;
+        ``discount``, of what follows, 0 where the episode ends before; ``return``, discounted, of the episode
+        from here on; ``success``, of the episode; ``task``, a place in `tasks`; ``observation.*``.
+        """
+        return self._columns[name][: len(self)]
+
+    def add(self, segment: Segment, chunk: np.ndarray) -> np.ndarray:
+        """Adds an episode.
+
+        Args:
+            segment: the whole of it.
+            chunk: float32 (T, K, A), what was executed, in normalised units.
+
+        Returns:
+            Its T rows.
+
+        Raises:
+            InputError: it is not a whole episode, or longer than the memory.
+        """
+        t = len(segment)
+        if segment.origin.decision or not segment.episode or t > self.capacity:
+            remedy = (
+                f"the critic looks at whole episodes of at most algorithm.memory={self.capacity} decisions"
+            )
+            raise InputError("rollout.segment_length", t, remedy)
+        rows = (self.total + np.arange(t)) % self.capacity
+        returns = np.zeros(t + 1)
+        for i in reversed(range(t)):
+            returns[i] = segment.reward[i] + self.gamma * returns[i + 1]
+        ahead = np.minimum(self.n_step, t - np.arange(t))
+        ends = np.arange(t) + ahead == t
+        discount = self.gamma**ahead
+        environment = segment.observations[ENVIRONMENT_STATE][:-1].reshape(t, -1)
+        if segment.task not in self._codes:
+            self._codes[segment.task] = _code(segment.task)
+            self.tasks.append(segment.task)
+        code = np.broadcast_to(self._codes[segment.task], (t, CODE))
+        columns: dict[str, Any] = {
+            "state": np.concatenate([environment, code], 1).astype(np.float32),
+            "chunk": chunk,
+            "reward": (returns[:-1] - discount * returns[np.arange(t) + ahead]).astype(np.float32),
+            "discount": np.where(ends, 0.0, discount).astype(np.float32),
+            "following": np.where(ends, rows, rows[0] + np.arange(t) + ahead) % self.capacity,
+            "return": returns[:-1].astype(np.float32),
+            "success": np.full(t, segment.success),
+            "task": np.full(t, self.tasks.index(segment.task)),
+        }
+        columns |= {k: v[:-1] for k, v in segment.observations.items() if k != ENVIRONMENT_STATE}
+        for name, values in columns.items():
+            self.write(name, rows, values, self.total + t)
+        self.total += t
+        return rows
+
+    def write(self, name: str, rows: np.ndarray, values: np.ndarray, total: int | None = None) -> None:
+        """Sets rows of a column, which is made if it is new.
+
+        Args:
+            name: of the column.
+            rows: (B,).
+            values: (B, ...).
+            total: rows that there are then; None: as many as now.
+        """
+        size = min(self.total if total is None else total, self.capacity)
+        column = self._columns.get(name)
+        if column is None or len(column) < size:
+            room = FIRST
+            while room < size:
+                room *= 2
+            grown = np.zeros((min(room, self.capacity), *values.shape[1:]), values.dtype)
+            if column is not None:
+                grown[: len(column)] = column
+            self._columns[name] = column = grown
+        column[rows] = values
+
+    def observations(self, rows: np.ndarray) -> tuple[dict[str, np.ndarray], list[str]]:
+        """What the policy saw, each (B, ...), and its instructions."""
+        seen = {k: v[rows] for k, v in self._columns.items() if k.startswith("observation.")}
+        return seen, [self.tasks[i] for i in self._columns["task"][rows]]
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs; see `snapshot`."""
+        columns = {name: self[name].copy() for name in self._columns}
+        return {"total": self.total, "tasks": list(self.tasks), "columns": columns}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave."""
+        self.total, self.tasks, self._columns = state["total"], list(state["tasks"]), dict(state["columns"])
+        self._codes = {task: _code(task) for task in self.tasks}
+
+
+def _code(task: str) -> np.ndarray:
+    """±1 for each of 16 bits of the instruction's hash: known without a list of all tasks."""
+    bits = np.frombuffer(hashlib.sha256(task.encode()).digest(), np.uint8)[:CODE]
+    return np.where(bits & 1, 1.0, -1.0).astype(np.float32)
