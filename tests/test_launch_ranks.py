@@ -83,7 +83,10 @@ def story(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> It
 def test_two_ranks_train_and_publish(story: Story):
     assert [u["update"] for u in story.updates[: story.version]] == [i + 1.0 for i in range(story.version)]
     assert 0 < story.served <= story.version
-    assert all(np.isfinite(u["loss"]) and u["grad_norm"] > 0 and u["skipped"] == 0 for u in story.updates)
+    assert all(
+        np.isfinite(u["loss"]) and u["value_grad_norm"] > 0 and u["skipped"] == 0 for u in story.updates
+    )
+    assert [u["grad_norm"] > 0 for u in story.updates] == [False] + [True] * (len(story.updates) - 1)
 
 
 def test_acting_and_learning_in_parts_agree(story: Story):

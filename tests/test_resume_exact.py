@@ -40,7 +40,7 @@ CASES: dict[str, dict[str, Any]] = {
         "replay": ReplayConfig(capacity=64, min_decisions=16, ahead=32, samples_per_insert=1),
         "algorithm": ChunkCriticConfig(),
     },
-    "counted episodes": {"rollout": RolloutConfig(worlds=4, segment_length=3, episodes=20)},
+    "counted episodes": {"rollout": RolloutConfig(worlds=4, segment_length=3, episodes=30)},
     "tasks that fail more often": {
         "rollout": RolloutConfig(worlds=4, segment_length=3, task_sampling="failures"),
         "env": SimulatedConfig(max_steps=16, task="match,mirror"),

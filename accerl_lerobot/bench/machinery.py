@@ -141,6 +141,8 @@ class MachineryConfig(Section):
         Raises:
             InputError: `latency_trace` is none.
         """
+        if self.latency_trace is not None:
+            read_trace(self.latency_trace)
         return Measured(self.run_config(), ("match",), load=self.load())
 
     def load(self) -> Load:

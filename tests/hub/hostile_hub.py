@@ -171,7 +171,7 @@ def main(seed: int, scratch: Path, times: int) -> dict[str, Any]:
 
 
 def _memory_mib() -> int:
-    """The most that this program has held; `getrusage` would count what its parent held when it was started."""
+    """The most that this program has held; `getrusage` would count what its parent held at its start."""
     (line,) = [x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith("VmHWM:")]
     return int(line.split()[1]) // 1024
 

@@ -281,9 +281,9 @@ def test_it_learns_by_reinforcement(tmp_path: Path):
         checkpoint,
         env=SimulatedConfig(max_steps=4, hold=2, tolerance=0.3, reward="dense", terminate_on_success=False),
         policy=PolicyConfig(path=str(checkpoint), device="cpu"),
-        algorithm=GIPOConfig(gamma=0.5),
+        algorithm=GIPOConfig(gamma=0.5, entropy_coef=0.03),
         trainer=TrainerConfig(
-            updates=100, batch_decisions=256, lr=4e-3, value_lr=3e-3, warmup_updates=3, value_warmup_updates=5
+            updates=80, batch_decisions=256, lr=4e-3, value_lr=3e-3, warmup_updates=3, value_warmup_updates=5
         ),
     )
     engine = LocalEngine(config, ("match",))
