@@ -152,6 +152,13 @@ class RunConfig(Section):
         """Whether there are checkpoints on the way."""
         return bool(self.save_every_updates or self.save_every_s)
 
+    @property
+    def remembered(self) -> int:
+        """Decisions in the trainer's own memory at the end."""
+        if not isinstance(self.algorithm, ChunkCriticConfig):
+            return 0
+        return min(self.algorithm.memory, self.trainer.updates * self.trainer.batch_decisions)
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.demos.seed:

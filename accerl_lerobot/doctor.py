@@ -336,6 +336,7 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
         "rollout.worlds": rollout.workers * rollout.worlds * simulator,
         "rollout.segment_length": under_way(config) * pictures,
         "replay.capacity": config.replay.capacity * pictures,
+        **({"algorithm.memory": config.remembered * pictures} if config.remembered else {}),
         "evaluation.videos": frames * 3 * films.video_size**2 / GIB,
     }
 

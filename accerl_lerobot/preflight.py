@@ -318,7 +318,7 @@ def demos_bytes(config: DemosConfig, spec: WorldSpec) -> int:
 def disk_bytes(config: RunConfig, spec: WorldSpec, history: int) -> int:
     """Disk space that a run takes at least, as far as it is known before; weights made by SFT are not."""
     picture = sum(map(math.prod, spec.images.values()))
-    replay = config.replay.capacity * history * picture
+    replay = (config.replay.capacity + config.remembered) * history * picture
     policies = 1 + bool(config.saves)
     if config.save_every_updates:
         policies = 2 + config.trainer.updates // config.save_every_updates

@@ -153,7 +153,8 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--algorithm.level=row"], "algorithm.level='row': use token, action or chunk"),
     (
         ["--algorithm.type=gippo"],
-        "algorithm.type='gippo': did you mean gipo? Otherwise use one of awr, decoupled, gipo, is, ppo, sapo",
+        "algorithm.type='gippo': did you mean gipo? Otherwise use one of awr, chunk_critic, decoupled, "
+        "gipo, is, ppo, sapo",
     ),
     (["--algorithm.type=is", "--algorithm.cap=0.5"], "algorithm.cap=0.5: use a number of at least 1 or null"),
     (

@@ -124,18 +124,27 @@ def test_every_logged_number_is_explained(tiny_checkpoint: Path) -> None:
         "--replay.min_decisions=32",
         "--trainer.batch_decisions=16",
         "--rollout.worlds=4",
-        "--algorithm.reference_coef=0.1",
     ]
-    config = parse(RunConfig, arguments)
-    engine = LocalEngine(config, ("match",))
-    try:
-        engine.train()
-        while not (progress := engine.poll()).updates:
-            pass
-    finally:
-        engine.close()
+    off_policy = [
+        "--algorithm.type=chunk_critic",
+        "--algorithm.policy_steps=1",
+        "--env.environment_state=true",
+        "--rollout.segment_length=10",
+        "--trainer.value_warmup_updates=0",
+    ]
+    told: set[str] = set()
+    for more in (off_policy, ["--algorithm.reference_coef=0.1"]):
+        config = parse(RunConfig, arguments + more)
+        engine = LocalEngine(config, ("match",))
+        try:
+            engine.train()
+            while not (progress := engine.poll()).updates:
+                pass
+        finally:
+            engine.close()
+        told |= progress.updates[0].keys()
     with_ray = {"wait_s", "update_s", "publish_s"}
-    assert explained("train") == (progress.updates[0].keys() - {"update"}) | with_ray
+    assert explained("train") == (told - {"update"}) | with_ray
     rollout = progress.rollout.keys() | {f"replay_{k}" for k in progress.replay}
     of_weights = ("version", "swap_s", "publish_to_served_s")
     rollout |= {f"inference_{k}" for k in (*BatcherStats().metrics(), "busy_share", *of_weights)}

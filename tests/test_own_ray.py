@@ -40,6 +40,13 @@ class Stand:
         self.calls.append("shutdown")
 
 
+@pytest.fixture(autouse=True)
+def none_of_the_session(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hides a Ray that other tests use in this process: without it, that one would be ended here."""
+    for module in (own_ray, cluster):
+        monkeypatch.setattr(module, "ray_processes", dict)
+
+
 @pytest.mark.parametrize(
     ("responds", "calls"),
     [(True, ["init", "shutdown"]), (False, ["init", "shutdown", "init", "shutdown"])],
@@ -74,8 +81,9 @@ def test_one_that_was_there_before_is_left_as_it_is(monkeypatch: pytest.MonkeyPa
 def raylet(monkeypatch: pytest.MonkeyPatch) -> Iterator[psutil.Process]:
     """A process that is taken for Ray's only one."""
     with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"]) as process:
-        monkeypatch.setattr(own_ray, "ray_processes", lambda: {psutil.Process(process.pid): "raylet"})
-        yield psutil.Process(process.pid)
+        one = psutil.Process(process.pid)  # made once: there is none of a process that has gone
+        monkeypatch.setattr(own_ray, "ray_processes", lambda: {one: "raylet"})
+        yield one
         process.kill()
 
 
@@ -117,7 +125,8 @@ HANGS = """
 import os, signal, sys, time
 import psutil
 from accerl_lerobot import guardian, own_ray
-own_ray.ray_processes = lambda: {psutil.Process(int(sys.argv[1])): "gcs_server"}
+gcs_server = psutil.Process(int(sys.argv[1]))
+own_ray.ray_processes = lambda: {gcs_server: "gcs_server"}
 own_ray.kill_ray = lambda processes: None
 own_ray.GIVE_UP_S = 0.1
 guardian.explain(remedy="to go on: accerl train --resume=true")

@@ -306,8 +306,8 @@ def test_code_at_a_commit_and_no_code():
     check_remote_code(False, None, "policy")
 
 
-TIMES = 100
-"""What `tests.hostile` multiplies its shares with: about 80,000 files."""
+TIMES = 30
+"""What `tests.hostile` multiplies its shares with: about 24,000 files, of which about 140 are loaded."""
 
 
 def test_many_changed_files(tmp_path: Path):
@@ -315,13 +315,13 @@ def test_many_changed_files(tmp_path: Path):
     command = [sys.executable, "-m", "tests.hostile", "0", str(tmp_path), str(TIMES)]
     root = Path(__file__).parents[1]
     done = subprocess.run(
-        command, cwd=root, capture_output=True, text=True, errors="replace", timeout=3600, check=False
+        command, cwd=root, capture_output=True, text=True, errors="replace", timeout=600, check=False
     )
     assert done.returncode == 0, done.stderr[-4000:]
     found = json.loads(done.stdout.splitlines()[-1])
     outcomes: dict[str, int] = found["outcomes"]
-    assert sum(outcomes.values()) >= 75_000
-    assert sum(n for name, n in outcomes.items() if name.startswith(("load ", "open "))) >= 400
+    assert sum(outcomes.values()) >= 23_000
+    assert sum(n for name, n in outcomes.items() if name.startswith(("load ", "open "))) >= 140
     kinds = {name.rpartition(" ")[0] for name in outcomes}
     assert all(outcomes.get(f"{kind} refused", 0) > 0 for kind in kinds), "a check that never refuses"
     assert sum(n for name, n in outcomes.items() if name.endswith(" good")) > 5_000

@@ -14,7 +14,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -242,8 +242,8 @@ class Study:
         """
         from accerl_lerobot.preflight import check_start
 
-        for start in self.starts.values():
-            check_start(start)
+        for seed, start in self.starts.items():
+            check_start(replace(start, resume=self.start(seed).exists()))  # what is there is gone on with
         with locked(self.root, "output_dir", IN_USE) as lock:
             runner = _Runner(self.config.jobs, lock, console)
             runner.run("warm starts", {self.start(seed): start for seed, start in self.starts.items()})

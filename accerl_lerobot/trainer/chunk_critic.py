@@ -26,7 +26,6 @@ from accerl_lerobot.algorithms.chunk_critic import ChunkCriticConfig
 from accerl_lerobot.algorithms.diagnostics import lag_metrics
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
-from accerl_lerobot.fault_points import reach
 from accerl_lerobot.optimizers import copied, optimizer_state, restore_optimizer
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.trainer.anchors import CRITIC
@@ -126,7 +125,6 @@ class ChunkCriticUpdate:
         metrics |= {"reward_mean": float(rewards.mean())}
         if len(self.memory):
             metrics |= self._learn(len(rewards))
-        reach("trainer.backward")
         versions = torch.from_numpy(np.concatenate([segment.version for segment in segments]))
         metrics |= {name: float(value) for name, value in lag_metrics(versions, self.version).items()}
         self.version += 1
@@ -266,7 +264,7 @@ class ChunkCriticUpdate:
         climb = (algorithm.anchor * distance - pessimistic / scale).mean()
         loss = climb + algorithm.imitation * imitation
         self.optimizer.zero_grad(set_to_none=True)
-        (loss * math.nan if reach("trainer.loss") else loss).backward()
+        loss.backward()
         norm = float(torch.nn.utils.clip_grad_norm_(self._policy, self.config.grad_clip))
         if math.isfinite(float(loss.detach()) + norm):
             self.optimizer.step()

@@ -50,7 +50,8 @@ def load_episodes(
 
     wanted = range(meta.total_episodes) if only is None else only
     with checked(origin_of(dataset)):
-        data = LeRobotDataset(meta.repo_id, root=meta.root, revision=meta.revision)
+        # The default probes for FFmpeg's libraries, and prints their tracebacks where there are none.
+        data = LeRobotDataset(meta.repo_id, root=meta.root, revision=meta.revision, video_backend="pyav")
         episodes = [_episode(data, meta, index, spec, source) for index in wanted]
     remedies = {True: "add episodes that succeed", False: "add failures, see demos.failure_share"}
     for outcome, remedy in remedies.items() if both else ():

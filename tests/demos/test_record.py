@@ -11,8 +11,10 @@ import pytest
 
 from accerl_lerobot.demos.expert import make_expert, play
 from accerl_lerobot.demos.record import SIDECAR, DemosConfig, record_demos
+from accerl_lerobot.demos.starts import read_starts
 from accerl_lerobot.envs import LeRobotEnvConfig, MetaWorldConfig, SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.safety import Origin
 from tests.rounding import assert_close
 
 TASKS = "handle-press-v3,reach-v3"
@@ -64,7 +66,9 @@ def test_the_expert_succeeds_at_the_last_frame_of_each_episode(recorded: Path):
 def test_frames_are_what_the_world_showed_when_the_action_was_chosen(recorded: Path):
     data = rows(recorded)
     world = make_world(MetaWorldConfig(task=TASKS))
-    observation = world.reset(0, "handle-press-v3")
+    task, seed = read_starts(recorded, 2, Origin("dataset.root", str(recorded)))[0]
+    assert task == "handle-press-v3"
+    observation = world.reset(seed, task)
     for row in data[:10]:
         stored = (row["observation.images.corner2"] * 255).round().astype(np.uint8).transpose(1, 2, 0)
         assert np.array_equal(stored, observation["observation.images.corner2"])
