@@ -37,9 +37,9 @@ class ChunkCriticConfig(AlgorithmConfig):
     """Decisions ahead after which the critic's target bootstraps."""
     monte_carlo: Share = 0.25
     """Share of the observed return in the critic's target."""
-    critic_steps: Positive = 0.5
+    critic_steps: Positive = 1.0
     """Gradient steps of the critic for each new decision."""
-    policy_steps: NonNegative = 0.04
+    policy_steps: NonNegative = 0.08
     """Gradient steps of the policy for each new decision, after ``trainer.value_warmup_updates``."""
     pessimism: NonNegative = 1.0
     """Standard deviations of the ensemble that are taken off Q."""

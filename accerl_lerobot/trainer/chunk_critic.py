@@ -34,8 +34,8 @@ from accerl_lerobot.trainer.memory import Memory
 from accerl_lerobot.trainer.nonfinite import NonFiniteError
 
 MEMBERS, WIDTH = 6, 256
-CRITIC_BATCH, POLICY_BATCH, IMITATED = 256, 128, 64
-"""Rows of one step of the critic; of the policy; and own successes that such a step imitates beside."""
+CRITIC_BATCH, POLICY_BATCH = 256, 128
+"""Rows of one step of the critic and of the policy. Half of the policy's are drawn from successful episodes."""
 TAU = 0.01
 """Share of the critic's weights that its slow copy takes over in a step."""
 SMOOTHING = 0.1
@@ -249,14 +249,15 @@ class ChunkCriticUpdate:
         assert self._critic is not None
         algorithm, family = self.algorithm, self.adapter.family
         rows = self._draw(POLICY_BATCH)
-        own = won[torch.randint(len(won), (IMITATED,)).numpy()] if len(won) else won
+        if len(won):
+            half = POLICY_BATCH // 2
+            rows[:half] = won[torch.randint(len(won), (half,)).numpy()]
+        success = self._tensor("success", rows).float()
         with self.adapter.autocast():
             encoded = self.adapter.encode(*self.memory.observations(rows))
             chunk = family.propose(encoded, self._tensor("noise", rows)).float()
-            imitation = chunk.new_zeros(())
-            if len(own):
-                encoded = self.adapter.encode(*self.memory.observations(own))
-                imitation = family.imitation_loss(encoded, self._tensor("chunk", own)).mean()
+            error = family.imitation_loss(encoded, self._tensor("chunk", rows)).float()
+        imitation = (error * success).sum() / success.sum().clamp(min=1)
         proposal, state = self._tensor("proposal", rows), self._tensor("state", rows)
         q = self._critic(state, chunk)
         pessimistic = q.mean(0) - algorithm.pessimism * q.std(0)
