@@ -11,7 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from accerl_lerobot.algorithms import AlgorithmConfig, ChunkCriticConfig, GIPOConfig, RatioConfig
+from accerl_lerobot.algorithms import (
+    AlgorithmConfig,
+    ChunkCriticConfig,
+    GIPOConfig,
+    OffPolicyConfig,
+    RatioConfig,
+)
 from accerl_lerobot.dataset_config import DatasetConfig
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
@@ -155,7 +161,7 @@ class RunConfig(Section):
     @property
     def remembered(self) -> int:
         """Decisions in the trainer's own memory at the end."""
-        if not isinstance(self.algorithm, ChunkCriticConfig):
+        if not isinstance(self.algorithm, OffPolicyConfig):
             return 0
         return min(self.algorithm.memory, self.trainer.updates * self.trainer.batch_decisions)
 
@@ -170,8 +176,8 @@ class RunConfig(Section):
             raise InputError("policy.path", self.policy.path, remedy)
         if self.sft.steps and self.sft.init_path is None:
             check_chunk(self.sft.policy)
-        if isinstance(self.algorithm, ChunkCriticConfig):
-            self._check_chunk_critic()
+        if isinstance(self.algorithm, OffPolicyConfig):
+            self._check_off_policy()
         elif (
             isinstance(self.algorithm, RatioConfig)
             and self.algorithm.advantage == "group"
@@ -235,10 +241,10 @@ class RunConfig(Section):
             )
             raise InputError("rollout.group_size", self.rollout.group_size, remedy)
 
-    def _check_chunk_critic(self) -> None:
-        """Its own memory stands for replay's reuse, and it looks at whole real episodes."""
+    def _check_off_policy(self) -> None:
+        """A memory of its own stands for replay's reuse, and holds whole real episodes."""
         offered = getattr(self.env, "environment_state", None)
-        if not offered:
+        if isinstance(self.algorithm, ChunkCriticConfig) and not offered:
             remedy = "its critic reads the simulator's state: " + (
                 f"env.type={self.env.type} does not offer it, use gipo"
                 if offered is None

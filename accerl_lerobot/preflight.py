@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import draccus
 
 from accerl_lerobot import ray_environment
-from accerl_lerobot.algorithms import ChunkCriticConfig, RatioConfig
+from accerl_lerobot.algorithms import OffPolicyConfig, RatioConfig
 from accerl_lerobot.envs import EnvConfig, WorldSpec, make_world
 from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.ranges import Range, check
@@ -222,8 +222,8 @@ def check_start(config: RunConfig) -> int:
     policy = policy_to_be(config)
     check_weights_fit(config)
     spec = check_world(config.env)
-    if isinstance(config.algorithm, ChunkCriticConfig):
-        _check_chunk_critic(config, spec, policy)
+    if isinstance(config.algorithm, OffPolicyConfig):
+        _check_off_policy(config, spec, policy)
     renames, offered = config.policy.rename_map, env_features(spec)
     if config.policy.path is not None:
         check_features(policy_features(policy), offered, renames, "policy.path", config.policy.path)
@@ -404,17 +404,19 @@ def policy_gib(config: RunConfig) -> float:
     return 4 * (sizes.policy * processes + sizes.trained * copies) / 2**30
 
 
-def _check_chunk_critic(config: RunConfig, spec: WorldSpec, policy: Any) -> None:
+def _check_off_policy(config: RunConfig, spec: WorldSpec, policy: Any) -> None:
     """Refuses policies whose chunks have no gradient, and segments that are not whole episodes."""
     from accerl_lerobot.policies.loading import sampler_config
 
     sampler = sampler_config(config.policy, policy.type)
     if sampler.type not in ("flow", "gaussian") or getattr(sampler, "stochastic", "last") == "one":
         remedy = "use flow (with stochastic=last) or gaussian, or another algorithm.type"
-        raise InputError("policy.sampler.type", sampler.type, f"algorithm.type=chunk_critic: {remedy}")
+        raise InputError(
+            "policy.sampler.type", sampler.type, f"algorithm.type={config.algorithm.type}: {remedy}"
+        )
     decisions = math.ceil(spec.max_steps / getattr(policy, "n_action_steps", 1))
     if config.rollout.segment_length < decisions:
-        remedy = f"algorithm.type=chunk_critic looks at whole episodes; use at least {decisions}"
+        remedy = f"algorithm.type={config.algorithm.type} looks at whole episodes; use at least {decisions}"
         raise InputError("rollout.segment_length", config.rollout.segment_length, remedy)
 
 

@@ -154,7 +154,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     (
         ["--algorithm.type=gippo"],
         "algorithm.type='gippo': did you mean gipo? Otherwise use one of awr, chunk_critic, decoupled, "
-        "gipo, is, ppo, sapo",
+        "gipo, is, ppo, sapo, self_imitation",
     ),
     (["--algorithm.type=is", "--algorithm.cap=0.5"], "algorithm.cap=0.5: use a number of at least 1 or null"),
     (

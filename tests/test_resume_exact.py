@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.algorithms import ChunkCriticConfig, GIPOConfig
+from accerl_lerobot.algorithms import ChunkCriticConfig, GIPOConfig, SelfImitationConfig
 from accerl_lerobot.algorithms.decoupled import DecoupledConfig
 from accerl_lerobot.checkpoint import TRAINING_STATE
 from accerl_lerobot.config import RunConfig
@@ -39,6 +39,11 @@ CASES: dict[str, dict[str, Any]] = {
         "rollout": RolloutConfig(worlds=4, segment_length=4),
         "replay": ReplayConfig(capacity=64, min_decisions=16, ahead=32, samples_per_insert=1),
         "algorithm": ChunkCriticConfig(),
+    },
+    "self-imitation": {
+        "rollout": RolloutConfig(worlds=4, segment_length=4),
+        "replay": ReplayConfig(capacity=64, min_decisions=16, ahead=32, samples_per_insert=1),
+        "algorithm": SelfImitationConfig(policy_steps=0.25),
     },
     "counted episodes": {"rollout": RolloutConfig(worlds=4, segment_length=3, episodes=30)},
     "tasks that fail more often": {

@@ -25,6 +25,7 @@ from accerl_lerobot.algorithms.contract import (
     Level,
     LossInputs,
     LossOutput,
+    OffPolicyConfig,
     RatioConfig,
     check_level,
 )
@@ -33,6 +34,7 @@ from accerl_lerobot.algorithms.gipo import GIPOConfig, gipo_loss
 from accerl_lerobot.algorithms.importance import ImportanceConfig, importance_loss
 from accerl_lerobot.algorithms.ppo import PPOConfig, ppo_loss
 from accerl_lerobot.algorithms.sapo import SAPOConfig, sapo_loss
+from accerl_lerobot.algorithms.self_imitation import SelfImitationConfig
 
 ALGORITHMS: dict[str, Callable[[LossInputs, Any], LossOutput]] = {
     "awr": awr_loss,
@@ -43,7 +45,7 @@ ALGORITHMS: dict[str, Callable[[LossInputs, Any], LossOutput]] = {
     "sapo": sapo_loss,
 }
 """Name on the command line → loss; the second argument is the config registered under the same name.
-``chunk_critic`` is not among them: it weighs no likelihoods, see `trainer.chunk_critic`."""
+Each `OffPolicyConfig` has an update of its own instead, see `trainer.off_policy`."""
 
 
 def compute_loss(inputs: LossInputs, config: RatioConfig) -> LossOutput:
@@ -66,9 +68,11 @@ __all__ = [
     "Level",
     "LossInputs",
     "LossOutput",
+    "OffPolicyConfig",
     "PPOConfig",
     "RatioConfig",
     "SAPOConfig",
+    "SelfImitationConfig",
     "awr_loss",
     "check_level",
     "compute_loss",

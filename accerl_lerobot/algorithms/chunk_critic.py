@@ -18,13 +18,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from accerl_lerobot.algorithms.contract import AlgorithmConfig
+from accerl_lerobot.algorithms.contract import AlgorithmConfig, OffPolicyConfig
 from accerl_lerobot.ranges import NonNegative, Positive, Range, Share
 
 
 @AlgorithmConfig.register_subclass("chunk_critic")
 @dataclass(frozen=True, kw_only=True)
-class ChunkCriticConfig(AlgorithmConfig):
+class ChunkCriticConfig(OffPolicyConfig):
     """Settings of the off-policy chunk critic.
 
     Every decision is learnt from many times, out of a memory in the trainer; so one success moves the policy
@@ -39,14 +39,9 @@ class ChunkCriticConfig(AlgorithmConfig):
     """Share of the observed return in the critic's target."""
     critic_steps: Positive = 1.0
     """Gradient steps of the critic for each new decision."""
-    policy_steps: NonNegative = 0.08
-    """Gradient steps of the policy for each new decision, after ``trainer.value_warmup_updates``."""
     pessimism: NonNegative = 1.0
     """Standard deviations of the ensemble that are taken off Q."""
     anchor: NonNegative = 1.0
     """Weight of the squared distance from the chunk that the policy proposed a while ago."""
     imitation: NonNegative = 0.4
     """Weight of the imitation loss on own successes."""
-    memory: Annotated[int, Range("[1000, 100000000]")] = 100_000
-    """Decisions that the trainer remembers; the oldest leave first. At images of 64 pixels, 100,000 are
-    1.2 GB."""

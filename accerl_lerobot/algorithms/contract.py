@@ -7,12 +7,12 @@ Shape letters: N decisions of a batch, L log-prob factors of one decision, as it
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import draccus
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.ranges import NonNegative, Section, Share
+from accerl_lerobot.ranges import NonNegative, Range, Section, Share
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -69,6 +69,17 @@ class RatioConfig(AlgorithmConfig):
     def proximal_updates(self) -> int:
         """For how many updates the weights behind `LossInputs.log_prob_proximal` are kept; 0: not used."""
         return 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class OffPolicyConfig(AlgorithmConfig):
+    """Base of the algorithms that learn from a memory of all episodes and need no likelihood."""
+
+    policy_steps: NonNegative = 0.08
+    """Gradient steps of the policy for each new decision, after ``trainer.value_warmup_updates``."""
+    memory: Annotated[int, Range("[1000, 100000000]")] = 100_000
+    """Decisions that the trainer remembers; the oldest leave first. At images of 64 pixels, 100,000 are
+    1.2 GB."""
 
 
 def check_level(level: Level, actions: int | None) -> None:

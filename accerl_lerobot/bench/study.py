@@ -210,13 +210,15 @@ class Study:
     Args:
         config: what they have in common.
         cells: what they have not.
+        common: what all of them, warm starts too, add to the recipe.
 
     Raises:
         InputError: the recipe, or a cell's settings, are wrong.
     """
 
-    def __init__(self, config: StudyConfig, cells: Sequence[Cell]) -> None:
+    def __init__(self, config: StudyConfig, cells: Sequence[Cell], common: Sequence[str] = ()) -> None:
         self.config, self.root = config, Path(config.output_dir).expanduser().resolve()
+        self.common = list(common)
         self.cells = list(cells)
         self.starts = {
             seed: self._parse(seed, ["--trainer.updates=0", "--imagination.share=0"], self.start(seed))
@@ -279,6 +281,7 @@ class Study:
                 "--evaluation.every_updates=0",
                 "--evaluation.videos=0",
                 f"--output_dir={folder}",
+                *self.common,
                 *chosen,
             ],
         )

@@ -48,10 +48,11 @@ class Memory:
     def __getitem__(self, name: str) -> np.ndarray:
         """A column, (len, ...).
 
-        ``state`` float32 (E + 16), the environment's and what stands for the task; ``chunk`` float32 (K, A);
-        ``following``, the row `n_step` decisions on; ``reward``, discounted, of the decisions before that;
-        ``discount``, of what follows, 0 where the episode ends before; ``return``, discounted, of the episode
-        from here on; ``success``, of the episode; ``task``, a place in `tasks`; ``observation.*``.
+        ``state`` float32 (E + 16), the environment's, if it offers any, and what stands for the task;
+        ``chunk`` float32 (K, A); ``following``, the row `n_step` decisions on; ``reward``, discounted, of
+        the decisions before that; ``discount``, of what follows, 0 where the episode ends before;
+        ``return``, discounted, of the episode from here on; ``success``, of the episode; ``task``, a place
+        in `tasks`; ``observation.*``.
         """
         return self._columns[name][: len(self)]
 
@@ -70,9 +71,7 @@ class Memory:
         """
         t = len(segment)
         if segment.origin.decision or not segment.episode or t > self.capacity:
-            remedy = (
-                f"the critic looks at whole episodes of at most algorithm.memory={self.capacity} decisions"
-            )
+            remedy = f"the memory holds whole episodes of at most algorithm.memory={self.capacity} decisions"
             raise InputError("rollout.segment_length", t, remedy)
         rows = (self.total + np.arange(t)) % self.capacity
         returns = np.zeros(t + 1)
@@ -81,7 +80,8 @@ class Memory:
         ahead = np.minimum(self.n_step, t - np.arange(t))
         ends = np.arange(t) + ahead == t
         discount = self.gamma**ahead
-        environment = segment.observations[ENVIRONMENT_STATE][:-1].reshape(t, -1)
+        seen = {name: values[:-1] for name, values in segment.observations.items()}
+        environment = seen.pop(ENVIRONMENT_STATE, np.empty((t, 0))).reshape(t, -1)
         if segment.task not in self._codes:
             self._codes[segment.task] = _code(segment.task)
             self.tasks.append(segment.task)
@@ -96,7 +96,7 @@ class Memory:
             "success": np.full(t, segment.success),
             "task": np.full(t, self.tasks.index(segment.task)),
         }
-        columns |= {k: v[:-1] for k, v in segment.observations.items() if k != ENVIRONMENT_STATE}
+        columns |= seen
         for name, values in columns.items():
             self.write(name, rows, values, self.total + t)
         self.total += t

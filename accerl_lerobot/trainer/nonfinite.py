@@ -15,7 +15,7 @@ from accerl_lerobot import snapshot
 from accerl_lerobot.experience import Segment
 
 if TYPE_CHECKING:
-    from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
+    from accerl_lerobot.trainer.off_policy import OffPolicyUpdate
     from accerl_lerobot.trainer.update import Update
 
 
@@ -25,7 +25,7 @@ class NonFiniteError(RuntimeError):
 
 @contextmanager
 def keeping(
-    directory: Path | None, update: Update | ChunkCriticUpdate, segments: Sequence[Segment]
+    directory: Path | None, update: Update | OffPolicyUpdate, segments: Sequence[Segment]
 ) -> Iterator[None]:
     """Inside, an update is made of segments.
 

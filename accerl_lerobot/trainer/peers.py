@@ -30,7 +30,7 @@ from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.trainer.config import TrainerConfig
 
 if TYPE_CHECKING:
-    from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
+    from accerl_lerobot.trainer.off_policy import OffPolicyUpdate
     from accerl_lerobot.trainer.ranks import Ranks
     from accerl_lerobot.trainer.update import Update
     from accerl_lerobot.transport.meeting import Meeting
@@ -75,7 +75,7 @@ class Learner:
         self._algorithm, self._config, self._state = algorithm, config, state
         self.adapter: Any = loader(load)(policy)
 
-    def begin(self, ranks: Ranks) -> Update | ChunkCriticUpdate:
+    def begin(self, ranks: Ranks) -> Update | OffPolicyUpdate:
         """The updates, from the state on; what ranks share out is shared out then."""
         from accerl_lerobot.trainer.update import make_update
 
@@ -155,7 +155,7 @@ class Peers:
     def __init__(self, actors: Sequence[Any], config: TrainerConfig) -> None:
         self._actors, self._config = list(actors), config
 
-    def begin(self, learner: Learner) -> Update | ChunkCriticUpdate:
+    def begin(self, learner: Learner) -> Update | OffPolicyUpdate:
         """Meets them, once they have loaded their policies."""
         from accerl_lerobot.trainer import ranks
         from accerl_lerobot.transport.meeting import LOOPBACK, host, only_at

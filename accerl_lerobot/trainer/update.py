@@ -26,8 +26,8 @@ from torch import Tensor
 
 from accerl_lerobot.algorithms import (
     AlgorithmConfig,
-    ChunkCriticConfig,
     LossInputs,
+    OffPolicyConfig,
     RatioConfig,
     check_level,
     compute_loss,
@@ -50,17 +50,17 @@ from accerl_lerobot.trainer.ranks import Ranks
 from accerl_lerobot.trainer.sharding import arrange, synchronise
 
 if TYPE_CHECKING:
-    from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
+    from accerl_lerobot.trainer.off_policy import OffPolicyUpdate
 
 
 def make_update(
     adapter: Any, algorithm: AlgorithmConfig, config: TrainerConfig, ranks: Ranks | None = None
-) -> Update | ChunkCriticUpdate:
+) -> Update | OffPolicyUpdate:
     """The updates that belong to an algorithm; see `Update` for the arguments."""
-    if isinstance(algorithm, ChunkCriticConfig):
-        from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
+    if isinstance(algorithm, OffPolicyConfig):
+        from accerl_lerobot.trainer.chunk_critic import OFF_POLICY
 
-        return ChunkCriticUpdate(adapter, algorithm, config)
+        return OFF_POLICY[algorithm.type](adapter, algorithm, config)
     assert isinstance(algorithm, RatioConfig)
     return Update(adapter, algorithm, config, ranks)
 

@@ -28,6 +28,7 @@ from accerl_lerobot.algorithms import (
 )
 from accerl_lerobot.algorithms.ratio import LOG_RATIO_CLAMP
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.trainer.chunk_critic import OFF_POLICY
 from tests.algorithms import oracle
 from tests.algorithms.inputs import gradient, make_inputs, one
 
@@ -284,7 +285,7 @@ def test_inputs_are_left_as_they_were() -> None:
 
 
 def test_every_registered_config_has_a_loss() -> None:
-    assert AlgorithmConfig.get_known_choices().keys() == ALGORITHMS.keys() | {"chunk_critic"}
+    assert AlgorithmConfig.get_known_choices().keys() == ALGORITHMS.keys() | OFF_POLICY.keys()
     for name in ALGORITHMS:
         config = draccus.decode(AlgorithmConfig, {"type": name, "gamma": 0.9})
         assert config.type == name and config.gamma == 0.9

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.algorithms import ChunkCriticConfig
+from accerl_lerobot.algorithms import ChunkCriticConfig, SelfImitationConfig
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Origin, Request, Segment
@@ -27,6 +27,7 @@ from accerl_lerobot.trainer.chunk_critic import MEMBERS, ChunkCriticUpdate, Crit
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.memory import CODE, Memory
 from accerl_lerobot.trainer.nonfinite import NonFiniteError
+from accerl_lerobot.trainer.off_policy import OffPolicyUpdate
 from tests.runs import tiny_run
 
 GAMMA = 0.9
@@ -136,6 +137,8 @@ def test_the_ensemble_equals_a_slow_one():
             h = h / (1 + np.exp(-h))
         expected = (h @ weights[-1])[:, 0]
         np.testing.assert_allclose(critic(state, chunk)[member].detach(), expected, rtol=1e-4, atol=1e-5)
+    two = torch.tensor([4, 1])
+    torch.testing.assert_close(critic(state, chunk, two), critic(state, chunk)[two])
 
 
 def requests(adapter: LeRobotAdapter, count: int) -> list[Request]:
@@ -210,6 +213,52 @@ def test_the_policy_climbs_the_critic(tiny_checkpoint: Path):
     assert proposed() > before + 0.3
     assert metrics["explained_variance"] > 0.5 and metrics["gain"] > 0
     assert metrics["memory_decisions"] == 12 * 32
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["with the simulator's state", "without"])
+def test_self_imitation_goes_where_successes_are(tiny_checkpoint: Path, known: bool):
+    """Success is a chunk whose first action goes up; half of the chunks do, by chance."""
+    torch.manual_seed(0)
+    adapter = load_adapter(PolicyConfig(path=str(tiny_checkpoint), device="cpu"))
+    config = TrainerConfig(warmup_updates=0, value_warmup_updates=0, lr=1e-3)
+    update = OffPolicyUpdate(adapter, SelfImitationConfig(policy_steps=0.5), config)
+    rng = np.random.default_rng(0)
+
+    def proposed() -> float:
+        observations, tasks = update.memory.observations(np.zeros(64, int))
+        with torch.no_grad():
+            encoded = adapter.encode(observations, tasks)
+            noise = torch.randn(64, *adapter.family.noise_size())
+            return float(adapter.family.propose(encoded, noise)[:, 0, 0].mean())
+
+    for _ in range(6):
+        segments = []
+        for _ in range(32):
+            path = rng.standard_normal((1, 2, 4, 2)).astype(np.float32)
+            segments.append(episode([float(path[0, 1, 0, 0] > 0)], latent={"path": path}))
+            if not known:
+                del segments[-1].observations[ENVIRONMENT_STATE]
+        metrics = update.step(segments)
+        if update.version == 1:
+            first, before = metrics["imitation_loss"], proposed()
+    assert metrics["imitation_loss"] < first
+    mean_of_successes = (2 / np.pi) ** 0.5
+    assert proposed() == pytest.approx(mean_of_successes, abs=0.3) and proposed() > before + 0.1
+
+
+def test_a_step_imitates_successes_only(tiny_checkpoint: Path):
+    """The loss of a step equals the family's, averaged over those rows of its batch that succeeded."""
+    adapter = load_adapter(PolicyConfig(path=str(tiny_checkpoint), device="cpu"))
+    config = TrainerConfig(warmup_updates=0, value_warmup_updates=0, lr=0.0, weight_decay=0.0)
+    update = OffPolicyUpdate(adapter, SelfImitationConfig(policy_steps=0.25), config)
+    family = adapter.family
+    family.imitation_loss = lambda encoded, chunk: chunk[:, 0, 0] + 0 * encoded.features.sum((1, 2))
+    segments = []
+    for value, reward in ((1.0, 1.0), (3.0, 1.0), (100.0, 0.0), (200.0, 0.0)):
+        path = np.full((1, 2, 4, 2), value, np.float32)
+        segments.append(episode([reward], latent={"path": path}))
+    loss = update.step(segments)["imitation_loss"]
+    assert 1.0 < loss < 3.0
 
 
 def test_without_an_anchor_the_policy_moves_further(tiny_checkpoint: Path):

@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Updates from a memory of all episodes: the loop that off-policy algorithms share, and self-imitation.
+
+new episodes → memory → gradient steps of the policy, so many for each new decision
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from accerl_lerobot.algorithms import OffPolicyConfig
+from accerl_lerobot.algorithms.diagnostics import lag_metrics
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import Segment
+from accerl_lerobot.optimizers import optimizer_state, restore_optimizer
+from accerl_lerobot.policies.adapter import LeRobotAdapter
+from accerl_lerobot.policies.family import Encoded
+from accerl_lerobot.trainer.anchors import CRITIC
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.memory import Memory
+from accerl_lerobot.trainer.nonfinite import NonFiniteError
+
+POLICY_BATCH = 128
+"""Rows of one step of the policy. Half of them are drawn from successful episodes."""
+
+
+class OffPolicyUpdate:
+    """Has the methods of `update.Update`, and stands in its place. As it is, imitates successful episodes.
+
+    Args:
+        adapter: the policy.
+        algorithm: the objective.
+        config: the optimiser; ``batch_decisions`` of new experience make one update.
+
+    Raises:
+        InputError: the policy's chunks are no differentiable function of its weights.
+    """
+
+    n_step = 1
+    """Decisions after which a target bootstraps."""
+
+    def __init__(self, adapter: LeRobotAdapter, algorithm: OffPolicyConfig, config: TrainerConfig) -> None:
+        if not adapter.family.proposes:
+            remedy = "needs a policy that explores by flow or gaussian; use gipo"
+            raise InputError("algorithm.type", algorithm.type, remedy)
+        self.adapter, self.config = adapter, config
+        self.policy_steps = algorithm.policy_steps
+        self.memory = Memory(algorithm.memory, algorithm.gamma, self.n_step)
+        self.version = self.skipped = self._skipped_in_a_row = 0
+        self._owed: dict[str, float] = {}
+        self._schedule_updates = config.updates
+        self._policy = [p for k, p in adapter.trainable().items() if not k.startswith(CRITIC)]
+        self.optimizer = torch.optim.AdamW(
+            self._policy, lr=config.lr, betas=config.betas, weight_decay=config.weight_decay
+        )
+
+    def step(self, segments: Sequence[Segment]) -> dict[str, float]:
+        """Learns from new episodes and from those before; the version rises by one.
+
+        Returns:
+            Its metrics.
+
+        Raises:
+            InputError: a segment is not a whole episode.
+            NonFiniteError: see `update.Update.step`.
+        """
+        for segment in segments:
+            if not segment.truncated:  # the simulator diverged: nothing follows, and nothing failed
+                latent = {k: torch.from_numpy(v) for k, v in segment.latent.items()}
+                self.added(self.memory.add(segment, self.adapter.family.executed(latent).numpy()))
+        metrics = {"decisions": float(sum(map(len, segments))), "memory_decisions": float(len(self.memory))}
+        rewards = np.concatenate([segment.reward for segment in segments])
+        metrics |= {"reward_mean": float(rewards.mean())}
+        if len(self.memory):
+            metrics |= self.learn(len(rewards))
+        versions = torch.from_numpy(np.concatenate([segment.version for segment in segments]))
+        metrics |= {name: float(value) for name, value in lag_metrics(versions, self.version).items()}
+        self.version += 1
+        return metrics | {"skipped": float(self.skipped)}
+
+    def added(self, rows: np.ndarray) -> None:
+        """Completes new rows of the memory."""
+
+    def learn(self, new: int) -> dict[str, float]:
+        """Makes all steps that so many new decisions allow."""
+        return self.policy_learns(new)
+
+    def loss(self, rows: np.ndarray, encoded: Encoded, imitation: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """The objective of a step of the policy, and further metrics.
+
+        Args:
+            rows: (B,) of the memory.
+            encoded: their observations, differentiable.
+            imitation: scalar, the mean imitation loss on those of them that belong to successful episodes.
+        """
+        return imitation, {}
+
+    def state(self) -> dict[str, Any]:
+        """A copy of all that `restore` needs, the policy's weights apart; see `snapshot`."""
+        return {
+            "version": self.version,
+            "skipped": (self.skipped, self._skipped_in_a_row),
+            "schedule_updates": self._schedule_updates,
+            "owed": dict(self._owed),
+            "memory": self.memory.state(),
+            "optimizer": optimizer_state(self.optimizer),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave; the adapter has its weights already."""
+        self.version = state["version"]
+        self.skipped, self._skipped_in_a_row = state["skipped"]
+        self._schedule_updates, self._owed = state["schedule_updates"], dict(state["owed"])
+        self.memory.restore(state["memory"])
+        restore_optimizer(self.optimizer, state["optimizer"])
+
+    def steps(self, name: str, each: float, new: int) -> range:
+        """As many steps as are due at ``each`` for a new decision; what is left over is due later."""
+        owed = self._owed.get(name, 0.0) + each * new
+        due = int(owed)
+        self._owed[name] = owed - due
+        return range(due)
+
+    def policy_learns(self, new: int) -> dict[str, float]:
+        """The policy's steps of this update; none before ``value_warmup_updates``."""
+        start = self.config.value_warmup_updates
+        lr = self.config.lr * self.config.lr_share(self.version, start=start, updates=self._schedule_updates)
+        self.optimizer.param_groups[0]["lr"] = lr
+        metrics = {"lr": lr}
+        if self.version >= start:
+            won = np.flatnonzero(self.memory["success"])
+            metrics |= mean(self._policy_step(won) for _ in self.steps("policy", self.policy_steps, new))
+        return metrics
+
+    def draw(self, count: int) -> np.ndarray:
+        """Rows of the memory, any of them."""
+        return torch.randint(len(self.memory), (count,)).numpy()
+
+    def tensor(self, name: str, rows: np.ndarray) -> Tensor:
+        """Rows of a column, where the policy lives."""
+        return torch.from_numpy(self.memory[name][rows]).to(self.adapter.device)
+
+    def _policy_step(self, won: np.ndarray) -> dict[str, float]:
+        """One gradient step; `won` are the rows of successful episodes."""
+        rows = self.draw(POLICY_BATCH)
+        if len(won):
+            half = POLICY_BATCH // 2
+            rows[:half] = won[torch.randint(len(won), (half,)).numpy()]
+        success = self.tensor("success", rows).float()
+        with self.adapter.autocast():
+            encoded = self.adapter.encode(*self.memory.observations(rows))
+            error = self.adapter.family.imitation_loss(encoded, self.tensor("chunk", rows)).float()
+            imitation = (error * success).sum() / success.sum().clamp(min=1)
+            loss, metrics = self.loss(rows, encoded, imitation)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = float(torch.nn.utils.clip_grad_norm_(self._policy, self.config.grad_clip))
+        if math.isfinite(float(loss.detach()) + norm):
+            self.optimizer.step()
+            self._skipped_in_a_row = 0
+        else:
+            self._skip(float(loss.detach()), norm)
+        metrics |= {"policy_loss": loss, "imitation_loss": imitation}
+        return {name: float(value.detach()) for name, value in metrics.items()} | {"grad_norm": norm}
+
+    def _skip(self, loss: float, norm: float) -> None:
+        self.skipped += 1
+        self._skipped_in_a_row += 1
+        if self._skipped_in_a_row >= self.config.max_nonfinite:
+            raise NonFiniteError(
+                f"{self._skipped_in_a_row} steps in a row had a non-finite loss or gradient (the last one: "
+                f"loss {loss:g}, gradient norm {norm:g}); lower trainer.lr"
+            )
+
+
+def mean(steps: Iterator[dict[str, float]]) -> dict[str, float]:
+    """Means over steps; empty without any."""
+    made = list(steps)
+    return {name: sum(step[name] for step in made) / len(made) for name in (made[0] if made else ())}

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Practice after few-shot imitation: algorithms from one SFT policy, at equal real episodes.
+
+    python -m benchmarks.few_shot --tasks=lever-pull-v3,push-v3 --seeds=0 --jobs=2
+
+Writes few_shot.json, few_shot.md and few_shot.png into the output folder. The same command continues a study
+that was stopped, and adds tasks, seeds or algorithms to one that is finished.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from accerl_lerobot.bench.study import Cell, Study, StudyConfig, as_markdown, named, write
+from accerl_lerobot.console import Console
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.pictures import drawing
+from accerl_lerobot.evaluation.stats import Rate, mean_interval
+from accerl_lerobot.parsing import parse
+from accerl_lerobot.ranges import Steps
+
+COLUMNS = ("task", "seed", "algorithm", "SFT", "after", "real episodes", "env steps")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FewShotConfig(StudyConfig):
+    """Fields of the study."""
+
+    recipe: str = "recipes/few_shot.yaml"
+    """Demonstrations, SFT and trainer settings of every run."""
+    output_dir: str = "outputs/few_shot"
+    """One folder per task below it; finished runs are kept."""
+    seeds: tuple[int, ...] = (0,)
+    """Each with demonstrations, an SFT policy and evaluation starts of its own."""
+    tasks: tuple[str, ...] = ("lever-pull-v3",)
+    """MetaWorld tasks."""
+    algorithms: tuple[str, ...] = ("chunk_critic", "self_imitation")
+    """Values of ``algorithm.type``. Empty: SFT only, to choose tasks."""
+    explored: Steps = 1200
+    """Real exploring episodes of each run."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        named(self, "tasks")
+
+
+def few_shot(config: FewShotConfig) -> dict[str, Any]:
+    """Runs what is missing, task by task, and writes all results after each task.
+
+    Returns:
+        ``config``, ``rows`` (one per task, seed and algorithm) and ``means`` of each algorithm.
+
+    Raises:
+        InputError: see `Study.run`.
+        RuntimeError: see there.
+    """
+    console, root, rows = Console(), Path(config.output_dir).expanduser().resolve(), []
+    root.mkdir(parents=True, exist_ok=True)
+    for task in config.tasks:
+        cells = [
+            Cell(
+                name=f"{algorithm}-seed{seed}",
+                seed=seed,
+                of={"task": task, "algorithm": algorithm},
+                chosen=(f"--algorithm.type={algorithm}", f"--rollout.episodes={config.explored}"),
+            )
+            for seed in config.seeds
+            for algorithm in config.algorithms
+        ]
+        study = Study(replace(config, output_dir=str(root / task)), cells, [f"--env.task={task}"])
+        results = study.run(console)
+        for seed, start in results.starts.items():
+            rows.append(_row({"task": task, "algorithm": "sft"}, seed, start, start))
+        rows += [_row(c.of, c.seed, results.starts[c.seed], summary) for c, summary in results.cells]
+        result = {"config": asdict(config), "rows": rows, "means": means(rows)}
+        write(root, "few_shot", result, markdown(result), draw)
+        console.say(f"{task}: wrote few_shot.json, few_shot.md and few_shot.png into {root}")
+    return result
+
+
+def means(rows: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Mean success over tasks and seeds by algorithm, with a 95 % t interval over (task, seed) pairs."""
+    found: dict[str, dict[str, Any]] = {}
+    for name in dict.fromkeys(row["algorithm"] for row in rows):
+        success = [row["success"] for row in rows if row["algorithm"] == name]
+        found[name] = {"success": sum(success) / len(success), "policies": len(success)}
+        if len(success) > 1:
+            interval = mean_interval(success)
+            found[name]["ci95"] = [interval.low, interval.high]
+    return found
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """A table of all rows but SFT's, which is a column."""
+    rows = []
+    for row in result["rows"]:
+        if row["algorithm"] != "sft" or not result["config"]["algorithms"]:
+            rates = [_rate(row[key], row["n"]) for key in ("sft", "success")]
+            counts = [f"{row[key]:,}" for key in ("episodes", "env_steps")]
+            rows.append([row["task"], str(row["seed"]), row["algorithm"], *rates, *counts])
+    return as_markdown(COLUMNS, rows)
+
+
+def draw(path: Path, result: dict[str, Any]) -> None:
+    """A group of bars per task, one bar per algorithm; dots are seeds."""
+    rows = result["rows"]
+    tasks, names = (list(dict.fromkeys(row[key] for row in rows)) for key in ("task", "algorithm"))
+    with drawing(path) as axes:
+        for i, name in enumerate(names):
+            for j, task in enumerate(tasks):
+                success = [r["success"] for r in rows if (r["task"], r["algorithm"]) == (task, name)]
+                x = j + 0.8 * (i + 0.5) / len(names) - 0.4
+                if success:
+                    label = name if j == 0 else None
+                    axes.bar(x, sum(success) / len(success), 0.75 / len(names), color=f"C{i}", label=label)
+                    axes.scatter([x] * len(success), success, s=10, color="black", zorder=3)
+        axes.set_xticks(range(len(tasks)), [t.removesuffix("-v3") for t in tasks], rotation=20, ha="right")
+        axes.set(ylabel="success", ylim=(0, 1.02))
+        axes.legend()
+
+
+def _row(of: dict[str, Any], seed: int, start: dict[str, Any], summary: dict[str, Any]) -> dict[str, Any]:
+    shown = {"sft": start["success_after"], "success": summary["success_after"], "n": summary["n_after"]}
+    trained = {} if start is summary else summary
+    counts = {"episodes": trained.get("episodes_explored", 0), "env_steps": trained.get("env_steps", 0)}
+    return of | {"seed": seed} | shown | counts | {"rl_s": trained.get("rl_s", 0.0)}
+
+
+def _rate(success: float, n: int) -> str:
+    interval = Rate(successes=round(success * n), n=n).interval()
+    return f"{success:.0%} [{interval.low:.0%}, {interval.high:.0%}]"
+
+
+def main() -> int:
+    """Runs the study of the command line."""
+    try:
+        few_shot(parse(FewShotConfig, sys.argv[1:]))
+    except (InputError, RuntimeError) as error:
+        sys.stderr.write(f"few_shot: {error}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The few-shot study: what it compares, and how its numbers are put together by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from accerl_lerobot.bench import study as studies
+from accerl_lerobot.bench.study import Results, Study
+from benchmarks.few_shot import FewShotConfig, few_shot, means
+
+
+def a_summary(success: float, episodes: int = 0) -> dict[str, Any]:
+    counts = {"episodes_explored": episodes, "env_steps": 150 * episodes, "rl_s": 1.0}
+    return {"success_after": success, "n_after": 100} | counts
+
+
+def test_runs_of_a_task_share_its_policy_and_its_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    seen: list[Study] = []
+
+    def run(study: Study, console: studies.Console) -> Results:
+        seen.append(study)
+        after = {"chunk_critic": 0.9, "self_imitation": 0.5}
+        cells = [(c, a_summary(after[c.of["algorithm"]] - 0.1 * c.seed, episodes=30)) for c in study.cells]
+        return Results({seed: a_summary(0.4) for seed in study.config.seeds}, cells)
+
+    monkeypatch.setattr(Study, "run", run)
+    config = FewShotConfig(
+        tasks=("push-v3", "door-open-v3"), seeds=(0, 1), explored=30, output_dir=str(tmp_path)
+    )
+    result = few_shot(config)
+
+    for study, task in zip(seen, config.tasks, strict=True):
+        assert len(study.runs) == 4
+        for cell, run_config in zip(study.cells, study.runs, strict=True):
+            assert run_config.env.task == task and run_config.rollout.episodes == 30
+            assert run_config.algorithm.type == cell.of["algorithm"] and run_config.seed == cell.seed
+            assert run_config.policy.path.startswith(str(study.start(cell.seed)))
+            assert run_config.trainer.updates * run_config.trainer.batch_decisions >= 30 * 20
+        assert all(start.env.task == task for start in study.starts.values())
+
+    by_name = {name: group["success"] for name, group in result["means"].items()}
+    assert by_name == pytest.approx({"sft": 0.4, "chunk_critic": 0.85, "self_imitation": 0.45})
+    # Four values 0.9, 0.8, 0.9, 0.8: their standard error is 0.05 / sqrt(3), and t(3, 0.975) = 3.182.
+    low, high = result["means"]["chunk_critic"]["ci95"]
+    assert (low, high) == pytest.approx((0.85 - 0.0919, 0.85 + 0.0919), abs=1e-3)
+    table = (tmp_path / "few_shot.md").read_text().splitlines()
+    assert len(table) == 2 + 8
+    assert table[2] == "| push-v3 | 0 | chunk_critic | 40% [31%, 50%] | 90% [83%, 94%] | 30 | 4,500 |"
+    assert (tmp_path / "few_shot.png").stat().st_size > 5000 and (tmp_path / "few_shot.json").is_file()
+
+
+def test_one_policy_has_no_interval():
+    rows = [{"algorithm": "sft", "success": 0.5}]
+    assert means(rows) == {"sft": {"success": 0.5, "policies": 1}}
