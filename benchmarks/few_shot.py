@@ -39,7 +39,7 @@ class FewShotConfig(StudyConfig):
     """MetaWorld tasks."""
     algorithms: tuple[str, ...] = ("chunk_critic", "self_imitation")
     """Values of ``algorithm.type``. Empty: SFT only, to choose tasks."""
-    explored: Steps = 1200
+    explored: Steps = 1500
     """Real exploring episodes of each run."""
 
     def __post_init__(self) -> None:

@@ -349,7 +349,7 @@ def test_eval_in_one_process(
 
 def test_demos_refuses_an_existing_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["demos", str(QUICKSTART), f"--demos.root={tmp_path}"]) == 2
-    assert "exists already: remove it or name another folder" in capsys.readouterr().err
+    assert "the folder exists; choose another or remove it" in capsys.readouterr().err
 
 
 def test_bench_without_a_name(capsys: pytest.CaptureFixture[str]) -> None:
@@ -422,3 +422,41 @@ def test_a_run_that_cannot_go_on_ends_with_one_line(
     how = f"accerl train --resume=true --config_path={folder}/config.yaml"
     began, ended = capsys.readouterr().err.splitlines()
     assert f"run {folder}" in began and said.format(run=folder, how=how) in ended
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["eval", "--env.type=simulated", "--policy.path=a/b", "--output_dir="],
+        ["demos", "--demos.root="],
+        ["export", "--path=x", "--root="],
+        ["pull", "--repo_id=a/b", "--output_dir="],
+        ["report", "@run", "--output="],
+        ["timeline", "@run", "--output="],
+        ["bench", "latency", "--env.type=simulated", "--output_dir="],
+        ["bench", "scaling", "--output_dir="],
+        ["bench", "lag", f"--recipe={QUICKSTART}", "--output_dir="],
+    ],
+    ids=lambda arguments: " ".join(arguments[:2]),
+)
+def test_a_place_that_cannot_be_is_refused_before_any_work(
+    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    flag = arguments[-1].strip("-=")
+    for name in ("file/below", "x" * 300):
+        place = str(tmp_path / name)
+        given = [argument.replace("@run", str(tmp_path)) for argument in arguments]
+        assert cli.main([*given[:-1], f"{given[-1]}{place}"]) == 2
+        err = capsys.readouterr().err
+        assert err.startswith(f"accerl: {flag}={place!r}"[:150]) and err.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_folder_that_may_not_be_written_to_is_refused_before_an_evaluation(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
+    arguments = ["--env.type=simulated", "--policy.path=a/b", f"--output_dir={tmp_path / 'a' / 'b'}"]
+    assert cli.main(["eval", *arguments]) == 2
+    assert f"{tmp_path} cannot be written to" in capsys.readouterr().err

@@ -99,7 +99,7 @@ def test_what_does_not_repeat_itself_is_left_out(
 
 def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     for options, message in (
-        (["--root=" + str(tmp_path)], "exists already: remove it or name another folder"),
+        (["--root=" + str(tmp_path)], "the folder exists; choose another or remove it"),
         (["--path=" + str(tmp_path), "--root=new"], "no run in it: there is no config.yaml"),
         (["--pick=best"], "pick='best': use all, successes or failures"),
         (["--last=-1"], "use a whole number from 0"),

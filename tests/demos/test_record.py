@@ -146,7 +146,7 @@ def test_an_expert_that_cannot_succeed_is_reported_and_leaves_nothing(tmp_path: 
 
 def test_an_existing_folder_is_never_touched(tmp_path: Path):
     (tmp_path / "mine").mkdir()
-    with pytest.raises(InputError, match="exists already"):
+    with pytest.raises(InputError, match="^demos.root=.*the folder exists"):
         record_demos(SimulatedConfig(), DemosConfig(root=str(tmp_path / "mine")))
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.config import PullConfig, PushConfig
-from accerl_lerobot.hub.kinds import recognise, repo_type
+from accerl_lerobot.hub.kinds import read_json, recognise, repo_type
 from tests.hub.folders import write_json, write_policy_folder, write_run_folder
 
 TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
@@ -89,3 +90,9 @@ def test_other_fields_are_checked():
         PullConfig(repo_id="a/b", output_dir="x", repo_type="space")
     with pytest.raises(InputError, match="say something"):
         PushConfig(path="x", repo_id="a/b", message=" ")
+
+
+def test_a_device_or_a_pipe_in_place_of_a_file_is_not_read(tmp_path: Path):
+    os.symlink("/dev/zero", tmp_path / "evaluation.json")
+    os.mkfifo(tmp_path / "summary.json")
+    assert read_json(tmp_path / "evaluation.json") == read_json(tmp_path / "summary.json") == {}
