@@ -43,15 +43,18 @@ class InputError(ValueError):
         return TOKEN.sub("<token>", " ".join(f"{self.field}={value}: {self.remedy}".split()))
 
 
-def check_absent(path: Path) -> None:
-    """Refuses a folder for results that exists.
+def check_absent(path: Path, field: str = "output_dir") -> None:
+    """Refuses a folder for results that exists, or that cannot be created.
 
     Raises:
-        InputError: it does.
+        InputError: so it is; names `field`.
     """
-    expanded(str(path), "output_dir")
-    if path.exists():
-        raise InputError("output_dir", str(path), "the folder exists; choose another or remove it")
+    expanded(str(path), field)
+    if os.path.lexists(path):
+        raise InputError(field, str(path), "the folder exists; choose another or remove it")
+    above = next(folder for folder in path.absolute().parents if folder.exists())
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise InputError(field, str(path), f"{above} cannot be written to; name another folder")
 
 
 def is_full(error: BaseException | None) -> bool:
@@ -82,14 +85,14 @@ def expanded(path: str, field: str) -> Path:
     return found
 
 
-def make_folder(path: Path, field: str) -> None:
-    """Creates a folder and those above it.
+def make_folder(path: Path, field: str, *, again: bool = False) -> None:
+    """Creates a folder and those above it; it may be there if `again`.
 
     Raises:
         InputError: that is not possible; names `field`.
     """
     try:
-        path.mkdir(parents=True)
+        path.mkdir(parents=True, exist_ok=again)
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or str(error)
         raise InputError(field, str(path), f"cannot be created: {why}; name another folder") from error

@@ -275,9 +275,16 @@ def check_training_data(
 
 
 def _check_new_policy(policy: Any, source: Features, sft: SFTConfig) -> None:
-    """Gives a new policy the features that LeRobot will give it, and has LeRobot check them."""
+    """Gives a new policy the features that LeRobot will give it, and has LeRobot check them.
+
+    SmolVLA and π0 pad states and actions to a size of their own, and LeRobot does not compare it with theirs.
+    """
     from lerobot.configs.types import FeatureType, PolicyFeature
 
+    for name, most in ((STATE, "max_state_dim"), (ACTION, "max_action_dim")):
+        limit, shape = getattr(policy, most, None), source.shapes.get(name, (0,))
+        if limit is not None and limit < shape[0]:
+            raise InputError(f"sft.policy.{most}", limit, f"{name} has {shape[0]} numbers; use at least that")
     kinds = {STATE: FeatureType.STATE, ENV_STATE: FeatureType.ENV, ACTION: FeatureType.ACTION}
     features = {
         name: PolicyFeature(type=kinds.get(name, FeatureType.VISUAL), shape=shape)

@@ -21,6 +21,7 @@ import re
 import types
 import typing
 from collections.abc import Collection, Hashable, Iterable
+from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 from accerl_lerobot.errors import InputError
@@ -139,8 +140,14 @@ def check(hint: Any, value: Any, field: str) -> None:
     Raises:
         InputError: names `field` and what fits.
     """
-    if isinstance(value, str) and (len(value) > LONGEST_TEXT or "\0" in value):
-        raise InputError(field, value, f"use at most {LONGEST_TEXT:,} characters, none of them NUL")
+    for text in value if isinstance(value, (list, tuple)) else (value,):
+        if isinstance(text, str) and (len(text) > LONGEST_TEXT or "\0" in text):
+            raise InputError(field, value, f"use at most {LONGEST_TEXT:,} characters, none of them NUL")
+        if isinstance(text, str) and text.startswith("~"):
+            try:
+                Path(text).expanduser()
+            except RuntimeError as error:
+                raise InputError(field, value, "there is no such user; name a path in full") from error
     if not _fits(hint, value):
         raise InputError(field, value, f"use {wanted(hint)}")
 

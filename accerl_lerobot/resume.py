@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from accerl_lerobot.checkpoint import CHECKPOINTS, CONFIG, LAST, SUMMARY
 from accerl_lerobot.config import RunConfig, encode
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, make_folder
 from accerl_lerobot.parsing import CONSENT, decode, read_recipe
 from accerl_lerobot.stopping import StoppedError, Stopping
 
@@ -113,7 +113,7 @@ def locked(directory: Path, field: str, in_use: str) -> Iterator[int]:
     Raises:
         InputError: it is in use.
     """
-    directory.mkdir(parents=True, exist_ok=True)
+    make_folder(directory, field, again=True)
     with (directory / LOCK).open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

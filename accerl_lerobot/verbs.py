@@ -196,9 +196,9 @@ def evaluate(arguments: list[str]) -> int:
     summary: dict[str, Any] = summarise(results) | {"policy": config.policy.path}
     console.say(f"{config.policy.path}, LeRobot's sampler")
     console.rich.print(table(summary, "evaluation"))
+    sys.stdout.write(json.dumps(summary) + "\n")
     if out is not None:
         _write_evaluation(out, summary, results)
-    sys.stdout.write(json.dumps(summary) + "\n")
     return 0
 
 

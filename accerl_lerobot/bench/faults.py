@@ -33,7 +33,7 @@ from accerl_lerobot.bench.victims import CLASSES, DRIVER, EVERYTHING, LIGHT, TRA
 from accerl_lerobot.checkpoint import CHECKPOINTS, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.console import Console
-from accerl_lerobot.errors import InputError, check_absent
+from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate
 from accerl_lerobot.ranges import Range, Repeats, Section, Seed, Steps
@@ -116,7 +116,7 @@ def bench_faults(config: BenchFaultsConfig) -> dict[str, Any]:
     root, console = Path(config.output_dir).expanduser().resolve(), Console()
     recipe = recipe_of(config)
     check_absent(root)
-    root.mkdir(parents=True)
+    make_folder(root, "output_dir")
     start = Start(config.recipe, recipe, config.stall_s, root, console)
     result: dict[str, Any] = {"config": asdict(config), "host": host(), "hits": [], "runs": []}
     for target in config.targets:

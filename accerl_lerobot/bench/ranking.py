@@ -18,7 +18,7 @@ from rich.table import Table
 
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate
 from accerl_lerobot.ranges import Device, Range, Section, Threads
@@ -54,8 +54,8 @@ class BenchRankingConfig(Section):
             raise InputError("policies", self.policies, "name at least one checkpoint, none of them twice")
         if self.path is None:
             raise InputError("path", None, "give the folder world_model that accerl world-model has written")
-        if self.output_dir is not None and Path(self.output_dir).expanduser().exists():
-            raise InputError("output_dir", self.output_dir, "the folder exists; choose another or remove it")
+        if self.output_dir is not None:
+            check_absent(Path(self.output_dir).expanduser())
 
 
 def bench_ranking(config: BenchRankingConfig) -> dict[str, Any]:
@@ -129,7 +129,7 @@ def bench_ranking(config: BenchRankingConfig) -> dict[str, Any]:
     }
     if config.output_dir is not None:
         folder = Path(config.output_dir).expanduser()
-        folder.mkdir(parents=True)
+        make_folder(folder, "output_dir")
         (folder / "ranking.json").write_text(json.dumps(result, indent=2) + "\n")
         draw(folder / "ranking.png", result)
         console.say(f"wrote ranking.json and ranking.png into {folder}")

@@ -28,7 +28,7 @@ from accerl_lerobot.bench.host import host, ranged, spread
 from accerl_lerobot.bench.study import as_markdown, as_table, write
 from accerl_lerobot.bench.victims import DRIVER, EVERYTHING, Victim
 from accerl_lerobot.console import Console
-from accerl_lerobot.errors import InputError, check_absent
+from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.metrics import METRICS, MetricsLog, WandBConfig
 from accerl_lerobot.ranges import Positive, Range, Section, Seed
 from accerl_lerobot.replay.journal import EPISODES
@@ -99,7 +99,7 @@ def bench_soak(config: BenchSoakConfig) -> dict[str, Any]:
     root, console = Path(config.output_dir).expanduser().resolve(), Console()
     recipe = recipe_of(config.of)
     check_absent(root)
-    root.mkdir(parents=True)
+    make_folder(root, "output_dir")
     start = Start(config.recipe, recipe, config.stall_s, root, console)
     rng, orders = random.Random(config.seed), root / "run.orders"
     result: dict[str, Any] = {"config": asdict(config), "host": host(), "blocks": []}

@@ -20,7 +20,7 @@ from accerl_lerobot.bench.host import host, ranged, spread
 from accerl_lerobot.bench.study import as_markdown, as_table, write
 from accerl_lerobot.config import RunConfig, parse
 from accerl_lerobot.console import Console
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, expanded, make_folder
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.ranges import Positive, Repeats, Section
 from accerl_lerobot.replay.pacing import decisions_under_way
@@ -66,7 +66,7 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
     """
     from accerl_lerobot.preflight import check_policy, check_world
 
-    console, root = Console(), Path(config.output_dir).expanduser()
+    console, root = Console(), expanded(config.output_dir, "output_dir")
     run: RunConfig = parse(
         RunConfig,
         [
@@ -81,7 +81,7 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
         replace(run, launch=replace(run.launch, schedule=schedule))
     spec = check_world(run.env)
     tasks, history = spec.tasks, check_policy(run, spec)
-    root.mkdir(parents=True, exist_ok=True)
+    make_folder(root, "output_dir", again=True)
     result: dict[str, Any] = {"config": asdict(config), "host": host()}
     order = config.rounds * (*config.schedules, *reversed(config.schedules))
     blocks: list[Block] = []

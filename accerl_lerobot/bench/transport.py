@@ -29,7 +29,7 @@ from rich.table import Table
 from accerl_lerobot import ray_environment
 from accerl_lerobot.bench.host import host, spread
 from accerl_lerobot.console import Console
-from accerl_lerobot.errors import InputError, check_absent
+from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.ranges import Choice, Range, Repeats, Section, Seed
@@ -123,7 +123,7 @@ def bench_transport(config: BenchTransportConfig) -> dict[str, Any]:
     load = os.getloadavg()[0]
     result = {"config": asdict(config), "host": before, "load_after": load, "results": results}
     if folder is not None:
-        folder.mkdir(parents=True)
+        make_folder(folder, "output_dir")
         (folder / "transport.json").write_text(json.dumps(result, indent=2) + "\n")
         draw(folder / "transport.png", result)
         console.say(f"wrote transport.json and transport.png into {folder}")

@@ -28,7 +28,7 @@ from accerl_lerobot.bench.host import host, ranged, spread
 from accerl_lerobot.bench.study import as_markdown, as_table, named, write
 from accerl_lerobot.checkpoint import TRAINING_STATE, WEIGHTS
 from accerl_lerobot.console import Console
-from accerl_lerobot.errors import InputError, check_absent
+from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.ranges import Range, Repeats, Section, Seed
 from accerl_lerobot.weights.channel import Way
 
@@ -106,7 +106,7 @@ def bench_weights(config: BenchWeightsConfig) -> dict[str, Any]:
                     cells += _measure(config, size, readers)
     result = {"config": asdict(config), "cells": cells, "changed": changed, "host": [before, host()]}
     if root is not None:
-        root.mkdir(parents=True)
+        make_folder(root, "output_dir")
         write(root, "weights", result, as_markdown(_COLUMNS, _rows(result)), draw)
     return result
 

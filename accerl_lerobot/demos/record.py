@@ -70,6 +70,8 @@ class DemosConfig(Section, section="demos"):
     """Share of episodes that drift at random from early on and fail; for success and world models."""
     keep_failures: bool = False
     """Whether an expert episode that failed is kept; otherwise it is tried again with another seed."""
+    shifted: bool = False
+    """Whether ``env.shift`` holds for the demonstrations too; otherwise they show the world without it."""
     max_steps: Annotated[int, Range("[1, 1000000]")] = 500
     """Episode limit in env steps; the environment's own limit holds too."""
     seed: Seed = 0
@@ -99,6 +101,8 @@ def record_demos(env_config: EnvConfig, config: DemosConfig) -> Path:
     """
     root = check_free(config.root, "demos.")
     env_config = env_config.shortened(config.max_steps)
+    if not config.shifted:
+        env_config = env_config.nominal()
     world = make_world(env_config)
     spec = world.spec
     make_expert(env_config, world, spec.tasks[0])  # refuses an environment without experts before any work

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from accerl_lerobot import guardian
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, check_absent, expanded
 
 
 def check_target(root: str, repo_id: str, prefix: str = "") -> None:
@@ -33,11 +33,11 @@ def check_free(root: str, prefix: str = "") -> Path:
     """The folder of a dataset that is to be written.
 
     Raises:
-        InputError: it exists.
+        InputError: it exists, or cannot be created.
     """
-    if Path(root).exists():
-        raise InputError(f"{prefix}root", root, "exists already: remove it or name another folder")
-    return Path(root)
+    folder = expanded(root, f"{prefix}root")
+    check_absent(folder, f"{prefix}root")
+    return folder
 
 
 @contextmanager

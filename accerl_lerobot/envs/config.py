@@ -32,3 +32,8 @@ class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
     def shortened(self, max_steps: int) -> Self:
         """This config with its episode limit lowered to `max_steps`, if it is longer."""
         return dataclasses.replace(self, max_steps=min(self.max_steps, max_steps))
+
+    def nominal(self) -> Self:
+        """This config without deployment shift, where the environment knows any."""
+        shift = getattr(self, "shift", None)
+        return self if shift is None else dataclasses.replace(self, **{"shift": type(shift)()})

@@ -9,7 +9,8 @@ Importing this file loads neither MuJoCo nor metaworld.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from typing import Annotated, Any, Literal
 
@@ -19,6 +20,7 @@ from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec, checked_acti
 from accerl_lerobot.envs.config import EnvConfig
 from accerl_lerobot.envs.gl import import_mujoco, new_renderer
 from accerl_lerobot.envs.metaworld_tasks import description, resolve
+from accerl_lerobot.envs.shift import ShiftConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 from accerl_lerobot.ranges import Range
@@ -59,6 +61,7 @@ class MetaWorldConfig(EnvConfig):
     """Whether observations hold ``observation.environment_state``: MetaWorld's own 39 numbers, objects and
     goal included, and the share of `max_steps` gone. For ``algorithm.type=chunk_critic``; a policy that was
     trained without it never reads it."""
+    shift: ShiftConfig = field(default_factory=ShiftConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -114,6 +117,7 @@ class MetaWorld(World):
         self._steps = 0
         self._success = False
         self._done = True
+        self._delayed: deque[np.ndarray] = deque()
 
     @property
     def raw_observation(self) -> np.ndarray:
@@ -135,6 +139,7 @@ class MetaWorld(World):
         # older goal. This places the markers and leaves the physics as it is.
         import_mujoco().mj_kinematics(sim.model, sim.data)
         self._task, self._steps, self._success, self._done = task, 0, False, False
+        self._delayed = deque([np.zeros(ACTION_DIM, np.float32)] * self.config.shift.action_delay)
         return self._observe()
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
@@ -143,7 +148,8 @@ class MetaWorld(World):
         actions = checked_actions(actions, self.spec)
         sim, rewards, nonfinite = self._sims[self._task], [], False
         for action in actions:
-            self._raw, shaped, _, _, info = sim.step(action)
+            self._delayed.append(action)
+            self._raw, shaped, _, _, info = sim.step(self._delayed.popleft())
             self._steps += 1
             nonfinite = not (math.isfinite(shaped) and np.isfinite(self._raw).all()) or _diverged(sim)
             succeeded = not nonfinite and bool(info["success"])
@@ -203,6 +209,7 @@ class MetaWorld(World):
             model.vis.quality.shadowsize = 0
             model.light_castshadow[:] = 0
             model.mat_reflectance[:] = 0
+        self.config.shift.apply(sim, self.config.cameras)
         self._eyes[task] = new_renderer(model, self.config.image_size, self.config.image_size)
         return sim
 

@@ -102,7 +102,7 @@ def _is_last(folder: Path, run: Path) -> bool:
 
 def _recipe(path: Path) -> dict[str, Any]:
     try:
-        tree = yaml.safe_load(path.read_text())
+        tree = yaml.safe_load(path.read_text()) if path.is_file() else None
     except (OSError, ValueError, yaml.YAMLError):
         return {}
     return tree if isinstance(tree, dict) else {}

@@ -63,9 +63,10 @@ def recognise(folder: Path, field: str = "path") -> str:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The mapping in a JSON file; empty if there is none."""
+    """The mapping in a JSON file; empty if there is none, or a pipe or device in its place."""
     try:
-        content = json.loads(path.read_text()) if path.stat().st_size <= JSON_MOST else None
+        readable = path.is_file() and path.stat().st_size <= JSON_MOST
+        content = json.loads(path.read_text()) if readable else None
     except (OSError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}

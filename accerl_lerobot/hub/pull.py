@@ -26,7 +26,7 @@ from huggingface_hub.hf_api import RepoFile
 from accerl_lerobot.checkpoint import CHECKPOINTS, LAST, PRETRAINED, defect, relocate, write_manifest
 from accerl_lerobot.checkpoint import CONFIG as RECIPE
 from accerl_lerobot.checkpoint import MANIFEST as OF_CHECKPOINT
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.hub.config import REPO_TYPES, PullConfig
 from accerl_lerobot.hub.contents import RECORD
 from accerl_lerobot.hub.kinds import POLICY, RUN, recognise
@@ -53,9 +53,8 @@ def pull(config: PullConfig) -> dict[str, Any]:
     Raises:
         InputError: it is not there, not to be had, or not what was pushed; there is no new folder then.
     """
-    repo_id, home = str(config.repo_id), Path(str(config.output_dir)).expanduser().absolute()
-    if home.exists() or home.is_symlink():
-        raise InputError("output_dir", str(home), "the folder exists; choose another or remove it")
+    repo_id, home = str(config.repo_id), expanded(str(config.output_dir), "output_dir").absolute()
+    check_absent(home)
     with told(repo_id, config.revision, writing=False) as allowance:
         api = HfApi()
         kind_of_repo, commit = _resolve(api, config)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -58,6 +59,14 @@ class TuningConfig(Section, section="policy.tuning"):
     """lora: regular expression that must match the whole name of a linear layer inside the policy; those
     inside PyTorch's own attention are passed over, as it reads their weights without calling them. None: what
     LeRobot's own PEFT training adapts in this policy."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        try:
+            re.compile(self.targets or "")
+        except re.error as error:
+            remedy = f"not a regular expression: {error}"
+            raise InputError("policy.tuning.targets", self.targets, remedy) from error
 
 
 @dataclass(frozen=True, kw_only=True)

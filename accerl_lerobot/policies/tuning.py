@@ -75,10 +75,7 @@ def _inject(policy: Any, config: TuningConfig) -> None:
         raise InputError("policy.tuning.targets", None, remedy)
     # Not its subclasses: attention reads the weight of its own without calling it, past any adapter.
     linear = [name for name, module in policy.named_modules() if type(module) is nn.Linear]
-    try:
-        matching = [name for name in linear if re.fullmatch(targets, name)]
-    except re.error as error:
-        raise InputError("policy.tuning.targets", targets, f"not a regular expression: {error}") from error
+    matching = [name for name in linear if re.fullmatch(targets, name)]
     if not matching:
         some = ", ".join(linear[:: max(1, len(linear) // 3)][:3])
         remedy = f"matches none of the policy's {len(linear)} linear layers, such as {some}"

@@ -21,7 +21,7 @@ from urllib.parse import quote
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from accerl_lerobot import __version__
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.report.blocks import Page
 from accerl_lerobot.report.charts import SPANS
 from accerl_lerobot.report.comparison import comparison_page
@@ -50,6 +50,7 @@ def write_report(config: ReportConfig, recipes: Mapping[str, type[Any]]) -> Path
     Raises:
         InputError: a run cannot be read, runs are of different kinds, or the page has no place.
     """
+    output = None if config.output is None else expanded(config.output, "output")
     runs = [read_run(Path(name).expanduser()) for name in config.runs]
     if len({run.path.resolve() for run in runs}) < len(runs):
         raise InputError("runs", ",".join(config.runs), "name each run once")
@@ -57,9 +58,7 @@ def write_report(config: ReportConfig, recipes: Mapping[str, type[Any]]) -> Path
     if len(verbs) > 1:
         remedy = f"a page compares runs of one kind; these are of accerl {' and '.join(verbs)}"
         raise InputError("runs", ",".join(config.runs), remedy)
-    if config.output is not None:
-        output = Path(config.output).expanduser()
-    else:
+    if output is None:
         output = runs[0].path / NAME if len(runs) == 1 else Path(NAME)
     _check_place(output)
     page = page_of(runs, recipes, time.time())

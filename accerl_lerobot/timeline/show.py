@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from accerl_lerobot.checkpoint import write_atomically
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.timeline.chrome import trace
 from accerl_lerobot.timeline.config import TimelineConfig
 from accerl_lerobot.timeline.picture import MARK, draw
@@ -40,10 +40,9 @@ def show_timelines(config: TimelineConfig) -> dict[str, Any]:
     Raises:
         InputError: a run has no timeline, the window is not within one, or the picture has no place.
     """
+    picture = None if config.output is None else expanded(config.output, "output")
     timelines = [read_timeline(Path(name).expanduser()) for name in config.runs]
-    if config.output is not None:
-        picture = Path(config.output).expanduser()
-    else:
+    if picture is None:
         picture = timelines[0].run / PICTURE if len(timelines) == 1 else Path(PICTURE)
     _check_place(picture)
     windows = choose_windows(timelines, config.start_s, config.seconds)

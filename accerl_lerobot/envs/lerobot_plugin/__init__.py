@@ -26,6 +26,7 @@ from lerobot.envs.utils import freeze_after_episode_end
 
 from accerl_lerobot.envs.metaworld import ACTION_DIM, FPS, STATE_DIM, MetaWorld, MetaWorldConfig
 from accerl_lerobot.envs.metaworld_tasks import description
+from accerl_lerobot.envs.shift import ShiftConfig
 from accerl_lerobot.experience import Observation
 
 VIDEO_SIZE = 256
@@ -98,6 +99,7 @@ class AccerlMetaWorldEnvConfig(EnvConfig):
     image_size: int = 64
     max_steps: int = 500
     lighting: Literal["cheap", "default"] = "cheap"
+    shift: dict[str, Any] = field(default_factory=dict)
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
 
@@ -122,6 +124,7 @@ class AccerlMetaWorldEnvConfig(EnvConfig):
             image_size=self.image_size,
             max_steps=self.max_steps,
             lighting=self.lighting,
+            shift=ShiftConfig(**self.shift),
         )
 
     @property

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Deployment shift: each field changes what it names and nothing else."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.demos.record import SIDECAR, DemosConfig, record_demos
+from accerl_lerobot.envs import MetaWorld, MetaWorldConfig
+from accerl_lerobot.envs.shift import ShiftConfig
+from accerl_lerobot.errors import InputError
+
+pytest.importorskip("metaworld")
+TASK = "push-v3"
+IMAGE = "observation.images.corner2"
+ACTIONS = np.random.default_rng(0).uniform(-1, 1, (30, 4)).astype(np.float32)
+
+
+def world(**shift: Any) -> MetaWorld:
+    return MetaWorld(MetaWorldConfig(task=TASK, shift=ShiftConfig(**shift)))
+
+
+def played(of: MetaWorld, actions: np.ndarray = ACTIONS, seed: int = 5) -> tuple[np.ndarray, np.ndarray]:
+    """MetaWorld's 39 numbers after the reset and each action, and the last frame."""
+    frame = of.reset(seed, TASK)[IMAGE]
+    states = [of.raw_observation]
+    for action in actions:
+        frame = of.step_chunk(action[None]).observation[IMAGE]
+        states.append(of.raw_observation)
+    return np.stack(states), frame
+
+
+def test_pictures_change_with_camera_and_light_and_physics_does_not():
+    states, frame = played(world())
+    for shift in ({"camera": (0.0, 0.1, 0.0)}, {"light": 0.5}):
+        others, other = played(world(**shift))
+        np.testing.assert_array_equal(others, states)
+        assert np.abs(other.astype(int) - frame).mean() > 3
+    assert played(world(light=0.5))[1].mean() < 0.8 * frame.mean() < frame.mean()
+
+
+def test_friction_scales_that_of_every_surface():
+    nominal, slippery = world(), world(friction=0.25)
+    for each in (nominal, slippery):
+        each.reset(0, TASK)
+    a, b = (each._sims[TASK].model.geom_friction for each in (nominal, slippery))
+    np.testing.assert_allclose(b[:, 0], 0.25 * a[:, 0])
+    np.testing.assert_array_equal(b[:, 1:], a[:, 1:])
+
+
+def test_an_action_comes_so_many_steps_late_in_every_episode():
+    late = world(action_delay=3)
+    first = np.concatenate([np.zeros((3, 4), np.float32), ACTIONS[:-3]])
+    expected, _ = played(world(), first)
+    for _ in range(2):  # nothing is left over from the episode before
+        np.testing.assert_array_equal(played(late)[0], expected)
+
+
+def test_starts_come_from_wider_ranges():
+    nominal, wide = world(), world(start_range=2.0)
+    seen: dict[str, list[np.ndarray]] = {"nominal": [], "wide": []}
+    for seed in range(40):
+        for name, each in (("nominal", nominal), ("wide", wide)):
+            each.reset(seed, TASK)
+            seen[name].append(each._sims[TASK]._last_rand_vec)
+    space = nominal._sims[TASK]._random_reset_space
+    half = (space.high - space.low) / 2
+    drawn = np.stack(seen["wide"]) - (space.high + space.low) / 2
+    assert (np.abs(drawn) <= 2 * half + 1e-9).all() and (np.abs(drawn) > half + 1e-9).any(0)[:2].all()
+    assert (np.abs(np.stack(seen["nominal"]) - (space.high + space.low) / 2) <= half + 1e-9).all()
+
+
+def test_demonstrations_show_the_world_without_shift_unless_told(tmp_path: Path):
+    config = MetaWorldConfig(task="drawer-open-v3", shift=ShiftConfig(light=0.5))
+    for shifted, light in ((False, 1.0), (True, 0.5)):
+        root = tmp_path / str(shifted)
+        record_demos(config, DemosConfig(episodes=1, root=str(root), processes=1, shifted=shifted))
+        assert json.loads((root / SIDECAR).read_text())["env"]["shift"]["light"] == light
+
+
+def test_a_value_out_of_range_is_refused():
+    with pytest.raises(InputError, match=r"env\.shift\.action_delay=-1: use a whole number from 0 to 100"):
+        ShiftConfig(action_delay=-1)
