@@ -116,7 +116,8 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         """See the base class."""
         assert self._critic is not None
         algorithm = self.algorithm
-        chunk = self.adapter.family.propose(encoded, self.tensor("noise", rows)).float()
+        with self.adapter.autocast():
+            chunk = self.adapter.family.propose(encoded, self.tensor("noise", rows)).float()
         proposal, state = self.tensor("proposal", rows), self.tensor("state", rows)
         q = self._critic(state, chunk)
         pessimistic = q.mean(0) - algorithm.pessimism * q.std(0)

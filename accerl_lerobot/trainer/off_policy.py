@@ -156,8 +156,8 @@ class OffPolicyUpdate:
         with self.adapter.autocast():
             encoded = self.adapter.encode(*self.memory.observations(rows))
             error = self.adapter.family.imitation_loss(encoded, self.tensor("chunk", rows)).float()
-            imitation = (error * success).sum() / success.sum().clamp(min=1)
-            loss, metrics = self.loss(rows, encoded, imitation)
+        imitation = (error * success).sum() / success.sum().clamp(min=1)
+        loss, metrics = self.loss(rows, encoded, imitation)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         norm = float(torch.nn.utils.clip_grad_norm_(self._policy, self.config.grad_clip))

@@ -275,6 +275,25 @@ def test_without_an_anchor_the_policy_moves_further(tiny_checkpoint: Path):
     assert moved[0] > 2 * moved[1]
 
 
+def test_the_critic_computes_in_fp32_beside_a_policy_in_bf16(
+    tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+):
+    seen = set()
+    forward = Critic.forward
+
+    def spy(self: Critic, *inputs: Any) -> torch.Tensor:
+        q = forward(self, *inputs)
+        seen.add((torch.is_autocast_enabled("cpu"), q.dtype))
+        return q
+
+    monkeypatch.setattr(Critic, "forward", spy)
+    adapter = load_adapter(PolicyConfig(path=str(tiny_checkpoint), device="cpu", precision="bf16"))
+    config = TrainerConfig(warmup_updates=0, value_warmup_updates=0)
+    update = ChunkCriticUpdate(adapter, ChunkCriticConfig(policy_steps=0.5), config)
+    metrics = update.step([episode([0.0, 0.0, 0.0, 1.0])])
+    assert np.isfinite(metrics["policy_loss"]) and seen == {(False, torch.float32)}
+
+
 def test_what_is_not_finite_is_skipped_and_ends_the_run(tiny_checkpoint: Path):
     update = learner(tiny_checkpoint, ChunkCriticConfig(policy_steps=1.0), max_nonfinite=3)
     before = update.adapter.export_trainable()
