@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import cast
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.safety import MIB, Origin, brief, tensor_shapes
+from accerl_lerobot.safety import MIB, Origin, brief, safe_join, tensor_shapes
 
 SLACK = 1536 * MIB
 """Bytes that a child may take beside its weights."""
@@ -65,7 +65,9 @@ def rehearse[T](task: Callable[[], T], folder: Path, origin: Origin) -> T:
     numbers = sum(
         math.prod(shape)
         for path in sorted(folder.rglob("*.safetensors"))
-        for _, shape in tensor_shapes(path, origin).values()
+        for _, shape in tensor_shapes(
+            safe_join(folder, path.relative_to(folder).as_posix(), origin), origin
+        ).values()
     )
     memory, cpu_s = SLACK + TIMES * 4 * numbers, round(CPU_S + CPU_S_PER_NUMBER * numbers)
     reader, writer = os.pipe()

@@ -226,7 +226,7 @@ def read_recipe(path: Path) -> dict[str, Any]:
     try:
         if (size := path.stat().st_size) > LARGEST_RECIPE:
             raise InputError("config_path", str(path), f"{size:,} bytes; a recipe has a few thousand")
-        tree = _loaded(path.read_text())
+        tree = load_yaml(path.read_text())
     except InputError:
         raise
     except (yaml.YAMLError, ValueError) as error:
@@ -290,7 +290,12 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _loaded(text: str) -> Any:
+def load_yaml(text: str) -> Any:
+    """The value in a YAML text, within `DEEPEST` and `MOST_NODES`.
+
+    Raises:
+        yaml.YAMLError: it is not good YAML, or beyond these bounds.
+    """
     try:
         return yaml.load(text, _Loader)
     except yaml.YAMLError:
@@ -316,7 +321,7 @@ def _value(text: str) -> Any:
     if text == "":
         return text
     try:
-        return _loaded(text)
+        return load_yaml(text)
     except yaml.YAMLError:
         return text
 

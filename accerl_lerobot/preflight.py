@@ -345,7 +345,7 @@ def check_disk(folder: str | None, needed: int, field: str = "output_dir") -> No
     Raises:
         InputError: see above.
     """
-    path = Path(folder or ".").expanduser().absolute()
+    path = expanded(folder or ".", field).absolute()
     while not path.exists():
         path = path.parent
     free = shutil.disk_usage(path).free

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import fcntl
-import json
 import shlex
 import signal
 from collections.abc import Iterator
@@ -16,6 +15,7 @@ from accerl_lerobot.checkpoint import CHECKPOINTS, CONFIG, LAST, SUMMARY
 from accerl_lerobot.config import RunConfig, encode
 from accerl_lerobot.errors import InputError, make_folder
 from accerl_lerobot.parsing import CONSENT, decode, read_recipe
+from accerl_lerobot.safety import Origin, check_number, read_json
 from accerl_lerobot.stopping import StoppedError, Stopping
 
 LOCK = ".lock"
@@ -72,6 +72,7 @@ def begun_run(path: Path | None, config: RunConfig) -> Begun:
         directory, checkpoint = folders[2], folders[0].name
     if not (directory / CONFIG).is_file() or not (directory / LOCK).is_file():
         raise InputError("config_path", str(path), f"no run has been begun there; {how}")
+    origin = Origin("config_path", str(path))
     before: RunConfig = decode(RunConfig, read_recipe(directory / CONFIG))
     for name, (was, now) in _differences(encode(before), encode(config), "").items():
         if not was and name.rpartition(".")[2] in CONSENT:
@@ -82,9 +83,12 @@ def begun_run(path: Path | None, config: RunConfig) -> Begun:
     summary, checkpoints = directory / SUMMARY, directory / CHECKPOINTS
     newest = (checkpoints / checkpoint).resolve() == (checkpoints / LAST).resolve()
     # From an earlier checkpoint there are updates left to make.
-    if newest and summary.is_file() and json.loads(summary.read_text())["updates"] >= config.trainer.updates:
-        remedy = f"the run {directory} has made them, and has ended; ask for more"
-        raise InputError("trainer.updates", config.trainer.updates, remedy)
+    if newest and summary.is_file():
+        made: Any = read_json(summary, origin).get("updates")
+        check_number(made, 0, 1e9, f"{SUMMARY}: updates", origin)
+        if made >= config.trainer.updates:
+            remedy = f"the run {directory} has made them, and has ended; ask for more"
+            raise InputError("trainer.updates", config.trainer.updates, remedy)
     return Begun(directory, checkpoint)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 import re
 import stat
 import string
@@ -70,16 +71,35 @@ def safe_join(root: Path, name: object, origin: Origin) -> Path:
     if why := unsafe_name(name):
         raise origin.refuse(str(name)[:PATH_MOST], f"{why}; only files inside the folder are read")
     path = root / str(name)
+    _check_link(path, root, str(name), origin)
+    return path
+
+
+def _check_link(path: Path, root: Path, name: str, origin: Origin) -> None:
     try:
         real, home = path.resolve(), root.resolve()
     except (OSError, RuntimeError, ValueError) as error:
-        raise origin.refuse(str(name), "its links go in a circle; put the file itself there") from error
+        raise origin.refuse(name, "its links go in a circle; put the file itself there") from error
     homes = [home]
     if home.parent.name == "snapshots" and re.match(r"(models|datasets)--", home.parent.parent.name):
         homes.append(home.parent.parent / "blobs")
     if not any(real.is_relative_to(home) for home in homes):
-        raise origin.refuse(str(name), "a link that leads out of the folder; put the file itself there")
-    return path
+        raise origin.refuse(name, "a link that leads out of the folder; put the file itself there")
+
+
+def check_folder(folder: Path, origin: Origin) -> None:
+    """Refuses a run's folder that holds more than files and folders of its own.
+
+    Raises:
+        InputError: a link leads out of it, or there is a pipe or a device, reading which may never end.
+    """
+    for at, folders, files in os.walk(folder):
+        for path in (Path(at, name) for name in (*folders, *files)):
+            name = path.relative_to(folder).as_posix()
+            _check_link(path, folder, name, origin)
+            with contextlib.suppress(FileNotFoundError):  # the run may still be going on
+                if not (path.is_dir() or stat.S_ISREG(path.stat().st_mode)):
+                    raise origin.refuse(name, "neither a file nor a folder; remove it")
 
 
 def check_name(name: object, what: str, origin: Origin) -> str:

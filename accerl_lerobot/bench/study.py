@@ -24,7 +24,7 @@ from rich.table import Table
 from accerl_lerobot.checkpoint import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.console import Console
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate, mean_interval
 from accerl_lerobot.ranges import Range, Section, Seed, Steps
@@ -217,7 +217,7 @@ class Study:
     """
 
     def __init__(self, config: StudyConfig, cells: Sequence[Cell], common: Sequence[str] = ()) -> None:
-        self.config, self.root = config, Path(config.output_dir).expanduser().resolve()
+        self.config, self.root = config, expanded(config.output_dir, "output_dir").resolve()
         self.common = list(common)
         self.cells = list(cells)
         self.starts = {

@@ -42,6 +42,7 @@ from accerl_lerobot.experience import IMAGINED, REAL
 from accerl_lerobot.parsing import decode, drop_consents, read_recipe
 from accerl_lerobot.ranges import Choice, Range, Section, Steps
 from accerl_lerobot.replay.journal import EPISODES, Done, read_journal, whole_episodes
+from accerl_lerobot.safety import Origin, check_folder
 from accerl_lerobot.world_model.recorded import DREAMS, read_dreams
 
 SIDECAR = Path("meta") / "accerl_rollouts.json"
@@ -94,6 +95,7 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
     run, root = Path(str(config.path)).expanduser(), check_free(config.root)
     if not (run / CONFIG).is_file():
         raise InputError("path", str(run), f"no run in it: there is no {CONFIG}")
+    check_folder(run, Origin("path", str(run)))
     settings = _settings(run, config.hub_path)
     if config.source == IMAGINED:
         return _export_dreams(settings, config, run, root, console)

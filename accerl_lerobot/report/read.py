@@ -19,6 +19,8 @@ import yaml
 from accerl_lerobot.checkpoint import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.metrics import METRICS
+from accerl_lerobot.parsing import LARGEST_RECIPE, load_yaml
+from accerl_lerobot.safety import Origin, check_folder
 from accerl_lerobot.world_model.imagination_config import FILMS
 
 Record = dict[str, Any]
@@ -134,6 +136,9 @@ def read_run(path: Path) -> Run:
         raise InputError(
             "runs", str(path), f"no run in it: there is no {CONFIG}, which every run writes first"
         )
+    check_folder(path, Origin("runs", str(path)))
+    if (size := config_path.stat().st_size) > LARGEST_RECIPE:
+        raise InputError("runs", str(config_path), f"{size:,} bytes; a recipe has a few thousand")
     text = _text(config_path)
     config = _mapping(config_path, text)
     verb = _verb(config)
@@ -200,7 +205,7 @@ def _text(path: Path) -> str:
 def _mapping(path: Path, text: str) -> Record:
     """YAML and JSON alike, as JSON is YAML; but large JSON is read faster as such."""
     try:
-        tree = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
+        tree = json.loads(text) if path.suffix == ".json" else load_yaml(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         remedy = f"damaged ({str(error).splitlines()[0]}); restore it, or remove it"
         raise InputError("runs", str(path), remedy) from error

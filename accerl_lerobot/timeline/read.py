@@ -11,6 +11,7 @@ import numpy as np
 
 from accerl_lerobot.checkpoint import CONFIG
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.safety import Origin, check_folder
 from accerl_lerobot.timeline.parts import Section, read_sections
 from accerl_lerobot.timeline.states import CHECKPOINT, ROLES, STATES, TIMELINE, TRAINING, role_of
 
@@ -159,6 +160,7 @@ def read_timeline(run_directory: Path) -> Timeline:
     if not run_directory.is_dir():
         remedy = "a file; name the folder of a run" if run_directory.exists() else "no such folder"
         raise InputError("runs", str(run_directory), remedy)
+    check_folder(run_directory, Origin("runs", str(run_directory)))
     sections = read_sections(folder)
     if not sections and not (run_directory / CONFIG).is_file() and not folder.is_dir():
         remedy = f"no run in it: there is no {CONFIG}, which every run writes first"
