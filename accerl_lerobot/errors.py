@@ -98,6 +98,17 @@ def make_folder(path: Path, field: str, *, again: bool = False) -> None:
         raise InputError(field, str(path), f"cannot be created: {why}; name another folder") from error
 
 
+def output_folder(path: str) -> Path:
+    """The folder ``output_dir`` names, created if it is not there; results of before are kept in it.
+
+    Raises:
+        InputError: it cannot be created.
+    """
+    folder = expanded(path, "output_dir")
+    make_folder(folder, "output_dir", again=True)
+    return folder
+
+
 @contextmanager
 def kept_traceback(directory: Path) -> Iterator[None]:
     """Appends the traceback of an unexpected error to ``error.log`` in a run's folder, and adds a note that

@@ -62,13 +62,9 @@ def rehearse[T](task: Callable[[], T], folder: Path, origin: Origin) -> T:
     """
     if not sys.platform.startswith("linux"):
         return task()
-    numbers = sum(
-        math.prod(shape)
-        for path in sorted(folder.rglob("*.safetensors"))
-        for _, shape in tensor_shapes(
-            safe_join(folder, path.relative_to(folder).as_posix(), origin), origin
-        ).values()
-    )
+    names = (path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*.safetensors")))
+    headers = (tensor_shapes(safe_join(folder, name, origin), origin) for name in names)
+    numbers = sum(math.prod(shape) for header in headers for _, shape in header.values())
     memory, cpu_s = SLACK + TIMES * 4 * numbers, round(CPU_S + CPU_S_PER_NUMBER * numbers)
     reader, writer = os.pipe()
     parent = os.getpid()

@@ -224,8 +224,7 @@ def read_recipe(path: Path) -> dict[str, Any]:
         hint = f"did you mean {' or '.join(str(path.parent / name) for name in near)}?" if near else ""
         raise InputError("config_path", str(path), f"no such file; {hint or 'see recipes/'}")
     try:
-        if (size := path.stat().st_size) > LARGEST_RECIPE:
-            raise InputError("config_path", str(path), f"{size:,} bytes; a recipe has a few thousand")
+        check_recipe_size(path, "config_path")
         tree = load_yaml(path.read_text())
     except InputError:
         raise
@@ -288,6 +287,17 @@ class _Loader(yaml.SafeLoader):
                 )
             seen.add(key_node.value)
         return super().construct_mapping(node, deep)
+
+
+def check_recipe_size(path: Path, field: str) -> None:
+    """Refuses a recipe of more than `LARGEST_RECIPE` bytes, which is never read.
+
+    Raises:
+        InputError: names `field` and the size.
+        OSError: the file cannot be looked at.
+    """
+    if (size := path.stat().st_size) > LARGEST_RECIPE:
+        raise InputError(field, str(path), f"{size:,} bytes; a recipe has a few thousand")
 
 
 def load_yaml(text: str) -> Any:

@@ -16,7 +16,7 @@ from typing import Any
 
 from accerl_lerobot.bench.study import Cell, Study, StudyConfig, as_markdown, named, write
 from accerl_lerobot.console import Console
-from accerl_lerobot.errors import InputError
+from accerl_lerobot.errors import InputError, output_folder
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate, mean_interval
 from accerl_lerobot.parsing import parse
@@ -57,8 +57,7 @@ def few_shot(config: FewShotConfig) -> dict[str, Any]:
         InputError: see `Study.run`.
         RuntimeError: see there.
     """
-    console, root, rows = Console(), Path(config.output_dir).expanduser().resolve(), []
-    root.mkdir(parents=True, exist_ok=True)
+    console, root, rows = Console(), output_folder(config.output_dir).resolve(), []
     for task in config.tasks:
         cells = [
             Cell(
@@ -72,8 +71,8 @@ def few_shot(config: FewShotConfig) -> dict[str, Any]:
         ]
         study = Study(replace(config, output_dir=str(root / task)), cells, [f"--env.task={task}"])
         results = study.run(console)
-        for seed, start in results.starts.items():
-            rows.append(_row({"task": task, "algorithm": "sft"}, seed, start, start))
+        sft = {"task": task, "algorithm": "sft"}
+        rows += [_row(sft, seed, start, start) for seed, start in results.starts.items()]
         rows += [_row(c.of, c.seed, results.starts[c.seed], summary) for c, summary in results.cells]
         result = {"config": asdict(config), "rows": rows, "means": means(rows)}
         write(root, "few_shot", result, markdown(result), draw)
@@ -124,9 +123,8 @@ def draw(path: Path, result: dict[str, Any]) -> None:
 
 def _row(of: dict[str, Any], seed: int, start: dict[str, Any], summary: dict[str, Any]) -> dict[str, Any]:
     shown = {"sft": start["success_after"], "success": summary["success_after"], "n": summary["n_after"]}
-    trained = {} if start is summary else summary
-    counts = {"episodes": trained.get("episodes_explored", 0), "env_steps": trained.get("env_steps", 0)}
-    return of | {"seed": seed} | shown | counts | {"rl_s": trained.get("rl_s", 0.0)}
+    counts = {"episodes": summary["episodes_explored"], "env_steps": summary["env_steps"]}
+    return of | {"seed": seed} | shown | counts | {"rl_s": summary["rl_s"]}
 
 
 def _rate(success: float, n: int) -> str:

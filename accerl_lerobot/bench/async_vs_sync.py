@@ -27,7 +27,7 @@ from accerl_lerobot.bench.machinery import MachineryConfig
 from accerl_lerobot.bench.study import as_markdown, as_table, write
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs.simulated import read_trace
-from accerl_lerobot.errors import InputError, expanded, make_folder
+from accerl_lerobot.errors import InputError, output_folder
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate
@@ -82,8 +82,7 @@ def bench_async_vs_sync(config: BenchAsyncVsSyncConfig) -> dict[str, Any]:
     """
     for trace in config.traces:
         read_trace(trace, "traces")
-    console, root = Console(), expanded(config.output_dir, "output_dir")
-    make_folder(root, "output_dir", again=True)
+    console, root = Console(), output_folder(config.output_dir)
     result: dict[str, Any] = {"config": asdict(config), "host": host(), "floors": floors(), "laws": []}
     every = laws(config)
     with console.stage("laws", total=len(every)) as stage:

@@ -20,7 +20,7 @@ from accerl_lerobot.bench.machinery import MachineryConfig
 from accerl_lerobot.bench.study import as_markdown, as_table, write
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs.simulated import read_trace
-from accerl_lerobot.errors import InputError, expanded, make_folder
+from accerl_lerobot.errors import InputError, output_folder
 from accerl_lerobot.inference.batcher import quantile
 from accerl_lerobot.ranges import NonNegative, Positive, Range, Repeats
 from accerl_lerobot.replay.turns import ASYNCHRONOUS
@@ -58,8 +58,7 @@ def bench_batching(config: BenchBatchingConfig) -> dict[str, Any]:
     """
     if config.latency_trace is not None:
         read_trace(config.latency_trace)
-    console, root = Console(), expanded(config.output_dir, "output_dir")
-    make_folder(root, "output_dir", again=True)
+    console, root = Console(), output_folder(config.output_dir)
     result: dict[str, Any] = {"config": asdict(config), "host": host(), "floors": floors()}
     rules = {"one at a time": replace(config, max_batch=1, max_wait_ms=0.0)}
     rules |= {_name(wait): replace(config, max_wait_ms=wait) for wait in config.waits_ms}

@@ -24,7 +24,7 @@ from accerl_lerobot.bench.study import as_markdown, as_table, write
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, World, make_world
 from accerl_lerobot.envs.simulated import RESET
-from accerl_lerobot.errors import expanded, make_folder
+from accerl_lerobot.errors import output_folder
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.ranges import Range, Section, Seed
 from accerl_lerobot.seeds import train_seed
@@ -57,8 +57,7 @@ def bench_latency(config: BenchLatencyConfig) -> dict[str, Any]:
         one decision's duration with the next, None where they do not vary), ``trace`` (the file), ``config``
         and ``host``.
     """
-    console, root = Console(), expanded(config.output_dir, "output_dir")
-    make_folder(root, "output_dir", again=True)
+    console, root = Console(), output_folder(config.output_dir)
     world = make_world(config.env)
     try:
         with console.stage("decisions", total=config.decisions) as stage:

@@ -22,7 +22,7 @@ from accerl_lerobot.bench.machinery import MachineryConfig
 from accerl_lerobot.bench.study import as_markdown, as_table, write
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs.simulated import read_trace
-from accerl_lerobot.errors import InputError, expanded, make_folder
+from accerl_lerobot.errors import InputError, output_folder
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.ranges import NonNegative, Positive, Range, Repeats
 from accerl_lerobot.replay.turns import ASYNCHRONOUS
@@ -61,8 +61,7 @@ def bench_scaling(config: BenchScalingConfig) -> dict[str, Any]:
     """
     if config.latency_trace is not None:
         read_trace(config.latency_trace)
-    console, root = Console(), expanded(config.output_dir, "output_dir")
-    make_folder(root, "output_dir", again=True)
+    console, root = Console(), output_folder(config.output_dir)
     result: dict[str, Any] = {"config": asdict(config), "host": host(), "floors": floors()}
     blocks: dict[int, list[Block]] = {n: [] for n in config.counts}
     forth, back = config.blocks - config.blocks // 2, config.blocks // 2

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from typing import Annotated, Any, Literal
 
@@ -70,6 +70,10 @@ class MetaWorldConfig(EnvConfig):
             raise InputError("env.camera", self.camera, "name each camera once, separated by commas")
         if unknown := [name for name in self.cameras if name not in CAMERAS]:
             raise InputError("env.camera", self.camera, f"{unknown[0]!r} is none of: {', '.join(CAMERAS)}")
+
+    def nominal(self) -> MetaWorldConfig:
+        """See the base class."""
+        return replace(self, shift=ShiftConfig())
 
     @property
     def tasks(self) -> tuple[str, ...]:

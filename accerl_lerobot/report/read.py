@@ -19,7 +19,7 @@ import yaml
 from accerl_lerobot.checkpoint import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.metrics import METRICS
-from accerl_lerobot.parsing import LARGEST_RECIPE, load_yaml
+from accerl_lerobot.parsing import check_recipe_size, load_yaml
 from accerl_lerobot.safety import Origin, check_folder
 from accerl_lerobot.world_model.imagination_config import FILMS
 
@@ -137,8 +137,7 @@ def read_run(path: Path) -> Run:
             "runs", str(path), f"no run in it: there is no {CONFIG}, which every run writes first"
         )
     check_folder(path, Origin("runs", str(path)))
-    if (size := config_path.stat().st_size) > LARGEST_RECIPE:
-        raise InputError("runs", str(config_path), f"{size:,} bytes; a recipe has a few thousand")
+    check_recipe_size(config_path, "runs")
     text = _text(config_path)
     config = _mapping(config_path, text)
     verb = _verb(config)
