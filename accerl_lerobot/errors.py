@@ -14,8 +14,9 @@ from pathlib import Path
 
 TOKEN = re.compile(r"\bhf_\w{6,}")
 """A token of the Hub, which somebody may have typed where it does not belong; it is not repeated."""
-LONGEST = 200
-"""Characters of a value that are shown; a whole room may have been given where a number belongs."""
+LONGEST, LONGEST_REMEDY = 200, 1200
+"""Characters of a value and of a remedy that are shown; a whole room may have been given where a number
+belongs, and some remedies repeat a part of it."""
 
 
 class InputError(ValueError):
@@ -37,10 +38,12 @@ class InputError(ValueError):
         super().__init__(field, value, remedy)
 
     def __str__(self) -> str:
-        value = repr(self.value)
+        value, remedy, half = repr(self.value), self.remedy, LONGEST_REMEDY // 2
         if len(value) > LONGEST:
             value = f"{value[: LONGEST - 1]}…"
-        return TOKEN.sub("<token>", " ".join(f"{self.field}={value}: {self.remedy}".split()))
+        if len(remedy) > LONGEST_REMEDY:  # what to do stands at its end
+            remedy = f"{remedy[:half]}…{remedy[-half:]}"
+        return TOKEN.sub("<token>", " ".join(f"{self.field}={value}: {remedy}".split()))
 
 
 def check_absent(path: Path, field: str = "output_dir") -> None:

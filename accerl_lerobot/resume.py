@@ -15,7 +15,7 @@ from accerl_lerobot.checkpoint import CHECKPOINTS, CONFIG, LAST, SUMMARY
 from accerl_lerobot.config import RunConfig, encode
 from accerl_lerobot.errors import InputError, make_folder
 from accerl_lerobot.parsing import CONSENT, decode, read_recipe
-from accerl_lerobot.safety import Origin, check_number, read_json
+from accerl_lerobot.safety import Origin, check_folder, check_number, read_json
 from accerl_lerobot.stopping import StoppedError, Stopping
 
 LOCK = ".lock"
@@ -73,6 +73,7 @@ def begun_run(path: Path | None, config: RunConfig) -> Begun:
     if not (directory / CONFIG).is_file() or not (directory / LOCK).is_file():
         raise InputError("config_path", str(path), f"no run has been begun there; {how}")
     origin = Origin("config_path", str(path))
+    check_folder(directory, origin)
     before: RunConfig = decode(RunConfig, read_recipe(directory / CONFIG))
     for name, (was, now) in _differences(encode(before), encode(config), "").items():
         if not was and name.rpartition(".")[2] in CONSENT:

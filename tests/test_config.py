@@ -303,6 +303,8 @@ def test_groups_serve_either_kind_of_advantage() -> None:
 def test_long_values_are_shortened() -> None:
     text = str(InputError("a", "x" * 1000, "shorten\nit"))
     assert len(text) < 250 and text.endswith("…: shorten it")
+    text = str(InputError("a", 1, f"{'y' * 5000} is none; use 2"))
+    assert len(text) < 1300 and text.endswith("y is none; use 2")
 
 
 @pytest.mark.parametrize("size", [0, -1, 2.0, "2", True, None])

@@ -181,6 +181,33 @@ def test_what_is_no_run_is_refused(
     assert "no such file" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "why"),
+    [
+        ("summary.json", "null", "a mapping is wanted"),
+        ("summary.json", '{"updates": ', "not good JSON"),
+        ("summary.json", '{"updates": -1}', "use 0 to"),
+        (".lock", None, "a link that leads out of the folder"),
+        ("timeline", None, "a link that leads out of the folder"),
+    ],
+)
+def test_a_damaged_or_hostile_run_is_refused_before_anything_is_written(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, text: str | None, why: str
+):
+    run, outside = tmp_path / "run", tmp_path / "outside"
+    shutil.copytree(whole, run, symlinks=True)
+    if text is None:
+        shutil.move(run / name, outside)
+        (run / name).symlink_to(outside)
+    else:
+        (run / name).write_text(text)
+    before = sorted((path, path.stat().st_mtime_ns) for path in tmp_path.rglob("*"))
+    assert go_on(run, "--trainer.updates=20") == 2
+    error = capsys.readouterr().err
+    assert f"{name}: " in error and why in error and error.count("\n") == 1
+    assert sorted((path, path.stat().st_mtime_ns) for path in tmp_path.rglob("*")) == before
+
+
 def test_an_asynchronous_run_that_was_killed_and_stopped_goes_on(tiny_checkpoint: Path, tmp_path: Path):
     """All of it real, in processes of their own, of which the first gets SIGKILL and the second SIGTERM."""
     run = tmp_path / "run"

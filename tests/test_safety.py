@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from accerl_lerobot import safety
+from accerl_lerobot import cli, safety
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.safety import (
     Origin,
@@ -111,6 +111,27 @@ def test_links_lead_about_inside_and_in_the_hub_s_cache_only(tmp_path: Path):
     assert safe_join(snapshot, "config.json", ORIGIN).read_text() == "{}"
     with pytest.raises(InputError, match="leads out"):
         safe_join(snapshot, "other", ORIGIN)
+
+
+@pytest.mark.parametrize("verb", ["report {}", "timeline {}", "export --path={} --root=new"])
+def test_a_run_from_elsewhere_is_read_without_leaving_its_folder(
+    verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    run = tmp_path / "run"
+    run.mkdir()
+    monkeypatch.chdir(tmp_path)
+    (run / "config.yaml").write_text("trainer: {}\n")
+    (tmp_path / "secret").write_text("secret")
+    for name, make, why in (
+        ("metrics.jsonl", lambda path: path.symlink_to("../secret"), "metrics.jsonl: a link that leads out"),
+        ("pipe", os.mkfifo, "pipe: neither a file nor a folder"),
+    ):
+        make(run / name)
+        assert cli.main(verb.format(run).split()) == 2
+        error = capsys.readouterr().err
+        assert why in error and error.count("\n") == 1
+        (run / name).unlink()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "secret"]
 
 
 @pytest.mark.parametrize(
