@@ -87,18 +87,26 @@ def _check_link(path: Path, root: Path, name: str, origin: Origin) -> None:
         raise origin.refuse(name, "a link that leads out of the folder; put the file itself there")
 
 
+RUN_FILES = {".yaml", ".json", ".jsonl", ".bin", ".safetensors"}
+"""What names of a run's files end with."""
+
+
 def check_folder(folder: Path, origin: Origin) -> None:
     """Refuses a run's folder that holds more than files and folders of its own.
 
     Raises:
-        InputError: a link leads out of it, or there is a pipe or a device, reading which may never end.
+        InputError: a link leads out of it, there is a pipe or a device, reading which may never end, or a
+            folder where a file belongs.
     """
     for at, folders, files in os.walk(folder):
         for path in (Path(at, name) for name in (*folders, *files)):
             name = path.relative_to(folder).as_posix()
             _check_link(path, folder, name, origin)
             with contextlib.suppress(FileNotFoundError):  # the run may still be going on
-                if not (path.is_dir() or stat.S_ISREG(path.stat().st_mode)):
+                if path.is_dir():
+                    if path.suffix in RUN_FILES:
+                        raise origin.refuse(name, "a folder where a file belongs; remove it")
+                elif not stat.S_ISREG(path.stat().st_mode):
                     raise origin.refuse(name, "neither a file nor a folder; remove it")
 
 
