@@ -187,7 +187,7 @@ def check_data(root: Path, info: dict[str, Any], origin: Origin, whole: bool = F
                 _check_images(file, feature, list(features[feature]["shape"]), name, origin)
     if whole and rows < info.get("total_frames", 0):
         raise origin.refuse(DATA, _fewer(rows, info["total_frames"]))
-    videos = root / "videos"
+    videos = safe_join(root, "videos", origin)
     for path in videos.rglob("*") if videos.is_dir() else ():
         safe_join(root, path.relative_to(root).as_posix(), origin)
 

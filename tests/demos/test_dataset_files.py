@@ -297,6 +297,11 @@ def test_links_out_of_the_folder(copied: Path, tmp_path: Path):
     (copied / "data/chunk-000").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(InputError, match="a link that leads out of the folder"):
         check_data(copied, info(), ORIGIN)
+    (copied / "data/chunk-000").unlink()
+    (tmp_path / "elsewhere").rename(copied / "data/chunk-000")
+    (copied / "videos").symlink_to(tmp_path)
+    with pytest.raises(InputError, match="videos: a link that leads out of the folder"):
+        check_data(copied, info(), ORIGIN)
 
 
 def column(name: str, values: Callable[[list[Any]], Any]) -> Callable[[pa.Table], pa.Table]:
