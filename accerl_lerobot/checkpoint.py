@@ -43,9 +43,9 @@ RUN_STATE, WEIGHTS = "run", "weights"
 STEP = "training_step.json"
 """LeRobot's file of how far it has come."""
 FORMAT = 2
-"""Of the manifest and the training state; another one is refused."""
+"""Format of the manifest and the training state; another one is refused."""
 UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError)
-"""What reading a manifest raises that is none."""
+"""Exceptions of reading a broken manifest."""
 BACKBONE = "backbone"
 """Folder beside the weights with the vision-language backbone's config and tokenisers."""
 FAST = f"{BACKBONE}/fast"
@@ -135,7 +135,7 @@ def go_back_to(checkpoint: Path) -> None:
 
 
 def begun(checkpoints: Path) -> bool:
-    """Whether there is a checkpoint, whole or not."""
+    """True if there is a checkpoint, whole or not."""
     if checkpoints.is_dir():
         _tidy(checkpoints)
     return bool(_numbered(checkpoints))
@@ -305,7 +305,7 @@ def relocate(directory: Path, home: Path) -> None:
 
 
 def displaced(directory: Path) -> bool:
-    """Whether a checkpoint has a backbone folder of its own and its files name one that is not there."""
+    """True if a checkpoint has a backbone folder of its own and its files name one that is not there."""
     if not (directory / BACKBONE).is_dir():
         return False
     return any(not Path(fields[key]).is_dir() for fields, key, _ in _local_names(*_named(directory)))

@@ -63,7 +63,7 @@ found = GcsClient(address=sys.argv[1]).internal_kv_get(b"CLUSTER_METADATA", b"cl
 print((found or b"{}").decode())
 """
 VERSIONS = ("python", "lerobot", "torch", "accerl_lerobot", "its code")
-"""What must be alike on all nodes. Ray compares its own version."""
+"""Packages whose versions must be alike on all nodes. Ray compares its own version."""
 
 
 def start_ray(launch: LaunchConfig | None = None) -> None:
@@ -258,7 +258,7 @@ def _check_cluster(address: str, launch: LaunchConfig) -> None:
 
 
 def _answer(process: subprocess.Popen[str]) -> tuple[str | None, str]:
-    """What it has printed, None if it has failed; and its complaints."""
+    """Its printed answer, None if it has failed; and its complaints."""
     try:
         said, complaint = process.communicate(timeout=ANSWER_S)
     except subprocess.TimeoutExpired:
@@ -324,7 +324,7 @@ def _seen(config: RunConfig) -> Callable[[Node], Node]:
 
 
 def _reports(nodes: list[Node], config: RunConfig) -> dict[str, dict[str, str]]:
-    """What each of them has, compared with what is here."""
+    """Reports of the nodes, each compared with this machine."""
     policy = config.policy.path if config.policy.path and Path(config.policy.path).is_dir() else None
     tell = _teller()
     with _mark(config) as mark:
@@ -372,7 +372,7 @@ def _mark(config: RunConfig) -> Iterator[str | None]:
 
 
 def _teller() -> Callable[[str | None, str | None], dict[str, str]]:
-    """What a node runs; it travels as code, since the package may be missing there."""
+    """Code that a node runs; it travels as text, since the package may be missing there."""
 
     def tell(mark: str | None, policy: str | None) -> dict[str, str]:
         import hashlib

@@ -81,7 +81,7 @@ class LaunchConfig(Section, section="launch"):
     started again from the last checkpoint because one of them was lost that is not started again alone; once
     more ends the run with its error."""
     timeline: bool = True
-    """Whether every worker records what it does when, for ``accerl timeline``: up to 8 MB each time one is
+    """True if every worker records what it does when, for ``accerl timeline``: up to 8 MB each time one is
     started."""
 
     def __post_init__(self) -> None:
@@ -121,7 +121,7 @@ class RunConfig(Section):
     """
 
     seed: Seed = 0
-    """Of demonstrations, SFT, exploration, replay and the starts of evaluation."""
+    """Seed of demonstrations, SFT, exploration, replay and the starts of evaluation."""
     output_dir: str | None = None
     """Folder of the run; must not exist. None: ``outputs/<date>/<time>_<job_name>``."""
     job_name: str = "run"
@@ -155,7 +155,7 @@ class RunConfig(Section):
 
     @property
     def saves(self) -> bool:
-        """Whether there are checkpoints on the way."""
+        """True if there are checkpoints on the way."""
         return bool(self.save_every_updates or self.save_every_s)
 
     @property

@@ -39,7 +39,7 @@ POLICY_PROCESS_GIB, ROLLOUT_PROCESS_GIB, SIMULATOR_GIB, RAY_GIB = 1.2, 0.4, 0.17
 LeRobot, a rollout process without its worlds, each task of each MetaWorld (renderers included), Ray's own
 processes."""
 DISK_GIB = 2.0
-"""What a run may need for demonstrations, checkpoints and videos."""
+"""Space that demonstrations, checkpoints and videos of a run may need."""
 RENDER_TIMEOUT_S = 120
 
 DRAW = """
@@ -69,7 +69,7 @@ class Check:
     status: str
     """ok, warn or FAIL; only the last makes the exit code 1."""
     text: str
-    """What was found and, unless it is fine, what to do."""
+    """The finding and, unless it is fine, the remedy."""
 
 
 def main(arguments: list[str]) -> int:
@@ -100,7 +100,7 @@ def main(arguments: list[str]) -> int:
 
 
 def machine(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
-    """What any run needs, and what `config` asks for beyond; `history` is the policy's ``n_obs_steps``."""
+    """Needs of any run, and those of `config` beyond; `history` is the policy's ``n_obs_steps``."""
     yield python_version()
     yield packages()
     yield hugging_face_datasets()
@@ -195,7 +195,7 @@ def ray_imports(joins: bool = False) -> Check:
 
 
 def cuda(config: RunConfig | None) -> Check:
-    """Whether torch sees a GPU, and whether the recipe insists on one."""
+    """Checks that torch sees a GPU, and tells if the recipe insists on one."""
     wish = config.policy.device if config is not None else "auto"
     try:
         import torch
@@ -273,7 +273,7 @@ def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
 
 
 def dreams(config: RunConfig) -> Iterator[Check]:
-    """Whether what is to be imagined fits the world and the policy."""
+    """True if what is to be imagined fits the world and the policy."""
     if not config.imagination.share:
         return
     from accerl_lerobot.world_model.dreaming import check_imagination

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run asks of an engine: the asynchronous one (`launch`) or the one-process one (`local`)."""
+"""The interface of an engine: the asynchronous one (`launch`) or the one-process one (`local`)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def pause_s(restarts: int) -> float:
 
 @dataclass(kw_only=True)
 class Progress:
-    """What happened since the last poll."""
+    """Events since the last poll."""
 
     version: int
     """Updates made so far."""
@@ -45,10 +45,10 @@ class WorkerError(RuntimeError):
 
 
 class Saved(NamedTuple):
-    """What was written."""
+    """Files of one checkpoint."""
 
     version: int
-    """Of the policy: updates behind it."""
+    """Version of the policy: updates behind it."""
     updates: list[dict[str, float]]
     """Metrics of those updates among them that `Engine.poll` has not reported, and will not any more."""
 
@@ -97,7 +97,7 @@ class Engine(ABC):
 
 
 def episode_key(plan: EpisodePlan) -> tuple[str, int]:
-    """What names a planned episode."""
+    """Key of a planned episode."""
     return plan.group, plan.index
 
 

@@ -61,7 +61,7 @@ def check_absent(path: Path, field: str = "output_dir") -> None:
 
 
 def is_full(error: BaseException | None) -> bool:
-    """Whether an error is that of a full disk, here or in a worker whose error carries the text."""
+    """True if an error is that of a full disk, here or in a worker whose error carries the text."""
     while error is not None:
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             return True

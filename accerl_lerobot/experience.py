@@ -57,7 +57,7 @@ class Decision:
     chunk: np.ndarray
     """float32 (K, A), in the environment's action units (un-normalised); not clipped."""
     latent: dict[str, np.ndarray]
-    """What the policy actually sampled; `log_prob` is the density of this, in normalised action space."""
+    """The policy's actual sample; `log_prob` is the density of this, in normalised action space."""
     log_prob: np.ndarray
     """float32 (L,), one entry per factor (for a flow policy one per row of the chunk that has a density); the
     chunk's is their sum."""
@@ -72,9 +72,9 @@ class Origin(NamedTuple):
     """Where in which episode something begins."""
 
     task: str
-    """Of `World.reset`, which is not the instruction."""
+    """Task of `World.reset`, which is not the instruction."""
     seed: int
-    """Of `World.reset`."""
+    """Seed of `World.reset`."""
     decision: int
     """Decisions made before."""
 
@@ -110,7 +110,7 @@ class Segment:
     terminated: bool
     truncated: bool
     success: bool
-    """Whether the episode had succeeded when the segment ended."""
+    """True if the episode had succeeded when the segment ended."""
     key: str
     """Unique: worker, incarnation, sequence number. Makes an insert idempotent."""
     advantage: np.ndarray | None = None
@@ -120,7 +120,7 @@ class Segment:
     origin: Origin
     """Where it begins; of an imagined one, the real observation that it was imagined from."""
     world_version: int | None = None
-    """Of the world model that imagined it, in gradient steps."""
+    """Version of the world model that imagined it, in gradient steps."""
     episode: dict[str, float] = field(default_factory=dict)
     """Set on the last segment of an episode: ``return``, ``steps``, ``decisions``, ``success``."""
 

@@ -29,9 +29,9 @@ CRASHES = ("exception", "exit", "kill", "stop", "hang")
 """exception: one is raised. exit: the process ends with code 0. kill: by SIGKILL. stop: SIGSTOP, so that the
 process hangs. hang: one thread does, and the others of the process answer as if nothing were wrong."""
 SAVING = ("exception", "exit", "kill", "stop")
-"""Of these, what can befall a worker that saves: how long a thread needs for that, nobody knows."""
+"""Faults among these for a worker that saves: how long a thread needs for that, nobody knows."""
 UNWATCHED = ("exception", "exit", "kill")
-"""What can befall the run's own process, which nobody watches."""
+"""Faults of the run's own process, which nobody watches."""
 NAN, FULL, TORN = "nan", "full", "torn"
 """nan: what is computed there is not finite. full: the disk is. torn: a file that was just written loses its
 end, and the process is killed, as by a loss of power."""
@@ -111,7 +111,8 @@ def withdraw(folder: Path, point: str) -> bool:
 
 
 def proof(taken: Path) -> dict[str, Any] | None:
-    """What `order` was given, and the ``pid`` and ``monotonic`` moment of who took it; None: nobody has."""
+    """The order that `order` was given, and the ``pid`` and ``monotonic`` moment of who took it; None:
+    nobody has."""
     try:
         said = json.loads(taken.read_text())
     except (FileNotFoundError, ValueError):  # not taken, or being written
@@ -137,7 +138,7 @@ def reach(point: str, path: Path | None = None) -> bool:
 
 
 class _Orders:
-    """Those that this process looks for."""
+    """Orders that this process looks for."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

@@ -112,7 +112,7 @@ def _one_line(flag: str, text: str) -> str:
 
 
 def _bare(config_class: type[Any]) -> str:
-    """What stands on the command line without a name."""
+    """Positional arguments of the command line."""
     name: str | None = getattr(config_class, "BARE", None)
     if name is None:
         return "[recipe.yaml | --config_path=recipe.yaml]"
@@ -174,7 +174,7 @@ def _entry(flag: str, text: str) -> list[str]:
 
 
 def _choices(field: Any) -> list[str]:
-    """What a field's values mean, where its metadata has a table of them: each entry has a `what`."""
+    """Meanings of a field's values, where its metadata has a table of them: each entry has a `what`."""
     return [f"{name}: {entry.what}" for name, entry in field.metadata.get("choices", {}).items()]
 
 

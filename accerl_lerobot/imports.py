@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is imported by name once it is needed: entries of our own tables, and packages that a user names."""
+"""Imports by name at the time of need: entries of our own tables, and packages that a user names."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DISCOVER = "discover_packages_path"
 
 
 def imported(path: str) -> Any:
-    """What a table's ``module:name`` stands for."""
+    """Object behind a table's ``module:name``."""
     module, _, name = path.partition(":")
     return getattr(importlib.import_module(module), name)
 

@@ -198,7 +198,7 @@ class RayEngine(Engine):
         return {w.name: int(w.call("ready", timeout=self._limit)) for w in self._everyone()}
 
     def batching(self) -> BatcherStats:
-        """What the inference services have batched so far."""
+        """Batches of the inference services so far."""
         return self._inference.batching()
 
     @property
@@ -211,7 +211,7 @@ class RayEngine(Engine):
         return [*([self._learner] if self._learner is not None else []), *self._dreamers]
 
     def _everyone(self) -> Iterator[Watched]:
-        """Those that others depend on first."""
+        """All workers, those that others depend on first."""
         yield from self._inference.workers()
         yield from self._others
         yield from self._seats.workers()

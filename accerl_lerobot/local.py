@@ -219,7 +219,7 @@ class LocalEngine(Engine):
 
     @property
     def _exploring(self) -> bool:
-        """Whether learning goes on."""
+        """True if learning goes on."""
         if not self._training or self._update.version >= self._config.trainer.updates:
             return False
         return not self._replay.exhausted(self._config.trainer.batch_decisions)

@@ -271,7 +271,7 @@ class Loop:
         return self.times.rl_s + (0.0 if since is None else time.monotonic() - since)
 
     def _is_due(self, version: int) -> bool:
-        """Whether it is time for a checkpoint."""
+        """True if it is time for a checkpoint."""
         updates, seconds = self.config.save_every_updates, self.config.save_every_s
         if updates and version // updates > self.saved:
             return True

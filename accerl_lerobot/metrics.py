@@ -30,7 +30,7 @@ class WandBConfig(Section, section="wandb"):
     """Weights & Biases, off unless enabled."""
 
     enable: bool = False
-    """Whether to log there too; the machine must be logged in."""
+    """Log there too; the machine must be logged in."""
     project: str = "accerl-lerobot"
     """Project of the run."""
     entity: str | None = None

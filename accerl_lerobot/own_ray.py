@@ -139,7 +139,7 @@ class RayWatch(threading.Thread):
         self.join()
 
     def _fate(self, process: psutil.Process) -> str:
-        """What has become of a process; empty: nothing."""
+        """Fate of a process; empty: nothing happened."""
         try:
             status = process.status()
         except psutil.NoSuchProcess:
@@ -155,7 +155,7 @@ class RayWatch(threading.Thread):
 
 
 def _responds() -> bool:
-    """Whether a process can still be had."""
+    """True if a process can still be had."""
     try:
         return bool(ray.get(ray.remote(_there).options(num_cpus=0).remote(), timeout=RESPONDS_S))
     except (RayError, GetTimeoutError):

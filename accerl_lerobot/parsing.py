@@ -464,7 +464,7 @@ def _leaf(hint: Any, value: Any, field: str) -> Any:
 
 
 def _apart(field: Any, section: type[Any]) -> dict[str, Any]:
-    """What a field's default says of a section where it is not what the section's own class would say.
+    """Differences of a field's default of a section from the section's own class.
 
     draccus takes the class's word for all that is not given, so one field given would change the others.
     """

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 ALL = "all"
 TINY = 1e-6
-"""What is left of a GPU after sums of shares is compared with what is asked to within this."""
+"""Rest of a GPU up to which sums of shares count as equal to the share that is asked for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,9 +63,10 @@ class Asked(NamedTuple):
     names: tuple[str, ...]
     config: RoleConfig
     network: bool = True
-    """Whether they have one, and so take part of a GPU and need files."""
+    """True if they have one, and so take part of a GPU and need files."""
     share: float | None = None
-    """Of GPUs that each takes if ``config`` does not say; None: what others on the same nodes leave."""
+    """Share of a GPU that each takes if ``config`` does not say; None: what others on the same nodes
+    leave."""
 
 
 class Place(NamedTuple):
@@ -141,7 +142,7 @@ def this_machine() -> Node:
 
 
 def asked(config: RunConfig) -> list[Asked]:
-    """What a run needs besides replay, those first that take most of a GPU."""
+    """Needs of a run besides replay, those first that take most of a GPU."""
     placement, c = config.launch.placement, config
     ranks = ("trainer", *(f"trainer rank {i}" for i in range(1, c.trainer.ranks)))
     found = [
@@ -251,7 +252,7 @@ def _shared(roles: list[Asked], sites: dict[str, list[Node]], config: RunConfig)
 
 
 def _share(role: Asked, group: list[Asked], gpus: float, config: RunConfig) -> float:
-    """Of GPUs, for each process of a role."""
+    """Share of GPUs, for each process of a role."""
     if role.config.gpus is not None:
         if role.role == "trainer" and len(role.names) > 1 and 0 < role.config.gpus <= 0.5:
             remedy = "two ranks could share a GPU, which NCCL refuses; use more than 0.5"
@@ -268,7 +269,7 @@ def _share(role: Asked, group: list[Asked], gpus: float, config: RunConfig) -> f
 
 
 class _Room:
-    """What is left of every node while workers are placed; GPUs are filled up as Ray does it."""
+    """Free part of every node while workers are placed; GPUs are filled up as Ray does it."""
 
     def __init__(self, nodes: Sequence[Node]) -> None:
         self._cpus = {node.number: node.cpus for node in nodes}

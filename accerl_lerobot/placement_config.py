@@ -55,6 +55,6 @@ class PlacementConfig(Section, section="launch.placement"):
 
     @property
     def elsewhere(self) -> bool:
-        """Whether any role may be on another node."""
+        """True if any role may be on another node."""
         roles = (self.trainer, self.inference, self.imagination, self.rollout)
         return any(role.nodes not in (None, "0") for role in roles)

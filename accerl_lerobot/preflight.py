@@ -25,7 +25,7 @@ from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.ranges import Range, check
 
 LARGEST_FIELD = 10**6
-"""Of a policy config; LeRobot has no size or number of steps beyond."""
+"""Largest number in a policy config; LeRobot has no size or number of steps beyond."""
 ABSURD = 2
 """Times this machine's memory that a rough estimate may be; ``accerl doctor`` warns long before."""
 
@@ -72,7 +72,7 @@ def policy_features(policy: Any) -> Features:
 
 
 def resizes(policy: Any) -> bool:
-    """Whether a policy resizes its images by itself, by LeRobot's config of it."""
+    """True if a policy resizes its images by itself, by LeRobot's config of it."""
     return any(getattr(policy, field, None) for field in RESIZERS)
 
 

@@ -185,7 +185,7 @@ def _fits(hint: Any, value: Any) -> bool:
 
 
 def wanted(hint: Any) -> str:
-    """What fits an annotation, in words."""
+    """Values that fit an annotation, in words."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
         for mark in arguments[1:]:

@@ -49,7 +49,7 @@ RAY_PROCESSES = {
 }
 """Ray's own processes → how their command lines begin, without and with a title of their own."""
 NEEDED = ("gcs_server", "raylet", "dashboard agent", "runtime env agent")
-"""Of these, the ones that Ray does not work without: a raylet ends with its agents."""
+"""Processes among these without which Ray does not work: a raylet ends with its agents."""
 
 
 def kind_of(command: Sequence[str]) -> str | None:
@@ -59,7 +59,7 @@ def kind_of(command: Sequence[str]) -> str | None:
 
 
 PASSED_ON = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
-"""What workers on other nodes are told besides `WORKERS`, where it is set here."""
+"""Environment variables that workers on other nodes get besides `WORKERS`, where they are set here."""
 _AUTH = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 
 
@@ -99,7 +99,7 @@ def check_private() -> None:
 
 
 def has_token() -> bool:
-    """Whether there is a token of the user's where Ray looks for one."""
+    """True if there is a token of the user's where Ray looks for one."""
     if os.environ.get("RAY_AUTH_TOKEN"):
         return True
     path = os.environ.get("RAY_AUTH_TOKEN_PATH") or Path.home() / ".ray" / "auth_token"
@@ -116,7 +116,7 @@ def without_token() -> dict[str, str]:
 
 
 def passed_on() -> dict[str, str]:
-    """What workers have in their environment on nodes that were not started from here."""
+    """Environment of workers on nodes that were not started from here."""
     return {name: os.environ[name] for name in (*WORKERS, *PASSED_ON) if name in os.environ}
 
 

@@ -72,7 +72,7 @@ class Placed(Protocol):
 
     @property
     def job_name(self) -> str:
-        """What the folder is called then."""
+        """Name of the run's folder."""
 
 
 def make_output_dir(config: Placed) -> Path:

@@ -52,7 +52,7 @@ class Seat:
     starts: int = 0
     """Where it is in the worker's seeds."""
     restarts: int = 0
-    """Of them, since the run was begun or gone on with."""
+    """Restarts of workers, since the run was begun or gone on with."""
     outstanding: dict[tuple[str, int], EpisodePlan] = field(default_factory=dict)
     """Planned episodes without a result."""
     unsent: list[EpisodePlan] = field(default_factory=list)
@@ -66,7 +66,7 @@ class Seat:
     budget: int | None = None
     """Exploring episodes that are still to be played; None: no end."""
     spent: bool = False
-    """Whether all of them are in replay."""
+    """True if all of them are in replay."""
     unreachable: tuple[float, Exception] | None = None
     """Since when its process cannot be reached, on `time.monotonic`, and how that was found."""
     worker: Watched = field(init=False)
@@ -92,7 +92,7 @@ class Seats:
         self._past: dict[str, float] = {"restarts": 0.0}
         self._peers: tuple[list[Endpoint], Endpoint] | None = None
         self.in_turn = False
-        """Whether worlds wait for replay after each segment."""
+        """True if worlds wait for replay after each segment."""
         self._seats = [
             Seat(index=index, budget=budget, spent=budget == 0)
             for index, budget in enumerate(budgets(config.rollout))
@@ -126,7 +126,7 @@ class Seats:
             seat.moved = inference
 
     def workers(self) -> Iterator[Watched]:
-        """Those that have been started."""
+        """Workers that have been started."""
         return (seat.worker for seat in self._seats if hasattr(seat, "worker"))
 
     def plan(self, plans: list[EpisodePlan]) -> None:
@@ -181,12 +181,12 @@ class Seats:
 
     @property
     def outstanding(self) -> bool:
-        """Whether a planned episode has no result yet."""
+        """True if a planned episode has no result yet."""
         return any(seat.outstanding for seat in self._seats)
 
     @property
     def spent(self) -> bool:
-        """Whether all exploring episodes that were paid for are in replay."""
+        """True if all exploring episodes that were paid for are in replay."""
         return all(seat.spent for seat in self._seats)
 
     @property

@@ -56,12 +56,12 @@ class Service:
     begins: float = 0.0
     """When the next process is started, while there is none."""
     coming: Generator[Any, Any, Endpoint] | None = None
-    """What is left to do until it is asked; None: it is, or there is no process."""
+    """Remaining steps until it is asked; None: it is, or there is no process."""
     awaited: Any = None
     """The answer that `coming` waits for."""
     deadline: float = 0.0
     up: bool = True
-    """Whether those who ask it have been told where it is."""
+    """True if those who ask it have been told where it is."""
 
 
 class Services:
@@ -78,11 +78,11 @@ class Services:
         self._config = config
         self._serves = (config.policy, config.inference, version, state, load, timeline_folder(config))
         self.restarts = 0
-        """Of all, since this engine began."""
+        """Restarts of all, since this engine began."""
         self._trainer: Any = None
         """Handle of the one whose weights they serve; None: nothing is published yet."""
         self._together = [0] * config.inference.workers
-        """Of each, the worlds that are in lock step."""
+        """Worlds of each that are in lock step."""
         several = config.inference.workers > 1
         names = [f"inference {i}" if several else "inference" for i in range(config.inference.workers)]
         self._services = [Service(index=index, name=name) for index, name in enumerate(names)]
@@ -94,7 +94,7 @@ class Services:
             service.worker = self._new(service.name)
 
     def workers(self) -> Iterator[Watched]:
-        """Those that there are now."""
+        """Workers that there are now."""
         there = (service for service in self._services if hasattr(service, "worker"))
         return (service.worker for service in there if not service.begins)
 
@@ -195,11 +195,11 @@ class Services:
 
     @property
     def up(self) -> list[bool]:
-        """Of each, whether those who ask it know where it is."""
+        """For each, True if those who ask it know where it is."""
         return [service.up for service in self._services]
 
     def batching(self) -> BatcherStats:
-        """What they have batched so far."""
+        """Their batches so far."""
         limit = self._config.launch.stall_s
         return added([worker.call("batching", timeout=limit) for worker in self.workers()])
 
@@ -265,7 +265,7 @@ class Services:
             return endpoint
 
     def _steps(self, service: Service) -> Generator[Any, Any, Endpoint]:
-        """What is to be done until a new process may be asked; waits for what it yields."""
+        """Steps until a new process may be asked; waits for whatever it yields."""
         launch, worker = self._config.launch, service.worker
         service.deadline = time.monotonic() + max(START_S, launch.stall_s)
         yield worker.actor.ready.remote()

@@ -36,7 +36,7 @@ def kind[T](cls: type[T]) -> type[T]:
 
 
 def kind_named(name: str) -> type[Any] | None:
-    """What was registered under this name; None: nothing."""
+    """Type that was registered under this name; None: nothing."""
     return _KINDS.get(name)
 
 
@@ -54,7 +54,7 @@ def save(path: Path, tree: Any) -> None:
 
 
 def load(path: Path) -> Any:
-    """What `save` was given; arrays are writable and owned by the caller.
+    """Reads a file of `save`; arrays are writable and owned by the caller.
 
     Raises:
         InputError: a file is missing or is not of this format.
@@ -145,7 +145,7 @@ _READERS: dict[str, Callable[[dict[str, Any], dict[str, np.ndarray]], Any]] = {
 
 
 def field_names(cls: type[Any]) -> tuple[str, ...]:
-    """Of a dataclass or named tuple, in order."""
+    """Fields of a dataclass or named tuple, in order."""
     if dataclasses.is_dataclass(cls):
         return tuple(field.name for field in dataclasses.fields(cls))
     names: tuple[str, ...] = cls._fields

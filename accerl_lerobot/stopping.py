@@ -18,7 +18,7 @@ _arrived = False
 
 
 def arrived() -> bool:
-    """Whether one of these signals has come since a context of this module was entered."""
+    """True if one of these signals has come since a context of this module was entered."""
     global _arrived
     with suppress(OSError):  # none has come
         numbers = b"" if _pipe is None else os.read(_pipe[0], 64)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 def in_parts(tensor: Tensor) -> bool:
-    """Whether this process holds a part of it only."""
+    """True if this process holds a part of it only."""
     return hasattr(tensor, "full_tensor")
 
 

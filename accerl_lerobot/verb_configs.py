@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the command lines of the verbs are parsed into, where it is not a whole run."""
+"""Fields of the verbs' command lines, where they are not a whole run's."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class WorldModelEvalRun(Section):
     discover_packages_path: str | None = None
     """Package to import that registers the type of the world model, where that is not one of ours."""
     seed: Seed = 0
-    """Of which windows are tried."""
+    """Seed of the choice of windows."""
     output_dir: str | None = None
     """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
     job_name: str = "world_model_eval"

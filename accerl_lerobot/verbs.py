@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each verb of ``accerl`` does, once its arguments are parsed.
+"""The verbs of ``accerl``, once their arguments are parsed.
 
 Results go to the standard output, everything else to the standard error: LeRobot prints while it loads, and
 what a verb hands on should stay readable for programs.

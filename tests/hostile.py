@@ -43,7 +43,7 @@ NAMES = (
 
 
 CPU_S = 3
-"""Of a child process that loads one."""
+"""Processor seconds of a child process that loads one."""
 
 
 class TimeLimitError(Exception):
@@ -237,7 +237,7 @@ def _too_long(*_: object) -> None:
 
 
 def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
-    """What is called before anything is loaded."""
+    """Checks that are called before anything is loaded."""
     from accerl_lerobot.demos.dataset_files import check_data, check_info, check_metadata, check_stats
     from accerl_lerobot.policies import files
     from accerl_lerobot.safety import Origin, read_json, tensor_shapes

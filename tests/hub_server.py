@@ -55,13 +55,13 @@ class Fault:
 
 @dataclass
 class Answer:
-    """What is about to be sent."""
+    """An answer about to be sent."""
 
     path: str
     status: int
     headers: dict[str, str]
     pieces: list[bytes]
-    """Of the body;"""
+    """Pieces of the body;"""
     pause_s: float = 0.0
     """after each of them, so long."""
 
@@ -71,7 +71,7 @@ class File:
     """One file of a commit."""
 
     oid: str
-    """Of git: sha1 of the blob, or of the pointer."""
+    """Git's identifier: sha1 of the blob, or of the pointer."""
     size: int
     sha256: str
     lfs: bool
@@ -429,7 +429,7 @@ def serving(folder: Path) -> Iterator[HubServer]:
 
 
 def environment(server: HubServer, home: Path, token: str | None = WRITER) -> dict[str, str]:
-    """What a process has in its environment to take the server for the Hub, with an empty cache in `home`."""
+    """Environment of a process that takes the server for the Hub, with an empty cache in `home`."""
     found = {
         "HF_ENDPOINT": server.url,
         "HF_HOME": str(home),

@@ -120,7 +120,7 @@ class LightTrainer:
         self._idle = False
         self._publishing = threading.Event()
         self._ledger: list[dict[str, int]] = []
-        """Of each update, the keys of its segments, and their decisions."""
+        """Keys of each update's segments, and their decisions."""
         if state is not None:
             self._ledger = snapshot.load(state / "trainer")["ledger"]
 

@@ -101,7 +101,7 @@ def test_what_a_killed_process_left_behind_is_no_obstacle(tmp_path: Path):
 
 
 def test_the_same_version_again_replaces_the_first(tmp_path: Path):
-    """What goes with the same weights, replay above all, need not be the same."""
+    """The same weights may be saved with another state, replay above all."""
     first = save_checkpoint(tmp_path, writer(5, "first"))
     again = save_checkpoint(tmp_path, writer(5, "again"))
     assert first == again and (first / PRETRAINED / "model.safetensors").read_text() == "again"

@@ -202,7 +202,7 @@ def test_a_log_level_that_is_none_is_refused(
 
 
 class TestTrain:
-    """What `accerl train` does around `run.train`."""
+    """`accerl train` around `run.train`."""
 
     @pytest.fixture
     def arguments(self, tmp_path: Path, tiny_checkpoint: Path) -> list[str]:

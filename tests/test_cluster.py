@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run finds out of a cluster before it joins it; with real ones, see `test_launch_nodes`."""
+"""Checks of a cluster before a run joins it; with real ones, see `test_launch_nodes`."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def recipe(tmp_path: Path) -> str:
 
 
 class TestOverrides:
-    """What the command line changes in a recipe."""
+    """Overrides of a recipe by the command line."""
 
     def test_a_field_of_a_choice_needs_no_type(self, recipe: str) -> None:
         config = parse(RunConfig, [f"--config_path={recipe}", "--env.task=match", "--algorithm.sigma=2"])
@@ -55,7 +55,7 @@ class TestOverrides:
         assert config.algorithm == GIPOConfig(sigma=0.2)
 
     def test_the_other_fields_of_a_room_keep_the_values_that_help_shows(self) -> None:
-        """Of a room whose default in this place is not that of its class, too."""
+        """Also for a section whose default in this place is not that of its class."""
         usual = RunConfig().imagination
         config = parse(RunConfig, ["--imagination.replay.ahead=100", "--imagination.learn.trial.most=7"])
         assert config.imagination.replay == replace(usual.replay, ahead=100)
@@ -381,7 +381,7 @@ class TestConsent:
 
 
 class TestPreflight:
-    """What LeRobot knows about `sft.policy`."""
+    """LeRobot's knowledge about `sft.policy`."""
 
     @pytest.mark.parametrize(
         ("policy", "message"),

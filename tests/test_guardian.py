@@ -46,7 +46,7 @@ if __name__ == "__main__":
 
 
 def until(there: Callable[[], bool], seconds: float = 120.0) -> bool:
-    """Whether something comes about, on a machine that may be busy."""
+    """True once something comes about, on a machine that may be busy."""
     deadline = time.monotonic() + seconds
     while not (done := there()) and time.monotonic() < deadline:
         time.sleep(0.05)

@@ -32,7 +32,7 @@ DURING = 12
 
 @dataclass
 class Story:
-    """What was reported, in order."""
+    """Reports of a run, in order."""
 
     config: RunConfig
     directory: Path

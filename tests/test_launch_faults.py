@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What becomes of a run when one of its processes fails, hangs or is killed.
+"""Faults of a run's processes: failures, hangs and kills.
 
 Which weights decide does not matter here, so inference and trainer are stand-ins that start at once; rollout
 and replay are real. The run with everything real is in ``test_launch.py``.
@@ -85,7 +85,7 @@ def until_training(engine: RayEngine) -> None:
 
 
 def gone(pid: int) -> bool:
-    """Whether a process ends within a minute."""
+    """True if a process ends within a minute."""
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline:
         try:

@@ -35,7 +35,7 @@ EVALUATED = 8
 
 @dataclass
 class Story:
-    """What was reported, in order."""
+    """Reports of a run, in order."""
 
     config: RunConfig
     history: list[Progress] = field(default_factory=list)

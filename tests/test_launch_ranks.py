@@ -37,7 +37,7 @@ TWO = TrainerConfig(
 
 @dataclass
 class Story:
-    """What the run with two ranks did."""
+    """Events of the run with two ranks."""
 
     config: RunConfig
     saved: Path
@@ -51,7 +51,7 @@ class Story:
 
 
 def probes(updates: list[dict[str, float]]) -> list[float]:
-    """What acting and learning differed by, where that was measured."""
+    """Differences between acting and learning, where they were measured."""
     return [u["logprob/mismatch_max"] for u in updates if "logprob/mismatch_max" in u]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who starts Ray ends it, one that does not respond is not kept, and one that has lost a process is seen."""
+"""A Ray that we started ends with us, one that hangs is dropped, and one that has lost a process is seen."""
 
 from __future__ import annotations
 

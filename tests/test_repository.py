@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What must hold of the repository itself, whoever adds a file to it."""
+"""Rules for the repository itself, whoever adds a file to it."""
 
 from __future__ import annotations
 
@@ -91,6 +91,20 @@ def test_no_file_is_too_long() -> None:
 def test_every_module_says_what_it_is() -> None:
     silent = [str(p.relative_to(ROOT)) for p in sources() if not ast.get_docstring(ast.parse(p.read_text()))]
     assert silent == []
+
+
+def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
+    vague = [
+        f"{path.relative_to(ROOT)}:{node.lineno}"
+        for folder in (PACKAGE, ROOT / "tests", ROOT / "benchmarks")
+        for path in sorted(folder.rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+        and node.value.value.strip().startswith(("What ", "Whether ", "Of ", "Those ", "Who "))
+    ]
+    assert vague == []
 
 
 def test_nothing_shadows_hugging_face_datasets_or_the_standard_library() -> None:

@@ -330,7 +330,7 @@ def test_code_at_a_commit_and_no_code():
 
 
 TIMES = 30
-"""What `tests.hostile` multiplies its shares with: about 24,000 files, of which about 140 are loaded."""
+"""Factor on the shares of `tests.hostile`: about 24,000 files, of which about 140 are loaded."""
 
 
 def test_many_changed_files(tmp_path: Path):

@@ -193,7 +193,7 @@ def load_dying(config: SimulatedPolicyConfig, size: int, died: Path, policy: Any
 def test_in_turn_a_service_that_is_lost_is_waited_for_and_the_round_is_finished(
     light_ray: None, tmp_path: Path, schedule: Any, lag: float, size: int, ahead: float
 ):
-    """Those that had their answer go on, and are a decision ahead of the one that has to ask again."""
+    """Callers that had their answer go on, and are a decision ahead of the one that has to ask again."""
     from accerl_lerobot.launch import RayEngine
 
     died = tmp_path / "died"

@@ -196,7 +196,7 @@ SECRETS = {
     r"[:=]\s*['\"][A-Za-z0-9+/_-]{24,}['\"]",
     "W&B key": r"(?i)wandb.{0,20}\b[0-9a-f]{40}\b",
 }
-"""What is searched for in every file under version control."""
+"""Patterns that are searched for in every file under version control."""
 
 
 def secrets(text: str) -> list[str]:

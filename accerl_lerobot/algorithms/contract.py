@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every objective receives and returns, and the settings all of them share.
+"""Inputs, outputs and shared settings of all objectives.
 
 Shape letters: N decisions of a batch, L log-prob factors of one decision, as its policy stores them.
 """
@@ -50,7 +50,7 @@ class RatioConfig(AlgorithmConfig):
     """``gae``: from the critic. ``group``: relative to other episodes from the same start, stamped on
     segments by the rollout worker; V is not used then, and `value_coef` may as well be 0."""
     level: Level = "action"
-    """What one importance ratio covers: each log-prob factor (``token``), those of one ``action`` of the
+    """Extent of one importance ratio: each log-prob factor (``token``), those of one ``action`` of the
     chunk, or the whole ``chunk``. A flow or Gaussian policy has one factor per action."""
     value_coef: NonNegative = 0.5
     """Weight of the critic's regression error."""
@@ -152,7 +152,7 @@ class LossInputs:
 
 @dataclass(frozen=True, kw_only=True)
 class LossOutput:
-    """What an update needs and what it logs."""
+    """Loss and metrics of one batch."""
 
     loss: Tensor
     """(), call ``backward`` on it."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is logged about every update, and what each number means.
+"""The metrics that are logged about every update, and their meaning.
 
 ``approx_kl``
     Mean of (ρ − 1) − log ρ: KL(μ‖π) in nats, by how much the policy has left the samples.
@@ -87,7 +87,7 @@ def explained_variance(value: Tensor, returns: Tensor) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True)
 class Samples:
-    """What the metrics of one batch are computed from, without gradient; parts of a batch are joined first.
+    """Inputs of one batch's metrics, without gradient; parts of a batch are joined first.
 
     Quantiles, the effective sample size and explained variance of a batch are not means of those of its
     micro-batches, so they are computed once, from the samples of all micro-batches and ranks.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all objectives have in common: the critic, the KL penalties, the entropy bonus and the diagnostics.
+"""Terms that all objectives share: the critic, the KL penalties, the entropy bonus and the diagnostics.
 
 L = L_policy + value_coef · mean value error + kl_coef · KL(μ‖π) + reference_coef · KL(π‖π_ref)
              − entropy_coef · H
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 USUAL_CLIP = (0.2, 0.2)
-"""What the clip fraction counts for an algorithm that clips nothing, so that runs can be compared."""
+"""Clip range of the reported clip fraction for an algorithm that clips nothing, so that runs can be
+compared."""
 
 
 def advantage_column(inputs: LossInputs) -> Tensor:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What asynchrony gains: the same workers, asynchronous, overlapped and synchronous, by turns in one run.
+"""The gain from asynchrony: the same workers, asynchronous, overlapped and synchronous, by turns in one run.
 
     S    decisions learned from per second, asynchronous over synchronous
     S*   the most that any schedule could gain over the synchronous one: the tightest of what the worlds, the
@@ -43,20 +43,20 @@ TRIALS = 100
 
 @dataclass(frozen=True, kw_only=True)
 class BenchAsyncVsSyncConfig(MachineryConfig):
-    """What is compared, how often."""
+    """Fields of ``accerl bench async-vs-sync``."""
 
     cvs: tuple[Annotated[float, Range("[0, 10]")], ...] = (0.0, 0.1, 0.3, 0.5, 1.0)
     """Laws of latency: standard deviation over mean; takes the place of `latency_cv`."""
     traces: tuple[str, ...] = ()
     """More laws: files of `accerl bench latency`, each a world's own; takes the place of `latency_trace`."""
     seconds: Positive = 8.0
-    """Of a block, at least."""
+    """Shortest duration of a block."""
     rounds: Repeats = 3
     """Times each arm is measured twice, forth and back."""
     learning_updates: Steps = 18
-    """Of each run that learns; 0: none does."""
+    """Updates of each run that learns; 0: none does."""
     seeds: tuple[Seed, ...] = (0, 1, 2)
-    """Of those runs."""
+    """Seeds of the runs that learn."""
     output_dir: str = "outputs/async_vs_sync"
     """Folder for async_vs_sync.json, .md and .png."""
 
@@ -100,7 +100,7 @@ def bench_async_vs_sync(config: BenchAsyncVsSyncConfig) -> dict[str, Any]:
 
 
 def compare(config: MachineryConfig, blocks: list[Block]) -> dict[str, Any]:
-    """Of one law's blocks: `bench_async_vs_sync`'s ``laws``.
+    """Compares one law's blocks: `bench_async_vs_sync`'s ``laws``.
 
     Args:
         config: with that law.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run's own files say of it: whether anything that counted was lost, or counted twice.
+"""Audit of a run's own files: was anything that counted lost, or counted twice?
 
 updates      each is in ``metrics.jsonl`` once, and none is missing before the newest
 books        inserted = stored + evicted + retired, as replay counts its segments
@@ -44,7 +44,7 @@ def audit_updates(records: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def audit_segments(run: Path) -> dict[str, Any]:
-    """Of the newest whole checkpoint, its name as ``saved``, and ``segments``, ``segments_lost`` and
+    """Audits the newest whole checkpoint: its name as ``saved``, and ``segments``, ``segments_lost`` and
     ``segments_doubled`` of the journal up to then; ``saved`` alone says why where there is none.
     """
     try:

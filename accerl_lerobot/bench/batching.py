@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What waiting for others does: batches, waits and decisions a second under several rules for batching.
+"""The effect of waiting for other requests on batches, waits and decisions a second, by batching rule.
 
 *one at a time* does not batch. *as they come* takes whatever waits when the service is free. The others have
 the oldest request wait so long for more to come. Each rule is an engine of its own, all of them forth and
@@ -37,9 +37,9 @@ class BenchBatchingConfig(MachineryConfig):
     waits_ms: tuple[Annotated[float, Range("[0, 10000)")], ...] = (0.0, 2.0, 10.0, 40.0)
     """Waits of the oldest request, in milliseconds; 0: as they come. Take the place of `max_wait_ms`."""
     seconds: Positive = 5.0
-    """Of a block, at least."""
+    """Shortest duration of a block."""
     blocks: Repeats = 3
-    """Of each rule, each time it has its turn."""
+    """Blocks of each rule, one each time it has its turn."""
     output_dir: str = "outputs/batching"
     """Folder for batching.json and .md."""
 
@@ -76,7 +76,7 @@ def bench_batching(config: BenchBatchingConfig) -> dict[str, Any]:
 
 
 def summed(turns: list[dict[str, Any]]) -> dict[str, Any]:
-    """Of the turns of one rule: see `bench_batching`."""
+    """Sums the turns of one rule: see `bench_batching`."""
     waits = sum((Counter(turn["waits"]) for turn in turns), Counter())
     sizes = sum((Counter(turn["sizes"]) for turn in turns), Counter())
     return {

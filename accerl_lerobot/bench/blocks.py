@@ -22,7 +22,7 @@ MOST_BUSY = 0.6
 
 @dataclass(frozen=True, kw_only=True)
 class Block:
-    """What was measured in some seconds."""
+    """Measurements over some seconds."""
 
     schedule: str
     seconds: float
@@ -131,7 +131,8 @@ def _seconds(update: dict[str, float]) -> float:
 
 
 def _observations(inference: dict[str, float]) -> int:
-    """Of all requests so far; each has one. A count again, which a mean times its divisor is not always."""
+    """Counts the observations of all requests so far; each has one. A count again, which a mean times its
+    divisor is not always."""
     return round(inference["batches"] * inference["batch_size_mean"])
 
 

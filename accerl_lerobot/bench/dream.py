@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a world model costs here: dreaming a chunk, judging it, and learning from a batch.
+"""Cost of a world model on this machine: dreaming a chunk, judging it, and learning from a batch.
 
 Weights are random and so is what is seen; a model that has learnt costs the same.
 """
@@ -23,7 +23,7 @@ from accerl_lerobot.world_model.sizes import TinyConfig
 
 @dataclass(frozen=True, kw_only=True)
 class BenchDreamConfig(Section):
-    """What is measured."""
+    """Fields of ``accerl bench dream``."""
 
     world_model: WorldModelConfig = field(default_factory=TinyConfig)
     cameras: Annotated[int, Range("[1, 64]")] = 1

@@ -49,7 +49,7 @@ ARMS = {
     "shuffled": ("--imagination.model=shuffled",),
     "oracle": ("--imagination.model=oracle",),
 }
-"""What each dreams with."""
+"""World model of each arm's dreams."""
 SPARE = 1.25
 """Draws that a budget of real episodes gives, beside what the updates of a cell need: nobody knows before how
 long the episodes are."""
@@ -57,7 +57,7 @@ long the episodes are."""
 
 @dataclass(frozen=True, kw_only=True)
 class BenchEfficiencyConfig(StudyConfig):
-    """What is compared."""
+    """Fields of ``accerl bench efficiency``."""
 
     recipe: str = "recipes/dreams.yaml"
     """The run that every cell is a variation of; read once, when the study starts."""
@@ -66,12 +66,13 @@ class BenchEfficiencyConfig(StudyConfig):
     seeds: tuple[Seed, ...] = (0, 1, 2, 3, 4)
     """Each a warm start of its own."""
     arms: tuple[Annotated[str, Choice(ARMS)], ...] = tuple(ARMS)
-    """Of none, learned (goes on learning), frozen (does not), oracle (a simulator), and the placebos copy
-    (nothing moves) and shuffled (is told other actions)."""
+    """Compared world models: none, learned (goes on learning), frozen (does not), oracle (a simulator), and
+    the placebos copy (nothing moves) and shuffled (is told other actions)."""
     budgets: tuple[Annotated[int, Range("[1, 1000000]")], ...] = (16, 64, 256)
     """Real episodes of a cell, ``rollout.episodes``."""
     decisions: Annotated[int, Range("[1, 100000]")] = 15
-    """Of a real episode, about; from it follows how often each is learnt from, for the updates to be made."""
+    """Decisions of a real episode, about; from it follows how often each is learnt from, for the updates to
+    be made."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -80,8 +81,8 @@ class BenchEfficiencyConfig(StudyConfig):
 
 
 def cells(config: BenchEfficiencyConfig, recipe: RunConfig) -> list[Cell]:
-    """Of all arms, budgets and seeds; seeds outermost, so that what is stopped has compared everything on the
-    first ones.
+    """Cells of all arms, budgets and seeds; seeds outermost, so that what is stopped has compared everything
+    on the first ones.
     """
     updates = recipe.trainer.updates if config.updates is None else config.updates
     made = []
@@ -151,7 +152,7 @@ def compare(config: BenchEfficiencyConfig, results: Results) -> dict[str, Any]:
 
 
 def over_none(rows: Sequence[dict[str, Any]], none: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """What is gained over imagining nothing, by seeds: ``gain`` and its ``gain_ci95``.
+    """Gain over imagining nothing, by seeds: ``gain`` and its ``gain_ci95``.
 
     That is `mean_interval` of the seeds' gains, and never narrower than of all episodes together by Newcombe
     (1998, method 10): seeds may gain alike by chance. Empty where `none` is, or there is one seed.

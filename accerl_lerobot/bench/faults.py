@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run survives: faults of each of its processes, at named points and at any moment, and at what cost.
+"""Faults that a run survives: in each of its processes, at named points and at any moment, and their cost.
 
     accerl bench faults                                          # a run made of time: seconds each
     accerl bench faults --recipe=recipes/quickstart.yaml --faults=kill --targets=driver --repeats=5
@@ -53,7 +53,7 @@ ENDLESS = 1_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class BenchFaultsConfig(Section):
-    """What is done, and to whom."""
+    """Fields of ``accerl bench faults``."""
 
     recipe: str | None = None
     """The run. Its demonstrations and SFT are cut short, unless it has a policy: they do not matter here.
@@ -69,8 +69,8 @@ class BenchFaultsConfig(Section):
         "driver",
         "everything",
     )
-    """Of these, and of Ray's own processes: gcs_server, raylet, dashboard agent, runtime env agent and log
-    monitor; where anything is imagined, of dream and world learning. driver: the process of the run
+    """Processes to strike: these, and Ray's own: gcs_server, raylet, dashboard agent, runtime env agent and
+    log monitor; where anything is imagined, dream and world learning too. driver: the process of the run
     itself, which is gone on with by its command line. everything: it and all below it, at once."""
     faults: tuple[str, ...] = FAULTS
     """kill, stop: SIGKILL and SIGSTOP, at a point or at any moment. exception, exit (with code 0), hang (of
@@ -85,7 +85,7 @@ class BenchFaultsConfig(Section):
     on to the last of them and ends by itself, and so does one that was left alone, to compare what they have
     learnt. 0: hits follow each other, and the run is asked to stop like others."""
     seed: Seed = 0
-    """Of the order, the places and the moments."""
+    """Seed of the order, the places and the moments."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

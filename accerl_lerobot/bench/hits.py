@@ -46,14 +46,14 @@ TIDY_S = 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class Hit:
-    """What came of one."""
+    """Outcome of one fault."""
 
     target: str
     fault: str
     place: str
     """One of `POINTS`, or `ANYWHERE`."""
     fired: bool
-    """Whether there is a proof that it happened."""
+    """True if there is a proof that it happened."""
     outcome: str
     """See above."""
     seconds: float | None = None
@@ -64,7 +64,7 @@ class Hit:
     doubled: int = 0
     """Updates in it twice."""
     books: bool | None = None
-    """Whether replay's add up."""
+    """True if replay's add up."""
     said: str = ""
     """Why it was lost, or what the run ended with."""
 

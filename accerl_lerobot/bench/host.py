@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a measurement ran on: the machine, how busy it was, and what its parts can do at best."""
+"""The machine of a measurement: its parts, how busy it was, and the best they can do."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ def host() -> dict[str, Any]:
 
 
 def floors() -> dict[str, float]:
-    """What nothing here can beat: copying memory, waking up, a byte through a pipe and back in one thread."""
+    """Lower bounds of all measurements here: copying memory, waking up, a byte through a pipe and back in
+    one thread."""
     source = np.ones(MEMCPY_BYTES, np.uint8)
     target = np.empty_like(source)
     copies = [_seconds(lambda: np.copyto(target, source)) for _ in range(9)][1:]
@@ -68,7 +69,7 @@ def spread(values: list[float]) -> dict[str, Any]:
 
 
 def ranged(values: dict[str, Any], form: str) -> str:
-    """What `spread` gives, for people: median and range in this form."""
+    """Formats the outcome of `spread`: median and range in this form."""
     return f"{values['median']:{form}} ({values['min']:{form}} to {values['max']:{form}})"
 
 

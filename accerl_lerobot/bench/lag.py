@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What staleness does to each algorithm: one recipe, with published weights held back on purpose.
+"""The effect of staleness on each algorithm: one recipe, with published weights held back on purpose.
 
     accerl bench lag --recipe=recipes/quickstart.yaml --updates=200
 
@@ -34,7 +34,7 @@ from accerl_lerobot.ranges import Steps
 
 @dataclass(frozen=True, kw_only=True)
 class BenchLagConfig(StudyConfig):
-    """What is compared."""
+    """Fields of ``accerl bench lag``."""
 
     output_dir: str = "outputs/lag"
     """Folder of the runs and of lag.json, lag.md and lag.png; finished cells in it are kept."""
@@ -50,8 +50,8 @@ class BenchLagConfig(StudyConfig):
 
 
 def cells(config: BenchLagConfig) -> list[Cell]:
-    """Of all algorithms, lags and seeds; seeds outermost, so that what is stopped has compared everything on
-    the first ones.
+    """Cells of all algorithms, lags and seeds; seeds outermost, so that what is stopped has compared
+    everything on the first ones.
     """
     return [
         Cell(

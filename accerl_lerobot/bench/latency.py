@@ -35,7 +35,7 @@ QUANTILES = (0.5, 0.95, 0.99)
 
 @dataclass(frozen=True, kw_only=True)
 class BenchLatencyConfig(Section):
-    """What is timed, for how long."""
+    """Fields of ``accerl bench latency``."""
 
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     """Any world."""
@@ -44,7 +44,7 @@ class BenchLatencyConfig(Section):
     decisions: Annotated[int, Range("[2, 1000000000]")] = 600
     """Timed; more than an episode has, or no reset is."""
     seed: Seed = 0
-    """Of the actions and episodes."""
+    """Seed of the actions and episodes."""
     output_dir: str = "outputs/latency"
     """Folder for trace.txt (a duration on each line), latency.json, .md and .png."""
 
@@ -117,7 +117,7 @@ def timed(
 
 
 def described(seconds: np.ndarray) -> dict[str, float]:
-    """Of durations (T,): ``mean``, ``p50``, ``p95``, ``p99`` and ``longest`` in milliseconds, ``cv``
+    """Describes durations (T,): ``mean``, ``p50``, ``p95``, ``p99`` and ``longest`` in milliseconds, ``cv``
     (standard deviation over mean) and ``n``."""
     return {
         "mean": 1000 * float(seconds.mean()),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a policy of full size costs here: memory, decisions, updates, and what rounding does to its log-probs.
+"""Cost of a full-size policy here: memory, decisions, updates, and the rounding of its log-probs.
 
 Weights are random, sizes those of the published checkpoint, inputs made up: nothing is downloaded. Decisions
 are made, re-scored at equal weights, and learnt from, as inference and trainer do it.
@@ -22,12 +22,12 @@ from accerl_lerobot.policies.config import TuningConfig
 from accerl_lerobot.ranges import Choice, Device, Range, Repeats, Section
 
 STATE_DIM, ACTION_DIM, TOKENS = 8, 7, 48
-"""Of LIBERO: end-effector state, end-effector action; length of a padded instruction."""
+"""LIBERO's sizes: end-effector state, end-effector action; length of a padded instruction."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchPolicyConfig(Section):
-    """What is measured."""
+    """Fields of ``accerl bench policy``."""
 
     type: Annotated[str, Choice(BUILDERS)] = "smolvla"
     """smolvla, pi0 or pi05."""

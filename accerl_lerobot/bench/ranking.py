@@ -38,7 +38,7 @@ class BenchRankingConfig(Section):
     env: EnvConfig = field(default_factory=MetaWorldConfig)
     """The world."""
     episodes: Annotated[int, Range("[1, 1000000]")] = 50
-    """Of each policy, in the world and in dreams."""
+    """Episodes of each policy, in the world and in dreams."""
     worlds: Annotated[int, Range("[1, 1000]")] = 8
     """Episodes at a time in the world."""
     device: Device = "auto"

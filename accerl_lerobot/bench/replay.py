@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the replay costs: storing, drawing, the journal and a checkpoint, in one process and without waiting.
+"""Cost of the replay: storing, drawing, the journal and a checkpoint, in one process and without waiting.
 
 Per decision, as that is what everything else is counted in. With and without the journal by turns; the share
 of a run that the journal and checkpoints take follows from the decisions a second that it makes.

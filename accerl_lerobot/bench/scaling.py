@@ -40,7 +40,7 @@ class BenchScalingConfig(MachineryConfig):
     update_ms: NonNegative = 10.0
     """Short, so that the trainer is not what is measured."""
     seconds: Positive = 6.0
-    """Of a block, at least."""
+    """Shortest duration of a block."""
     blocks: Repeats = 5
     """At each count."""
     output_dir: str = "outputs/scaling"
@@ -78,7 +78,7 @@ def bench_scaling(config: BenchScalingConfig) -> dict[str, Any]:
 
 
 def compare(config: BenchScalingConfig, blocks: dict[int, list[Block]]) -> list[dict[str, Any]]:
-    """Of the blocks of each count: `bench_scaling`'s ``counts``."""
+    """Compares the blocks of each count: `bench_scaling`'s ``counts``."""
     rates = {n: spread([b.decisions_per_s for b in of]) for n, of in blocks.items()}
     first = config.counts[0]
     one = rates[first]["median"] / first

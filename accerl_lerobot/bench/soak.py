@@ -36,7 +36,7 @@ from accerl_lerobot.timeline.read import shares
 
 QUIET, STRUCK = "quiet", "struck"
 ORDER = (QUIET, STRUCK, STRUCK, QUIET)
-"""Of blocks, again and again."""
+"""Order of blocks, again and again."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +58,7 @@ class BenchSoakConfig(Section):
     stall_s: Annotated[float, Range("[5, inf)")] = 10.0
     """See ``bench faults``."""
     seed: Seed = 0
-    """Of faults, places and moments."""
+    """Seed of faults, places and moments."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -72,7 +72,7 @@ class BenchSoakConfig(Section):
 
     @property
     def blocks(self) -> int:
-        """Of them, in whole turns."""
+        """Number of blocks, in whole turns."""
         whole = int(self.minutes * 60 / self.block_s)
         return whole // len(ORDER) * len(ORDER)
 
@@ -161,7 +161,8 @@ def _made(victim: Victim) -> tuple[int, float]:
 
 
 def compare(blocks: list[dict[str, Any]]) -> dict[str, Any]:
-    """Of blocks in `ORDER`: ``rates`` of either kind, and what is ``left`` of them, pair by pair."""
+    """Compares the blocks in `ORDER`: ``rates`` of either kind, and the share ``left`` of them, pair by
+    pair."""
     rates, left = {}, {}
     for name in ("updates", "decisions"):
         of = {kind: [b[name] for b in blocks if b["kind"] == kind] for kind in (QUIET, STRUCK)}

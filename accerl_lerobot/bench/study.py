@@ -34,12 +34,12 @@ INTERVALS = "intervals are 95 %, over seeds where there are several"
 """For people, see `together`."""
 IN_USE = "a study, or a run of one that was killed, still writes there; wait for it or end it"
 LOG_LINES = 12
-"""Of a run that failed, shown in the error."""
+"""Log lines of a failed run that its error shows."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StudyConfig(Section):
-    """What all studies have."""
+    """Fields that all studies have."""
 
     recipe: str = "recipes/quickstart.yaml"
     """The run that every cell is a variation of; read once, when the study starts."""
@@ -48,9 +48,9 @@ class StudyConfig(Section):
     seeds: tuple[Seed, ...] = (0, 1, 2)
     """Each a warm start of its own."""
     updates: Steps | None = None
-    """Of each cell; None: the recipe's."""
+    """Updates of each cell; None: the recipe's."""
     episodes: Annotated[int, Range("[1, 1000000]")] = 100
-    """Of the evaluation after each cell."""
+    """Episodes of the evaluation after each cell."""
     jobs: Annotated[int, Range("[1, 1024]")] = 2
     """Cells that run at the same time, each on one thread."""
 
@@ -71,16 +71,16 @@ class Cell:
     """One run of a study."""
 
     name: str
-    """Of its folder."""
+    """Name of its folder."""
     seed: int
     of: dict[str, Any]
-    """What tells it from the others of its seed, for people."""
+    """Values that distinguish it from the others of its seed, for people."""
     chosen: tuple[str, ...]
-    """What it adds to the command line."""
+    """Arguments that it adds to the command line."""
 
 
 class Results(NamedTuple):
-    """What runs said of themselves."""
+    """Summaries of the runs of a study."""
 
     starts: dict[int, dict[str, Any]]
     """Summary of each seed's warm start."""
@@ -93,7 +93,7 @@ class Results(NamedTuple):
         return {str(seed): summary["success_after"] for seed, summary in self.starts.items()}
 
     def table(self, shown: Sequence[str]) -> list[dict[str, Any]]:
-        """What each cell is of, its seed, success and n, and these fields of its summary."""
+        """Table of the cells: their values, seed, success and n, and these fields of the summary."""
         return [
             cell.of
             | {"seed": cell.seed, "success": summary["success_after"], "n": summary["n_after"]}

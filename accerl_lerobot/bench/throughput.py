@@ -29,7 +29,7 @@ from accerl_lerobot.replay.turns import Schedule
 
 @dataclass(frozen=True, kw_only=True)
 class BenchThroughputConfig(Section):
-    """What is measured, for how long."""
+    """Fields of ``accerl bench throughput``."""
 
     recipe: str = "recipes/quickstart.yaml"
     """The run."""
@@ -38,7 +38,7 @@ class BenchThroughputConfig(Section):
     schedules: tuple[Schedule, ...] = ARMS
     """Which ones, by turns in one run."""
     seconds: Positive = 20.0
-    """Of a block, at least."""
+    """Shortest duration of a block."""
     rounds: Repeats = 3
     """Times each schedule is measured twice, forth and back."""
     output_dir: str = "outputs/throughput"
@@ -102,7 +102,7 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
 
 
 def books(run: RunConfig, rollout: dict[str, float], replay: dict[str, float]) -> dict[str, float]:
-    """What became of the decisions that were made.
+    """Accounts for all decisions that were made.
 
     Raises:
         RuntimeError: fewer are under way than none, or more than there can be.
@@ -151,7 +151,7 @@ def _rows(result: dict[str, Any]) -> list[list[str]]:
 
 
 def _draw(path: Path, result: dict[str, Any]) -> None:
-    """What is collected and what is learned from, for each schedule; whiskers are ranges of blocks."""
+    """Draws the decisions collected and learned from, for each schedule; whiskers are ranges of blocks."""
     schedules = result["schedules"]
     with drawing(path) as axes:
         for place, (key, label) in zip(

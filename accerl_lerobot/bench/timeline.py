@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What recording the timeline costs.
+"""Cost of recording the timeline.
 
     accerl bench timeline --run=RUN
 
@@ -32,10 +32,10 @@ ON, OFF, FLOOR = "on", "off", "floor"
 
 @dataclass(frozen=True, kw_only=True)
 class BenchTimelineConfig(Section):
-    """What is measured, for how long."""
+    """Fields of ``accerl bench timeline``."""
 
     entries: Annotated[int, Range("[2, 100000000]")] = 100_000
-    """Of one block, 2 or more."""
+    """Entries of one block, 2 or more."""
     repeats: Repeats = 5
     """Times each arm is measured twice."""
     folder: str | None = None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What it costs to ask inference for a decision: Ray, shared memory, and what no transport can beat.
+"""Cost of asking inference for a decision: Ray, shared memory, and the lower bound of any transport.
 
     accerl bench transport --output_dir=outputs/transport
 
@@ -45,18 +45,18 @@ CHUNK, ACTIONS, LATENT = 50, 7, 32
 
 @dataclass(frozen=True, kw_only=True)
 class BenchTransportConfig(Section):
-    """What is measured, how often."""
+    """Fields of ``accerl bench transport``."""
 
     sizes: tuple[Annotated[str, Choice(IMAGES)], ...] = tuple(IMAGES)
     """Observations: ``12 KB`` (64 pixels, one camera) and ``301 KB`` (224 pixels, two cameras)."""
     callers: tuple[Annotated[int, Range("[1, 1000]")], ...] = (1, 8)
     """Processes that ask at a time."""
     calls: Annotated[int, Range("[10, 100000000]")] = 400
-    """Of each caller in a block."""
+    """Calls of each caller in a block."""
     rounds: Repeats = 3
     """Times each arm is measured twice."""
     seed: Seed = 0
-    """Of what is in the images."""
+    """Seed of the images' contents."""
     output_dir: str | None = None
     """Folder to create, for transport.json and transport.png; None prints only."""
 
@@ -91,7 +91,7 @@ def decision() -> Decision:
 
 
 def arrays_of(request: Request) -> list[np.ndarray]:
-    """What weighs in a request."""
+    """The large arrays of a request."""
     return [value for value in request.observation.values() if isinstance(value, np.ndarray)]
 
 

@@ -38,7 +38,7 @@ from accerl_lerobot.transport.nameless import listening, new_name, new_socket
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
 
 LONG_S = 120.0
-"""What takes that long hangs."""
+"""Seconds after which an end counts as hung."""
 SIZE = struct.Struct("<Q")
 LARGEST = 1 << 20
 """Bytes of an observation at most."""
@@ -167,7 +167,7 @@ class Crowd:
 
 
 class Floor:
-    """What no transport can beat: bare pipes and a bare socket between the same two processes."""
+    """Lower bound of any transport: bare pipes and a bare socket between the same two processes."""
 
     def __init__(self, name: str) -> None:
         self._token = new_socket()

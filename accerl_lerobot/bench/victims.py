@@ -88,7 +88,7 @@ class Victim:
         return sorted(pid for pid in found if (now := _stat(pid)) is not None and now[1] not in found)
 
     def records(self) -> list[dict[str, Any]]:
-        """What it has logged; a last line that is being written is left out."""
+        """Records that it has logged; a last line that is being written is left out."""
         path = self.folder / METRICS
         lines = path.read_text().splitlines(keepends=True) if path.is_file() else []
         return [json.loads(line) for line in lines if line.endswith("\n")]
@@ -175,13 +175,13 @@ def hit(pid: int, number: int) -> bool:
 
 
 def alive(pid: int) -> bool:
-    """Whether there is such a process, which is no zombie."""
+    """True if there is such a process, which is no zombie."""
     now = _stat(pid)
     return now is not None and now[0] not in "ZX"
 
 
 def await_hit(pid: int, number: int, timeout: float = 10.0) -> bool:
-    """Whether a signal that was sent has done what it should: the process has stopped, or is gone."""
+    """True if a signal that was sent has done what it should: the process has stopped, or is gone."""
     deadline = time.monotonic() + timeout
     while time.monotonic() < deadline:
         now = _stat(pid)

@@ -41,7 +41,7 @@ ARMS: dict[str, tuple[str, Way, bool, float]] = {
 }
 """Arm → transport and way, whether only changes are sent, and the share of values that an update changes."""
 FAR = ("Ray", "gloo")
-"""Those that lead to other nodes."""
+"""Readers on other nodes."""
 MB = 1 << 20
 WARM = 4
 """Publications of a block that do not count: until all slabs have been written to and mapped."""
@@ -50,7 +50,7 @@ Tensors = dict[str, np.ndarray]
 
 @dataclass(frozen=True, kw_only=True)
 class BenchWeightsConfig(Section):
-    """What is published, to how many."""
+    """Fields of ``accerl bench weights``."""
 
     sizes_mb: tuple[Annotated[int, Range("[1, 1048576]")], ...] = (1, 16, 256, 1024)
     """Sizes of a set of float32 weights, in MiB. With two readers the largest needs about 15 times
@@ -62,7 +62,7 @@ class BenchWeightsConfig(Section):
     repeats: Repeats = 5
     """Publications of each arm that count, each in a block of its own."""
     seed: Seed = 0
-    """Of the values, and of which ones change."""
+    """Seed of the values, and of which ones change."""
     apart: bool = False
     """Readers are on a Ray node of their own, with an object store of its own, and share no memory: what lies
     between two machines, but for the cable."""
@@ -153,7 +153,7 @@ def changed_shares(folder: Path) -> list[dict[str, Any]]:
 
 
 def draw(path: Path, result: dict[str, Any]) -> None:
-    """What memcpy allows and how much of it is reached, over the size; a line per arm."""
+    """Draws the speed of memcpy and the share of it that is reached, over the size; a line per arm."""
     import matplotlib as mpl
 
     mpl.use("Agg")

@@ -35,7 +35,7 @@ Decide = Callable[[], int]
 
 @dataclass(frozen=True, kw_only=True)
 class BenchWorldConfig(Section):
-    """What is measured, for how long."""
+    """Fields of ``accerl bench world``."""
 
     task: str = "drawer-open-v3"
     """One MetaWorld task."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a LeRobotDataset's files say is checked before LeRobot believes it.
+"""Checks of a LeRobotDataset's files, before LeRobot believes them.
 
 LeRobot fills the templates of ``meta/info.json`` in with `str.format` and joins the outcome to the folder.
 Where an image's ``bytes`` are missing, Hugging Face's `datasets` opens what its ``path`` names, a file of
@@ -57,12 +57,12 @@ DTYPES = {
 IMAGES = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")
 """First bytes of PNG and JPEG, which LeRobot writes; for one of the others Pillow runs a program."""
 LEARNT = ("action", "observation", "next.reward", "timestamp")
-"""What names of features begin with in which a number that is not finite would be learnt from."""
+"""First parts of the names of features in which a non-finite number would be learnt from."""
 PLAIN = {"Value", "Sequence", "List", "LargeList"}
 """Kinds of columns that `datasets` reads without opening other files."""
 DATA_PLACES: dict[str, type] = {"chunk_index": int, "file_index": int}
 VIDEO_PLACES: dict[str, type] = DATA_PLACES | {"video_key": str}
-"""What the templates of ``info.json`` may have filled in."""
+"""Fields that the templates of ``info.json`` may contain."""
 
 
 def check_info(info: dict[str, Any], origin: Origin) -> None:
@@ -290,7 +290,7 @@ def _regular(values: Any, depth: int = 0) -> tuple[int, ...] | None:
 
 
 def _files(root: Path, folder: str, origin: Origin) -> list[Path]:
-    """Those that LeRobot would read, none of which leads out of the dataset."""
+    """Files that LeRobot would read, none of which leads out of the dataset."""
     if not safe_join(root, folder, origin).is_dir():
         return []
     found = sorted((root / folder).glob("*/*.parquet"))
@@ -432,7 +432,7 @@ _FAMILIES = {"bool": "b", "int": "i", "uint": "i", "float": "f"}
 
 
 def _family(kind: Any) -> str:
-    """What a column holds, at the bottom of its lists: b, i, f, or nothing of these."""
+    """Kind of a column's values, at the bottom of its lists: b, i, f, or nothing of these."""
     import pyarrow as pa
 
     kind = getattr(kind, "storage_type", kind)

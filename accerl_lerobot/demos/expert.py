@@ -30,7 +30,7 @@ _DRIFT_FROM = 60
 
 @dataclass(kw_only=True)
 class Episode:
-    """What one episode showed; every array has one row per env step."""
+    """One recorded episode; every array has one row per env step."""
 
     observations: dict[str, np.ndarray]
     """Before each step, under LeRobot's names."""
@@ -41,7 +41,7 @@ class Episode:
     task: str
     """The instruction text."""
     done: bool
-    """Whether the last step ended the episode."""
+    """True if the last step ended the episode."""
     success_at: int
     """Index of the first step after which the task was achieved; -1 for never."""
     seed: int

@@ -55,7 +55,7 @@ TOLERANCE = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class ExportConfig(Section):
-    """What is taken, and where to."""
+    """Fields of ``accerl export``."""
 
     path: str | None = None
     """Folder of an ``accerl train`` run."""

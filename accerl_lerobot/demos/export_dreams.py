@@ -27,7 +27,7 @@ from accerl_lerobot.world_model.recorded import Dreamt
 VERSION, WORLD_VERSION = "policy_version", "world_model_version"
 """Features: updates behind the weights that decided; gradient steps behind the world model."""
 IMAGINED, DEPTH = "imagined", "dream_depth"
-"""Whether the frame was imagined, and after how many imagined decisions it is seen."""
+"""True if the frame was imagined, and after how many imagined decisions it is seen."""
 ORIGIN_SEED, ORIGIN_DECISION = "origin_seed", "origin_decision"
 """The real episode that the dream begins in, and after how many of its decisions."""
 _NUMBERS = (VERSION, WORLD_VERSION, DEPTH, ORIGIN_SEED, ORIGIN_DECISION)

@@ -69,9 +69,9 @@ class DemosConfig(Section, section="demos"):
     failure_share: Share = 0.0
     """Share of episodes that drift at random from early on and fail; for success and world models."""
     keep_failures: bool = False
-    """Whether an expert episode that failed is kept; otherwise it is tried again with another seed."""
+    """Keep expert episodes that failed; otherwise they are tried again with another seed."""
     shifted: bool = False
-    """Whether ``env.shift`` holds for the demonstrations too; otherwise they show the world without it."""
+    """Apply ``env.shift`` to the demonstrations too; otherwise they show the world without it."""
     max_steps: Annotated[int, Range("[1, 1000000]")] = 500
     """Episode limit in env steps; the environment's own limit holds too."""
     seed: Seed = 0

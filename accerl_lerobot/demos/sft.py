@@ -66,7 +66,7 @@ class SFTConfig(Section, section="sft"):
     backbone: BackboneConfig | None = None
     """Write a random backbone of this size for the new policy instead of loading one from the Hub."""
     trust_remote_code: bool = False
-    """Whether Python code from a Hub repository that the policy names is run with your rights. It needs
+    """True if Python code from a Hub repository that the policy names is run with your rights. It needs
     `code_revision`. π0-FAST does without: its action tokeniser is read, not run."""
     code_revision: str | None = None
     """Commit of that repository, 40 hexadecimal digits: the one whose code you have read. No other is run."""

@@ -23,7 +23,7 @@ def write_starts(root: Path, starts: Sequence[Start]) -> None:
 
 
 def read_starts(root: Path, episodes: int, origin: Origin) -> list[Start]:
-    """What `write_starts` wrote.
+    """Reads the file of `write_starts`.
 
     Args:
         root: of the dataset.

@@ -17,7 +17,7 @@ from accerl_lerobot.experience import Observation
 
 @dataclass(frozen=True, kw_only=True)
 class WorldSpec:
-    """What a policy must fit to act in a world."""
+    """Sizes and features that a policy must fit to act in a world."""
 
     images: dict[str, tuple[int, int, int]]
     """``observation.images.<camera>`` → (H, W, 3)."""
@@ -39,7 +39,7 @@ class WorldSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class ChunkResult:
-    """What happened while a chunk was executed; `rewards` has one entry per executed step, at most K."""
+    """Outcome of one executed chunk; `rewards` has one entry per executed step, at most K."""
 
     observation: Observation
     """After the last executed step."""
@@ -48,7 +48,7 @@ class ChunkResult:
     terminated: bool
     truncated: bool
     success: bool
-    """Whether the task has been achieved at any step of the episode so far."""
+    """True if the task has been achieved at any step of the episode so far."""
     info: dict[str, float] = field(default_factory=dict)
 
     @property

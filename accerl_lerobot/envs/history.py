@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a policy that looks back sees: the last observations of any world, oldest first.
+"""Observation history for policies that look back: the last observations of any world, oldest first.
 
 LeRobot's ``n_obs_steps`` counts env steps, not decisions, so the last states of a chunk are looked at one by
 one; all before them are passed without a picture, as always.

@@ -51,7 +51,7 @@ class LeRobotEnvConfig(EnvConfig):
     kwargs: dict[str, Any] = field(default_factory=dict)
     """Fields of LeRobot's config of that environment, such as ``task`` or ``obs_type``."""
     trust_remote_code: bool = False
-    """Whether an environment on the Hub is run with your rights. It needs ``hub_path`` in `kwargs`, with the
+    """True if an environment on the Hub is run with your rights. It needs ``hub_path`` in `kwargs`, with the
     commit whose code you have read: ``owner/name@COMMIT`` or ``owner/name@COMMIT:file.py``."""
     task: str = ""
     """Instruction text, for environments that have none of their own."""

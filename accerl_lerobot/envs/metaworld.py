@@ -54,11 +54,11 @@ class MetaWorldConfig(EnvConfig):
     lighting: Literal["cheap", "default"] = "cheap"
     """``cheap`` (no shadows, reflections or multisampling: ten times faster in software) or ``default``."""
     terminate_on_success: bool = True
-    """Whether the first success ends the episode."""
+    """True if the first success ends the episode."""
     reward: Literal["success", "dense"] = "success"
     """``success`` (1.0 at the first success, else 0.0) or ``dense`` (MetaWorld's own, 0 to 10 a step)."""
     environment_state: bool = False
-    """Whether observations hold ``observation.environment_state``: MetaWorld's own 39 numbers, objects and
+    """True if observations hold ``observation.environment_state``: MetaWorld's own 39 numbers, objects and
     goal included, and the share of `max_steps` gone. For ``algorithm.type=chunk_critic``; a policy that was
     trained without it never reads it."""
     shift: ShiftConfig = field(default_factory=ShiftConfig)
@@ -237,7 +237,7 @@ class MetaWorld(World):
 
 
 def _diverged(sim: Any) -> bool:
-    """Whether MuJoCo met non-finite numbers in this episode and silently reset itself."""
+    """True if MuJoCo met non-finite numbers in this episode and silently reset itself."""
     warning = import_mujoco().mjtWarning
     bad = (warning.mjWARN_BADQPOS, warning.mjWARN_BADQVEL, warning.mjWARN_BADQACC)
     return any(sim.data.warning.number[kind] for kind in bad)

@@ -26,7 +26,7 @@ INSTRUCTIONS = {"match": "Match the target", "mirror": "Mirror the target"}
 _SIGN = {"match": 1.0, "mirror": -1.0}
 _REACH = 0.8
 RESET = "reset"
-"""What a line of a trace begins with that is of a reset."""
+"""First word of a trace's lines about resets."""
 
 
 @EnvConfig.register_subclass("simulated")
@@ -57,9 +57,9 @@ class SimulatedConfig(EnvConfig):
     reward: Literal["success", "dense"] = "success"
     """``success`` (1.0 at the first success, else 0.0) or ``dense`` (1 − distance, each step)."""
     terminate_on_success: bool = True
-    """Whether the first success ends the episode."""
+    """True if the first success ends the episode."""
     environment_state: bool = False
-    """Whether observations hold ``observation.environment_state``: the state, and the share of `max_steps`
+    """True if observations hold ``observation.environment_state``: the state, and the share of `max_steps`
     gone."""
     step_ms: NonNegative = 0.0
     """Mean time an env step takes, in milliseconds; slept, so it costs no processor."""

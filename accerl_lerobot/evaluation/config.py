@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is evaluated, how often, on which seeds."""
+"""Fields of evaluation: tasks, times and seeds."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What people look at: the success curve, and the policy before and after."""
+"""Pictures for people: the success curve, and the policy before and after."""
 
 from __future__ import annotations
 

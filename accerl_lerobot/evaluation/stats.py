@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a number of successes allows one to say, and whether two policies differ.
+"""Intervals of success rates, and comparisons of two policies.
 
 A success rate is never reported without n and an interval. Two policies are compared on the *same* (task,
 seed) episodes: what both solve or both fail says nothing about the difference, and leaving it out is what
@@ -72,7 +72,7 @@ class Comparison:
     difference: float
     """Rate of a minus rate of b, in [−1, 1]."""
     interval: Interval
-    """Of the difference."""
+    """Interval of the difference."""
     p_value: float
     """Two-sided, of the exact McNemar test: how often chance alone splits the disagreements this unevenly."""
 
@@ -175,7 +175,7 @@ def mean_interval(values: Sequence[float], confidence: float = 0.95) -> Interval
 
 
 def compare(a: Outcomes, b: Outcomes, confidence: float = 0.95) -> Comparison:
-    """Whether a is better than b, episode by episode.
+    """True if a is better than b, episode by episode.
 
     Args:
         a: outcomes of one policy.

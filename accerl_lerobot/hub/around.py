@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known of a folder that is pushed: the run it came from, and what was measured there.
+"""Facts around a folder that is pushed: the run it came from, and its measurements.
 
 A number goes with a policy only if it was measured on it: a run's summary is of its last checkpoint, and an
 evaluation says which policy it was of.
@@ -31,15 +31,15 @@ KEPT = {
 
 @dataclass(frozen=True, kw_only=True)
 class Around:
-    """What is known."""
+    """Facts around a folder."""
 
     recipe: dict[str, Any] = field(default_factory=dict)
     summary: dict[str, Any] = field(default_factory=dict)
-    """Of a run that ended with this very policy."""
+    """Summary of a run that ended with this very policy."""
     evaluation: dict[str, Any] = field(default_factory=dict)
     """By ``accerl eval``, of this very policy."""
     trial: dict[str, Any] = field(default_factory=dict)
-    """Of the world model."""
+    """Trial of the world model."""
     files: Mapping[str, Path] = field(default_factory=dict)
     """Name in the repository → file that goes with the folder."""
 
@@ -96,7 +96,7 @@ def _run_of(folder: Path, kind: str) -> Path | None:
 
 
 def _is_last(folder: Path, run: Path) -> bool:
-    """Whether a run's summary is of the policy in `folder`."""
+    """True if a run's summary is of the policy in `folder`."""
     return folder.parent.name.isdigit() and int(folder.parent.name) == read_json(run / SUMMARY).get("updates")
 
 

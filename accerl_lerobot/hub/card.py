@@ -131,7 +131,7 @@ def _measured(around: Around) -> list[tuple[str, dict[str, Any]]]:
 
 
 def _results(around: Around) -> list[EvalResult]:
-    """What was measured last, in all and per task, for the Hub's model index."""
+    """Latest measurements, in all and per task, for the Hub's model index."""
     rows = _measured(around)
     if not rows or rows[-1][0] == "before RL":
         return []
@@ -232,7 +232,7 @@ def _use_policy(repo_id: str, kind: str, config: Mapping[str, Any], around: Arou
 
 
 def _own_backbone(config: Mapping[str, Any]) -> bool:
-    """Whether LeRobot finds its backbone only once it has been pulled, which sets its place."""
+    """True if LeRobot finds its backbone only once it has been pulled, which sets its place."""
     named = str(config.get("vlm_model_name") or "")
     return named.startswith(("/", "backbone"))
 

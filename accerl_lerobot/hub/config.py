@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is pushed and pulled, and where; free of the Hub's client."""
+"""Fields of ``accerl push`` and ``accerl pull``; free of the Hub's client."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class PushConfig(Section):
     revision: str = "main"
     """A branch that is there."""
     private: bool = True
-    """Whether only you see it. A repository that is public is written to only when this is false, and one
+    """Keep the repository private. A repository that is public is written to only when this is false, and one
     that is private stays so."""
     message: str | None = None
-    """Of the commit. None: says what was pushed."""
+    """Message of the commit. None: says what was pushed."""
     include: list[str] = field(default_factory=list)
     """Folders of a run that are left at home otherwise, such as ``[demos, sft, tensorboard]``."""
     evaluation: str | None = None

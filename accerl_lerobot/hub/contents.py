@@ -25,7 +25,7 @@ from accerl_lerobot.hub.manifest import CARD, MANIFEST, entry_of
 from accerl_lerobot.hub.portable import cleaned, is_record, own_names
 
 RECORD = "accerl_pulled.json"
-"""What a pull leaves beside the files: which commit they are."""
+"""File that a pull leaves beside the others: the commit that they are of."""
 NOT_CONTENTS = (CARD, MANIFEST, RECORD, ".gitattributes")
 OF_A_RUN = (".yaml", ".json", ".jsonl", ".png", ".jpg", ".gif", ".svg", ".mp4", ".html")
 """Suffixes of files at the top of a run that are results."""
@@ -36,7 +36,7 @@ Files = dict[str, Path | bytes]
 
 
 def contents(folder: Path, kind: str, include: Sequence[str] = ()) -> Files:
-    """What a folder is worth keeping for, without paths of this machine.
+    """Files of a folder that are worth keeping, without paths of this machine.
 
     Args:
         folder: of `kind`.

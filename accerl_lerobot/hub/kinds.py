@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a folder is, seen from what is in it."""
+"""Kinds of folders, told by their files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NEEDED = {
 }
 """Kind → what its folder has at least."""
 CODEBASE_VERSION = "v3.0"
-"""Of LeRobotDatasets, and the tag under which LeRobot looks for them on the Hub."""
+"""Version of LeRobotDatasets, and the tag under which LeRobot looks for them on the Hub."""
 
 
 def repo_type(kind: str) -> str:

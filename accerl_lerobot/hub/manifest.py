@@ -26,7 +26,7 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class Entry:
-    """What a file must be."""
+    """Size and hash that a file must have."""
 
     size: int
     """Bytes."""
@@ -37,7 +37,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What was pushed."""
+    """Files of a push."""
 
     kind: str
     files: Mapping[str, Entry]

@@ -40,7 +40,7 @@ HOMES = (
 
 
 def is_record(name: str) -> bool:
-    """Whether a file is text that may name paths."""
+    """True if a file is text that may name paths."""
     path = PurePosixPath(name)
     return path.suffix in RECORDS and path.name not in VOCABULARIES
 
@@ -112,7 +112,7 @@ def _relative(text: str, folder: Path) -> str:
 
 
 def _is_local(value: Any) -> bool:
-    """Whether it is a path of a machine as a whole."""
+    """True if it is a path of a machine as a whole."""
     whole = isinstance(value, str) and value.startswith(("/", "~/")) and "\n" not in value
     return whole and _of_a_machine(value)
 

@@ -250,7 +250,7 @@ def _receive(folder: Path, home: Path, expected: dict[str, Entry], repo_id: str)
 
 
 def _both(pushed: Entry, listed: Entry | None) -> Entry:
-    """What a file must be by the list that was pushed and, where that agrees, by the server's."""
+    """Size and hash of a file by the list that was pushed and, where that agrees, by the server's."""
     oid = listed.oid if listed is not None else None
     return Entry(pushed.size, pushed.sha256, oid)
 

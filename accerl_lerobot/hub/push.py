@@ -152,7 +152,7 @@ class _Push:
         self.api.create_repo(self.repo_id, private=self.config.private, repo_type=self.type, exist_ok=True)
 
     def _before(self, commit: str) -> Manifest | None:
-        """What the last push left there.
+        """Manifest of the last push there.
 
         Raises:
             InputError: something of another kind.

@@ -172,7 +172,7 @@ def _frames(error: BaseException) -> Iterator[Any]:
 
 
 def _answered(error: HfHubHTTPError, writing: bool) -> str:
-    """What the Hub's answer means, and what to do."""
+    """Meaning of the Hub's answer, and the remedy."""
     code = error.response.status_code
     has_token = get_token() is not None
     if code == 401 and has_token and not isinstance(error, RepositoryNotFoundError):

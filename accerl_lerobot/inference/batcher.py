@@ -28,7 +28,7 @@ SHORTEST_S = 1e-6
 
 @dataclass(kw_only=True)
 class BatcherStats:
-    """What the batcher has done so far."""
+    """Counters of the batcher so far."""
 
     batches: int = 0
     requests: int = 0
@@ -132,7 +132,7 @@ class Batcher[R: Sized]:
         self._observations += len(request)
 
     def due(self, now: float) -> bool:
-        """Whether the next batch should be served: it cannot grow any more, or its oldest request has
+        """True if the next batch should be served: it cannot grow any more, or its oldest request has
         waited."""
         deadline = self.next_deadline()
         return deadline is not None and now >= deadline

@@ -21,7 +21,7 @@ def dealt(workers: int, services: int) -> list[int]:
 
 
 def together(metrics: Sequence[dict[str, float]]) -> dict[str, float]:
-    """What services report, as one: sums of batches, means over batches and requests, the oldest version;
+    """Reports of services, as one: sums of batches, means over batches and requests, the oldest version;
     nothing of none."""
     if len(metrics) < 2:
         return dict(*metrics)
@@ -40,7 +40,7 @@ def together(metrics: Sequence[dict[str, float]]) -> dict[str, float]:
 
 
 def added(stats: Sequence[BatcherStats]) -> BatcherStats:
-    """What services have batched, as one."""
+    """Batches of several services, as one."""
     sizes: Counter[int] = sum((Counter(s.batch_sizes) for s in stats), Counter())
     return BatcherStats(
         batches=sum(s.batches for s in stats),

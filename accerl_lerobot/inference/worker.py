@@ -227,7 +227,7 @@ class InferenceWorker:
         }
 
     async def batching(self) -> BatcherStats:
-        """What has been batched so far."""
+        """Batches so far."""
         stats = self._batcher.stats
         # Copied in one go each: the other thread adds to them.
         return replace(stats, batch_sizes=dict(stats.batch_sizes), waits=Counter(stats.waits))

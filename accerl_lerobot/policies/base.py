@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the engine needs of a policy: π(chunk | observation) with a density, and V(observation).
+"""The engine's interface to a policy: π(chunk | observation) with a density, and V(observation).
 
 An adapter wraps one LeRobot policy with its processors. `decide` acts, `evaluate` re-scores what was stored;
 both run the same code on the same weights, so the ratio at equal weights is 1.
@@ -36,7 +36,7 @@ class Evaluation:
     entropy: Tensor
     """(B,)."""
     value: Value
-    """Of B observations."""
+    """Values of B observations."""
 
 
 class PolicyAdapter(nn.Module, ABC):
@@ -90,7 +90,8 @@ class PolicyAdapter(nn.Module, ABC):
 
     @abstractmethod
     def trainable(self) -> dict[str, nn.Parameter]:
-        """What the trainer updates and publishes, by name; the critic's begin with ``value_head.``"""
+        """Parameters that the trainer updates and publishes, by name; the critic's begin with
+        ``value_head.``"""
 
     @abstractmethod
     def copy_weights(self) -> Any:

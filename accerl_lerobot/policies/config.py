@@ -78,7 +78,7 @@ class PolicyConfig(Section, section="policy"):
     revision: str | None = None
     """Hub revision."""
     trust_remote_code: bool = False
-    """Whether Python code from a Hub repository that the checkpoint names, such as a vision encoder's, is run
+    """True if Python code from a Hub repository that the checkpoint names, such as a vision encoder's, is run
     with your rights. It needs `code_revision`."""
     code_revision: str | None = None
     """Commit of that repository, 40 hexadecimal digits: the one whose code you have read. No other is run."""
@@ -108,7 +108,7 @@ Load = Callable[[PolicyConfig], "PolicyAdapter"]
 
 
 def loader(load: Load | None) -> Load:
-    """What makes a worker's adapter: `load`, or what loads LeRobot's checkpoints."""
+    """Function that makes a worker's adapter: `load`, or the one that loads LeRobot's checkpoints."""
     if load is not None:
         return load
     from accerl_lerobot.policies.loading import load_adapter

@@ -75,7 +75,7 @@ class Schedule:
     scheduler: str
     """DDPM or DDIM."""
     prediction: str
-    """What the network predicts: epsilon (the noise) or sample (the actions)."""
+    """Target that the network predicts: epsilon (the noise) or sample (the actions)."""
     clip: float | None
     """Bound of x̂, if it is clipped."""
 

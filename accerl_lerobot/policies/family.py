@@ -32,12 +32,12 @@ class Encoded:
     mask: Tensor
     """bool (B, P), True where a feature is of something real."""
     context: Any
-    """What the family samples from; each family's file says what that is."""
+    """Input that the family samples from; each family's file defines it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Action:
-    """What a family answers for a batch."""
+    """A family's answer for a batch."""
 
     chunk: Tensor
     """(B, K, A), K executed actions in the policy's normalised units."""
@@ -75,7 +75,7 @@ class Model(ABC):
     idle: tuple[str, ...] = ()
     """Prefixes of the parameters that no action depends on; never trained, nor published."""
     width: int
-    """Of the features."""
+    """Width of the features."""
 
     @staticmethod
     def loading() -> AbstractContextManager[None]:
@@ -93,7 +93,7 @@ class Family(nn.Module, ABC):
     frozen: ClassVar[bool] = False
     """True: only the family's own parameters are trained, never the policy's."""
     proposes: ClassVar[bool] = False
-    """Whether chunks are differentiable functions of the weights: `propose`, `executed`, `imitation_loss`."""
+    """True if chunks are differentiable functions of the weights: `propose`, `executed`, `imitation_loss`."""
 
     @abstractmethod
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:

@@ -26,7 +26,7 @@ CONFIG = "processor_config.json"
 
 @dataclass(frozen=True, kw_only=True)
 class FastTokenizer:
-    """What LeRobot asks of FAST's tokeniser, under the names it asks for."""
+    """FAST's tokeniser with the methods that LeRobot calls."""
 
     bpe_tokenizer: Any
     """Merges characters into tokens, a `PreTrainedTokenizerFast`."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a checkpoint's files say is checked before LeRobot, transformers or PyTorch believe it.
+"""Checks of a checkpoint's files, before LeRobot, transformers or PyTorch believe them.
 
 LeRobot imports and calls whatever a processor's ``class`` names, with the arguments that stand beside it, and
 joins ``state_file`` to the folder as it is. Names of backbones and tokenisers may be folders of this machine.
@@ -30,7 +30,7 @@ from accerl_lerobot.safety import (
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 OURS, VALUE_HEAD, FAMILY = "accerl.json", "value_head.safetensors", "family.safetensors"
 FILES = ("*.json", WEIGHTS, "policy_*.safetensors", VALUE_HEAD, FAMILY, f"{BACKBONE}/*")
-"""What is fetched of a checkpoint on the Hub."""
+"""Files that are fetched of a checkpoint on the Hub."""
 PROCESSORS = (PREPROCESSOR, "policy_postprocessor.json")
 DEPTH_MOST = 20
 
@@ -123,7 +123,7 @@ def check_processor(folder: Path, name: str, origin: Origin, *, fetched: bool = 
 
 
 def check_statistics(folder: Path, origin: Origin) -> None:
-    """What a checkpoint's processors normalise by.
+    """Checks the numbers that a checkpoint's processors normalise by.
 
     Raises:
         InputError: a number is NaN or infinite.

@@ -244,7 +244,7 @@ def _counted(k: int, action_mask: Tensor, shape: FlowShape, config: FlowSamplerC
 
 
 def _latent(path: list[Tensor], index: Tensor, config: FlowSamplerConfig) -> dict[str, Tensor]:
-    """What replay must keep: the whole path, its two ends, or the drawn transition."""
+    """Latent that replay must keep: the whole path, its two ends, or the drawn transition."""
     if config.stochastic == "all":
         return {"path": torch.stack(path, 1)}
     if config.stochastic == "last":

@@ -55,7 +55,7 @@ class GaussianModel(Model):
     row_width: int | None = None
     """W; None where the policy has a std of its own."""
     squashed: bool = False
-    """Whether the action is tanh u."""
+    """True if the action is tanh u."""
 
     @abstractmethod
     def stock(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor | None]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a checkpoint needs beside its weights: a backbone's config, and tokenisers.
+"""Files that a checkpoint needs beside its weights: a backbone's config, and tokenisers.
 
 LeRobot names them, by Hub id or by absolute path, and looks them up when it loads. Ours carry them in the
 folder `checkpoint.BACKBONE`, which goes first when one of ours is loaded: no Hub, and no gate such as

@@ -87,7 +87,7 @@ def draw(logits: Tensor, uniform: Tensor, temperature: float) -> Tensor:
 
 
 def token_log_prob(logits: Tensor, tokens: Tensor, temperature: float) -> Tensor:
-    """Of each token (...), in fp32, from logits (..., V)."""
+    """Log-prob of each token (...), in fp32, from logits (..., V)."""
     log_probs = torch.log_softmax(logits.float() / temperature, -1)
     return log_probs.gather(-1, tokens[..., None])[..., 0]
 

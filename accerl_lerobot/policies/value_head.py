@@ -14,7 +14,7 @@ from accerl_lerobot.policies.density import pooled
 
 @dataclass(frozen=True, kw_only=True)
 class Value:
-    """What the critic says of a batch."""
+    """The critic's output for a batch."""
 
     mean: Tensor
     """(B,), V."""
@@ -24,7 +24,7 @@ class Value:
     """(bins,), evenly spaced returns."""
 
     def error(self, returns: Tensor) -> Tensor:
-        """What is minimised, per observation: squared error, or cross-entropy with two-hot targets.
+        """Regression loss per observation: squared error, or cross-entropy with two-hot targets.
 
         Two-hot: a return between two of the support's is split between them such that the mean is kept
         (Farebrother et al., arXiv 2403.03950).

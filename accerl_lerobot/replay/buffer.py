@@ -44,7 +44,7 @@ A trainer draws one batch ahead, and goes on for some moments while it is saved.
 @kind
 @dataclass(kw_only=True)
 class ReplayCounters:
-    """What happened since the run began, resumptions included; in decisions where the name says so."""
+    """Counters since the run began, resumptions included; in decisions where the name says so."""
 
     inserted_segments: int = 0
     inserted_decisions: int = 0
@@ -67,7 +67,7 @@ class ReplayCounters:
     unspent_draws: int = 0
     """Draws that left with their segments, in decisions: what pacing failed to use."""
     departed_uses: dict[int, int] = field(default_factory=dict)
-    """Of the segments that left: times trained on → segments."""
+    """Uses of the segments that left: times trained on → segments."""
 
 
 @dataclass(kw_only=True)
@@ -122,15 +122,15 @@ class Replay:
 
     @property
     def pace(self) -> Pace:
-        """What the predicates of `pacing` look at."""
+        """State of the buffer for the predicates of `pacing`."""
         return Pace(stored=self._stored, available=self._available)
 
     def may_insert(self) -> bool:
-        """Whether rollouts should bring another segment now; `insert` does not refuse one too many."""
+        """True if rollouts should bring another segment now; `insert` does not refuse one too many."""
         return pacing.may_insert(self.config, self.pace)
 
     def may_sample(self, batch_decisions: int) -> bool:
-        """Whether the trainer should draw a batch now; `sample` itself does not wait for the warm start."""
+        """True if the trainer should draw a batch now; `sample` itself does not wait for the warm start."""
         return pacing.may_sample(self.config, self.pace, batch_decisions)
 
     def insert(self, segment: Segment) -> bool:
@@ -311,7 +311,7 @@ class Replay:
 
 
 def is_finite(segment: Segment) -> bool:
-    """Whether no floating-point number of the segment is a NaN or an infinity."""
+    """True if no floating-point number of the segment is a NaN or an infinity."""
     arrays = [segment.log_prob, segment.value, segment.reward, *segment.latent.values()]
     arrays += segment.observations.values()
     arrays += [] if segment.advantage is None else [segment.advantage]

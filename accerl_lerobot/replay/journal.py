@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was done in real worlds, on disk: enough to do it again, and see it all.
+"""Record of the episodes of real worlds, on disk: enough to repeat them, and to see them.
 
 ``RUN/episodes.jsonl`` has one line per segment that replay has stored: where it begins, the actions that were
 executed, what they brought and whose they were. Pictures are not in it; a world that is given the same seed
@@ -38,11 +38,11 @@ class Done:
     steps: tuple[int, ...]
     """Env steps of each decision."""
     versions: tuple[int, ...]
-    """Of the weights behind each decision."""
+    """Versions of the weights behind each decision."""
     rewards: tuple[float, ...]
-    """Of each decision, its cost taken off."""
+    """Rewards of each decision, its cost taken off."""
     ended: bool
-    """Whether the episode ended with it."""
+    """True if the episode ended with it."""
     success: bool
 
 
@@ -90,7 +90,7 @@ class Journal:
 
 
 def read_journal(path: Path) -> Iterator[Done]:
-    """What is in a journal, in order; a last line that is half written is left out.
+    """Reads a journal, in order; a last line that is half written is left out.
 
     Raises:
         InputError: there is no such file, or a line in it is broken.

@@ -53,12 +53,12 @@ class MixedReplay:
         self.real, self.imagined, self.share = Replay(real), Replay(imagined), share
         self.real_ended = False
         self.awaited = share > 0
-        """Whether anything may be imagined later on, although nothing is now."""
+        """True if anything may be imagined later on, although nothing is now."""
         self.held = False
-        """Whether real episodes, if they are counted, are to wait."""
+        """True if real episodes, if they are counted, are to wait."""
 
     def may_insert(self, source: str = REAL) -> bool:
-        """Whether another segment of this source should be brought now."""
+        """True if another segment of this source should be brought now."""
         if source == REAL and self.held and self._patient:
             return False
         return self._of(source).may_insert() or (source == REAL and self._waits)
@@ -75,11 +75,11 @@ class MixedReplay:
         self.real_ended = True
 
     def may_sample(self, batch_decisions: int) -> bool:
-        """Whether a batch should be drawn now."""
+        """True if a batch should be drawn now."""
         return self._parts(batch_decisions) is not None
 
     def exhausted(self, batch_decisions: int) -> bool:
-        """Whether there is no batch and never will be."""
+        """True if there is no batch and never will be."""
         hopeless = self.real_ended and not self.share and not self.awaited
         return hopeless and not self.may_sample(batch_decisions)
 
@@ -125,8 +125,8 @@ class MixedReplay:
             self._journal.cut(state["journal"])
 
     def metrics(self) -> dict[str, float]:
-        """Of the real store by their names; where anything is imagined, of the other one with ``imagined_``
-        before them, and its share.
+        """Metrics of the real store by their names; where anything is imagined, of the other one with
+        ``imagined_`` before them, and its share.
         """
         if not (self.share or self.awaited or self.imagined.counters.inserted_segments):
             return self.real.metrics()

@@ -97,7 +97,7 @@ class Pace:
 
     stored: int
     available: int
-    """Of those, the ones whose segment has draws left."""
+    """Decisions among those whose segment has draws left."""
 
 
 def entitle(samples_per_insert: float, n: int, carry: float) -> tuple[int, float]:
@@ -118,19 +118,19 @@ def entitle(samples_per_insert: float, n: int, carry: float) -> tuple[int, float
 
 
 def may_sample(config: ReplayConfig, pace: Pace, batch_decisions: int) -> bool:
-    """Whether the trainer may draw a batch now."""
+    """True if the trainer may draw a batch now."""
     return pace.stored >= config.min_decisions and pace.available >= batch_decisions
 
 
 def may_insert(config: ReplayConfig, pace: Pace) -> bool:
-    """Whether rollouts may bring another segment now."""
+    """True if rollouts may bring another segment now."""
     return pace.stored < config.min_decisions or pace.available < config.ahead
 
 
 def decisions_under_way(
     *, workers: int, worlds: int, segment_length: int, group_size: int = 0, episode_decisions: int = 0
 ) -> int:
-    """What environments of equal speed decide while a segment is on its way to the door.
+    """Decisions that environments of equal speed make while a segment is on its way to the door.
 
         workers · worlds · segment_length                                          without groups
         workers · worlds · episode_decisions · (1 + ⌈(group_size − 1) / worlds⌉)   with groups

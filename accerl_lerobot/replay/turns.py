@@ -22,7 +22,7 @@ SYNCHRONOUS: Schedule = "synchronous"
 
 
 class Turns:
-    """Who may go on.
+    """Order in which rollouts and the trainer may go on.
 
     Nobody is kept for ever, as long as the trainer lives: where collecting may not go on, a batch is ready or
     learned from, and each is followed by an update; where no batch may be drawn, one is learned from.
@@ -33,7 +33,7 @@ class Turns:
         self._drawn = self._learnt = 0
 
     def may_collect(self, ready: bool) -> bool:
-        """Whether who has brought a segment may go on.
+        """True if who has brought a segment may go on.
 
         Args:
             ready: whether the pace would let a batch be drawn now.
@@ -43,7 +43,7 @@ class Turns:
         return self.schedule == ASYNCHRONOUS or not (ready and self._learning)
 
     def may_draw(self) -> bool:
-        """Whether the trainer may have its next batch."""
+        """True if the trainer may have its next batch."""
         return self.schedule == ASYNCHRONOUS or not self._learning
 
     def drawn(self) -> None:

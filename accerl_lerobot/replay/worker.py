@@ -39,7 +39,7 @@ IN_TRANSIT = 1024
 
 
 class News(NamedTuple):
-    """What those who dream ask for."""
+    """Answer to workers that dream."""
 
     segments: list[Segment]
     """Real ones that have come since."""
@@ -82,7 +82,7 @@ class ReplayWorker:
         # Nothing is imagined until a dreamer says so.
         self._replay.awaited = imagined is not None
         self._mixes = [(0.0, imagined is not None)] * dreamers
-        """What each of them has said last: the share, and whether it may be more later on."""
+        """Last report of each of them: the share, and the chance of more later on."""
         self._real: deque[Segment] = deque(maxlen=IN_TRANSIT if imagined else 0)
         self._real_count = 0
         self._rng = np.random.default_rng(seed)
@@ -236,7 +236,7 @@ class ReplayWorker:
 
     @contextmanager
     def _failing(self) -> Iterator[None]:
-        """What goes wrong inside is this worker's failure, and not that of whoever has asked."""
+        """Turns an exception inside into this worker's failure, and not that of the caller."""
         if self._failure is not None:
             raise stopped(self._failure)
         try:

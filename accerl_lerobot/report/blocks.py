@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a page consists of. Text here is plain text; the template escapes all of it."""
+"""Parts of a page. Text here is plain text; the template escapes all of it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Tile:
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """Of a table."""
+    """A cell of a table."""
 
     text: str
     interval: tuple[float, float, float] | None = None
@@ -30,7 +30,7 @@ class Cell:
     good: bool | None = None
     """Coloured, if it is good or bad."""
     colour: int | None = None
-    """Of a line that stands for this row in the charts."""
+    """Colour of the line that stands for this row in the charts."""
     number: bool = False
     """Right-aligned."""
 
@@ -64,7 +64,7 @@ class Film:
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """Of a `Bar`."""
+    """A part of a `Bar`."""
 
     name: str
     share: float
@@ -107,7 +107,7 @@ class Folded:
 
 @dataclass(frozen=True, kw_only=True)
 class Changes:
-    """What was set to something else than usual."""
+    """Settings that differ from the defaults."""
 
     caption: str
     rows: Sequence[tuple[str, str, str]]
@@ -165,7 +165,7 @@ class Page:
 
 
 def figures(*charts: Chart) -> list[Block]:
-    """Those of the charts that show anything; nothing if none does."""
+    """Charts that show anything; nothing if none does."""
     drawn = [draw(chart) for chart in charts if drawable(chart)]
     return [Figures(charts=drawn)] if drawn else []
 

@@ -27,7 +27,7 @@ COLOURS = 8
 WHOLE = (-0.03, 1.04)
 """Ends of a share from 0 to 100 %, such that a dot at either is whole."""
 ROOM = 0.06
-"""Of the height, free above and below the data where the limits are not given."""
+"""Share of the height that is free above and below the data where the limits are not given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,19 +48,19 @@ class Series:
 
 @dataclass(frozen=True, kw_only=True)
 class Chart:
-    """What is to be drawn."""
+    """A chart to be drawn."""
 
     title: str
     x_label: str
     series: tuple[Series, ...]
     unit: str = ""
-    """Of y."""
+    """Unit of y."""
     note: str = ""
-    """What it means, one sentence."""
+    """Meaning of the chart, one sentence."""
     limits: tuple[float | None, float | None] = (None, None)
     """Ends of y; None: of the data."""
     share: bool = False
-    """Whether y is a share, shown in per cent."""
+    """True if y is a share, shown in per cent."""
     wide: bool = False
 
 
@@ -145,7 +145,7 @@ def rates(name: str, seconds: np.ndarray, counter: np.ndarray, *, colour: int = 
 
 
 def drawable(chart: Chart) -> bool:
-    """Whether there is anything to see: a line of two points, or an interval."""
+    """True if there is anything to see: a line of two points, or an interval."""
     return any(len(s.x) > (s.kind == "line") for s in chart.series)
 
 
@@ -201,7 +201,7 @@ def in_words(chart: Chart) -> str:
 
 
 def _x_range(series: Sequence[Series]) -> tuple[float, float]:
-    """Of all x; points stand half a dot within it."""
+    """Range of all x; points stand half a dot within it."""
     x = np.concatenate([s.x if s.reach is None else np.array(s.reach) for s in series])
     low, high = float(x.min()), float(x.max())
     if low == high:

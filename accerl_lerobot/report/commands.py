@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What to type next: the run again, its policy evaluated here and by LeRobot, and shared."""
+"""Commands to type next: the run again, its policy evaluated here and by LeRobot, and shared."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PLUGIN = "accerl_lerobot.envs.lerobot_plugin"
 
 
 def commands(run: Run) -> list[tuple[str, str]]:
-    """What each does, and the line; those that need a checkpoint only where there is one."""
+    """Purpose and line of each command; those that need a checkpoint only where there is one."""
     recipe = _quoted(run.path / CONFIG)
     found = []
     if run.verb == "train" and run.result is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``accerl report`` is asked for."""
+"""Fields of ``accerl report``."""
 
 from __future__ import annotations
 

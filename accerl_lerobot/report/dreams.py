@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was imagined: how much, how true, and what the world model had to pass."""
+"""Imagined episodes: how many, how true, and the gates that the world model had to pass."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ AT_MOST = ("false_success", "false_success_still")
 
 
 def dream_blocks(rollout: Sequence[Record], imagination: Mapping[str, Any]) -> list[Block]:
-    """Of a run that imagines; nothing for one that does not."""
+    """Blocks about a run that imagines; nothing for one that does not."""
     if not imagination.get("share") or not has(rollout, "imagination_dreams"):
         return []
     return [Words(text=_amount(rollout)), *figures(*_charts(rollout)), *_trial(rollout, imagination)]

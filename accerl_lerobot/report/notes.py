@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What somebody should know before they believe a run: one plain sentence each, none if all is well."""
+"""Warnings before anybody believes a run: one plain sentence each, none if all is well."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COUNTED = {
 }
 """Counter → sentence; a run in which it is 0 needs none."""
 THINGS = {"restarts": "restart", "dropped_nonfinite": "decision"}
-"""What is counted, where it is not segments."""
+"""Nouns of what is counted, where it is not segments."""
 
 
 def status(run: Run, now: float) -> tuple[str, bool]:

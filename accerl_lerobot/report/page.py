@@ -75,7 +75,7 @@ def write_report(config: ReportConfig, recipes: Mapping[str, type[Any]]) -> Path
 
 
 def page_of(runs: list[Run], recipes: Mapping[str, type[Any]], now: float) -> Page:
-    """What stands on the page of one run, or of several."""
+    """Makes the page of one run, or of several."""
     if len(runs) > 1:
         return comparison_page(runs, now)
     (run,) = runs
@@ -112,7 +112,7 @@ def render(page: Page, folder: Path, video_mb: float) -> str:
 
 
 def film(path: Path, folder: Path, video_mb: float) -> tuple[bool, str]:
-    """Whether a video is inside the page, and its address: the video itself, or where it lies."""
+    """True if a video is inside the page, and its address: the video itself, or where it lies."""
     if path.stat().st_size <= video_mb * 1e6:
         return True, f"data:video/mp4;base64,{base64.b64encode(path.read_bytes()).decode()}"
     return False, quote(os.path.relpath(path.resolve(), folder))

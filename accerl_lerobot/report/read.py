@@ -53,7 +53,7 @@ def _is_trial(value: Any) -> bool:
 
 
 Needs = dict[str, Callable[[Any], bool]]
-"""What a page cannot do without, and what it has to be."""
+"""Fields that a page cannot do without, and their types."""
 
 SUMMARY_NEEDS: Needs = {
     "success_after": _is_number,
@@ -87,11 +87,11 @@ GROWING = ("wall_s", "env_steps", "decisions", "episodes")
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """What a run's folder says."""
+    """Contents of a run's folder."""
 
     path: Path
     verb: str
-    """What wrote it: train, world-model or world-model-eval."""
+    """Verb that wrote it: train, world-model or world-model-eval."""
     config: Record
     config_text: str
     """The file itself."""
@@ -100,24 +100,25 @@ class Run:
     result: Record | None
     """summary.json of train, trial.json of the others; None: not finished."""
     torn: bool
-    """Whether the last line of metrics.jsonl is incomplete."""
+    """True if the last line of metrics.jsonl is incomplete."""
     sessions: int
     """How often it was started: 1 if it was never taken up again."""
     written: float
     """When something was last written, in seconds since 1970."""
     videos: tuple[Path, ...]
     dreams: tuple[Path, ...]
-    """Of held-out episodes beside their dreams, in the order of the trials that they were made after."""
+    """Pictures of held-out episodes beside their dreams, in the order of the trials that they were made
+    after."""
     checkpoint: Path | None
     """The newest policy, a LeRobot checkpoint."""
 
     @property
     def name(self) -> str:
-        """Of its folder."""
+        """Name of its folder."""
         return self.path.resolve().name
 
     def room(self, name: str) -> Record:
-        """Of its config; one that another version did not have is empty."""
+        """Section of its config; one that another version did not have is empty."""
         room = self.config.get(name)
         return room if isinstance(room, dict) else {}
 
@@ -172,7 +173,7 @@ def column(records: Sequence[Record], name: str) -> np.ndarray:
 
 
 def has(records: Sequence[Record], name: str) -> bool:
-    """Whether any record has this number."""
+    """True if any record has this number."""
     return any(isinstance(record.get(name), (int, float)) for record in records)
 
 
@@ -263,7 +264,7 @@ def _continuous(lines: list[Record]) -> tuple[dict[str, list[Record]], int]:
     """
     records: dict[str, list[Record]] = {}
     ends: dict[str, float] = {}
-    """Of this start, newest value of each counter."""
+    """Newest value of each counter since this start."""
     carried = dict.fromkeys(GROWING, 0.0)
     sessions, last = 1, 0.0
     for record in lines:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run was asked for: its recipe as differences from the defaults, and what that implies."""
+"""The recipe of a run as differences from the defaults, and their consequences."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def unreadable(config_class: type[Any], tree: dict[str, Any]) -> str:
 
 
 def _usual(instance: Any, config_class: type[Any], tree: dict[str, Any]) -> dict[str, Any]:
-    """What every field is by default where `tree` chooses types; unchecked, as some rooms have no default.
+    """Default of every field where `tree` chooses types; unchecked, as some sections have no default.
 
     Args:
         instance: whose fields are the defaults; None: those of the class.

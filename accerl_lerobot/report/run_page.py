@@ -187,7 +187,7 @@ def films(run: Run) -> list[Section]:
 
 
 def recipe_blocks(run: Run, config_class: type[Any]) -> list[Block]:
-    """What differs from the defaults, and all of it."""
+    """Differences from the defaults, and the whole recipe."""
     rows = [(field, shown(v), shown(usual)) for field, v, usual in differences(config_class, run.config)]
     found: list[Block] = [Changes(caption="What this run sets, and what the default would be", rows=rows)]
     if why := unreadable(config_class, run.config):
@@ -319,5 +319,5 @@ def _task_names(run: Run) -> str:
 
 
 def _apart(a: Sequence[float], b: Sequence[float]) -> bool:
-    """Whether two intervals have nothing in common."""
+    """True if two intervals have nothing in common."""
     return a[1] < b[0] or b[1] < a[0]

@@ -40,7 +40,8 @@ def speed_charts(train: Sequence[Record], rollout: Sequence[Record]) -> list[Cha
 
 
 def time_blocks(train: Sequence[Record], rollout: Sequence[Record], batch: int | None) -> list[Block]:
-    """What each worker did, as far as it is measured; nothing for the engine in which nobody waits."""
+    """Time of each worker by activity, as far as it is measured; nothing for the engine in which nobody
+    waits."""
     spent = {key: float(np.nansum(column(train, key))) for key, _, _ in TRAINER if has(train, key)}
     if not spent or not sum(spent.values()):
         return []
@@ -76,7 +77,7 @@ def _role_bars(rollout: Sequence[Record]) -> list[Bar]:
 
 
 def _partial_bars(spent: dict[str, float], inference: float | None) -> list[Bar]:
-    """What the trainer and inference log of themselves, which all runs do."""
+    """Busy shares that the trainer and inference log of themselves, as all runs do."""
     bars = [Bar(name="trainer", parts=_trainer_parts(spent))]
     if inference is not None:
         idle = Part(name="waiting for requests", share=1 - inference, colour=7, note=percent(1 - inference))
@@ -100,7 +101,7 @@ def _trainer_parts(spent: dict[str, float]) -> list[Part]:
 
 
 def _verdict(spent: dict[str, float], at_the_door: float | None, inference: float | None) -> str:
-    """Who waited for whom, in words; `inference` is its busy share."""
+    """Says in words which worker waited for which; `inference` is its busy share."""
     waited = spent.get("wait_s", 0.0) / sum(spent.values())
     text = f"The trainer was busy for {percent(1 - waited)} of its time and waited for batches in the rest. "
     if at_the_door is not None:

@@ -223,7 +223,7 @@ def _gates(found: Record) -> list[Block]:
 
 
 def _learning(run: Run) -> list[Chart]:
-    """What was learnt, as lines, and the same on what was held out, as points."""
+    """Training losses as lines, and the same on held-out windows as points."""
     charts = []
     for kind, title, names in (
         ("world_model", "Loss of the world model", _parts(run.records.get("world_model", []))),
@@ -243,7 +243,7 @@ def _learning(run: Run) -> list[Chart]:
 
 
 def _parts(records: Sequence[Record]) -> tuple[str, ...]:
-    """Of a world model's loss, by their names, which each class of models has its own; else the loss."""
+    """Names of the parts of a world model's loss, which each class of models has its own; else the loss."""
     names = dict.fromkeys(name for record in records for name in record)
     parts = tuple(name for name in names if name not in ("kind", "step", "loss", "grad_norm"))
     return parts or ("loss",)

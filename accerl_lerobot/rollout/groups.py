@@ -89,7 +89,7 @@ class Place(NamedTuple):
 
 
 def comparable(outcomes: list[Outcome], rule: GroupFilter) -> bool:
-    """Whether a group of at least two is worth learning from."""
+    """True if a group of at least two is worth learning from."""
     returns = [o.episode_return for o in outcomes]
     if rule == "none":
         return True
@@ -101,7 +101,7 @@ def comparable(outcomes: list[Outcome], rule: GroupFilter) -> bool:
 @kind
 @dataclass(kw_only=True)
 class GroupCounters:
-    """What became of the groups of a worker, and of the decisions in them."""
+    """Counts of a worker's groups, and of the decisions in them, by their fate."""
 
     kept: int = 0
     dropped: int = 0

@@ -37,7 +37,7 @@ def whole_groups(episodes: int, config: RolloutConfig) -> int:
 
 
 def incarnation_after(incarnation: int, starts: int) -> int:
-    """Of the process that takes a worker's place, such that it meets none of its seeds again.
+    """Number of the process that takes a worker's place, such that it meets none of its seeds again.
 
     Args:
         incarnation: of the one before.
@@ -118,7 +118,7 @@ class EpisodePlans:
 
     @property
     def spent(self) -> bool:
-        """Whether every exploring episode has been handed out."""
+        """True if every exploring episode has been handed out."""
         return self._budget is not None and self._budget <= 0
 
     def state(self) -> dict[str, Any]:

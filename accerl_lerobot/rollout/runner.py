@@ -129,7 +129,7 @@ class EpisodeResult:
 @kind
 @dataclass
 class Counters:
-    """What a runner has done so far."""
+    """Counters of a runner so far."""
 
     env_steps: int = 0
     decisions: int = 0
@@ -182,7 +182,7 @@ class RolloutRunner:
 
     @property
     def exploring(self) -> bool:
-        """Whether an exploring episode is under way."""
+        """True if an exploring episode is under way."""
         return any(slot.plan is not None and slot.plan.explore for slot in self._slots)
 
     def start(self, slot: int) -> Request | None:
@@ -237,7 +237,7 @@ class RolloutRunner:
         return self._request(state)
 
     def request(self, slot: int) -> Request | None:
-        """What the episode in `slot` waits for; None if there is none."""
+        """Request of the episode in `slot`; None if it waits for nothing."""
         state = self._slots[slot]
         return None if state.plan is None else self._request(state)
 

@@ -20,7 +20,7 @@ _STATE = ("plan", "episode_return", "steps", "decisions", "versions", "frames", 
 
 @dataclass
 class Slot:
-    """What `RolloutRunner` knows of an episode under way."""
+    """State of one episode under way in `RolloutRunner`."""
 
     world: World
     plan: EpisodePlan | None = None

@@ -46,7 +46,7 @@ QUEUE = 32
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """What a rollout worker answers when it is asked how it is."""
+    """A rollout worker's answer when it is asked how it is."""
 
     episodes: list[EpisodeResult]
     """Finished since the last report."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every worker of a run did when: recorded by each, read and drawn afterwards."""
+"""The timeline: every worker's activity over time, recorded by each, read and drawn afterwards."""
 
 from accerl_lerobot.timeline.clock import Clock, NoClock, open_clock
 from accerl_lerobot.timeline.states import (

@@ -18,7 +18,7 @@ COLOURS = (
     "thread_state_running", "white", "thread_state_iowait", "rail_load", "rail_animation", "olive",
     "terrible", "good", "generic_work",
 )  # fmt: skip
-"""Of the states: names that the viewers know."""
+"""Colours of the states: names that the viewers know."""
 
 
 def trace(timeline: Timeline, window: Window) -> dict[str, Any]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``accerl timeline`` is asked for."""
+"""Fields of ``accerl timeline``."""
 
 from __future__ import annotations
 

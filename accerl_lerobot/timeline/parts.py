@@ -29,7 +29,7 @@ from accerl_lerobot.timeline.states import RECOVERY, STATES, role_of
 
 FORMAT = 1
 BITS = 4
-"""Of an entry, for the state."""
+"""Bits of an entry that hold the state."""
 PART_BYTES = 4_000_000
 SUFFIX = ".bin"
 BOOT = Path("/proc/sys/kernel/random/boot_id")
@@ -103,7 +103,7 @@ class Parts:
 
     @property
     def closed(self) -> bool:
-        """Whether `close` was called."""
+        """True if `close` was called."""
         return self._file.closed
 
     def close(self) -> None:
@@ -138,10 +138,10 @@ class Head:
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """What is kept of one process; the intervals between `times` are spent in `states`."""
+    """Kept part of one process; the intervals between `times` are spent in `states`."""
 
     head: Head
-    """Of the oldest part that is kept."""
+    """Head of the oldest part that is kept."""
     times: np.ndarray
     """int64 (n + 1,), nanoseconds since the section began."""
     states: np.ndarray

@@ -16,7 +16,7 @@ from accerl_lerobot.timeline.states import STATES, bubble
 PALETTE = (
     "#3a7d44", "#dfe3e8", "#f0b429", "#5b8def", "#9b5de5", "#8d6e63", "#d64545", "#a8c8a0", "#7fb8c9",
 )  # fmt: skip
-"""Of the states: work is green, waiting pale, waiting at a full door yellow."""
+"""Colours of the states: work is green, waiting pale, waiting at a full door yellow."""
 COLUMNS = 1600
 """Across; an interval that is shorter than a column colours it in proportion."""
 MARK = "accerl timeline"

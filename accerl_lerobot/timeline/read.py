@@ -39,7 +39,7 @@ class Row:
 
     @property
     def role(self) -> str:
-        """What is before the number in its name."""
+        """Part of its name before the number."""
         return role_of(self.worker)
 
     def until(self, at: np.ndarray) -> np.ndarray:
@@ -61,7 +61,7 @@ class Row:
 
 @dataclass(frozen=True, kw_only=True)
 class Timeline:
-    """What the workers of a run did when."""
+    """Activity of a run's workers over time."""
 
     run: Path
     rows: tuple[Row, ...]

@@ -26,7 +26,7 @@ PICTURE, TRACE = "timeline.png", "timeline.json"
 TURNS = 16
 """Updates that are drawn."""
 LEAST_S, MOST_S = 2.0, 60.0
-"""Of a window that nobody has chosen."""
+"""Shortest and longest window that is chosen by default."""
 
 
 def show_timelines(config: TimelineConfig) -> dict[str, Any]:
@@ -135,7 +135,7 @@ def _middle(timeline: Timeline, seconds: float) -> float:
 
 
 def _longest(timeline: Timeline) -> Window:
-    """Of the training, what went on without a new start."""
+    """Longest stretch of the training without a new start."""
     return max(timeline.training(), key=lambda window: window[1] - window[0])
 
 

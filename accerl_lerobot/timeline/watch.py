@@ -20,7 +20,7 @@ class _Place:
     """How far a section has been read."""
 
     path: Path
-    """Of its newest part."""
+    """Path of its newest part."""
     byte: int
     at_ns: int
     state: int

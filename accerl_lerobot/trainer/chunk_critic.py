@@ -40,7 +40,7 @@ DISTANCE = 0.3
 RENEWED_IN = 80
 """Steps of the policy in which all proposals are computed again."""
 SMALLEST_SCALE = 0.02
-"""Of the mean return that Q is divided by."""
+"""Smallest mean return that Q is divided by."""
 
 
 class Critic(nn.Module):

@@ -59,7 +59,7 @@ class TrainerConfig(Section, section="trainer"):
     publish_every: Annotated[int, Range("[1, 1000000]")] = 1
     """Updates between two publications of the weights."""
     publish_changes: bool = False
-    """Whether only the values that differ from the set before are sent, where that is less and the workers
+    """Send only the values that differ from the set before, where that is less and the workers
     are on one machine. It pays where an update leaves most values as they are, as where little is trained at
     a time; an optimiser with momentum moves nearly every float32 value in every update."""
     hold_back: Steps = 0
@@ -76,9 +76,10 @@ class TrainerConfig(Section, section="trainer"):
     ranks: Annotated[int, Range("[1, 1024]")] = 1
     """Processes that make each update together, each from its part of the batch; on GPUs each has its own."""
     sharding: Literal["none", "ddp", "zero2", "zero3"] = "none"
-    """What of the training each of several ranks keeps. none: there is one rank. ddp: everything. zero2: its
-    part of weights, gradients and optimiser state, and all weights from an update's forward pass to the end
-    of its backward pass. zero3: its part, and all weights of one block at a time (PyTorch's FSDP2)."""
+    """Part of the training state that each of several ranks keeps. none: there is one rank. ddp: everything.
+    zero2: its part of weights, gradients and optimiser state, and all weights from an update's forward pass
+    to the end of its backward pass. zero3: its part, and all weights of one block at a time (PyTorch's
+    FSDP2)."""
     cpu_offload: bool = False
     """With zero2 or zero3 on GPUs: a rank's part stays in the memory of the CPU, where the optimiser runs."""
     activation_checkpointing: bool = False
@@ -106,15 +107,15 @@ class TrainerConfig(Section, section="trainer"):
 
     @property
     def zero(self) -> bool:
-        """Whether each rank keeps its part of the weights only."""
+        """True if each rank keeps its part of the weights only."""
         return self.sharding in ZERO
 
     def publishes(self, version: int) -> bool:
-        """Whether the weights of `version` are handed over."""
+        """True if the weights of `version` are handed over."""
         return version % self.publish_every == 0 or version == self.updates
 
     def gpu_shares(self, gpus: float, others: int) -> tuple[float, float]:
-        """What each rank, and each other process with a network, takes of a GPU.
+        """Share of a GPU for each rank, and for each other process with a network.
 
         More than half a GPU each keeps two ranks off the same one, which NCCL refuses; where there are more
         GPUs than ranks, the others have those that are left.

@@ -124,7 +124,7 @@ class Memory:
         column[rows] = values
 
     def observations(self, rows: np.ndarray) -> tuple[dict[str, np.ndarray], list[str]]:
-        """What the policy saw, each (B, ...), and its instructions."""
+        """The policy's observations, each (B, ...), and its instructions."""
         seen = {k: v[rows] for k, v in self._columns.items() if k.startswith("observation.")}
         return seen, [self.tasks[i] for i in self._columns["task"][rows]]
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What becomes of a batch that nothing can be learnt from: it is kept, for people to look at.
+"""A batch with a non-finite loss is kept, for people to look at.
 
 RUN/nonfinite-000123.json, .safetensors    the batch that would have made update 123; `snapshot.load` reads it
 """

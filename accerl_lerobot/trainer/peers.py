@@ -48,7 +48,7 @@ class RankError(RuntimeError):
 
 
 class Learner:
-    """What every rank has: a policy, and the updates of it.
+    """A rank's policy, and the updates of it.
 
     Args:
         policy: the checkpoint to start from.
@@ -208,7 +208,7 @@ class Peers:
     def _failure(
         self, method: str, calls: list[Any], silence: bool = True, own: Exception | None = None
     ) -> RankError | None:
-        """What is wrong with the others, if anything: first the dead, then the silent, then the rest.
+        """The others' fault, if there is any: first the dead, then the silent, then the rest.
 
         Args:
             method: what they were to do.

@@ -44,7 +44,7 @@ class Ranks:
         """Puts the first rank's values into those of all."""
 
     def each(self, score: Callable[[np.ndarray], Tensor], rows: np.ndarray, size: int) -> Tensor:
-        """What `score` says of rows, (rows, ...) on the CPU; a rank is asked of its own, `size` at once."""
+        """Results of `score` for rows, (rows, ...) on the CPU; a rank is asked of its own, `size` at once."""
         said = [(turn.own, score(turn.rows).cpu()) for turn in turns(rows, size, self.rank, self.size)]
         return self.gather(torch.cat([rows if own else rows[:0] for own, rows in said]), len(rows))
 

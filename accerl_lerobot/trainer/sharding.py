@@ -82,7 +82,7 @@ def _share_out(adapter: PolicyAdapter, blocks: Sequence[nn.Module], config: Trai
 
 
 def synchronise(adapter: PolicyAdapter, now: bool) -> None:
-    """Whether the next backward pass ends with gradients averaged over ranks, or adds to those kept back."""
+    """True if the next backward pass ends with gradients averaged over ranks, or adds to those kept back."""
     if hasattr(adapter, "set_requires_gradient_sync"):
         adapter.set_requires_gradient_sync(now)
 
@@ -215,7 +215,7 @@ def _tensors(value: Any) -> Iterator[Tensor]:
 
 
 def _plain(value: Any) -> bool:
-    """Whether it is made of tensors and numbers, none of which a call can leave another tensor in."""
+    """True if it is made of tensors and numbers, none of which a call can leave another tensor in."""
     if isinstance(value, tuple):
         return all(map(_plain, value))
     return value is None or isinstance(value, (Tensor, str, int, float, torch.dtype, torch.device))

@@ -191,7 +191,7 @@ class Update:
 
     @property
     def _is_proximal(self) -> bool:
-        """Whether the weights of now are the proximal ones."""
+        """True if the weights of now are the proximal ones."""
         every = self.algorithm.proximal_updates
         return every > 0 and self.version % every == 0
 

@@ -48,11 +48,11 @@ class DamagedMessageError(ValueError):
 
 
 class Layout(NamedTuple):
-    """What all messages of one structure have in common, as who writes them sees it."""
+    """Common layout of all messages of one structure, as their writer sees it."""
 
     skeleton: bytes
     offsets: list[int]
-    """Of the arrays."""
+    """Offsets of the arrays."""
     end: int
     """Where the values begin."""
 

@@ -129,7 +129,7 @@ class Asked(ABC):
         """Has the caller get a `ServiceStoppedError` that names this error."""
 
     def __len__(self) -> int:
-        """Of the message, which is a list where this is asked for."""
+        """Length of the message, which is a list where this is asked for."""
         return len(self.message)
 
 
@@ -198,5 +198,5 @@ class Server:
 
 
 def stopped(error: BaseException) -> ServiceStoppedError:
-    """What a caller is told of a failure."""
+    """The error that a caller gets for a failure."""
     return ServiceStoppedError(f"the service has stopped: {error!r}")

@@ -17,7 +17,7 @@ FIELD = "launch.transport"
 
 @dataclass(frozen=True, kw_only=True)
 class Endpoint:
-    """What a worker needs in order to call a service.
+    """Address of a service, which a worker needs in order to call it.
 
     Example:
         >>> inference = Endpoint(name="inference", method=actor.decide, address=address)
@@ -25,11 +25,11 @@ class Endpoint:
     """
 
     name: str
-    """Of the service, for messages."""
+    """Name of the service, for messages."""
     method: Any
-    """Of the actor's handle; the way through Ray."""
+    """Method of the actor's handle; the way through Ray."""
     address: Address | None = None
-    """Of its shared memory; None: only Ray leads there."""
+    """Address of its shared memory; None: only Ray leads there."""
     transport: Transport = "auto"
 
     def connect(self) -> Caller:
@@ -50,7 +50,7 @@ class Endpoint:
 
 
 def listens(transport: Transport) -> bool:
-    """Whether services are to offer shared memory to their callers.
+    """True if services are to offer shared memory to their callers.
 
     Raises:
         InputError: it was asked for and this system does not have it.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What two processes of one user share without giving it a name: memory, and the socket it is sent through.
+"""Memory that two processes of one user share without a name, and the socket it is sent through.
 
 Memory is a memfd and a socket's name is in Linux's abstract namespace, so nothing is left of either when
 whoever holds it is gone, however that ended. Other users could see a socket's name, which says nothing, and
@@ -17,12 +17,12 @@ import socket
 import struct
 
 ALIGNMENT = 64
-"""Of arrays in shared memory, in bytes: a line of the cache."""
+"""Alignment of arrays in shared memory, in bytes: a line of the cache."""
 
 
 @functools.cache
 def available() -> bool:
-    """Whether this system has what it takes."""
+    """True if this system has what it takes."""
     try:
         os.close(new_memory(1))
         select.epoll().close()
@@ -48,7 +48,7 @@ def new_memory(size: int) -> int:
 
 
 def is_sealed(file: int) -> bool:
-    """Whether the size of this memory cannot change any more."""
+    """True if the size of this memory cannot change any more."""
     return fcntl.fcntl(file, fcntl.F_GET_SEALS) & _seals() == _seals()
 
 
@@ -75,7 +75,7 @@ def listening(name: str, waiting: int) -> socket.socket:
 
 
 def same_user(connection: socket.socket) -> bool:
-    """Whether the process at the other end is of this user."""
+    """True if the process at the other end is of this user."""
     size = struct.calcsize("3i")
     _, user, _ = struct.unpack("3i", connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size))
     return bool(user == os.getuid())

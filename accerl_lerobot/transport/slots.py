@@ -20,25 +20,25 @@ LARGEST = 2**31
 LEAST = 2**16
 """Bytes of a slot at least; what a message leaves of it is room for the reply."""
 SLOTS = 64
-"""Of one caller at most, and so messages that it may have under way. Their tokens fit into the buffers of the
-two sockets, so no end ever waits for the other one to read."""
+"""Slots of one caller at most, and so messages that it may have under way. Their tokens fit into the buffers
+of the two sockets, so no end ever waits for the other one to read."""
 _TOKEN = struct.Struct("<BIQQQd")
 _ROOM_FOR_A_FILE = socket.CMSG_LEN(struct.calcsize("i"))
 
 ASK, ANSWER, FAIL = range(3)
-"""What a token is for."""
+"""Purpose of a token."""
 
 
 class Token(NamedTuple):
-    """What goes through the socket; a file goes with it where the slot is new or has been replaced."""
+    """Message on the socket; a file goes with it where the slot is new or has been replaced."""
 
     what: int
     slot: int
     ticket: int
     start: int
-    """Of the message in the slot."""
+    """First byte of the message in the slot."""
     size: int
-    """Of the message."""
+    """Bytes of the message."""
     sent: float
     """On `time.monotonic`."""
 

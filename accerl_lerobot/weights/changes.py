@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What differs between two sets of weights: index and new value, bit for bit.
+"""Differences between two sets of weights: index and new value, bit for bit.
 
 The values themselves and no differences of them, so that nothing drifts: whoever applies them to the set they
 were found against has the other one exactly, which its digest confirms. Both sets are looked at as words of a
@@ -31,7 +31,7 @@ class Changes(NamedTuple):
 
     @property
     def nbytes(self) -> int:
-        """What they take."""
+        """Bytes that they take."""
         return int(self.where.nbytes + self.words.nbytes)
 
 

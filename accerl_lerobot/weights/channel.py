@@ -23,7 +23,7 @@ from typing import Literal
 import numpy as np
 
 Way = Literal["ray", "gloo"]
-"""What carries weights from the trainer to readers with which it shares no memory."""
+"""Channel that carries weights from the trainer to readers with which it shares no memory."""
 WAY = "launch.weights"
 Tensors = dict[str, np.ndarray]
 """Parameter name → array; dtype and shape arrive as they were sent."""

@@ -39,11 +39,11 @@ class Shipment:
     published_s: float
     """When `publish` was called, on the clock `time.monotonic`, which all processes of a machine share."""
     digest: bytes = b""
-    """Of the whole set; the thread adds it."""
+    """Digest of the whole set; the thread adds it."""
 
 
 class Publisher(ABC):
-    """What all publishers share.
+    """Base of all publishers.
 
     Args:
         slabs: how many there may be; enough of them that one is always free, see `_held`.

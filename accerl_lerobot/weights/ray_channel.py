@@ -40,7 +40,7 @@ class _Reader:
 
 
 class CallingPublisher(Publisher):
-    """What publishers share whose readers are called through Ray, one call to each under way."""
+    """Base of publishers whose readers are called through Ray, one call to each under way."""
 
     _readers: list[Any]
 
@@ -52,13 +52,14 @@ class CallingPublisher(Publisher):
 
     @abstractmethod
     def _busy(self) -> bool:
-        """Whether a reader has been sent something, or has come and is owed the newest set."""
+        """True if a reader has been sent something, or has come and is owed the newest set."""
 
     def _wake(self) -> None:
         self._changed.notify_all()
 
     def _let_go(self, reader: Any, error: Exception) -> None:
-        """Of one that has died. One that lives and cannot be reached is ended: another takes its place."""
+        """Forgets a reader that has died. One that lives and cannot be reached is ended: another takes its
+        place."""
         with self._changed:
             self._readers.remove(reader)
             self._changed.notify_all()
@@ -146,7 +147,7 @@ class RayPublisher(CallingPublisher):
 
 
 def answered(answer: Any, method: str, timeout_s: float) -> Any:
-    """What a reader answers.
+    """Waits for a reader's answer.
 
     Raises:
         TimeoutError: names the question that was not answered.

@@ -46,7 +46,7 @@ class Received:
     changed: dict[str, np.ndarray] | None = None
     """Name → indices of the elements, flattened, that differ from the set before; None: all may."""
     nbytes: int = 0
-    """What the reader has to read of it."""
+    """Bytes that the reader has to read of it."""
 
 
 class SharedMemoryReader:
@@ -197,7 +197,7 @@ class SharedMemoryReader:
 
 
 def _changes(message: Message, layout: Layout, slab: Slab) -> Changes:
-    """What the publisher put behind the layout."""
+    """Changes that the publisher put behind the layout."""
     count, word, memory = message.changed, layout.word, slab.memory
     start = aligned(layout.end + 4 * count)
     return Changes(

@@ -39,7 +39,7 @@ class Message(NamedTuple):
     """A set that lies in a slab; the slab's file descriptor comes with the first one about it."""
 
     slot: int
-    """Of the slab; one that comes for a slot takes the place of the one before."""
+    """Slot of the slab; one that comes for a slot takes the place of the one before."""
     version: int
     published_s: float
     size: int
@@ -64,9 +64,9 @@ class Message(NamedTuple):
 
 FORMAT = struct.Struct("<QqdQQ?qq")
 CONFIRMED = struct.Struct("<q16s")
-"""What follows every message: version, and digest of the whole set."""
+"""Trailer of every message: version, and digest of the whole set."""
 APPLIED = struct.Struct("<q")
-"""What a reader answers: the version that it has applied, so that it does not hold the slab any more."""
+"""A reader's answer: the version that it has applied, so that it does not hold the slab any more."""
 
 
 @dataclass(eq=False)
@@ -98,7 +98,7 @@ class SharedMemoryPublisher(Publisher):
         self._base: Shipment | None = None
         self._difference: Changes | None = None
         self.address = new_name()
-        """What readers connect to, on this machine."""
+        """Address on this machine that readers connect to."""
         self._listener = listening(self.address, readers)
         self._event = os.eventfd(0, os.EFD_CLOEXEC)
         self._selector = selectors.DefaultSelector()

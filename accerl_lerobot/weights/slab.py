@@ -25,7 +25,7 @@ from accerl_lerobot.transport.nameless import aligned, new_memory
 
 
 class TornSetError(RuntimeError):
-    """What was received is not the set that was published; none of it has been used."""
+    """The received set is not the one that was published; none of it has been used."""
 
 
 class Place(NamedTuple):
@@ -73,7 +73,7 @@ class Layout:
         return cls(places, max((aligned(p.offset + p.nbytes) for p in places.values()), default=0), text)
 
     def fits(self, tensors: Mapping[str, np.ndarray]) -> bool:
-        """Whether these lie like that."""
+        """True if these lie like that."""
         return len(self.places) == len(tensors) and all(
             name == other and place.shape == tensor.shape and place.dtype == tensor.dtype.str
             for (name, place), (other, tensor) in zip(self.places.items(), tensors.items(), strict=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether dreams say of policies what reality says of them.
+"""Agreement of dreams with reality about policies.
 
 Two things are asked. Between policies: does the one that succeeds more often in dreams succeed more often in
 reality? Within one: do dreams and reality agree, start by start? The first is what choosing between policies

@@ -79,7 +79,7 @@ class ShuffledModel(WorldModel):
 
 
 def learnt_within(model: WorldModel) -> LearnableWorldModel:
-    """What learns: the model itself, or the one that a `ShuffledModel` tells the wrong actions."""
+    """The part that learns: the model itself, or the one that a `ShuffledModel` tells the wrong actions."""
     model = model.model if isinstance(model, ShuffledModel) else model
     assert isinstance(model, LearnableWorldModel)  # `ModelKind.learns` says so of no other
     return model

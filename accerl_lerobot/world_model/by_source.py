@@ -9,17 +9,17 @@ from typing import Any
 
 
 def every_source(found: dict[str, Any]) -> list[dict[str, Any]]:
-    """What came of a trial on each source, the first of them first."""
+    """Results of a trial on each source, the first of them first."""
     return [found, *(found.get("sources") or {}).values()]
 
 
 def compared(found: dict[str, Any]) -> bool:
-    """Whether there is more to tell by source than of one trial."""
+    """True if there is more to tell by source than of one trial."""
     return bool(found.get("sources") or found.get("alike"))
 
 
 def source_rows(every: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
-    """What is told of each source: a name, and a text for each of them."""
+    """Rows about each source: a name, and a text for each of them."""
     rows = [("episodes", [str((one.get("tried") or {}).get("episodes", "")) for one in every])]
     rows += [("gates that hold", [_holding(one["gates"]) for one in every])]
     ends = [one.get("outcomes") or {} for one in every]
@@ -44,7 +44,7 @@ def source_rows(every: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
 
 
 def _holding(gates: dict[str, Any]) -> str:
-    """Of a source's own, which have no source in their name."""
+    """Results of a source's own, which have no source in their name."""
     gates = {name: gate for name, gate in gates.items() if "." not in name}
     return f"{sum(gate['holds'] for gate in gates.values())} of {len(gates)}"
 

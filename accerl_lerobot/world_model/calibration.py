@@ -30,14 +30,14 @@ class Calibration:
         self._pairs: list[tuple[bool, float]] = []
         self._done = dreams == 0
         self.threshold: float | None = None
-        """What came of it; None: nothing yet, or nothing at all."""
+        """Threshold that was found; None: nothing yet, or nothing at all."""
 
     def end_real(self) -> None:
         """No real episode will come any more; of those that were counted, some may have been lost."""
         self._real_ended = True
 
     def wants(self, told: bool) -> bool:
-        """Whether dreams are wanted: not where no real episode has ended, or ever will.
+        """True if dreams are wanted: not where no real episode has ended, or ever will.
 
         Args:
             told: whether there is the beginning of one that has.
@@ -45,7 +45,7 @@ class Calibration:
         return not self._done and (told or not self._real_ended)
 
     def waits(self, ended: int, told: bool) -> bool:
-        """Whether dreams are wanted, and must not begin yet.
+        """True if dreams are wanted, and must not begin yet.
 
         Args:
             ended: real episodes that have.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a world model is told: its size, its objective, how it learns, and what it takes to pass.
+"""Settings of a world model: its size, its objective, how it learns, and the gates that it must pass.
 
 Free of torch, as all configs are.
 """
@@ -29,7 +29,7 @@ class NetworkConfig(Section, section="world_model.model.network"):
     """Side of the pixel blocks that become channels; image height and width are multiples of it times 2 for
     every further level."""
     channels: tuple[Annotated[int, Range("[1, 65536]")], ...] = (64, 96)
-    """Of each level, finest first."""
+    """Channels of each level, finest first."""
     blocks: Annotated[int, Range("[1, 1000]")] = 1
     """Residual blocks per level."""
     condition: Annotated[int, Range("[1, 65536]")] = 128
@@ -44,7 +44,7 @@ class NetworkConfig(Section, section="world_model.model.network"):
 
     @property
     def multiple(self) -> int:
-        """What image sides must be a multiple of."""
+        """Number that image sides must be a multiple of."""
         return self.space_to_depth * 2 ** (len(self.channels) - 1)
 
 
@@ -73,7 +73,7 @@ class LearnableModelConfig(Section, draccus.ChoiceRegistry, section="world_model
 
     @property
     def multiple(self) -> int:
-        """What image sides must be a multiple of."""
+        """Number that image sides must be a multiple of."""
         return 1
 
     def provides(self, state_dim: int) -> frozenset[str]:
@@ -103,7 +103,7 @@ class PixelModelConfig(LearnableModelConfig):
     heads: Annotated[int, Range("[2, 1000]")] = 3
     """Predictions of the robot's state, several so that they can disagree."""
     state_weight: NonNegative = 1.0
-    """Of the state's loss beside the image's."""
+    """Weight of the state's loss beside the image's."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
 
     def __post_init__(self) -> None:
@@ -180,7 +180,7 @@ class SuccessLearnConfig(Section, section="world_model.success"):
 
 @dataclass(frozen=True, kw_only=True)
 class TrialConfig(Section, section="world_model.trial"):
-    """What is tried, and what it takes to pass."""
+    """Gates of a trial, and its data."""
 
     depth: Annotated[int, Range("[1, 100000]")] = 6
     """Chunks dreamt, the horizon it is judged for."""
@@ -196,9 +196,9 @@ class TrialConfig(Section, section="world_model.trial"):
     skill_last: float = 0.0
     """and at the horizon, more than this; there on all pixels too, or what should not move does."""
     sensitivity: float = 1.2
-    """What the lower end of the sensitivity's interval after one chunk must exceed."""
+    """Value that the lower end of the sensitivity's interval after one chunk must exceed."""
     auroc: float = 0.9
-    """What the lower end of the interval of the AUROC of dreams' outcomes must exceed."""
+    """Value that the lower end of the interval of the AUROC of dreams' outcomes must exceed."""
     false_success: float = 0.25
     """Largest share of dreams that may be taken for a success although they cannot be one: with the true
     actions of episodes that failed, and with none."""
@@ -207,7 +207,7 @@ class TrialConfig(Section, section="world_model.trial"):
     dream: failures that were held out, or in a run all of the policy's newest. Of all that do not, it is the
     one that tells most successes from failures."""
     recall: float = 0.3
-    """What the share of successes must exceed that are dreamt, and taken, for such."""
+    """Value that the share of successes that are dreamt, and taken, for such must exceed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,7 +246,7 @@ class StandInConfig(Section, section="success"):
     revision: str | None = None
     """Hub revision."""
     trust_remote_code: bool = False
-    """Whether Python code from a Hub repository that the model names, such as the backbone's of LeRobot's
+    """True if Python code from a Hub repository that the model names, such as the backbone's of LeRobot's
     classifier, is run with your rights. It needs `code_revision`."""
     code_revision: str | None = None
     """Commit of that repository, 40 hexadecimal digits: the one whose code you have read. No other is run."""

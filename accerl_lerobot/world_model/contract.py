@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a world model is: it begins at what was seen, and goes one action chunk at a time.
+"""The interface of a world model: it begins at a real observation, and goes one action chunk at a time.
 
     state = model.begin(context, tasks)
     dream = model.step(state, actions, seeds)         # dream.frames, dream.robot; go on from dream.state
@@ -66,7 +66,7 @@ def _padded(x: Tensor, sides: list[int]) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True)
 class WorldModelSpec:
-    """What a world model shows, and of what world."""
+    """Sizes of a world model, and the world that it is of."""
 
     cameras: tuple[str, ...]
     """``observation.images.<camera>``, in the order of V."""
@@ -82,14 +82,14 @@ class WorldModelSpec:
     context: int
     """L."""
     provides: frozenset[str]
-    """Of pixels, state, uncertainty, success."""
+    """Outputs among pixels, state, uncertainty, success."""
     tasks: tuple[str, ...] = ()
     """Names of the world's tasks; none: it does not say."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dream:
-    """What is seen after a chunk."""
+    """Predicted observation after a chunk."""
 
     state: State
     """To go on from."""
@@ -106,7 +106,7 @@ class Dream:
 
 
 class Context(NamedTuple):
-    """What was seen until a dream begins, a chunk apart, the newest last. It is the anchor too."""
+    """Observations until a dream begins, a chunk apart, the newest last. They are the anchor too."""
 
     frames: Tensor
     """uint8 (B, L, V, H, W, 3)."""
@@ -126,7 +126,7 @@ class History(NamedTuple):
     """How to get to where a dream begins, for those that can go there."""
 
     task: str
-    """Of `World.reset`,"""
+    """Task of `World.reset`,"""
     seed: int
     """and this too."""
     actions: np.ndarray
@@ -172,7 +172,7 @@ class LearnableWorldModel(nn.Module, WorldModel):
     """
 
     doubt: Tensor
-    """What its uncertainty is to be divided by, a scalar; see `trial.calibrate`."""
+    """Scalar that its uncertainty is to be divided by; see `trial.calibrate`."""
 
     def __init__(self, spec: WorldModelSpec, config: LearnableModelConfig) -> None:
         super().__init__()
@@ -185,7 +185,7 @@ class LearnableWorldModel(nn.Module, WorldModel):
 
     @abstractmethod
     def loss(self, windows: Windows, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-        """What is minimised.
+        """Loss of a batch of windows.
 
         Args:
             windows: of real episodes.
@@ -197,7 +197,7 @@ class LearnableWorldModel(nn.Module, WorldModel):
 
 
 def learnable_class(config: LearnableModelConfig) -> type[LearnableWorldModel]:
-    """What `config` is of.
+    """Class that `config` is of.
 
     Raises:
         InputError: nothing is there, or not what learns.
@@ -229,12 +229,12 @@ def new_learnable(spec: WorldModelSpec, config: LearnableModelConfig) -> Learnab
 
 
 class Means(NamedTuple):
-    """What a world model of `kinds.KINDS` can be made of."""
+    """Ingredients of a world model of `kinds.KINDS`."""
 
     config: ImaginationConfig
     """The run's."""
     spec: WorldModelSpec
-    """Of `learnt`; without that, of all that the real world shows."""
+    """Spec of `learnt`; without that, of all that the real world shows."""
     learnt: LearnableWorldModel | None
     """The one in ``imagination.path``, in inference; None: its kind asks for no folder."""
     simulator: Callable[[], World]

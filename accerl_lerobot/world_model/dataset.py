@@ -62,8 +62,8 @@ def load_episodes(
 
 
 def fingerprint(meta: Any) -> str:
-    """What tells a dataset from others, whatever it is called: how long each of its episodes is, in their
-    order, and statistics of its actions."""
+    """Hash that tells a dataset from others, whatever it is called: how long each of its episodes is, in
+    their order, and statistics of its actions."""
     moments = [np.asarray(meta.stats["action"][k], np.float64).round(6).tolist() for k in ("mean", "std")]
     ends = [list(map(int, meta.episodes[f"dataset_{end}_index"])) for end in ("from", "to")]
     said = json.dumps([ends, meta.fps, moments])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a policy would do at a dreamt frame, beside what it would do at the real one.
+"""A policy's decisions at dreamt frames, beside those at the real ones.
 
 Pixels may be right where nobody looks. So real episodes are dreamt from beginning to end with the actions
 that were made, and wherever the policy would have decided it decides twice: on what was seen, and on what is
@@ -42,7 +42,7 @@ BATCH = 64
 
 
 class Decided(NamedTuple):
-    """Of one policy, at M moments; see `decide_twice`."""
+    """Decisions of one policy, at M moments; see `decide_twice`."""
 
     real: np.ndarray
     """float32 (M, K, A), on what was seen."""

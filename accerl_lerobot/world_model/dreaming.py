@@ -38,7 +38,7 @@ EARLIER = "earlier"
 def make_imagination(
     config: RunConfig, name: str, on_segment: Callable[[Segment], object], index: int = 0
 ) -> Imagination:
-    """What dreams in a run, or a part of it.
+    """Makes the workers' imagination of a run, or a part of it.
 
     Args:
         config: the run; its ``policy.path`` must be set.
@@ -72,7 +72,7 @@ def make_imagination(
 
 
 def _sources(config: RunConfig, spec: WorldModelSpec) -> list[Source]:
-    """What a world model that goes on learning learns from, beside the run's own episodes."""
+    """Datasets that a learning world model learns from, beside the run's own episodes."""
     if not config.imagination.learns:
         return []
     sources = list(load_sources(Path(str(config.imagination.path)), "imagination"))
@@ -103,7 +103,7 @@ def _recorded(
 
 
 def load_dreamer(config: RunConfig, world: WorldSpec) -> Dreamer:
-    """What a run dreams with; its ``policy.path`` must be set.
+    """Loads a run's world model; its ``policy.path`` must be set.
 
     Raises:
         InputError: see `make_imagination`.
@@ -114,7 +114,7 @@ def load_dreamer(config: RunConfig, world: WorldSpec) -> Dreamer:
 
 
 def make_learner(config: RunConfig, dreamer: Dreamer | None = None) -> OnlineLearner:
-    """What a run's world model goes on learning with, from `dreamer` on; None: from the saved one.
+    """Makes the learner of a run's world model, from `dreamer` on; None: from the saved one.
 
     Raises:
         InputError: a dataset it was pre-trained on cannot be read, is of another world, or is named twice.
@@ -178,7 +178,7 @@ def _films(config: RunConfig) -> TrialFilms | None:
 
 
 def _trial(config: ImaginationConfig, longest: int) -> TrialConfig:
-    """What is tried is what will be dreamt, in so many chunks at most."""
+    """Trial of the run's own dreams, in so many chunks at most."""
     trial = config.learn.trial
     if config.horizon is None:
         return replace(trial, whole=True, depth=min(trial.depth, longest))

@@ -56,7 +56,7 @@ class Episode:
 
     @property
     def success(self) -> bool:
-        """Whether the task was achieved."""
+        """True if the task was achieved."""
         return self.success_at >= 0
 
     @property

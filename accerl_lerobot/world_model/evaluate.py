@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 
 
 class _Part(NamedTuple):
-    """What is tried of a dataset."""
+    """A dataset's part in an evaluation."""
 
     meta: Any
     source: Source | None
@@ -157,7 +157,7 @@ def _decisions(
     sources: dict[str, list[Episode]],
     console: Console,
 ) -> dict[str, dict[str, Any]]:
-    """Of each source how alike these decide, see `alike`."""
+    """Likeness of the decisions of each source, see `alike`."""
     with console.stage("dreams for policies"):
         again = {name: replayed_whole(model, episodes) for name, episodes in sources.items()}
     decided: dict[str, list[Decided]] = {name: [] for name in sources}
@@ -172,7 +172,7 @@ def _decisions(
 
 
 def _part(meta: Any, sources: Sequence[Source]) -> _Part:
-    """Of a dataset that it has learnt from, what was held out; of another one everything."""
+    """Held-out part of a dataset that it has learnt from; of another one everything."""
     source = find(sources, fingerprint(meta))
     if source is None:
         return _Part(meta, None, list(range(meta.total_episodes)), [])

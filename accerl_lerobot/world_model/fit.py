@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a world model can stand for a world."""
+"""Checks that a world model can stand for a world."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.contract import WorldModelSpec
 
 SHOWN = 4
-"""Of a list of tasks, in an error."""
+"""Tasks of a list that an error shows."""
 
 
 def check_fit(spec: WorldModelSpec, world: WorldSpec, executed: int, history: int, judged: bool) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was observed, as a world model knows it."""
+"""Observations in the world model's format."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def seen(observations: dict[str, np.ndarray], spec: WorldModelSpec) -> tuple[np.
 def observed(
     frames: np.ndarray, robot: np.ndarray, task: str, spec: WorldModelSpec, world: WorldSpec
 ) -> Observation:
-    """What a policy is shown of frames (V, H, W, 3) and a state (S,), in the sizes of its world."""
+    """A policy's observation of frames (V, H, W, 3) and a state (S,), in the sizes of its world."""
     observation: Observation = {TASK: task}
     for v, camera in enumerate(spec.cameras):
         if camera in world.images:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What dreams promise, against what happens: the kill switch.
+"""Guard that compares dreams with reality: the kill switch.
 
 Each real outcome is held against the share of dreams that succeed when it is told. Of a real episode that has
 just ended, both are of nearly the same policy, and one that has learnt is not taken for a world model that
@@ -18,7 +18,7 @@ from accerl_lerobot.snapshot import kind
 @kind
 @dataclass
 class DreamCounters:
-    """What was imagined so far."""
+    """Counters of dreams so far."""
 
     dreams: int = 0
     """That have ended."""
@@ -82,10 +82,10 @@ class KillSwitch:
 
     @property
     def share(self) -> float:
-        """Of successes among the newest dreams; NaN before there are any."""
+        """Share of successes among the newest dreams; NaN before there are any."""
         return self._share
 
     @property
     def shares(self) -> tuple[float, float]:
-        """Of successes, imagined and real, at the same times; NaN before there are any."""
+        """Shares of successes, imagined and real, at the same times; NaN before there are any."""
         return self._imagined, self._real

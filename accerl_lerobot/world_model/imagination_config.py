@@ -48,7 +48,7 @@ class OnlineLearnConfig(Section, section="imagination.learn"):
     last_tries: Annotated[int, Range("[1, 1000000]")] = 5
     """Trials after the last real episode; after them, what has not passed never dreams."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    """What it was pre-trained on: of it, it learns from the episodes that it knows, and is tried on those
+    """Dataset of its pre-training: of it, it learns from the episodes that it knows, and is tried on those
     that were held out. Another dataset is learnt from whole."""
     online: DatasetConfig = field(default_factory=DatasetConfig)
     """Episodes of an earlier policy that it was pre-trained on, in the same way."""
@@ -57,8 +57,8 @@ class OnlineLearnConfig(Section, section="imagination.learn"):
             most=120, depth=4, auroc=0.6, false_success=0.5, recall=0.3, false_positives=0.3
         )
     )
-    """What it must pass to serve. Outcomes are tried on what `ImaginationConfig.horizon` says is dreamt. A
-    dozen held-out episodes tell little; beyond that, `gap` watches."""
+    """Gates that it must pass to serve. Outcomes are tried on what `ImaginationConfig.horizon` says is
+    dreamt. A dozen held-out episodes tell little; beyond that, `gap` watches."""
     memory: Annotated[int, Range("[2, 1000000]")] = 400
     """Real episodes kept to learn from."""
     films: Annotated[int, Range("[0, 1000000]")] = 1
@@ -68,12 +68,13 @@ class OnlineLearnConfig(Section, section="imagination.learn"):
 
 @dataclass(frozen=True, kw_only=True)
 class ImaginationConfig(Section, section="imagination"):
-    """What the policy learns from dreams."""
+    """Settings of the policy's learning from dreams."""
 
     share: Annotated[float, Range("[0, 1)")] = 0.0
     """Share of the decisions of a batch that are imagined; 0: none."""
     model: Annotated[str, Choice(KINDS)] = field(default="learned", metadata={"choices": KINDS})
-    """What dreams. shuffled and copy are placebos: what helps as much as they do is not the world model."""
+    """World model of the dreams. shuffled and copy are placebos: what helps as much as they do is not the
+    world model."""
     path: str | None = None
     """The folder ``world_model`` that ``accerl world-model`` has written; oracle needs none, copy one for its
     success model."""
@@ -184,10 +185,10 @@ class ImaginationConfig(Section, section="imagination"):
 
     @property
     def kind(self) -> ModelKind:
-        """What is known of `model`."""
+        """Properties of `model`."""
         return KINDS[self.model]
 
     @property
     def learns(self) -> bool:
-        """Whether the world model goes on learning."""
+        """True if the world model goes on learning."""
         return self.share > 0 and self.kind.learns and self.learn.steps_per_episode > 0

@@ -51,13 +51,13 @@ class _Row:
     """Decisions after which the world's time limit ends it."""
     depth: int = 0
     calibrates: bool = False
-    """Whether nothing is to be learnt from it, see `Calibration`;"""
+    """True if nothing is to be learnt from it, see `Calibration`;"""
     highest: float = 0.0
     """then, P(success) so far."""
 
 
 class Dreamer(NamedTuple):
-    """What dreams, and what tells successes, where that is another."""
+    """The model that dreams, and the one that tells successes, where that is another."""
 
     model: WorldModel
     success: SuccessModel | None
@@ -109,7 +109,7 @@ class Imagination:
         self.switch = KillSwitch(config.gap, config.window, outcomes)
         self.version = 0
         self.waits = config.learns
-        """Whether no model has passed its trial yet."""
+        """True if no model has passed its trial yet."""
         self._model, self._world = model, world
         self._success = None if "success" in model.spec.provides else success
         self._calibration = Calibration(config.calibrate if self._success is not None else 0, ended)
@@ -133,7 +133,7 @@ class Imagination:
 
     @property
     def dreamer(self) -> Dreamer:
-        """What dreams now, and what tells successes."""
+        """The model that dreams now, and the one that tells successes."""
         return Dreamer(self._model, self._success)
 
     def remember(self, segment: Segment) -> None:
@@ -215,17 +215,17 @@ class Imagination:
 
     @property
     def on(self) -> bool:
-        """Whether anything is to be imagined now."""
+        """True if anything is to be imagined now."""
         off = self.waits or self.prepares or self.switch.tripped
         return not off and self._doubted_in_a_row < self.config.window
 
     @property
     def prepares(self) -> bool:
-        """Whether it waits for real episodes to end, by which it is to be calibrated."""
+        """True if it waits for real episodes to end, by which it is to be calibrated."""
         return self._calibration.waits(self._starts.ended, self._starts.told)
 
     def requests(self) -> list[Request]:
-        """What is to be decided, one for each dream; none before anything real was seen, or switched off."""
+        """Requests for decisions, one for each dream; none before anything real was seen, or switched off."""
         if not len(self._starts) or not self.on:
             return []
         self._begin([i for i, row in enumerate(self._rows) if row is None])
@@ -368,7 +368,7 @@ class Imagination:
         return probabilities(self._success, np.stack([r.frames for r in self._rows if r is not None]), frames)
 
     def _take_over(self) -> None:
-        """What calibration has found, if it has."""
+        """Takes over calibration's threshold, if there is one."""
         if self._success is not None and self._calibration.threshold is not None:
             self._success.config.threshold = self._calibration.threshold
 

@@ -68,7 +68,7 @@ class InverseProbe(nn.Module):
         self.register_buffer("mean", torch.zeros(actions))
         self.register_buffer("std", torch.ones(actions))
         self.known: frozenset[int] = frozenset()
-        """Of the episodes that are tried, those that it has learnt from: there it is not read."""
+        """Tried episodes that it has learnt from: there it is not read."""
 
     def forward(self, before: Tensor, after: Tensor) -> Tensor:
         """Actions in units of their usual spread, (B, A), from frames uint8 (B, V, H, W, 3)."""

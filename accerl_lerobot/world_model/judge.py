@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a world model is worth, in numbers that a model which ignores its actions cannot have.
+"""Measures of a world model that a model which ignores its actions cannot pass.
 
     skill          1 − MSE(model) / MSE(copy of the last frame), on all pixels or on those that changed
     sensitivity    MSE(with the actions of other windows) / MSE(with the true ones); 1 if actions are ignored

@@ -11,20 +11,20 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class ModelKind:
-    """What has to be known of a world model before there is one."""
+    """Properties of a world model that are known before there is one."""
 
     make: str
     """``module:name`` of what makes it of a `contract.Means`, the class itself for instance."""
     what: str
     """For ``--help``, one sentence."""
     folder: bool = True
-    """Whether it is made of the world model in ``imagination.path``, beside which its success model is."""
+    """True if it is made of the world model in ``imagination.path``, beside which its success model is."""
     learns: bool = False
-    """Whether that one goes on learning in a run; it is what dreams then, or a `ShuffledModel` of it is."""
+    """True if that one goes on learning in a run; it dreams then, or a `ShuffledModel` of it does."""
     judges: bool = False
-    """Whether it tells successes itself, see `Dream.success`; its `WorldModelSpec.provides` says so too."""
+    """True if it tells successes itself, see `Dream.success`; its `WorldModelSpec.provides` says so too."""
     whole: bool = False
-    """Whether it can begin only where all that led there is known, see `History`."""
+    """True if it can begin only where all that led there is known, see `History`."""
     rows: int = 1
     """Dreams that it must have beside each other, at least."""
 

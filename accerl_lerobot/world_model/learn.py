@@ -187,7 +187,7 @@ def _windows(
     config: LearnConfig,
     rng: np.random.Generator,
 ) -> Windows:
-    """Those at these places; `rng` draws how far back their anchors lie."""
+    """Windows at these places; `rng` draws how far back their anchors lie."""
     back = rng.integers(config.anchors + 1, size=len(at))
     return cut(
         episodes,

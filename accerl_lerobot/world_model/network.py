@@ -62,7 +62,7 @@ class Denoiser(nn.Module):
         self.leave = nn.Sequential(_norm(first), nn.SiLU(), nn.Conv2d(first, image * pixels, 3, padding=1))
         _zero(self.leave[-1])
         self.width = config.channels[-1] + width
-        """Of the summary."""
+        """Width of the summary."""
 
     def forward(
         self, x: Tensor, label: Tensor, frames: Tensor, chunk: Tensor, state: Tensor | None

@@ -59,7 +59,7 @@ METRICS = "metrics.jsonl"
 
 
 def world_spec(config: WorldModelConfig, env: EnvConfig) -> WorldModelSpec:
-    """What the model is to be of."""
+    """Spec of the model to be learnt."""
     world = make_world(env)
     try:
         seen = world.spec

@@ -90,7 +90,7 @@ class Unfinished:
 
 
 class Promotion(NamedTuple):
-    """What has become of it, on the CPU, and what its trial found."""
+    """A model offered for promotion, on the CPU, and the outcome of its trial."""
 
     model: LearnableWorldModel
     success: SuccessPairsRewardModel
@@ -157,10 +157,10 @@ class OnlineLearner:
         self._unfinished = Unfinished()
         self._examples: Examples | None = None
         self._new = True
-        """Whether there are episodes that `_examples` does not know."""
+        """True if there are episodes that `_examples` does not know."""
         self._ended = self._since = self._last_tries = 0
         self._untried: dict[str, Any] = {}
-        """Of the state, what was otherwise before the trial whose outcome nobody has yet."""
+        """Parts of the state as they were before the trial whose outcome nobody has yet."""
         self._trying: float | None = None
         """When the trial began that is going on; read on another thread."""
 
@@ -170,7 +170,7 @@ class OnlineLearner:
         return self._learner.count
 
     def due(self, last: bool) -> bool:
-        """Whether it is to be tried.
+        """True if it is to be tried.
 
         Args:
             last: no real episode will come any more.
@@ -182,7 +182,7 @@ class OnlineLearner:
         return (self._since > 0 or not self.promoted) and self._last_tries < self.config.last_tries
 
     def promising(self, last: bool) -> bool:
-        """Whether another version may be promoted; see `due`."""
+        """True if another version may be promoted; see `due`."""
         return not last or self.owed >= 1 or self.due(last)
 
     def add(self, segment: Segment) -> None:
@@ -240,7 +240,7 @@ class OnlineLearner:
             self._trying = None
 
     def handed_over(self) -> None:
-        """What was promoted last serves now."""
+        """Notes that the last promoted model serves now."""
         self._untried = {}
 
     def _promote(self, last: bool) -> Promotion | None:
@@ -319,7 +319,7 @@ class OnlineLearner:
         self._unfinished.parts.update(state["unfinished"])
 
     def metrics(self) -> dict[str, float]:
-        """What it has learnt from, and how its trials ended."""
+        """Counts of its learning and of its trials."""
         trying = self._trying
         return {
             "learn_steps": float(self.version),

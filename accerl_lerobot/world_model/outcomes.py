@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether dreams end as reality did, with the actions that were really made.
+"""Comparison of dreams' outcomes with reality's, under the actions that were really made.
 
 An episode is dreamt to its end, and the highest P(success) on the way is the dream's *score*: one that is
 once taken for a success ends there. One chunk in thirty that is wrongly taken for a success may pass a trial
@@ -28,7 +28,7 @@ FOLDS = 4
 
 
 class Scores(NamedTuple):
-    """Of M dreams."""
+    """Scores of M dreams."""
 
     dreamt: np.ndarray
     """Highest P(success) on the way, until the task was really achieved."""
@@ -112,7 +112,7 @@ def together(*parts: Scores) -> Scores:
 
 
 def threshold(found: Scores, theirs: np.ndarray, config: TrialConfig) -> float | None:
-    """What counts as a success.
+    """Lowest score that counts as a success.
 
     Of the thresholds that let no larger share of failures through than `TrialConfig.false_positives`, the one
     at which most successes, less failures, are taken for successes. The strictest would be safe, and a policy
@@ -145,7 +145,7 @@ def threshold(found: Scores, theirs: np.ndarray, config: TrialConfig) -> float |
 def judged(
     found: Scores, theirs: np.ndarray, config: TrialConfig, given: float | None = None
 ) -> dict[str, Any]:
-    """What becomes of dreams.
+    """Judges dreams by their scores.
 
     Args:
         given: what counts as a success. None: what each part of the episodes is judged by is set on the

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What really happens under actions that nobody demonstrated: episodes played again, pushed off their way.
+"""Real outcomes of actions that nobody demonstrated: episodes played again, pushed off their way.
 
 An episode of a dataset is played from where it began with its own actions and noise on top. The noise is held
 for some steps, as what is drawn anew at each of them averages out. What then happens is the truth that dreams

@@ -122,7 +122,7 @@ class PixelWorldModel(LearnableWorldModel):
         return Dream(state=following, frames=frames, robot=robot, uncertainty=doubt)
 
     def loss(self, windows: Windows, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-        """What is minimised, over every valid chunk of the windows; after the first it sees its own dreams.
+        """Loss over every valid chunk of the windows; after the first it sees its own dreams.
 
         Returns:
             The loss, and ``image``, ``state`` and, of the dreamt ones, ``image_dreamt``.

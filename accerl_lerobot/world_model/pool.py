@@ -21,12 +21,12 @@ COUNTS = ("dreams", "decisions", "successes", "doubted")
 
 
 def part(config: ImaginationConfig, index: int) -> ImaginationConfig:
-    """What one of several dreams."""
+    """Part of one of several dreaming workers."""
     return replace(config, workers=1, dreams=dealt(config.dreams, config.workers)[index])
 
 
 def together(metrics: Sequence[dict[str, float]]) -> dict[str, float]:
-    """What those who dream report, as one: sums of counts, the oldest version, whether any dreams, and means
+    """Reports of those who dream, as one: sums of counts, the oldest version, if any dreams, and means
     of the shares that are compared; nothing of none, and nothing before all have said something."""
     if len(metrics) < 2 or not all(metrics):
         return dict(metrics[0]) if len(metrics) == 1 else {}

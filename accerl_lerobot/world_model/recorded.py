@@ -50,7 +50,7 @@ class Dreamt:
     origin: tuple[str, int, int]
     """Task and seed of the real episode it begins in, and decisions before."""
     world_version: int
-    """Of the world model, in gradient steps of the run."""
+    """Version of the world model, in gradient steps of the run."""
     success: bool
     terminated: bool
     truncated: bool
@@ -108,7 +108,7 @@ class DreamRecorder:
 
 
 def read_dreams(folder: Path, field: str = "path") -> Iterator[Dreamt]:
-    """What was recorded, in order.
+    """Reads recorded dreams, in order.
 
     Args:
         folder: of `DreamRecorder`.

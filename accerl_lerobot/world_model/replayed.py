@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What has happened, dreamt again: real frames to begin at, real actions, and what really came of them.
+"""Real episodes dreamt again: real frames to begin at, real actions, and their real outcomes.
 
 No policy decides anything here, so what is dreamt can be held against what was seen: by a trial, and by a
 success model that is to learn how a dream looks that goes wrong.
@@ -23,7 +23,7 @@ BATCH = 64
 
 
 class Dreams(NamedTuple):
-    """Of M windows."""
+    """Dreams of M windows."""
 
     frames: np.ndarray
     """uint8 (M, D, V, H, W, 3)."""
@@ -36,7 +36,7 @@ class Dreams(NamedTuple):
 
 
 def context_of(windows: Windows, rows: slice = slice(None)) -> Context:
-    """What a world model is shown of some windows before they begin."""
+    """A world model's context at the beginning of some windows."""
     known = windows.context
     return Context(
         frames=torch.from_numpy(windows.frames[rows, :known]),

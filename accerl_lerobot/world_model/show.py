@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What came of trials, as text."""
+"""Trials as text."""
 
 from __future__ import annotations
 

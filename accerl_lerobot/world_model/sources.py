@@ -135,7 +135,7 @@ def check_apart(dataset: DatasetConfig, episodes: Sequence[Episode], others: Seq
 
 @contextmanager
 def named(room: str) -> Iterator[None]:
-    """What is refused of a dataset bears the name of its room."""
+    """Names the section of a dataset in errors about it."""
     try:
         yield
     except InputError as error:

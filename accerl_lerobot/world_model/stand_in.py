@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 FILES = ("*.json", "*.safetensors")
-"""What is fetched of a reward model on the Hub."""
+"""Files that are fetched of a reward model on the Hub."""
 PREPROCESSOR = "*_preprocessor.json"
 IMAGES = "observation.image"
 BACKBONE = "model_name"
@@ -44,7 +44,7 @@ BLANK = 2
 
 
 class Threshold:
-    """What counts as a success; where a `SuccessPairsRewardModel` keeps it, too.
+    """Threshold of a success; where a `SuccessPairsRewardModel` keeps it, too.
 
     Args:
         threshold: P above which a frame does, in [0, 1].
@@ -55,7 +55,7 @@ class Threshold:
 
 
 class StandIn(nn.Module):
-    """What `SuccessPairsRewardModel.said` gives, from another reward model.
+    """Probabilities as of `SuccessPairsRewardModel.said`, from another reward model.
 
     Args:
         model: LeRobot's.
@@ -198,7 +198,7 @@ def _cameras(settings: Any, spec: WorldModelSpec, origin: Origin) -> dict[str, t
 
 
 def _pairs(settings: Any, spec: WorldModelSpec, origin: Origin) -> bool:
-    """Whether it looks at two frames a chunk apart; or else at one."""
+    """True if it looks at two frames a chunk apart; or else at one."""
     looks = settings.observation_delta_indices
     if looks is None or list(looks) == [0]:
         return False
@@ -233,7 +233,7 @@ def _load(settings: Any, folder: Path, origin: Origin, code_revision: str | None
 
 
 def _preprocessor(settings: Any, folder: Path, origin: Origin, fetched: bool) -> Any:
-    """What lerobot-train has saved beside the weights, with the statistics it normalises by."""
+    """Preprocessor that lerobot-train saved beside the weights, with the statistics it normalises by."""
     from lerobot.processor import PolicyProcessorPipeline
     from lerobot.rewards.factory import make_reward_pre_post_processors
 

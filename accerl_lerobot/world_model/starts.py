@@ -18,7 +18,7 @@ from accerl_lerobot.world_model.contract import History, WorldModelSpec
 from accerl_lerobot.world_model.frames import executed, seen
 
 Name = tuple[str, int]
-"""Of an episode: its task and its seed."""
+"""Name of an episode: its task and its seed."""
 UNDER_WAY = 1024
 """Episodes that may go on in another segment; of those left behind by a worker that died, the oldest go."""
 
@@ -44,12 +44,12 @@ class Start:
     history: History | None
     """None: where the segment began in mid-episode, what came before is not known."""
     achieved: bool | None
-    """Whether the real episode achieved the task within the horizon; None: it is not known, or not yet."""
+    """True if the real episode achieved the task within the horizon; None: it is not known, or not yet."""
 
 
 @kind
 class _Lead(NamedTuple):
-    """What led to a segment, which may begin in mid-episode."""
+    """Observations before a segment, which may begin in mid-episode."""
 
     decision: int
     """The segment's first."""
@@ -88,11 +88,11 @@ class StartPool:
         self._leads: dict[Name, _Lead] = {}
         """To what comes next of an episode that has not ended; the oldest first."""
         self._outcomes: dict[Name, bool] = {}
-        """Of episodes that have ended, and of which something is held."""
+        """Outcomes of episodes that have ended, and of which something is held."""
         self.ended = 0
         """Episodes that have ended so far."""
         self.told = False
-        """Whether there is a beginning of an episode that has ended; kept, as another thread reads it."""
+        """True if there is a beginning of an episode that has ended; kept, as another thread reads it."""
         self._count = 0
 
     def __len__(self) -> int:

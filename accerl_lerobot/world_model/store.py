@@ -53,7 +53,7 @@ class Source:
 
     repo_id: str
     fingerprint: str
-    """Of the dataset, whatever it is called, see `dataset.fingerprint`."""
+    """Fingerprint of the dataset, whatever it is called, see `dataset.fingerprint`."""
     learnt: tuple[int, ...]
     """Indices of episodes that it has learnt from,"""
     held_out: tuple[int, ...]
@@ -87,7 +87,7 @@ def save_world_model(
 
 
 def load_sources(directory: Path, room: str = "") -> tuple[Source, ...]:
-    """What a saved world model has learnt from; none if it does not say. `room` is of the ``path``.
+    """Sources that a saved world model has learnt from; none if it does not say. `room` is of the ``path``.
 
     Raises:
         InputError: it says something else.
@@ -178,7 +178,7 @@ def _imagine_once(model: LearnableWorldModel, success: SuccessPairsRewardModel |
 
 
 def _spec(content: object, origin: Origin) -> WorldModelSpec:
-    """What the file says of itself; cameras' names become parts of paths."""
+    """Spec in the file; cameras' names become parts of paths."""
     try:
         said = dict(cast(Any, content))
         sizes = {name: said[name] for name in ("state_dim", "action_dim", "chunk", "fps", "context")}

@@ -34,7 +34,7 @@ VALIDATED = 64
 
 
 class Examples:
-    """What episodes have to show: frames of successes and of failures, and chunks that led to them.
+    """Examples for a success model: frames of successes and of failures, and chunks that led to them.
 
     Args:
         episodes: to draw from.
@@ -255,7 +255,7 @@ def new_success_model(chunk: int) -> SuccessPairsRewardModel:
 def _loss(
     model: SuccessPairsRewardModel, pairs: Sequence[np.ndarray], generator: torch.Generator | None
 ) -> tuple[torch.Tensor, dict[str, float]]:
-    """Of what `Examples.seen` gives."""
+    """Loss of the examples of `Examples.seen`."""
     before, after, success, progress = pairs
     device = model.out.weight.device
     return model.loss(

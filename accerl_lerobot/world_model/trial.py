@@ -230,7 +230,7 @@ def _judged(
     newest: np.ndarray,
     d: int,
 ) -> dict[str, Any]:
-    """What the success model makes of the chunk at this depth, where it `happened`, see `replayed.made`."""
+    """The success model's judgement of the chunk at this depth, where it `happened`, see `replayed.made`."""
     labels, groups = windows.success[happened, d], windows.episode[happened]
     found: dict[str, Any] = {"successes": int(labels.sum()), "failures": int((~labels).sum())}
     for arm, dreams in arms.items():

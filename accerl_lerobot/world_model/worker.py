@@ -105,7 +105,7 @@ class DreamWorker:
             self._promoted = promotion
 
     def expect(self, promising: bool) -> None:
-        """Whether another model may be promoted later on."""
+        """True if another model may be promoted later on."""
         with self._lock:
             self._promising = promising
 
@@ -242,7 +242,7 @@ class WorldLearningWorker:
         news, learner = _News(replay, self._cursor), self._learner
         promising: bool | None = None
         held: bool | None = None
-        """What replay has been told; None: nothing by this process."""
+        """Replay's state as last reported to it; None: nothing by this process."""
         while not news.closed:
             self._clock.enter(TRANSPORT)
             with self._learning:
@@ -292,7 +292,7 @@ def _within(seconds: float, lock: threading.Lock, what: str) -> Iterator[None]:
 
 
 class _News:
-    """What is new in replay, asked for every now and then and never waited for."""
+    """News in replay, asked for every now and then and never waited for."""
 
     def __init__(self, replay: Any, cursor: int) -> None:
         self._replay, self._asked, self._next = replay, None, 0.0

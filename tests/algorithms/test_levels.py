@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one ratio covers, and factors that do not exist."""
+"""Extent of one ratio, and factors that do not exist."""
 
 from __future__ import annotations
 

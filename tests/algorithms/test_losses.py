@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What holds for every algorithm, and GIPO and PPO by hand; `test_peers` has the others by hand."""
+"""Properties of every algorithm, and GIPO and PPO by hand; `test_peers` has the others by hand."""
 
 import math
 import subprocess

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a world takes: its law by hand, and one of known durations, timed."""
+"""Durations of a world: its law by hand, and one of known durations, timed."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ class Aiming:
 
 
 class Knowing(WorldModel):
-    """What the simulated world does where one action on the target is enough: it turns bright then."""
+    """The simulated world where one action on the target is enough: it turns bright then."""
 
     spec = SPEC
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a dataset's files may say, and what LeRobot and `datasets` would have made of it."""
+"""Hostile files of a dataset, and what LeRobot and `datasets` would have made of them."""
 
 from __future__ import annotations
 
@@ -379,7 +379,7 @@ def test_a_local_dataset_is_not_completed_from_the_hub(copied: Path, part: str):
 
 
 def test_one_from_the_hub_is_checked_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """What has just been fetched, before LeRobot reads it."""
+    """Checked right after it was fetched, before LeRobot reads it."""
     from lerobot.datasets import dataset_metadata
 
     fetched = Path(shutil.copytree(ROOT, tmp_path / "fetched"))

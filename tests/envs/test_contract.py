@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every world must keep; a new world is one more row of `CASES`."""
+"""The contract of every world; a new world is one more row of `CASES`."""
 
 from __future__ import annotations
 

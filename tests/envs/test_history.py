@@ -33,7 +33,7 @@ def one_by_one(world: World, task: str, actions: np.ndarray) -> tuple[list[Obser
 
 
 def same(observation: Observation, states: list[Observation]) -> None:
-    """Whether it holds these states, oldest first."""
+    """True if it holds these states, oldest first."""
     for key, value in observation.items():
         if key == TASK:
             assert value == states[-1][key]

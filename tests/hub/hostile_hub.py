@@ -177,7 +177,7 @@ def _memory_mib() -> int:
 
 
 def _expected(written: str, scratch: Path, server: str) -> bool:
-    """Whether it is the server, a port on which nobody listens, or lies where a pull may write."""
+    """True if it is the server, a port on which nobody listens, or lies where a pull may write."""
     if written.startswith("socket.connect"):
         return server in written or "('127.0.0.1', 1)" in written
     path = Path(written)

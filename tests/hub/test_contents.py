@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What of a folder goes to the Hub, and what is known of the run around it."""
+"""Files of a folder that go to the Hub, and the facts about the run around it."""
 
 from __future__ import annotations
 

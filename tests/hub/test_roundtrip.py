@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is pushed comes back as it was and loads, through the real client and a Hub on this machine."""
+"""A pushed folder comes back as it was and loads, through the real client and a Hub on this machine."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def accerl(*arguments: str) -> None:
 
 
 def fresh(server: HubServer, home: Path, code: str, *arguments: str) -> Any:
-    """What a new process with an empty cache prints last, as JSON."""
+    """Last line, as JSON, of a new process with an empty cache."""
     command = [sys.executable, "-c", code, *arguments]
     variables = {k: v for k, v in os.environ.items() if not k.startswith("HF_")} | environment(server, home)
     done = subprocess.run(command, env=variables, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -135,7 +135,7 @@ def test_a_policy_from_the_hub_can_be_improved_and_pushed_again(hub: HubServer, 
 def test_a_run_that_was_pulled_can_be_gone_on_with(
     hub: HubServer, tiny_checkpoint: Path, tmp_path: Path, start: str
 ):
-    """Whether or not what it began from can be had."""
+    """With and without the checkpoint that it began from."""
     trainer = TrainerConfig(updates=3, batch_decisions=16, lr=1e-2, warmup_updates=0, value_warmup_updates=0)
     launch, evaluation = LaunchConfig(engine="local"), EvaluationConfig(episodes=2, videos=0)
     accerl("push", f"--path={tiny_checkpoint}", "--repo_id=alice/start")

@@ -120,7 +120,7 @@ def edit_config(path: Path, **changes: Any) -> None:
 
 
 def stock_chunk(path: Path, request: Request, **options: Any) -> np.ndarray:
-    """What stock LeRobot makes of a checkpoint and one observation: (1, K, A) in the world's units.
+    """Stock LeRobot's chunk for a checkpoint and one observation: (1, K, A) in the world's units.
 
     Args:
         path: the checkpoint.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every policy and family must keep, in numbers; a test class inherits it for its own checkpoint."""
+"""The contract of every policy and family, in numbers; a test class inherits it for its own checkpoint."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ class PolicyContract:
     parts: ClassVar[tuple[str, ...]]
     """Parts of parameter names, whose gradients are compared with finite differences."""
     shape: ClassVar[tuple[int, int]] = (3, 2)
-    """Of a chunk: executed rows, action dims."""
+    """Shape of a chunk: executed rows, action dims."""
     image: ClassVar[int] = 16
     slack: ClassVar[float] = 0.02
     """Relative error of finite differences: ReLUs bend, and smaller steps drown in rounding."""
     one_token: ClassVar[bool] = False
-    """Whether the critic's features are one token, among which an attention query has nothing to choose."""
+    """True if the critic's features are one token, among which an attention query has nothing to choose."""
 
     @staticmethod
     def write(directory: Path) -> Path:

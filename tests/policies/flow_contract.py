@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the tests of every flow policy share: the samplers, and the slow oracle on a policy's own velocity."""
+"""Tests that all flow policies share: the samplers, and the slow oracle on a policy's own velocity."""
 
 from __future__ import annotations
 

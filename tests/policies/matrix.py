@@ -92,18 +92,18 @@ KINDS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """What was found."""
+    """Findings about one policy."""
 
     parameters: int
     losses: tuple[float, float] | None
     """LeRobot's own loss on one batch before and after some of its gradient steps."""
     chunk: tuple[int, ...]
     factors: int
-    """Of a decision's log-prob."""
+    """Number of a decision's log-prob factors."""
     mismatch: float
     """Largest |ρ − 1| at equal weights, decided alone and re-scored together."""
     reloaded: bool
-    """Whether stock LeRobot loads what we save, tensor for tensor, and acts with it."""
+    """True if stock LeRobot loads our checkpoint, tensor for tensor, and acts with it."""
 
 
 def examine(name: str, directory: Path) -> Row:

@@ -38,7 +38,7 @@ def density(x: float, centre: float, scale: float) -> float:
 
 
 def counts(k: int, row: int, dim: int, shape: FlowShape, config: FlowSamplerConfig) -> bool:
-    """Whether entry (row, dim) of step k's outcome belongs to the density."""
+    """True if entry (row, dim) of step k's outcome belongs to the density."""
     if k == shape.num_steps - 1:
         return row < shape.executed and dim < shape.action_dim
     return dim < shape.action_dim or config.padded == "joint"

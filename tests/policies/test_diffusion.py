@@ -93,7 +93,7 @@ def adapter(path: Path) -> LeRobotAdapter:
 
 
 def own_noise(asked: list[Request], steps: int) -> tuple[Tensor, list[Tensor]]:
-    """What these requests begin with, (B, 8, 2), and the noise of each step."""
+    """Initial noise of these requests, (B, 8, 2), and the noise of each step."""
     first, rest = [], []
     for request in asked:
         rng = np.random.default_rng(request.noise_seed)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a checkpoint's files may say, and what LeRobot would have made of it."""
+"""Hostile files of a checkpoint, and what LeRobot would have made of them."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_good_ones_pass(good: Path, tiny_checkpoint: Path):
 
 
 def call(marker: Path) -> dict[str, Any]:
-    """What LeRobot 0.6.1 takes for a processor step: it imports the class and calls it."""
+    """LeRobot 0.6.1's way to a processor step: it imports the class and calls it."""
     return {"class": "subprocess.Popen", "config": {"args": ["touch", str(marker)]}}
 
 

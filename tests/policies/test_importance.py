@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an importance weight is for: E_μ[ρ f(a)] = E_π[f(a)] for the action the world executes.
+"""Importance weights: E_μ[ρ f(a)] = E_π[f(a)] for the action the world executes.
 
 "ρ = 1 at equal weights" and "E_μ[ρ] = 1" also hold for log-probs that leave out the padded dims they put
 noise into; this identity does not, because padded dims feed back into executed ones.

@@ -41,7 +41,7 @@ class UniversalActionProcessor:
         made.bpe_tokenizer = PreTrainedTokenizerFast.from_pretrained(folder)
         return made
 """
-"""What a tokeniser's repository could have in it, such as the class that LeRobot means to run."""
+"""Code in a tokeniser's repository, such as the class that LeRobot means to run."""
 
 
 @pytest.fixture(scope="module", autouse=True)

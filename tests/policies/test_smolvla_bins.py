@@ -68,7 +68,8 @@ def at_temperature(adapter: LeRobotAdapter, temperature: float) -> LeRobotAdapte
 
 
 def slow_log_probs(adapter: LeRobotAdapter, asked: list[Request], temperature: float) -> np.ndarray:
-    """Of every bin, (B, L, bins), one request at a time, by the head's matrix in double precision."""
+    """Log-probs of every bin, (B, L, bins), one request at a time, by the head's matrix in double
+    precision."""
     head, rows = adapter.policy.model.head, []
     weight, bias = head.weight.detach().double().numpy(), head.bias.detach().double().numpy()
     for request in asked:

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is trained: LeRobot's choice, everything, the expert, or low-rank adapters that are saved merged."""
+"""Trained parameters: LeRobot's choice, everything, the expert, or low-rank adapters that are saved
+merged."""
 
 from __future__ import annotations
 

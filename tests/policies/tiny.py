@@ -26,7 +26,7 @@ from tests.rounding import assert_close
 TOLERANCE = 1e-4
 """The contract: |ρ − 1| of a whole chunk at equal weights, in fp32 on any CPU; found are 1e-7 to 2e-5."""
 TEXTS = ("Match the target", "Go", "Mirror the target slowly, then stay")
-"""Of different lengths, so that a batch pads some of them."""
+"""Texts of different lengths, so that a batch pads some of them."""
 
 
 def requests(count: int, *, explore: bool = True, seed: int = 0, image: int = 32) -> list[Request]:

@@ -28,7 +28,7 @@ ACTIONS = "lerobot/fast-action-tokenizer"
 """The tokeniser of actions that π0-FAST asks for."""
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 KINDS = ("pi0", "pi05")
-"""Of the flow family."""
+"""Policies of the flow family."""
 VOCABULARY = 400
 SKIP = 8
 """PaliGemma's last tokens, which are none of FAST's; LeRobot's `fast_skip_tokens`."""

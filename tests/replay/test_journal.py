@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was done in real worlds, on disk."""
+"""The journal of real episodes, on disk."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ def play(scene: Callable[[ReplayWorker], Awaitable[Any]], config: ReplayConfig =
 
 
 async def waits(task: asyncio.Task[Any]) -> bool:
-    """Whether a call is still under way after everything that can run has run."""
+    """True if a call is still under way after everything that can run has run."""
     for _ in range(20):
         await asyncio.sleep(0)
     return not task.done()

@@ -28,7 +28,7 @@ INSTALL = (
     "apt-get install -y --no-install-recommends chromium-headless-shell"
 )
 ANSWER_S = 120.0
-"""Of a browser that starts on a machine with other things to do."""
+"""Seconds for a browser that starts on a machine with other things to do."""
 
 
 class Browser:
@@ -111,7 +111,7 @@ class Browser:
         self.evaluate("new Promise(done => requestAnimationFrame(() => setTimeout(done, 100)))")
 
     def evaluate(self, script: str) -> Any:
-        """What a script gives; a promise is awaited."""
+        """Value of a script; a promise is awaited."""
         given = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in given, given["exceptionDetails"]
         return given["result"].get("value")

@@ -22,7 +22,7 @@ from accerl_lerobot.verb_configs import WorldModelRun
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 
 HOSTILE = "<script>document.title = 'owned'</script>\"'><img src=x onerror=\"document.title = 'owned'\">"
-"""What a task, or any other text of a run, might be called."""
+"""Hostile names of a task, or any other text of a run."""
 
 
 def run_config(**fields: Any) -> RunConfig:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands on a page, as a program sees it."""
+"""A page's contents, as a program sees them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Seen(HTMLParser):
         super().__init__()
         self.elements: list[tuple[str, dict[str, str]]] = []
         self.charts: list[dict[str, Any]] = []
-        """What each chart tells the page's script, strict JSON."""
+        """Data of each chart for the page's script, strict JSON."""
         self._words: list[str] = []
         self._open: list[str] = []
         self.feed(html)

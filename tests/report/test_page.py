@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a page says of a run, that it says nothing else, and that it harms nobody."""
+"""A page tells a run's facts and nothing else, and harms nobody."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class TestARealRun:
 
 
 def series_limit(series: dict[str, Any]) -> float:
-    """What the line across the lag's chart stands at."""
+    """Value of the line across the lag's chart."""
     (bound,) = [s for name, s in series.items() if name.startswith("bound of the recipe")]
     return float(bound["y"][0])
 

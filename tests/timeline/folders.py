@@ -12,7 +12,7 @@ from accerl_lerobot.timeline.states import TIMELINE
 
 SECOND = 10**9
 UP = 10**15
-"""What the monotonic clock shows when a test begins; the calendar shows twice that."""
+"""The monotonic clock's time when a test begins; the calendar shows twice that."""
 
 
 class Hands:

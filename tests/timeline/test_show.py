@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What people look at: the picture, the trace and the shares."""
+"""Views for people: the picture, the trace and the shares."""
 
 from __future__ import annotations
 

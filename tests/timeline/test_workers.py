@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each worker says it does, while it does something that a test knows. Engines: ``test_engines.py``."""
+"""Each worker's reported activity, while it does something that a test knows. Engines:
+``test_engines.py``."""
 
 from __future__ import annotations
 
@@ -40,7 +41,7 @@ class StoppedError(Exception):
 
 
 def states(run: Path) -> list[str]:
-    """What the only worker was in, one after the other."""
+    """Successive states of the only worker."""
     (row,) = read_timeline(run).rows
     return [STATES[state] for state in row.states]
 

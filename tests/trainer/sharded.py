@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the ranks of a test do, in processes of their own; free of pytest, which they have no use for.
+"""Work of a test's ranks, in processes of their own; free of pytest, which they have no use for.
 
 Results travel as snapshots: every rank writes its own, and the test reads them.
 """
@@ -97,7 +97,7 @@ class Case(NamedTuple):
     adapter: Callable[[], PolicyAdapter]
     algorithm: AlgorithmConfig
     config: dict[str, Any]
-    """Of the trainer, apart from its ranks."""
+    """Config of the trainer, apart from its ranks."""
     batches: list[list[Segment]]
 
 

@@ -144,7 +144,7 @@ def test_copies_of_one_version_share_their_memory_and_others_do_not():
 
 
 class Recorder:
-    """What the loss was given, update by update, and what was copied when."""
+    """Arguments of the loss, update by update, and the moments of copies."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.inputs: list[LossInputs] = []

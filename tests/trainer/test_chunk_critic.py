@@ -171,7 +171,7 @@ def test_what_is_executed_and_proposed_is_what_the_policy_does(tiny_checkpoint: 
 
 
 def test_imitation_is_flow_matching():
-    """Of the field that leads straight to the chunk the loss is 0; of one that is off by 1 it is 1."""
+    """For the field that leads straight to the chunk the loss is 0; for one that is off by 1 it is 1."""
     shape = FlowShape(num_steps=3, chunk_size=4, executed=3, padded_dim=5, action_dim=2)
     target = torch.zeros(64, 4, 5)
     target[:, :3, :2] = torch.randn(64, 3, 2)

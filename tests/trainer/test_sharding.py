@@ -44,7 +44,7 @@ RUNS = [(size, how, name) for size, names in GROUPS.items() for how in SHARDINGS
 
 @pytest.fixture(scope="module")
 def alone() -> dict[str, dict[str, Any]]:
-    """What one rank makes of every case."""
+    """One rank's results for every case."""
     found = {}
     for name, case in sharded.cases().items():
         found[name] = sharded.run(case, sharded.config_of(case, "none", 1), Ranks())
@@ -53,7 +53,7 @@ def alone() -> dict[str, dict[str, Any]]:
 
 @pytest.fixture(scope="module")
 def folder(alone: dict[str, dict[str, Any]], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What groups of 2 and of 4 make of them, from the beginning and from one rank's checkpoint."""
+    """Results of groups of 2 and of 4, from the beginning and from one rank's checkpoint."""
     directory = tmp_path_factory.mktemp("ranks")
     for name, result in alone.items():
         snapshot.save(directory / "alone" / name, result["half"])

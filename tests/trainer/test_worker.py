@@ -26,7 +26,7 @@ from tests.trainer.linear import LinearAdapter, make_segments
 
 
 def copied(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What a store would have made of them."""
+    """Copies as a store would have made them."""
     return {name: tensor.copy() for name, tensor in tensors.items()}
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every transport must pass.
+"""Tests that every transport must pass.
 
 Use, in the test file of a transport::
 
@@ -30,7 +30,7 @@ from tests.replay.segments import make_segment
 Factory = Callable[[], Caller]
 Check = Callable[[Factory], None]
 LONG_S = 240.0
-"""What takes that long hangs."""
+"""Seconds after which an end counts as hung."""
 
 
 class Service:
@@ -60,7 +60,7 @@ class Service:
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two messages are equal, types, dtypes and shapes included."""
+    """True if two messages are equal, types, dtypes and shapes included."""
     if type(a) is not type(b):
         return False
     if isinstance(a, np.ndarray | np.generic):
@@ -73,7 +73,7 @@ def same(a: Any, b: Any) -> bool:
 
 
 def messages() -> list[Any]:
-    """Of everything that travels, and of what is easily lost on the way."""
+    """Messages of every kind that travels, and of the kinds easily lost on the way."""
     draw = np.random.default_rng(0)
     image = draw.integers(0, 255, (24, 16, 3)).astype(np.uint8)
     chunk = draw.normal(size=(4, 2)).astype(np.float32)

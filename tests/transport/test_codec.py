@@ -68,7 +68,7 @@ def test_what_is_remembered_is_bounded(monkeypatch: pytest.MonkeyPatch):
 
 @dataclass
 class Stranger:
-    """Of no registered kind."""
+    """An object of no registered kind."""
 
     a: int = 1
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What only shared memory can get wrong: slots, their files, tokens, strangers."""
+"""Faults of shared memory alone: slots, their files, tokens, strangers."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every weight transport must pass.
+"""Tests that every weight transport must pass.
 
 Use, in the test file of a transport::
 

@@ -371,7 +371,7 @@ for version in range(10**9):
 
 
 def test_a_trainer_that_is_killed_ends_the_reader_quietly_and_leaves_nothing():
-    """What was held stays readable; no name is left in a file system, and no memory once it is let go of."""
+    """Held weights stay readable; no name is left in a file system, and no memory once it is let go of."""
     before = set(os.listdir("/dev/shm"))
     process = subprocess.Popen([sys.executable, "-c", _TRAINER], stdout=subprocess.PIPE, text=True)
     held: list[Received] = []

@@ -28,14 +28,14 @@ from accerl_lerobot.world_model.episodes import Windows
 @LearnableModelConfig.register_subclass("linear")
 @dataclass(frozen=True, kw_only=True)
 class LinearModelConfig(LearnableModelConfig):
-    """Of one frame it has all it needs."""
+    """Settings of a model that needs only one frame."""
 
     make = "tests.world_model.linear_world:LinearWorldModel"
 
     context: int = 1
     """Frames it sees, the newest included."""
     gain: float = 1.0
-    """Of its motions; > 0."""
+    """Factor on its motions; > 0."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

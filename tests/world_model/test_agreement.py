@@ -11,7 +11,7 @@ from accerl_lerobot.world_model.agreement import agreement, even_threshold, matt
 
 
 def outcomes(rates: list[float], count: int = 20) -> np.ndarray:
-    """Of each policy, the first so many succeed."""
+    """Successes of each policy's first episodes, so many each."""
     return np.arange(count)[None] < np.array(rates)[:, None] * count
 
 

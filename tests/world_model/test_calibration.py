@@ -46,7 +46,8 @@ def test_where_all_episodes_ended_alike_nothing_is_told(outcome: bool):
 
 
 def act(dreams: Imagination, requests: list[Request]) -> list[Decision]:
-    """What brightens dreams that begin where an episode succeeded by 0.2 a chunk, and others by 0.18."""
+    """Actions that brighten dreams that begin where an episode succeeded by 0.2 a chunk, and others by
+    0.18."""
     sizes = [1.0 if row.start.achieved else 0.9 for row in dreams._rows if row is not None]
     assert len(sizes) == len(requests)
     return [decided(np.full((K, 2), size), value=7.0, version=5) for size in sizes]
@@ -90,7 +91,7 @@ def test_an_episode_that_has_not_ended_is_no_measure(bright: Any):
 
 
 def test_it_waits_for_the_failures_which_end_last(bright: Any):
-    """Of eight worlds, one succeeds at once: its episode alone would say that all do."""
+    """One of eight worlds succeeds at once: its episode alone would say that all do."""
     dreams, _ = imagination(Counting(), bright, horizon=None, calibrate=400, keyframes=0.0, ended=8)
     episodes = [*lived(1, solve_at=0), *(segment for seed in range(10, 17) for segment in lived(seed))]
     share = np.mean([episode.success for episode in episodes])

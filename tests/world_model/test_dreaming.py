@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run's world model goes on learning from."""
+"""Data that a run's world model goes on learning from."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def learnt() -> PixelWorldModel:
 
 
 def skills(frames: np.ndarray, wanted: np.ndarray, newest: np.ndarray, of: Windows) -> list[float]:
-    """Of each camera, frames uint8 (B, V, H, W, 3)."""
+    """Skill for each camera, frames uint8 (B, V, H, W, 3)."""
     return [
         skill(
             squared_errors(frames[:, v : v + 1], wanted[:, v : v + 1]),

@@ -73,7 +73,7 @@ def test_the_sampler_is_diffusers_edm_euler(steps: int):
 
 
 def test_the_sampler_finds_a_gaussian():
-    """Of images from N(m, s²) the best denoiser is known; what is sampled with it has their mean and std."""
+    """For images from N(m, s²) the best denoiser is known; its samples have their mean and std."""
     mean, std = 0.4, 0.3
 
     def best(x: Tensor, label: Tensor) -> Tensor:
@@ -146,6 +146,7 @@ def test_refining_starts_from_the_prediction():
 
 
 def test_a_network_that_says_nothing_makes_no_change():
-    """What starts at zero, as ours does, starts as "the frame stays": the refiner's image is the change."""
+    """A network that starts at zero, as ours does, starts as "the frame stays": the refiner's image is the
+    change."""
     silent = lambda x, label: torch.zeros_like(x)  # noqa: E731
     assert not refiner_sample(silent, images(3)[:, None][:, :0], [], SIGMA_DATA).any()

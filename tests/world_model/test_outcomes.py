@@ -34,7 +34,7 @@ def ending_on_the_right(count: int) -> list[Episode]:
 
 
 def on_the_right(model: object, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """What a perfect success model says of the dot."""
+    """Judgement of a perfect success model on the dot."""
     x = (after[:, 0, :, :, 0] > 200).any(1).argmax(1)
     said: np.ndarray = 0.1 + 0.8 * (x > SIZE / 2 + 0.5)
     return said

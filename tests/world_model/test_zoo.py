@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a newcomer's world model needs: a class and a line of the table."""
+"""Needs of a newcomer's world model: a class and a line of the table."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ class SmolVLABinsConfig(PreTrainedConfig):
     chunk_size: int = 8
     """Actions of a chunk."""
     n_action_steps: int = 8
-    """Of these, how many are executed."""
+    """Executed actions among these."""
     num_bins: int = 256
     """Bins per action dimension, of equal width over [-1, 1] in normalised units; an action beyond is taken
     as the outermost bin."""
@@ -38,7 +38,7 @@ class SmolVLABinsConfig(PreTrainedConfig):
     vlm_model_name: str = "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"
     """Hub id or folder of a SmolVLM."""
     load_vlm_weights: bool = True
-    """Whether a new policy starts from that model's weights or from random ones; unlike in smolvla, where
+    """Start a new policy from that model's weights instead of random ones; unlike in smolvla, where
     random ones are the default. False in every checkpoint, whose own file holds the weights."""
     num_vlm_layers: int = 16
     """How many of its language-model layers are kept, the first ones; 0 keeps all."""

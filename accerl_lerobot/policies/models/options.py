@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What several flow policies of LeRobot call alike in their configs."""
+"""Options that several of LeRobot's flow policies share in their configs."""
 
 from __future__ import annotations
 

@@ -14,12 +14,12 @@ from accerl_lerobot.errors import InputError
 @RewardModelConfig.register_subclass("success_pairs")
 @dataclass
 class SuccessPairsConfig(RewardModelConfig):
-    """What it looks at, and how large it is."""
+    """Inputs and sizes of the success model."""
 
     chunk: int = 10
     """Env steps between the two frames."""
     channels: tuple[int, ...] = (32, 64, 96)
-    """Of the convolutions, each of which halves the image; the first one does so twice."""
+    """Channels of the convolutions, each of which halves the image; the first one does so twice."""
     hidden: int = 128
     """Width of the layer behind them."""
     success_reward: float = 0.5

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What it looks at, and what it answers."""
+"""Inputs of the reward model, and its answer."""
 
 from __future__ import annotations
 
