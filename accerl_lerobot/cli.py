@@ -10,7 +10,7 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from accerl_lerobot import __version__
 from accerl_lerobot.errors import InputError, one_line
@@ -33,7 +33,7 @@ VERBS = {
     "timeline": ("verbs:timeline", "what every worker of a run did when: a picture, a trace and shares"),
     "export": ("verbs:export", "the episodes of a run as a LeRobotDataset, with a picture at every env step"),
     "doctor": ("doctor:main", "resolve a recipe and check this machine"),
-    "bench": ("verbs:bench", "measure: accerl bench world, policy, lag, dream, ranking, …"),
+    "bench": ("verbs:bench", "measure this machine: accerl bench world, policy, throughput or latency"),
 }
 
 
@@ -66,7 +66,7 @@ def show_help(verb: str, rest: list[str], section: str) -> int:
     names = [name for name in CONFIGS if name.split()[0] == verb]
     named = [name for name in names if len(names) == 1 or name.split()[-1] in rest]
     if named:
-        text = help_text(named[0], CONFIGS[named[0]], VERBS[verb][1], section)
+        text = help_text(f"accerl {named[0]}", CONFIGS[named[0]], VERBS[verb][1], section)
     else:
         docs = (sys.modules[CONFIGS[name].__module__].__doc__ or "" for name in names)
         briefs = (doc.partition("\n\n")[0].replace("\n", " ")[:90] for doc in docs)
@@ -92,48 +92,76 @@ def main(arguments: list[str] | None = None) -> int:
         hint = f"did you mean {near[0]}? Otherwise " if near else ""
         sys.stderr.write(f"accerl: no verb {verb!r}; {hint}use one of {', '.join(VERBS)}\n")
         return 2
+    return exit_code("accerl", lambda: run(verb, rest))
+
+
+def exit_code(program: str, work: Callable[[], int]) -> int:
+    """The exit code of `work`, or of the error that ends it, which is told in one line."""
     try:
-        code = run(verb, rest)
+        code = work()
         sys.stdout.flush()
     except InputError as error:
         # Ray raises a subclass whose text is a whole traceback; the error itself is inside.
-        return _refuse(str(getattr(error, "cause", error)))
+        return _refuse(program, str(getattr(error, "cause", error)))
     except KeyboardInterrupt as stop:
-        _refuse("interrupted")
+        _refuse(program, "interrupted")
         return 143 if isinstance(stop, TerminatedError) else 130
     except Exception as error:
         if isinstance(error, BrokenPipeError) and not _output_is_open():
             return 128 + signal.SIGPIPE
-        logging.getLogger(__name__).debug("accerl %s failed", verb, exc_info=error)
-        _refuse(one_line(error))
+        logging.getLogger(__name__).debug("%s failed", program, exc_info=error)
+        _refuse(program, one_line(error))
         return 1
     return code
 
 
 def run(verb: str, rest: list[str]) -> int:
     """Runs a verb, or shows its help."""
-    level = os.environ.get("ACCERL_LOG", "WARNING").upper()
-    if level not in LEVELS:
-        raise InputError("ACCERL_LOG", level, f"use {', '.join(LEVELS)}")
-    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s")
-    for argument in rest:
-        flag, _, section = argument.partition("=")
-        if flag in ("-h", "--help"):
-            return show_help(verb, rest, section)
-    from accerl_lerobot import guardian
-
-    guardian.start()  # before anything that it is to clean up
+    set_up_logging()
+    if (section := help_asked(rest)) is not None:
+        return show_help(verb, rest, section)
     module, _, name = VERBS[verb][0].partition(":")
-    with interrupted():
+    with guarded():
         function: Callable[[list[str]], int] = getattr(
             importlib.import_module(f"accerl_lerobot.{module}"), name
         )
         return function(rest)
 
 
-def _refuse(text: str) -> int:
+def help_asked(rest: list[str]) -> str | None:
+    """The section that ``--help`` names, "" for a bare one; None: it is not asked for."""
+    for argument in rest:
+        flag, _, section = argument.partition("=")
+        if flag in ("-h", "--help"):
+            return section
+    return None
+
+
+def set_up_logging() -> None:
+    """Sets the level that ``ACCERL_LOG`` names.
+
+    Raises:
+        InputError: it names none.
+    """
+    level = os.environ.get("ACCERL_LOG", "WARNING").upper()
+    if level not in LEVELS:
+        raise InputError("ACCERL_LOG", level, f"use {', '.join(LEVELS)}")
+    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s")
+
+
+@contextlib.contextmanager
+def guarded() -> Iterator[None]:
+    """Ends and removes, on the way out, whatever is started within and left behind."""
+    from accerl_lerobot import guardian
+
+    guardian.start()  # before anything that it is to clean up
+    with interrupted():
+        yield
+
+
+def _refuse(program: str, text: str) -> int:
     with contextlib.suppress(OSError):  # whoever reads it may be gone
-        sys.stderr.write(f"accerl: {text}\n")
+        sys.stderr.write(f"{program}: {text}\n")
     return 2
 
 

@@ -8,7 +8,7 @@ An order is a file. The process that comes to its point takes it by renaming it,
 once, so a fault happens once in a run however often processes are started anew; the renamed file says who
 took it and when, and is the proof that it happened. Without the variable a point is a comparison with None.
 
-`accerl bench faults` gives the orders.
+`python -m benchmarks faults` gives the orders.
 """
 
 from __future__ import annotations

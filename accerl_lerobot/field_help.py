@@ -35,11 +35,11 @@ COMMON = (
 """Fields that people change."""
 
 
-def help_text(verb: str, config_class: type[Any], what: str, section: str = "") -> str:
+def help_text(command: str, config_class: type[Any], what: str, section: str = "") -> str:
     """The text of ``--help``: all fields if they fit a page, otherwise those that people change.
 
     Args:
-        verb: as it is typed.
+        command: as it is typed.
         config_class: its config.
         what: what it does, one line.
         section: ``--help=SECTION``: all fields of a section, or ``all``.
@@ -48,7 +48,7 @@ def help_text(verb: str, config_class: type[Any], what: str, section: str = "") 
         InputError: there is no such section.
     """
     lines = [
-        f"usage: accerl {verb} {_bare(config_class)} [--section.field=value …]",
+        f"usage: {command} {_bare(config_class)} [--section.field=value …]",
         "",
         textwrap.fill(f"{what[0].upper()}{what[1:]}. Fields not given keep the value shown.", WIDTH),
         "",
@@ -59,7 +59,7 @@ def help_text(verb: str, config_class: type[Any], what: str, section: str = "") 
     if section == "all" or len(lines) + len(every) <= PAGE:
         return "\n".join(lines + every)
     lines += [line for name in COMMON for line in _brief(config_class, name)]
-    lines += ["", f"more: accerl {verb} --help=all, or --help=SECTION:"]
+    lines += ["", f"more: {command} --help=all, or --help=SECTION:"]
     hints = hints_of(config_class)
     for name, section_class in ((name, section_of(hint)) for name, hint in hints.items()):
         if section_class is not None:

@@ -18,22 +18,9 @@ from typing import Any
 
 import yaml
 
-from accerl_lerobot.bench.async_vs_sync import BenchAsyncVsSyncConfig
-from accerl_lerobot.bench.batching import BenchBatchingConfig
-from accerl_lerobot.bench.dream import BenchDreamConfig
-from accerl_lerobot.bench.efficiency import BenchEfficiencyConfig
-from accerl_lerobot.bench.faults import BenchFaultsConfig
-from accerl_lerobot.bench.lag import BenchLagConfig
 from accerl_lerobot.bench.latency import BenchLatencyConfig
 from accerl_lerobot.bench.policy import BenchPolicyConfig
-from accerl_lerobot.bench.ranking import BenchRankingConfig
-from accerl_lerobot.bench.replay import BenchReplayConfig
-from accerl_lerobot.bench.scaling import BenchScalingConfig
-from accerl_lerobot.bench.soak import BenchSoakConfig
 from accerl_lerobot.bench.throughput import BenchThroughputConfig
-from accerl_lerobot.bench.timeline import BenchTimelineConfig
-from accerl_lerobot.bench.transport import BenchTransportConfig
-from accerl_lerobot.bench.weights import BenchWeightsConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
 from accerl_lerobot.checkpoint import CONFIG
 from accerl_lerobot.config import RunConfig, encode, parse
@@ -313,10 +300,14 @@ def bench(arguments: list[str]) -> int:
         names = [verb.split()[1] for verb in CONFIGS if verb.startswith("bench ")]
         raise InputError("bench", name, f"name what is measured: {', '.join(names)}")
     config = parse(CONFIGS[f"bench {name}"], arguments[1:])
-    name = name.replace("-", "_")
-    module: Any = importlib.import_module(f"accerl_lerobot.bench.{name}")
+    return measure(f"accerl_lerobot.bench.{name}", config)
+
+
+def measure(module_name: str, config: Any) -> int:
+    """Runs ``bench_NAME`` of the module ``….NAME``, and shows what its ``table`` makes of the result."""
+    module: Any = importlib.import_module(module_name)
     with redirect_stdout(sys.stderr):
-        result = getattr(module, f"bench_{name}")(config)
+        result = getattr(module, f"bench_{module_name.rpartition('.')[2]}")(config)
     Console().rich.print(module.table(result))
     sys.stdout.write(json.dumps(result, indent=2) + "\n")
     return 0
@@ -338,20 +329,7 @@ CONFIGS: dict[str, type[Any]] = {
     "bench world": BenchWorldConfig,
     "bench policy": BenchPolicyConfig,
     "bench throughput": BenchThroughputConfig,
-    "bench scaling": BenchScalingConfig,
-    "bench async-vs-sync": BenchAsyncVsSyncConfig,
-    "bench transport": BenchTransportConfig,
-    "bench weights": BenchWeightsConfig,
-    "bench batching": BenchBatchingConfig,
-    "bench replay": BenchReplayConfig,
-    "bench timeline": BenchTimelineConfig,
     "bench latency": BenchLatencyConfig,
-    "bench lag": BenchLagConfig,
-    "bench dream": BenchDreamConfig,
-    "bench efficiency": BenchEfficiencyConfig,
-    "bench faults": BenchFaultsConfig,
-    "bench soak": BenchSoakConfig,
-    "bench ranking": BenchRankingConfig,
 }
 """Verb → what its command line is parsed into."""
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Practice after few-shot imitation: algorithms from one SFT policy, at equal real episodes.
 
-    python -m benchmarks.few_shot --tasks=lever-pull-v3,push-v3 --seeds=0 --jobs=2
+    python -m benchmarks few_shot --tasks=lever-pull-v3,push-v3 --seeds=0 --jobs=2
 
 Writes few_shot.json, few_shot.md and few_shot.png into the output folder. The same command continues a study
 that was stopped, and adds tasks, seeds or algorithms to one that is finished.
@@ -9,24 +9,25 @@ that was stopped, and adds tasks, seeds or algorithms to one that is finished.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.bench.study import Cell, Study, StudyConfig, as_markdown, named, write
+from rich.table import Table
+
+from accerl_lerobot.bench.tables import as_markdown, as_table, write
 from accerl_lerobot.console import Console
-from accerl_lerobot.errors import InputError, output_folder
+from accerl_lerobot.errors import output_folder
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate, mean_interval
-from accerl_lerobot.parsing import parse
 from accerl_lerobot.ranges import Steps
+from benchmarks.study import Cell, Study, StudyConfig, named
 
 COLUMNS = ("task", "seed", "algorithm", "SFT", "after", "real episodes", "env steps")
 
 
 @dataclass(frozen=True, kw_only=True)
-class FewShotConfig(StudyConfig):
+class BenchFewShotConfig(StudyConfig):
     """Fields of the study."""
 
     recipe: str = "recipes/few_shot.yaml"
@@ -47,7 +48,7 @@ class FewShotConfig(StudyConfig):
         named(self, "tasks")
 
 
-def few_shot(config: FewShotConfig) -> dict[str, Any]:
+def bench_few_shot(config: BenchFewShotConfig) -> dict[str, Any]:
     """Runs what is missing, task by task, and writes all results after each task.
 
     Returns:
@@ -92,15 +93,24 @@ def means(rows: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
     return found
 
 
+def table(result: dict[str, Any]) -> Table:
+    """Rows for people."""
+    return as_table("practice after few-shot imitation", COLUMNS, _rows(result))
+
+
 def markdown(result: dict[str, Any]) -> str:
     """A table of all rows but SFT's, which is a column."""
+    return as_markdown(COLUMNS, _rows(result))
+
+
+def _rows(result: dict[str, Any]) -> list[list[str]]:
     rows = []
     for row in result["rows"]:
         if row["algorithm"] != "sft" or not result["config"]["algorithms"]:
             rates = [_rate(row[key], row["n"]) for key in ("sft", "success")]
             counts = [f"{row[key]:,}" for key in ("episodes", "env_steps")]
             rows.append([row["task"], str(row["seed"]), row["algorithm"], *rates, *counts])
-    return as_markdown(COLUMNS, rows)
+    return rows
 
 
 def draw(path: Path, result: dict[str, Any]) -> None:
@@ -130,17 +140,3 @@ def _row(of: dict[str, Any], seed: int, start: dict[str, Any], summary: dict[str
 def _rate(success: float, n: int) -> str:
     interval = Rate(successes=round(success * n), n=n).interval()
     return f"{success:.0%} [{interval.low:.0%}, {interval.high:.0%}]"
-
-
-def main() -> int:
-    """Runs the study of the command line."""
-    try:
-        few_shot(parse(FewShotConfig, sys.argv[1:]))
-    except (InputError, RuntimeError) as error:
-        sys.stderr.write(f"few_shot: {error}\n")
-        return 1
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

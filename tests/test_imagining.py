@@ -283,7 +283,7 @@ def test_it_runs_asynchronously_with_two_who_dream(tiny_checkpoint: Path, world_
     [(DreamWorker, "_dreaming", "dreams"), (WorldLearningWorker, "_learning", "learning")],
 )
 def test_one_that_hangs_is_found_when_it_is_saved(kind: type, name: str, what: str, tmp_path: Path):
-    """And not after the minutes that large files may take; `accerl bench faults` does it to a whole run."""
+    """And not after the minutes that large files may take; `benchmarks.faults` does it to a whole run."""
     worker, held = object.__new__(kind), threading.Lock()
     worker._limit, worker._promoted = 1.0, "something that nobody takes over"
     setattr(worker, name, held)

@@ -19,7 +19,6 @@ import pytest
 import ray
 
 from accerl_lerobot import launch, seats
-from accerl_lerobot.bench.victims import alive
 from accerl_lerobot.config import LaunchConfig
 from accerl_lerobot.engine import Progress, WorkerError, pause_s
 from accerl_lerobot.envs import SimulatedConfig
@@ -34,6 +33,7 @@ from accerl_lerobot.trainer import worker as trainer_worker
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.transport.endpoint import Transport
 from accerl_lerobot.transport.shared_memory import Address, this_node
+from benchmarks.victims import alive
 from tests.light_workers import (
     FULL,
     HANGS,

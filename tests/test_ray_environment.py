@@ -293,6 +293,6 @@ def test_a_ray_that_others_could_talk_to_is_not_started():
 )
 def test_benches_that_start_ray_by_themselves_have_prepared_for_it(options: list[str]):
     clean = {k: v for k, v in os.environ.items() if not k.startswith("RAY_")}
-    command = [sys.executable, "-m", "accerl_lerobot.cli", "bench", *options]
+    command = [sys.executable, "-m", "benchmarks", *options]
     done = subprocess.run(command, env=clean, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr[-2000:]

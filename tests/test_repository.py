@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from accerl_lerobot.cli import VERBS
 from accerl_lerobot.config import RunConfig, parse
 from accerl_lerobot.doctor import pins
 from accerl_lerobot.preflight import check_sft_policy
 from accerl_lerobot.verbs import CONFIGS
+from benchmarks.__main__ import CONFIGS as BENCHMARKS
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "accerl_lerobot"
@@ -199,13 +199,13 @@ def test_links_in_the_documents_lead_somewhere() -> None:
 
 
 def commands() -> list[tuple[str, str]]:
-    """Every `accerl …` line of the documents' code blocks, continuation lines joined."""
+    """Lines `accerl …` and `python -m benchmarks …` of the documents' code blocks, continued lines joined."""
     found = []
     for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "datasets").rglob("*.md")]:
         for block in re.findall(r"```(?:bash|sh)\n(.*?)```", path.read_text(), flags=re.DOTALL):
             for line in block.replace("\\\n", " ").splitlines():
                 line = line.split("  #")[0].strip()
-                if line.startswith("accerl "):
+                if line.startswith(("accerl ", "python -m benchmarks ")):
                     found.append((str(path.relative_to(ROOT)), line))
     return found
 
@@ -213,10 +213,11 @@ def commands() -> list[tuple[str, str]]:
 @pytest.mark.parametrize(("path", "line"), commands())
 def test_commands_in_the_documents_parse(path: str, line: str) -> None:
     """Verb, fields, types and values; places that the reader fills in are written in capitals."""
-    _, verb, *arguments = shlex.split(line)
-    assert verb in VERBS, path
+    configs = CONFIGS if line.startswith("accerl ") else BENCHMARKS
+    verb, *arguments = shlex.split(line.removeprefix("python -m ").partition(" ")[2])
     if verb == "bench":
         verb, arguments = f"bench {arguments[0]}", arguments[1:]
+    assert verb in configs, path
     # A run's own config is one that train resolved, so its place is taken by no recipe at all.
     here = [a.replace("recipes/", f"{ROOT}/recipes/") for a in arguments if "RUN/config.yaml" not in a]
-    parse(CONFIGS[verb], here, recipe_class=RunConfig)
+    parse(configs[verb], here, recipe_class=RunConfig)

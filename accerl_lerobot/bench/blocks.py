@@ -12,10 +12,11 @@ from accerl_lerobot.bench.host import Processors
 from accerl_lerobot.config import RunConfig
 from accerl_lerobot.engine import Progress
 from accerl_lerobot.policies.config import Load
-from accerl_lerobot.replay.turns import Schedule
+from accerl_lerobot.replay.turns import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
 
 SETTLE = 2
 """Updates after a change that are not counted, beside those that need nothing new."""
+ARMS: tuple[Schedule, ...] = (ASYNCHRONOUS, OVERLAP, SYNCHRONOUS)
 MOST_BUSY = 0.6
 """Share of all cores above which the processors, and not what is slept, may be what is measured."""
 

@@ -2,7 +2,7 @@
 """How long a world takes from a decision to its next observation, and to reset.
 
     accerl bench latency --env.type=metaworld --env.task=door-open-v3
-    accerl bench async-vs-sync --traces='[outputs/latency/trace.txt]'
+    python -m benchmarks async_vs_sync --traces='[outputs/latency/trace.txt]'
 
 Random actions are played. The second command says what asynchrony gains where many worlds take turns at these
 durations, each from another moment on; they reset together, as episodes of equal length do.
@@ -20,7 +20,7 @@ import numpy as np
 from rich.table import Table
 
 from accerl_lerobot.bench.host import host
-from accerl_lerobot.bench.study import as_markdown, as_table, write
+from accerl_lerobot.bench.tables import as_markdown, as_table, write
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, World, make_world
 from accerl_lerobot.envs.simulated import RESET

@@ -14,10 +14,9 @@ from typing import Any
 
 from rich.table import Table
 
-from accerl_lerobot.bench.async_vs_sync import ARMS
-from accerl_lerobot.bench.blocks import Block, Measured, as_rows
+from accerl_lerobot.bench.blocks import ARMS, Block, Measured, as_rows
 from accerl_lerobot.bench.host import host, ranged, spread
-from accerl_lerobot.bench.study import as_markdown, as_table, write
+from accerl_lerobot.bench.tables import as_markdown, as_table, write
 from accerl_lerobot.config import RunConfig, parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, expanded, make_folder

@@ -3,8 +3,8 @@
 
 Entering a state ends the one before, so states exclude each other and their times add up to the time of the
 process by construction. Time is that of the monotonic clock, which processes of one machine share; what it
-was by the calendar when a process began is noted, for others. An entry is about a microsecond; `accerl bench
-timeline` measures it.
+was by the calendar when a process began is noted, for others. An entry is about a microsecond, as
+`benchmarks/timeline.py` measures.
 """
 
 from __future__ import annotations

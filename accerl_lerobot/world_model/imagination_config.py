@@ -89,8 +89,8 @@ class ImaginationConfig(Section, section="imagination"):
     with the success model of `path`, and is set anew as that goes on learning.
 
     That one is set on dreams with the actions that were made. A policy that looks at its dreams is flattered
-    more: ``accerl bench ranking`` says at which one it succeeds as often in dreams as in reality. Trials are
-    judged by it, too, so a strict one needs a lower `learn.trial.recall`.
+    more: ``python -m benchmarks ranking`` says at which one it succeeds as often in dreams as in reality.
+    Trials are judged by it, too, so a strict one needs a lower `learn.trial.recall`.
     """
     calibrate: Steps = 0
     """First dreams, from beginnings of real episodes to their ends, that nothing is learnt from: the

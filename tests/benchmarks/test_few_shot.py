@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot.bench import study as studies
-from accerl_lerobot.bench.study import Results, Study
-from benchmarks.few_shot import FewShotConfig, few_shot, means
+from benchmarks import study as studies
+from benchmarks.few_shot import BenchFewShotConfig, bench_few_shot, means
+from benchmarks.study import Results, Study
 
 
 def a_summary(success: float, episodes: int = 0) -> dict[str, Any]:
@@ -28,10 +28,10 @@ def test_runs_of_a_task_share_its_policy_and_its_episodes(tmp_path: Path, monkey
         return Results({seed: a_summary(0.4) for seed in study.config.seeds}, cells)
 
     monkeypatch.setattr(Study, "run", run)
-    config = FewShotConfig(
+    config = BenchFewShotConfig(
         tasks=("push-v3", "door-open-v3"), seeds=(0, 1), explored=30, output_dir=str(tmp_path)
     )
-    result = few_shot(config)
+    result = bench_few_shot(config)
 
     for study, task in zip(seen, config.tasks, strict=True):
         assert len(study.runs) == 4

@@ -19,8 +19,6 @@ import torch
 from torch import nn
 
 from accerl_lerobot import cli, console
-from accerl_lerobot.bench.dream import BenchDreamConfig, bench_dream, table
-from accerl_lerobot.bench.ranking import BenchRankingConfig
 from accerl_lerobot.config import parse
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import SimulatedConfig
@@ -40,6 +38,8 @@ from accerl_lerobot.world_model.offline import world_spec
 from accerl_lerobot.world_model.store import load_world_model, save_world_model
 from accerl_lerobot.world_model.success import new_success_model
 from accerl_lerobot.world_model.zoo import make_dreamer
+from benchmarks.dream import BenchDreamConfig, bench_dream, table
+from benchmarks.ranking import BenchRankingConfig
 from tests.runs import drive, replacing
 from tests.test_imagining import LOOSE, decisions, dreaming, lived
 from tests.world_model.test_offline import arguments, recorded

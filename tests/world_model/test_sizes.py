@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.bench.dream import BenchDreamConfig
 from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.field_help import help_text
@@ -22,6 +21,7 @@ from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.replayed import context_of
 from accerl_lerobot.world_model.sizes import SeriousConfig, SmallConfig, TinyConfig
 from accerl_lerobot.world_model.success import new_success_model, probabilities
+from benchmarks.dream import BenchDreamConfig
 
 SIZES = {TinyConfig: (64, 1.8), SmallConfig: (128, 19.2), SeriousConfig: (224, 84.7)}
 """Pixels, and millions of weights of a world of one camera, four numbers of state and four of action."""

@@ -10,14 +10,14 @@ from typing import Any
 import pytest
 import yaml
 
-from accerl_lerobot.bench import efficiency as bench
-from accerl_lerobot.bench.efficiency import ARMS, BenchEfficiencyConfig, cells
-from accerl_lerobot.bench.study import Results, Study, together
 from accerl_lerobot.config import DatasetConfig, RunConfig, encode, parse
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.stats import Rate
+from benchmarks import efficiency as bench
+from benchmarks.efficiency import ARMS, BenchEfficiencyConfig, cells
+from benchmarks.study import Results, Study, together
 from tests.runs import tiny_run
 
 

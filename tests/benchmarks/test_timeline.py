@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from accerl_lerobot.bench.timeline import BenchTimelineConfig, bench_timeline, table
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.timeline import COMPUTE, TRAINING, WAIT_IN
+from benchmarks.timeline import BenchTimelineConfig, bench_timeline, table
 from tests.timeline.folders import write_worker
 
 

@@ -16,11 +16,11 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from accerl_lerobot.bench.audit import audit_updates
-from accerl_lerobot.bench.study import last_words
-from accerl_lerobot.bench.victims import DRIVER, EVERYTHING, Victim, alive, await_hit, hit
 from accerl_lerobot.fault_points import FULL, NAN, POINTS, TORN, order, proof, withdraw
 from accerl_lerobot.ray_environment import NEEDED, RAY_PROCESSES
+from benchmarks.audit import audit_updates
+from benchmarks.study import last_words
+from benchmarks.victims import DRIVER, EVERYTHING, Victim, alive, await_hit, hit
 
 SIGNALS = {"kill": signal.SIGKILL, "stop": signal.SIGSTOP}
 """Fault → what is sent from outside, at any moment."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cost of recording the timeline.
 
-    accerl bench timeline --run=RUN
+    python -m benchmarks timeline --run=RUN
 
 Three arms, in turns, forth and back (A B C C B A): ``on`` enters states of a clock that writes to disk,
 ``off`` of one that records nothing, and ``floor`` only asks for the time, which no recorder can do without.
@@ -32,7 +32,7 @@ ON, OFF, FLOOR = "on", "off", "floor"
 
 @dataclass(frozen=True, kw_only=True)
 class BenchTimelineConfig(Section):
-    """Fields of ``accerl bench timeline``."""
+    """Fields of ``python -m benchmarks timeline``."""
 
     entries: Annotated[int, Range("[2, 100000000]")] = 100_000
     """Entries of one block, 2 or more."""

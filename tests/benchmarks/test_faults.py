@@ -16,18 +16,18 @@ import pytest
 import yaml
 
 from accerl_lerobot import snapshot
-from accerl_lerobot.bench.audit import audit_segments, audit_updates
-from accerl_lerobot.bench.faults import BenchFaultsConfig, bench_faults, markdown
-from accerl_lerobot.bench.hits import ANYWHERE, FAULTS, places
-from accerl_lerobot.bench.light_run import light_config
-from accerl_lerobot.bench.soak import BenchSoakConfig, compare, costs
-from accerl_lerobot.bench.victims import CLASSES, LIGHT, Victim, await_hit, descendants, hit, title
 from accerl_lerobot.checkpoint import CHECKPOINTS, TRAINING_STATE, save_checkpoint
 from accerl_lerobot.config import encode
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.fault_points import POINTS
 from accerl_lerobot.replay import MixedReplay, ReplayConfig
 from accerl_lerobot.replay.journal import EPISODES, Journal
+from benchmarks.audit import audit_segments, audit_updates
+from benchmarks.faults import BenchFaultsConfig, bench_faults, markdown
+from benchmarks.hits import ANYWHERE, FAULTS, places
+from benchmarks.light_run import light_config
+from benchmarks.soak import BenchSoakConfig, compare, costs
+from benchmarks.victims import CLASSES, LIGHT, Victim, await_hit, descendants, hit, title
 from tests.replay.segments import make_segment
 
 SLEEPS = """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How a run bears up: a fault in every other minute, and what of its throughput is left in that minute.
 
-    accerl bench soak --minutes=10
+    python -m benchmarks soak --minutes=10
 
 Blocks without a fault and blocks with one take turns, forth and back, in one run, so that whatever else
 changes befalls both alike. What counts is what counts in the end: an update that is lost with a worker and
@@ -21,18 +21,18 @@ from typing import Annotated, Any
 import psutil
 from rich.console import Group
 
-from accerl_lerobot.bench.audit import audit_segments, audit_updates
-from accerl_lerobot.bench.faults import BenchFaultsConfig, Start, end_run, recipe_of
-from accerl_lerobot.bench.hits import START_S, strike
 from accerl_lerobot.bench.host import host, ranged, spread
-from accerl_lerobot.bench.study import as_markdown, as_table, write
-from accerl_lerobot.bench.victims import DRIVER, EVERYTHING, Victim
+from accerl_lerobot.bench.tables import as_markdown, as_table, write
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.metrics import METRICS, MetricsLog, WandBConfig
 from accerl_lerobot.ranges import Positive, Range, Section, Seed
 from accerl_lerobot.replay.journal import EPISODES
 from accerl_lerobot.timeline.read import shares
+from benchmarks.audit import audit_segments, audit_updates
+from benchmarks.faults import BenchFaultsConfig, Start, end_run, recipe_of
+from benchmarks.hits import START_S, strike
+from benchmarks.victims import DRIVER, EVERYTHING, Victim
 
 QUIET, STRUCK = "quiet", "struck"
 ORDER = (QUIET, STRUCK, STRUCK, QUIET)

@@ -19,7 +19,13 @@ from typing import Any
 import numpy as np
 import ray
 
-from accerl_lerobot.bench.transport import (
+from accerl_lerobot.cluster import start_ray
+from accerl_lerobot.experience import Decision, Request
+from accerl_lerobot.transport.contract import Caller
+from accerl_lerobot.transport.endpoint import Endpoint, listens
+from accerl_lerobot.transport.nameless import listening, new_name, new_socket
+from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
+from benchmarks.transport import (
     FLOORS,
     MEMCPY,
     PIPE,
@@ -30,12 +36,6 @@ from accerl_lerobot.bench.transport import (
     decision,
     request_of,
 )
-from accerl_lerobot.cluster import start_ray
-from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.transport.contract import Caller
-from accerl_lerobot.transport.endpoint import Endpoint, listens
-from accerl_lerobot.transport.nameless import listening, new_name, new_socket
-from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
 
 LONG_S = 120.0
 """Seconds after which an end counts as hung."""

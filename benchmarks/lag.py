@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The effect of staleness on each algorithm: one recipe, with published weights held back on purpose.
 
-    accerl bench lag --recipe=recipes/quickstart.yaml --updates=200
+    python -m benchmarks lag --recipe=recipes/quickstart.yaml --updates=200
 
 Lag is what `trainer.hold_back` and replay make it; see `study.py`.
 """
@@ -14,27 +14,26 @@ from typing import Any
 
 from rich.table import Table
 
-from accerl_lerobot.bench.study import (
+from accerl_lerobot.bench.tables import as_markdown, write
+from accerl_lerobot.console import Console
+from accerl_lerobot.ranges import Steps
+from benchmarks.study import (
     INTERVALS,
     Cell,
     Results,
     Study,
     StudyConfig,
-    as_markdown,
     draw_lines,
     named,
     rated,
     tabled,
     together,
-    write,
 )
-from accerl_lerobot.console import Console
-from accerl_lerobot.ranges import Steps
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchLagConfig(StudyConfig):
-    """Fields of ``accerl bench lag``."""
+    """Fields of ``python -m benchmarks lag``."""
 
     output_dir: str = "outputs/lag"
     """Folder of the runs and of lag.json, lag.md and lag.png; finished cells in it are kept."""

@@ -6,15 +6,15 @@ import json
 
 import pytest
 
-from accerl_lerobot import cli
-from accerl_lerobot.bench.dream import BenchDreamConfig, bench_dream, table
 from accerl_lerobot.errors import InputError
+from benchmarks.__main__ import main
+from benchmarks.dream import BenchDreamConfig, bench_dream, table
 
 
 def test_it_measures(capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--batches=1,3", "--repeats=1", "--device=cpu", "--cameras=2", "--world_model.image_size=16"]
     small = ["--world_model.model.network.channels=8,8", "--world_model.learn.batch=2"]
-    assert cli.main(["bench", "dream", *options, *small]) == 0
+    assert main(["dream", *options, *small]) == 0
     result = json.loads(capsys.readouterr().out)
     assert set(result["seconds"]) == {"dream", "judge", "learn"}
     for times in (*result["seconds"]["dream"].values(), *result["seconds"]["judge"].values()):

@@ -20,7 +20,7 @@ from rich.table import Table
 
 from accerl_lerobot import snapshot
 from accerl_lerobot.bench.host import floors, host, ranged, spread
-from accerl_lerobot.bench.study import as_table
+from accerl_lerobot.bench.tables import as_table
 from accerl_lerobot.checkpoint import save_checkpoint
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Origin, Segment

@@ -17,11 +17,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.bench.study import last_words
 from accerl_lerobot.checkpoint import CONFIG
 from accerl_lerobot.fault_points import VARIABLE
 from accerl_lerobot.metrics import METRICS
 from accerl_lerobot.ray_environment import RAY_PROCESSES, kind_of
+from benchmarks.study import last_words
 
 CLASSES = {
     "rollout": "RolloutWorker",
@@ -36,7 +36,7 @@ CLASSES = {
 DRIVER, EVERYTHING = "driver", "everything"
 """The run's own process; it and all below it."""
 TRAIN = ("accerl_lerobot.cli", "train")
-LIGHT = ("accerl_lerobot.bench.light_run",)
+LIGHT = ("benchmarks.light_run",)
 """Modules that run, and their first arguments."""
 LOOK_S = 0.05
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How many real episodes a policy needs, with and without a world model.
 
-    accerl bench efficiency --recipe=recipes/dreams.yaml --budgets=16,64,256
+    python -m benchmarks efficiency --recipe=recipes/dreams.yaml --budgets=16,64,256
 
 Every cell may collect so many real episodes, and makes as many updates as any other unless its dreams are
 switched off; where nothing is imagined, each real decision is learnt from so much more often. What was real
@@ -18,21 +18,7 @@ from typing import Annotated, Any
 
 from rich.table import Table
 
-from accerl_lerobot.bench.study import (
-    INTERVALS,
-    Cell,
-    Results,
-    Study,
-    StudyConfig,
-    as_markdown,
-    draw_lines,
-    named,
-    pooled,
-    rated,
-    tabled,
-    together,
-    write,
-)
+from accerl_lerobot.bench.tables import as_markdown, write
 from accerl_lerobot.checkpoint import DEMOS
 from accerl_lerobot.config import RunConfig, parse
 from accerl_lerobot.console import Console
@@ -40,6 +26,19 @@ from accerl_lerobot.dataset_config import DatasetConfig
 from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.evaluation.stats import mean_interval
 from accerl_lerobot.ranges import Choice, Range, Seed
+from benchmarks.study import (
+    INTERVALS,
+    Cell,
+    Results,
+    Study,
+    StudyConfig,
+    draw_lines,
+    named,
+    pooled,
+    rated,
+    tabled,
+    together,
+)
 
 ARMS = {
     "none": ("--imagination.share=0",),
@@ -57,7 +56,7 @@ long the episodes are."""
 
 @dataclass(frozen=True, kw_only=True)
 class BenchEfficiencyConfig(StudyConfig):
-    """Fields of ``accerl bench efficiency``."""
+    """Fields of ``python -m benchmarks efficiency``."""
 
     recipe: str = "recipes/dreams.yaml"
     """The run that every cell is a variation of; read once, when the study starts."""

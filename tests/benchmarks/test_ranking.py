@@ -15,8 +15,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from accerl_lerobot.bench import ranking as bench
-from accerl_lerobot.bench.ranking import BenchRankingConfig
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
@@ -30,6 +28,8 @@ from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.side_by_side import dreamt, lived
 from accerl_lerobot.world_model.store import save_world_model
 from accerl_lerobot.world_model.success import new_success_model
+from benchmarks import ranking as bench
+from benchmarks.ranking import BenchRankingConfig
 from tests.test_imagining import ENV
 from tests.world_model.lived import SPEC, WORLD, K, decided
 

@@ -21,6 +21,7 @@ from typing import Annotated, Any, NamedTuple
 import yaml
 from rich.table import Table
 
+from accerl_lerobot.bench.tables import as_table
 from accerl_lerobot.checkpoint import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.console import Console
@@ -138,22 +139,6 @@ def tabled(
     return as_table(f"{title} {starts}; {INTERVALS}", columns, rows)
 
 
-def as_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    """Rows for people."""
-    shown = Table(title=title)
-    for column in columns:
-        shown.add_column(column)
-    for row in rows:
-        shown.add_row(*row)
-    return shown
-
-
-def as_markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Rows for the docs."""
-    lines = [columns, ["---"] * len(columns), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
 def draw_lines(
     path: Path,
     result: dict[str, Any],
@@ -188,20 +173,6 @@ def draw_lines(
         axes.axhline(start, color="0.6", ls="--", lw=1, label="before")
         axes.set(ylabel="success", ylim=(-0.02, 1.02))
         dress(axes)
-
-
-def write(
-    root: Path,
-    name: str,
-    result: dict[str, Any],
-    markdown: str,
-    draw: Callable[[Path, dict[str, Any]], object] | None = None,
-) -> None:
-    """Into a folder that is there: the numbers, the table and the picture, if any, under one name."""
-    (root / f"{name}.json").write_text(json.dumps(result, indent=2) + "\n")
-    (root / f"{name}.md").write_text(markdown)
-    if draw is not None:
-        draw(root / f"{name}.png", result)
 
 
 class Study:

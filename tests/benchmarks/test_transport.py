@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from accerl_lerobot.bench.transport import (
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.transport.nameless import available
+from benchmarks.transport import (
     ARMS,
     FLOORS,
     MEMCPY,
@@ -24,8 +26,6 @@ from accerl_lerobot.bench.transport import (
     request_of,
     table,
 )
-from accerl_lerobot.errors import InputError
-from accerl_lerobot.transport.nameless import available
 from tests.light_workers import light_ray
 
 __all__ = ["light_ray"]

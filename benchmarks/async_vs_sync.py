@@ -20,11 +20,10 @@ from typing import Annotated, Any
 
 from rich.console import Group
 
-from accerl_lerobot.bench.blocks import MOST_BUSY, Block, as_rows
+from accerl_lerobot.bench.blocks import ARMS, MOST_BUSY, Block, as_rows
 from accerl_lerobot.bench.host import floors, host, ranged, spread
 from accerl_lerobot.bench.latency import TRACE
-from accerl_lerobot.bench.machinery import MachineryConfig
-from accerl_lerobot.bench.study import as_markdown, as_table, write
+from accerl_lerobot.bench.tables import as_markdown, as_table, write
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs.simulated import read_trace
 from accerl_lerobot.errors import InputError, output_folder
@@ -33,8 +32,8 @@ from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate
 from accerl_lerobot.ranges import Positive, Range, Repeats, Seed, Steps
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
+from benchmarks.machinery import MachineryConfig
 
-ARMS: tuple[Schedule, ...] = (ASYNCHRONOUS, OVERLAP, SYNCHRONOUS)
 LEARNING = MachineryConfig(worlds=4, latency_ms=4.0, image_size=16, decide_ms=1.0, update_ms=8.0)
 """Small, as nothing is timed in it."""
 TRIALS = 100
@@ -43,7 +42,7 @@ TRIALS = 100
 
 @dataclass(frozen=True, kw_only=True)
 class BenchAsyncVsSyncConfig(MachineryConfig):
-    """Fields of ``accerl bench async-vs-sync``."""
+    """Fields of ``python -m benchmarks async_vs_sync``."""
 
     cvs: tuple[Annotated[float, Range("[0, 10]")], ...] = (0.0, 0.1, 0.3, 0.5, 1.0)
     """Laws of latency: standard deviation over mean; takes the place of `latency_cv`."""

@@ -9,20 +9,21 @@ from pathlib import Path
 
 import pytest
 
-from accerl_lerobot.bench import async_vs_sync, blocks
-from accerl_lerobot.bench.async_vs_sync import ARMS, BenchAsyncVsSyncConfig, bench_async_vs_sync
-from accerl_lerobot.bench.async_vs_sync import compare as compare_schedules
-from accerl_lerobot.bench.async_vs_sync import table as schedules_table
+from accerl_lerobot.bench import blocks
 from accerl_lerobot.bench.blocks import Block
 from accerl_lerobot.bench.host import Processors, floors, host, spread
-from accerl_lerobot.bench.machinery import MachineryConfig
-from accerl_lerobot.bench.scaling import BenchScalingConfig, bench_scaling
-from accerl_lerobot.bench.scaling import compare as compare_counts
 from accerl_lerobot.bench.throughput import BenchThroughputConfig, bench_throughput, books
 from accerl_lerobot.config import RunConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.rollout.runner import RolloutConfig
+from benchmarks import async_vs_sync
+from benchmarks.async_vs_sync import ARMS, BenchAsyncVsSyncConfig, bench_async_vs_sync
+from benchmarks.async_vs_sync import compare as compare_schedules
+from benchmarks.async_vs_sync import table as schedules_table
+from benchmarks.machinery import MachineryConfig
+from benchmarks.scaling import BenchScalingConfig, bench_scaling
+from benchmarks.scaling import compare as compare_counts
 from tests.light_workers import light_ray
 
 __all__ = ["light_ray"]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run in which all is real but what takes long: `accerl train` with worlds and a policy made of time.
 
-    python -m accerl_lerobot.bench.light_run --config_path=light.yaml --output_dir=RUN
+    python -m benchmarks.light_run --config_path=light.yaml --output_dir=RUN
 
 Its processes, checkpoints, journal, recoveries and `--resume` are those of any run; no process of it imports
 LeRobot or a simulator, so it starts in seconds. That is what faults are tried on, again and again.

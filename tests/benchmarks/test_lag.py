@@ -16,12 +16,12 @@ from typing import Any
 import pytest
 import yaml
 
-from accerl_lerobot.bench import lag as bench
-from accerl_lerobot.bench import study as studies
-from accerl_lerobot.bench.lag import BenchLagConfig, cells
-from accerl_lerobot.bench.study import Results, Study
 from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.errors import InputError
+from benchmarks import lag as bench
+from benchmarks import study as studies
+from benchmarks.lag import BenchLagConfig, cells
+from benchmarks.study import Results, Study
 from tests.runs import tiny_run
 
 

@@ -23,7 +23,7 @@ from accerl_lerobot.world_model.sizes import TinyConfig
 
 @dataclass(frozen=True, kw_only=True)
 class BenchDreamConfig(Section):
-    """Fields of ``accerl bench dream``."""
+    """Fields of ``python -m benchmarks dream``."""
 
     world_model: WorldModelConfig = field(default_factory=TinyConfig)
     cameras: Annotated[int, Range("[1, 64]")] = 1

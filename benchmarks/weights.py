@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``accerl bench weights``: from an optimiser step to the weights that act, against copying memory.
+"""``python -m benchmarks weights``: from an optimiser step to the weights that act, against copying memory.
 
-    accerl bench weights --output_dir=outputs/weights
+    python -m benchmarks weights --output_dir=outputs/weights
 
     stall     how long `publish` keeps the trainer; at best, one copy
     applied   from the call of `publish` until the slowest reader has the weights in its parameters; at best,
@@ -25,12 +25,13 @@ from rich.table import Table
 
 from accerl_lerobot import ray_environment, snapshot
 from accerl_lerobot.bench.host import host, ranged, spread
-from accerl_lerobot.bench.study import as_markdown, as_table, named, write
+from accerl_lerobot.bench.tables import as_markdown, as_table, write
 from accerl_lerobot.checkpoint import TRAINING_STATE, WEIGHTS
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.ranges import Range, Repeats, Section, Seed
 from accerl_lerobot.weights.channel import Way
+from benchmarks.study import named
 
 ARMS: dict[str, tuple[str, Way, bool, float]] = {
     "shared memory": ("shared_memory", "ray", False, 1.0),
@@ -50,7 +51,7 @@ Tensors = dict[str, np.ndarray]
 
 @dataclass(frozen=True, kw_only=True)
 class BenchWeightsConfig(Section):
-    """Fields of ``accerl bench weights``."""
+    """Fields of ``python -m benchmarks weights``."""
 
     sizes_mb: tuple[Annotated[int, Range("[1, 1048576]")], ...] = (1, 16, 256, 1024)
     """Sizes of a set of float32 weights, in MiB. With two readers the largest needs about 15 times
@@ -95,7 +96,7 @@ def bench_weights(config: BenchWeightsConfig) -> dict[str, Any]:
         check_absent(root)
     changed = [] if config.checkpoints is None else changed_shares(Path(config.checkpoints).expanduser())
     ray_environment.prepare()
-    from accerl_lerobot.bench.weights_readers import two_nodes
+    from benchmarks.weights_readers import two_nodes
 
     before, console, cells = host(), Console(), []
     largest = max(config.readers), MB * max(config.sizes_mb)
@@ -185,7 +186,7 @@ def draw(path: Path, result: dict[str, Any]) -> None:
 
 def _measure(config: BenchWeightsConfig, size_mb: int, readers: int) -> list[dict[str, Any]]:
     """One row per arm."""
-    from accerl_lerobot.bench.weights_readers import reading
+    from benchmarks.weights_readers import reading
 
     rng = np.random.default_rng(config.seed)
     elements = max(1, size_mb * MB // 4 // config.tensors)
@@ -208,8 +209,8 @@ def _block(
     arm: str, handles: list[Any], tensors: Tensors, copy: Tensors, rng: np.random.Generator
 ) -> dict[str, float]:
     """Publishes a few times, each after an update, and notes the last."""
-    from accerl_lerobot.bench.weights_readers import ask
     from accerl_lerobot.weights.choice import make_publisher
+    from benchmarks.weights_readers import ask
 
     transport, way, changes, share = ARMS[arm]
     publisher = make_publisher(handles, transport, changes=changes, way=way)

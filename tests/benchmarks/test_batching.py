@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from accerl_lerobot.bench import batching, replay
-from accerl_lerobot.bench.batching import BenchBatchingConfig
-from accerl_lerobot.bench.replay import BenchReplayConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.batcher import GRAIN, Batcher, quantile
+from benchmarks import batching, replay
+from benchmarks.batching import BenchBatchingConfig
+from benchmarks.replay import BenchReplayConfig
 from tests.light_workers import light_ray
 
 __all__ = ["light_ray"]

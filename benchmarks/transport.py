@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cost of asking inference for a decision: Ray, shared memory, and the lower bound of any transport.
 
-    accerl bench transport --output_dir=outputs/transport
+    python -m benchmarks transport --output_dir=outputs/transport
 
 A call is timed where a rollout worker would wait: from the request, through the contract, to the decision.
 The service answers at once, so what is measured is the way there and back. Arms:
@@ -45,7 +45,7 @@ CHUNK, ACTIONS, LATENT = 50, 7, 32
 
 @dataclass(frozen=True, kw_only=True)
 class BenchTransportConfig(Section):
-    """Fields of ``accerl bench transport``."""
+    """Fields of ``python -m benchmarks transport``."""
 
     sizes: tuple[Annotated[str, Choice(IMAGES)], ...] = tuple(IMAGES)
     """Observations: ``12 KB`` (64 pixels, one camera) and ``301 KB`` (224 pixels, two cameras)."""
@@ -108,7 +108,7 @@ def bench_transport(config: BenchTransportConfig) -> dict[str, Any]:
         InputError: `output_dir` exists, or this system has no shared memory.
     """
     ray_environment.prepare()
-    from accerl_lerobot.bench.transport_ends import Crowd
+    from benchmarks.transport_ends import Crowd
 
     folder = None if config.output_dir is None else Path(config.output_dir).expanduser()
     if folder is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``accerl bench weights``, small."""
+"""``python -m benchmarks weights``, small."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ import pytest
 from rich.console import Console
 
 from accerl_lerobot import snapshot
-from accerl_lerobot.bench.weights import ARMS, BenchWeightsConfig, bench_weights, changed_shares, table
 from accerl_lerobot.checkpoint import TRAINING_STATE, WEIGHTS
 from accerl_lerobot.errors import InputError
+from benchmarks.weights import ARMS, BenchWeightsConfig, bench_weights, changed_shares, table
 from tests.light_workers import light_ray
 
 __all__ = ["light_ray"]
@@ -52,7 +52,7 @@ def test_readers_apart_are_on_a_node_of_their_own(light_ray: None, tmp_path: Pat
         bench_weights(BenchWeightsConfig(sizes_mb=(1,), readers=(1,), repeats=1, apart=True))
     clean = {k: v for k, v in os.environ.items() if not k.startswith("RAY_")}
     options = ["--apart=true", "--sizes_mb=[1]", "--readers=[1,2]", "--repeats=1", "--tensors=2"]
-    command = [sys.executable, "-m", "accerl_lerobot.cli", "bench", "weights", *options]
+    command = [sys.executable, "-m", "benchmarks", "weights", *options]
     done = subprocess.run(
         [*command, f"--output_dir={tmp_path / 'apart'}"],
         env=clean,

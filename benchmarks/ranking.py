@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Does a world model know which policy is better?
 
-    accerl bench ranking --path=outputs/door_model/world_model --env.task=door-open-v3 --env.image_size=64 \\
-      --env.max_steps=150 --policies=RUN_A/checkpoints/last/pretrained_model,RUN_B/…
+    python -m benchmarks ranking --path=outputs/door_model/world_model --env.task=door-open-v3 \\
+      --env.image_size=64 --env.max_steps=150 --policies=RUN_A/checkpoints/last/pretrained_model,RUN_B/…
 
 Every policy plays the same episodes, in the world and in dreams that begin at the same observations.
 """

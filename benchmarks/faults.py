@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Faults that a run survives: in each of its processes, at named points and at any moment, and their cost.
 
-    accerl bench faults                                          # a run made of time: seconds each
-    accerl bench faults --recipe=recipes/quickstart.yaml --faults=kill --targets=driver --repeats=5
+    python -m benchmarks faults                                          # a run made of time: seconds each
+    python -m benchmarks faults --recipe=recipes/quickstart.yaml --faults=kill --targets=driver --repeats=5
 
 One run for each target, in which things go wrong again and again (`hits.py`), in an order drawn from the
 seed; each is proved to have happened. A cell is target × fault. After each the run's log is looked at, and at
@@ -24,12 +24,8 @@ import numpy as np
 import yaml
 from rich.table import Table
 
-from accerl_lerobot.bench.audit import audit_segments, audit_updates
-from accerl_lerobot.bench.hits import FAULTS, START_S, TIDY_S, places, strike
 from accerl_lerobot.bench.host import host
-from accerl_lerobot.bench.light_run import light_config
-from accerl_lerobot.bench.study import as_markdown, as_table, last_words, write
-from accerl_lerobot.bench.victims import CLASSES, DRIVER, EVERYTHING, LIGHT, TRAIN, Victim, alive
+from accerl_lerobot.bench.tables import as_markdown, as_table, write
 from accerl_lerobot.checkpoint import CHECKPOINTS, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.config import RunConfig, encode, parse
 from accerl_lerobot.console import Console
@@ -38,6 +34,11 @@ from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate
 from accerl_lerobot.ranges import Range, Repeats, Section, Seed, Steps
 from accerl_lerobot.ray_environment import RAY_PROCESSES
+from benchmarks.audit import audit_segments, audit_updates
+from benchmarks.hits import FAULTS, START_S, TIDY_S, places, strike
+from benchmarks.light_run import light_config
+from benchmarks.study import last_words
+from benchmarks.victims import CLASSES, DRIVER, EVERYTHING, LIGHT, TRAIN, Victim, alive
 
 IMAGINING = ("dream", "world learning")
 """Targets that are there where anything is imagined."""
@@ -53,7 +54,7 @@ ENDLESS = 1_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class BenchFaultsConfig(Section):
-    """Fields of ``accerl bench faults``."""
+    """Fields of ``python -m benchmarks faults``."""
 
     recipe: str | None = None
     """The run. Its demonstrations and SFT are cut short, unless it has a policy: they do not matter here.

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The studies and measurements behind the documents: ``python -m benchmarks`` lists them."""

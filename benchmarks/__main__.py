@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``python -m benchmarks NAME --field=value …``, from the repository's root."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from accerl_lerobot.cli import exit_code, guarded, help_asked, set_up_logging
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.field_help import help_text
+from accerl_lerobot.parsing import parse
+from accerl_lerobot.verbs import measure
+from benchmarks.async_vs_sync import BenchAsyncVsSyncConfig
+from benchmarks.batching import BenchBatchingConfig
+from benchmarks.dream import BenchDreamConfig
+from benchmarks.efficiency import BenchEfficiencyConfig
+from benchmarks.faults import BenchFaultsConfig
+from benchmarks.few_shot import BenchFewShotConfig
+from benchmarks.lag import BenchLagConfig
+from benchmarks.ranking import BenchRankingConfig
+from benchmarks.replay import BenchReplayConfig
+from benchmarks.scaling import BenchScalingConfig
+from benchmarks.soak import BenchSoakConfig
+from benchmarks.timeline import BenchTimelineConfig
+from benchmarks.transport import BenchTransportConfig
+from benchmarks.weights import BenchWeightsConfig
+
+CONFIGS: dict[str, type[Any]] = {
+    "few_shot": BenchFewShotConfig,
+    "lag": BenchLagConfig,
+    "efficiency": BenchEfficiencyConfig,
+    "ranking": BenchRankingConfig,
+    "faults": BenchFaultsConfig,
+    "soak": BenchSoakConfig,
+    "async_vs_sync": BenchAsyncVsSyncConfig,
+    "scaling": BenchScalingConfig,
+    "batching": BenchBatchingConfig,
+    "replay": BenchReplayConfig,
+    "timeline": BenchTimelineConfig,
+    "transport": BenchTransportConfig,
+    "weights": BenchWeightsConfig,
+    "dream": BenchDreamConfig,
+}
+"""Module with a function ``bench_NAME`` and a ``table`` of what it returns → its fields."""
+
+
+def usage() -> str:
+    """The list of all benchmarks."""
+    lines = [f"  {name:14} {_brief(config)}" for name, config in CONFIGS.items()]
+    return "\n".join(["usage: python -m benchmarks NAME [--field=value …]", "", *lines])
+
+
+def run(name: str, rest: list[str]) -> int:
+    """Runs a benchmark, or shows its help.
+
+    Raises:
+        InputError: there is no such benchmark, or a field of it is wrong.
+    """
+    set_up_logging()
+    if name not in CONFIGS:
+        raise InputError("NAME", name, f"use one of {', '.join(CONFIGS)}")
+    if (section := help_asked(rest)) is not None:
+        config_class = CONFIGS[name]
+        text = help_text(f"python -m benchmarks {name}", config_class, _brief(config_class), section)
+        sys.stdout.write(f"{text}\n")
+        return 0
+    with guarded():
+        return measure(f"benchmarks.{name}", parse(CONFIGS[name], rest))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs the benchmark of the command line; returns the exit code."""
+    name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    if name in ("-h", "--help", "help"):
+        sys.stdout.write(f"{usage()}\n")
+        return 0
+    return exit_code("benchmarks", lambda: run(name, rest))
+
+
+def _brief(config_class: type[Any]) -> str:
+    """The first sentence of the module that a config is in."""
+    doc = sys.modules[config_class.__module__].__doc__ or ""
+    return doc.partition("\n\n")[0].replace("\n", " ").rstrip(".")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
