@@ -36,7 +36,6 @@ from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline import TIMELINE
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.transport.endpoint import Transport
-from accerl_lerobot.weights.channel import WAY, Way
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 
 __all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "check_chunk", "decode", "encode", "parse"]
@@ -65,11 +64,6 @@ class LaunchConfig(Section, section="launch"):
     a message is written where the other process reads it. ray: it is copied, to any node. auto: shared memory
     between processes of one node, if the system has it, and Ray otherwise.
     """
-    weights: Way = "ray"
-    """How weights reach inference where they do not go through shared memory. ray: through its object stores.
-    gloo: torch.distributed sends them straight to each inference service, which is faster, and asks for no
-    token.
-    """
     stall_s: Positive = 300.0
     """How long, in seconds, a worker may owe an answer or a world a step, and a run stand still.
 
@@ -91,8 +85,6 @@ class LaunchConfig(Section, section="launch"):
                 "with launch.engine=local all is done in one process, in a schedule of its own; leave it out"
             )
             raise InputError("launch.schedule", self.schedule, remedy)
-        if self.weights != "ray" and self.engine == "local":
-            raise InputError(WAY, self.weights, "launch.engine=local is one process; leave the field out")
         self._check_cluster()
 
     def _check_cluster(self) -> None:
@@ -189,16 +181,6 @@ class RunConfig(Section):
                 f"use more than trainer.hold_back, {self.trainer.hold_back}, or all is thrown away as too old"
             )
             raise InputError("replay.max_lag", self.replay.max_lag, remedy)
-        if self.trainer.publish_changes and self.launch.engine == "local":
-            remedy = "launch.engine=local is one process, where nothing is sent; leave the field out"
-            raise InputError("trainer.publish_changes", True, remedy)
-        if self.trainer.publish_changes and self.launch.transport == "ray":
-            remedy = "it needs shared memory: use launch.transport=auto, or leave the field out"
-            raise InputError("trainer.publish_changes", True, remedy)
-        if self.launch.weights != "ray" and self.launch.transport == "shared_memory":
-            raise InputError(
-                WAY, self.launch.weights, "launch.transport=shared_memory leaves nothing to it; use auto"
-            )
         if self.inference.workers > 1 and self.launch.engine == "local":
             remedy = "launch.engine=local is one process; use launch.engine=ray, or 1"
             raise InputError("inference.workers", self.inference.workers, remedy)

@@ -117,7 +117,7 @@ class RayEngine(Engine):
         self.follow(self._config.launch.schedule)
         readers = self._inference.publishing(self._trainer.actor)
         self._trainer.work = self._trainer.actor.run.remote(
-            self._replay.actor, readers, self._config.launch.transport, self._config.launch.weights
+            self._replay.actor, readers, self._config.launch.transport
         )
         dreaming = [dreamer.actor for dreamer in self._dreamers]
         for dreamer, (deciding, inserting) in zip(self._dreamers, self._dreams_ask, strict=True):

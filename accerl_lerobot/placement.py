@@ -337,12 +337,6 @@ def _check_memory(plan: Plan, config: RunConfig) -> None:
         if far is not None:
             remedy = f"{far} shares no memory with {plan.nodes[0]}; use auto, which takes Ray between them"
             raise InputError(FIELD, config.launch.transport, remedy)
-    if config.trainer.publish_changes:
-        trainer = hosts["trainer"].host
-        far = next((n for w, n in hosts.items() if w.startswith("inference") and n.host != trainer), None)
-        if far is not None:
-            remedy = f"inference on {far} shares no memory with the trainer; leave the field out"
-            raise InputError("trainer.publish_changes", True, remedy)
 
 
 def _bins(gpus: float) -> list[float]:

@@ -23,26 +23,18 @@ from typing import Annotated, Any
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot import ray_environment, snapshot
+from accerl_lerobot import ray_environment
 from accerl_lerobot.bench.host import host, ranged, spread
 from accerl_lerobot.bench.tables import as_markdown, as_table, write
-from accerl_lerobot.checkpoint import TRAINING_STATE, WEIGHTS
 from accerl_lerobot.console import Console
-from accerl_lerobot.errors import InputError, check_absent, make_folder
+from accerl_lerobot.errors import check_absent, make_folder
 from accerl_lerobot.ranges import Range, Repeats, Section, Seed
-from accerl_lerobot.weights.channel import Way
 from benchmarks.study import named
 
-ARMS: dict[str, tuple[str, Way, bool, float]] = {
-    "shared memory": ("shared_memory", "ray", False, 1.0),
-    "Ray": ("ray", "ray", False, 1.0),
-    "gloo": ("ray", "gloo", False, 1.0),
-    "changes, 1 %": ("shared_memory", "ray", True, 0.01),
-    "changes, 100 %": ("shared_memory", "ray", True, 1.0),
-}
-"""Arm → transport and way, whether only changes are sent, and the share of values that an update changes."""
-FAR = ("Ray", "gloo")
-"""Readers on other nodes."""
+ARMS = {"shared memory": "shared_memory", "Ray": "ray"}
+"""Arm → transport."""
+FAR = ("Ray",)
+"""Arms with readers on other nodes."""
 MB = 1 << 20
 WARM = 4
 """Publications of a block that do not count: until all slabs have been written to and mapped."""
@@ -63,15 +55,12 @@ class BenchWeightsConfig(Section):
     repeats: Repeats = 5
     """Publications of each arm that count, each in a block of its own."""
     seed: Seed = 0
-    """Seed of the values, and of which ones change."""
+    """Seed of the values."""
     apart: bool = False
     """Readers are on a Ray node of their own, with an object store of its own, and share no memory: what lies
     between two machines, but for the cable."""
     output_dir: str | None = None
     """Folder for weights.json, weights.md and weights.png; must not exist. None: nothing is written."""
-    checkpoints: str | None = None
-    """Folder of a run's checkpoints. How many values of the trained weights differ between those that follow
-    each other, in float32 and rounded to bfloat16, is told too."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -85,16 +74,14 @@ def bench_weights(config: BenchWeightsConfig) -> dict[str, Any]:
     Returns:
         ``cells``: ``size_mb``, ``readers``, ``arm``; ``stall_ms``, ``applied_ms``, ``pause_ms`` and
         ``memcpy_ms``; ``mb`` that each reader read; and ``stall``, ``applied`` and ``pause`` as shares of
-        what memcpy allows, 1 the best: each median, min, max and all. ``changed``, of the checkpoints;
-        ``config``; ``host`` before and after.
+        what memcpy allows, 1 the best: each median, min, max and all; ``config``; ``host`` before and after.
 
     Raises:
-        InputError: the folder exists, there are no checkpoints, or readers are to be apart and Ray is there.
+        InputError: the folder exists, or readers are to be apart and Ray is there.
     """
     root = None if config.output_dir is None else Path(config.output_dir).expanduser()
     if root is not None:
         check_absent(root)
-    changed = [] if config.checkpoints is None else changed_shares(Path(config.checkpoints).expanduser())
     ray_environment.prepare()
     from benchmarks.weights_readers import two_nodes
 
@@ -105,7 +92,7 @@ def bench_weights(config: BenchWeightsConfig) -> dict[str, Any]:
             for readers in config.readers:
                 with console.stage(f"{size} MB, {readers} readers"):
                     cells += _measure(config, size, readers)
-    result = {"config": asdict(config), "cells": cells, "changed": changed, "host": [before, host()]}
+    result = {"config": asdict(config), "cells": cells, "host": [before, host()]}
     if root is not None:
         make_folder(root, "output_dir")
         write(root, "weights", result, as_markdown(_COLUMNS, _rows(result)), draw)
@@ -114,43 +101,7 @@ def bench_weights(config: BenchWeightsConfig) -> dict[str, Any]:
 
 def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
-    title = "milliseconds, and share of what memcpy allows"
-    if result["changed"]:
-        fp32, bf16 = (spread([pair[kind] for pair in result["changed"]]) for kind in ("fp32", "bf16"))
-        title += (
-            f"; between {len(result['changed']) + 1} checkpoints {fp32['median']:.1%} of the float32 values "
-            f"changed ({fp32['min']:.1%} to {fp32['max']:.1%}), of bfloat16 {bf16['median']:.1%} "
-            f"({bf16['min']:.1%} to {bf16['max']:.1%})"
-        )
-    return as_table(title, _COLUMNS, _rows(result))
-
-
-def changed_shares(folder: Path) -> list[dict[str, Any]]:
-    """Which share of the trained weights differs between checkpoints that follow each other.
-
-    Args:
-        folder: of checkpoints whose names are the numbers of their updates.
-
-    Raises:
-        InputError: it holds fewer than two.
-    """
-    import torch
-
-    paths = {int(path.name): path for path in folder.glob("*") if path.name.isdigit()}
-    steps = sorted(paths)
-    if len(steps) < 2:
-        raise InputError("checkpoints", str(folder), "name a folder of two checkpoints or more")
-    found: list[dict[str, Any]] = []
-    last: dict[str, Any] = {}
-    for step in steps:
-        weights = snapshot.load(paths[step] / TRAINING_STATE / WEIGHTS)
-        flat = torch.cat([torch.from_numpy(np.array(weights[name])).reshape(-1) for name in sorted(weights)])
-        kinds = {"fp32": flat.view(torch.int32), "bf16": flat.to(torch.bfloat16).view(torch.int16)}
-        if last:
-            shares = {kind: float((bits != last[kind]).float().mean()) for kind, bits in kinds.items()}
-            found.append({"from": steps[len(found)], "to": step, "values": len(flat), **shares})
-        last = kinds
-    return found
+    return as_table("milliseconds, and share of what memcpy allows", _COLUMNS, _rows(result))
 
 
 def draw(path: Path, result: dict[str, Any]) -> None:
@@ -197,7 +148,7 @@ def _measure(config: BenchWeightsConfig, size_mb: int, readers: int) -> list[dic
     with reading(readers, config.tensors, elements, apart=config.apart) as handles:
         for repeat in range(config.repeats):
             for arm in arms[:: -1 if repeat % 2 else 1]:
-                blocks[arm].append(_block(arm, handles, tensors, copy, rng))
+                blocks[arm].append(_block(arm, handles, tensors, copy))
     return [_cell(size_mb, readers, arm, notes) for arm, notes in blocks.items()]
 
 
@@ -205,23 +156,20 @@ def _arms(apart: bool) -> list[str]:
     return list(FAR if apart else ARMS)
 
 
-def _block(
-    arm: str, handles: list[Any], tensors: Tensors, copy: Tensors, rng: np.random.Generator
-) -> dict[str, float]:
+def _block(arm: str, handles: list[Any], tensors: Tensors, copy: Tensors) -> dict[str, float]:
     """Publishes a few times, each after an update, and notes the last."""
     from accerl_lerobot.weights.choice import make_publisher
     from benchmarks.weights_readers import ask
 
-    transport, way, changes, share = ARMS[arm]
-    publisher = make_publisher(handles, transport, changes=changes, way=way)
+    publisher = make_publisher(handles, ARMS[arm])
     try:
         for version in range(WARM + 1):
-            _update(tensors, 0.0, rng)
+            _update(tensors, 0.0)
             started = perf_counter()
             for name, tensor in tensors.items():
                 np.copyto(copy[name], tensor)
             memcpy = perf_counter() - started
-            _update(tensors, share, rng)
+            _update(tensors, 1.0)
             started = perf_counter()
             publisher.publish(version, tensors)
             stall = perf_counter() - started
@@ -237,12 +185,10 @@ def _block(
     return {"stall_s": stall, "memcpy_s": memcpy, **worst}
 
 
-def _update(tensors: Tensors, share: float, rng: np.random.Generator) -> None:
-    """Writes all values, as an optimiser does, so that caches are as after one; a share of them changes."""
+def _update(tensors: Tensors, step: float) -> None:
+    """Writes all values, as an optimiser does, so that caches are as after one."""
     for tensor in tensors.values():
-        tensor += share == 1
-        if 0 < share < 1:
-            tensor[rng.integers(0, len(tensor), max(1, int(share * len(tensor))))] += 1
+        tensor += np.float32(step)
 
 
 def _cell(size_mb: int, readers: int, arm: str, notes: list[dict[str, float]]) -> dict[str, Any]:

@@ -14,9 +14,7 @@ import ray
 from accerl_lerobot.cluster import start_ray
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.ray_environment import check_private
-from accerl_lerobot.transport.meeting import Meeting
 from accerl_lerobot.weights.channel import Tensors, monotonic_clock
-from accerl_lerobot.weights.direct import Coming, DirectReader
 from accerl_lerobot.weights.reader import Received, SharedMemoryReader
 
 _APART = "apart"
@@ -52,19 +50,6 @@ class ReadingWorker:
         self._apply(Received(version=version, tensors=tensors, published_s=published_s, nbytes=nbytes))
         return version
 
-    def node(self) -> str:
-        """See `InferenceWorker`."""
-        return str(ray.get_runtime_context().get_node_id())
-
-    def meet_publisher(self, meeting: Meeting) -> None:
-        """See `InferenceWorker`."""
-        self._direct = DirectReader(meeting, self._apply)
-
-    def receive_directly(self, coming: Coming) -> int:
-        """See `InferenceWorker`."""
-        self._apply(self._direct.take(coming, lambda: None))
-        return coming.version
-
     def note(self, version: int) -> dict[str, float]:
         """When a set was applied, how long that took, and its bytes.
 
@@ -81,12 +66,8 @@ class ReadingWorker:
 
     def _apply(self, received: Received) -> None:
         started = time.monotonic()
-        if received.changed is None:
-            for name, tensor in received.tensors.items():
-                np.copyto(self._parameters[name], tensor)
-        else:
-            for name, index in received.changed.items():
-                self._parameters[name][index] = received.tensors[name][index]
+        for name, tensor in received.tensors.items():
+            np.copyto(self._parameters[name], tensor)
         now = time.monotonic()
         self._notes[received.version] = {
             "applied_s": now - received.published_s,

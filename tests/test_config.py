@@ -171,12 +171,6 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--policy.device=foo"], "policy.device='foo': use auto, cpu, cuda or cuda:0"),
     (["--launch.engine=slurm"], "launch.engine='slurm': use ray or local"),
     (["--launch.transport=tcp"], "launch.transport='tcp': use auto, ray or shared_memory"),
-    (["--launch.weights=mpi"], "launch.weights='mpi': use ray or gloo"),
-    (["--launch.weights=gloo", "--launch.engine=local"], "launch.weights='gloo': launch.engine=local is one"),
-    (
-        ["--launch.weights=gloo", "--launch.transport=shared_memory"],
-        "launch.weights='gloo': launch.transport=shared_memory leaves nothing to it; use auto",
-    ),
     (["--rollout.group_size=1"], "rollout.group_size=1: groups of one have no comparison; use 0"),
     (["--rollout.group_advantage=gae"], "rollout.group_advantage='gae': use grpo, rloo or grpo_no_std"),
     (
@@ -453,9 +447,3 @@ def test_every_field_has_a_name_on_the_command_line() -> None:
 )
 def test_types_in_words(hint: Any, words: str) -> None:
     assert parsing.wanted(hint) == words
-
-
-def test_changes_are_not_sent_within_one_process():
-    with pytest.raises(InputError, match=r"^trainer.publish_changes=True: launch.engine=local"):
-        parse(RunConfig, ["--launch.engine=local", "--trainer.publish_changes=true"])
-    assert parse(RunConfig, ["--trainer.publish_changes=true"]).trainer.publish_changes

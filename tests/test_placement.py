@@ -50,7 +50,6 @@ def run(
     dreams: int = 0,
     device: str = "auto",
     transport: Any = "auto",
-    publish_changes: bool = False,
     **placement: RoleConfig,
 ) -> RunConfig:
     """A run of so many workers, its roles placed as the other keywords say."""
@@ -58,9 +57,7 @@ def run(
     return tiny_run(
         Path("nowhere"),
         policy=PolicyConfig(path="nowhere", device=device),
-        trainer=TrainerConfig(
-            updates=1, batch_decisions=16, ranks=ranks, sharding=sharding, publish_changes=publish_changes
-        ),
+        trainer=TrainerConfig(updates=1, batch_decisions=16, ranks=ranks, sharding=sharding),
         inference=InferenceConfig(workers=services),
         rollout=RolloutConfig(workers=max(rollouts, services), worlds=1, segment_length=3),
         imagination=ImaginationConfig(share=0.5 if dreams else 0.0, model="oracle", workers=max(1, dreams)),
@@ -197,9 +194,6 @@ def test_shared_memory_ends_where_the_machine_does():
     with pytest.raises(InputError, match=r"launch\.transport='shared_memory': node 1 .* shares no memory"):
         planned(nodes, config)
     assert planned([nodes[0], replace(nodes[1], host="host0")], config)  # two nodes of one machine
-    config = run(publish_changes=True, inference=at("1"))
-    with pytest.raises(InputError, match=r"trainer\.publish_changes=True: inference on node 1"):
-        planned(nodes, config)
 
 
 def test_a_rollout_worker_whose_node_has_left_goes_to_one_that_is_there():

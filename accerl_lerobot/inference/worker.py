@@ -23,7 +23,7 @@ import time
 from collections import Counter, deque
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 
@@ -39,10 +39,6 @@ from accerl_lerobot.transport.contract import Asked, Server, stopped
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
 from accerl_lerobot.weights.channel import monotonic_clock
 from accerl_lerobot.weights.reader import Received, SharedMemoryReader
-
-if TYPE_CHECKING:
-    from accerl_lerobot.transport.meeting import Meeting
-    from accerl_lerobot.weights.direct import Coming, DirectReader
 
 LOOK_S = 1.0
 """How long the thread that serves waits at most before it looks whether it is still wanted."""
@@ -103,7 +99,6 @@ class InferenceWorker:
         self._published: deque[Received] = deque(maxlen=1)
         self._together: deque[int] = deque(maxlen=1)
         self._reader: SharedMemoryReader | None = None
-        self._direct: DirectReader | None = None
         self._broken: BaseException | None = None
         self._swap_s = self._publish_to_served_s = 0.0
         self._unserved_since: float | None = None
@@ -149,23 +144,6 @@ class InferenceWorker:
         except OSError:
             return False
         return True
-
-    async def node(self) -> str:
-        """Which machine it is on."""
-        import ray
-
-        return str(ray.get_runtime_context().get_node_id())
-
-    async def meet_publisher(self, meeting: Meeting) -> None:
-        """Receives weights straight from the trainer from now on, see `weights.direct`."""
-        from accerl_lerobot.weights.direct import DirectReader
-
-        self._direct = await asyncio.to_thread(DirectReader, meeting, self._offer)
-
-    async def receive_directly(self, coming: Coming) -> int:
-        """Takes the set that comes; it serves from the next batch on."""
-        assert self._direct is not None, "who sends has met this worker"
-        return await self._direct.receive(coming)
 
     def _offer(self, received: Received) -> None:
         if received.version > self._received:
@@ -275,7 +253,7 @@ class InferenceWorker:
         if self._published:
             self._clock.enter(WEIGHT_SYNC)
             received, started = self._published.popleft(), time.monotonic()
-            self._adapter.load_trainable(received.tensors, received.changed)
+            self._adapter.load_trainable(received.tensors)
             received.release()
             self._swap_s = time.monotonic() - started
             self._version, self._unserved_since = received.version, received.published_s

@@ -107,15 +107,11 @@ class PolicyAdapter(nn.Module, ABC):
             weights: from `copy_weights`.
         """
 
-    def load_trainable(
-        self, tensors: dict[str, np.ndarray], changed: dict[str, np.ndarray] | None = None
-    ) -> None:
+    def load_trainable(self, tensors: dict[str, np.ndarray]) -> None:
         """Copies published weights in place: all of them, or none when they do not fit.
 
         Args:
             tensors: by name, all that `trainable` has.
-            changed: name → indices of the elements, flattened, that are to be copied, where the others are
-                known to be equal; None: all.
 
         Raises:
             ValueError: names or shapes differ from `trainable`.
@@ -130,14 +126,8 @@ class PolicyAdapter(nn.Module, ABC):
                     f"published {name} has shape {tensors[name].shape}, not {tuple(parameter.shape)}"
                 )
         with torch.no_grad():
-            if changed is None:
-                for name, parameter in parameters.items():
-                    _copy(parameter, tensors[name])
-            else:
-                for name, index in changed.items():
-                    values = torch.from_numpy(tensors[name].reshape(-1)[index])
-                    parameter = parameters[name]
-                    parameter.view(-1)[torch.from_numpy(index)] = values.to(parameter)
+            for name, parameter in parameters.items():
+                _copy(parameter, tensors[name])
 
     def view_trainable(self) -> dict[str, np.ndarray]:
         """`trainable` as NumPy arrays, to be copied before the next update.

@@ -58,10 +58,6 @@ class TrainerConfig(Section, section="trainer"):
     betas: tuple[Annotated[float, Range("[0, 1)")], Annotated[float, Range("[0, 1)")]] = (0.9, 0.95)
     publish_every: Annotated[int, Range("[1, 1000000]")] = 1
     """Updates between two publications of the weights."""
-    publish_changes: bool = False
-    """Send only the values that differ from the set before, where that is less and the workers
-    are on one machine. It pays where an update leaves most values as they are, as where little is trained at
-    a time; an optimiser with momentum moves nearly every float32 value in every update."""
     hold_back: Steps = 0
     """Updates by which published weights are held back: lag on purpose, to study it; 0: none."""
     probe_every: Steps = 25

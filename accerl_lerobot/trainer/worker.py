@@ -81,17 +81,16 @@ class TrainerWorker:
         """Answers once the policy is loaded; returns this process's id."""
         return os.getpid()
 
-    def run(self, replay: Any, readers: list[Any], transport: str = "auto", way: str = "ray") -> int:
+    def run(self, replay: Any, readers: list[Any], transport: str = "auto") -> int:
         """Trains; returns the number of updates made.
 
         Args:
             replay: actor handle.
             readers: actor handles; where the weights go.
             transport: see `make_publisher`.
-            way: see there.
         """
         self._clock.enter(WEIGHT_SYNC)
-        publisher = make_publisher(readers, transport, changes=self._config.publish_changes, way=way)
+        publisher = make_publisher(readers, transport)
         try:
             # A checkpoint need not hold a critic: all start from this one.
             with self._lock:

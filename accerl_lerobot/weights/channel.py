@@ -18,13 +18,9 @@ from __future__ import annotations
 import threading
 import time
 from abc import ABC, abstractmethod
-from typing import Literal
 
 import numpy as np
 
-Way = Literal["ray", "gloo"]
-"""Channel that carries weights from the trainer to readers with which it shares no memory."""
-WAY = "launch.weights"
 Tensors = dict[str, np.ndarray]
 """Parameter name → array; dtype and shape arrive as they were sent."""
 

@@ -2,7 +2,7 @@
 """Which way weights go to which reader.
 
 shared memory   to readers on this machine
-Ray, or gloo    to all others
+Ray             to all others
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from typing import Any, get_args
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.transport.endpoint import FIELD, Transport
 from accerl_lerobot.transport.nameless import available
-from accerl_lerobot.weights.channel import WAY, Way
 from accerl_lerobot.weights.publisher import FLUSH_S, Publisher
 from accerl_lerobot.weights.ray_channel import RayPublisher, answered
 from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
@@ -53,49 +52,39 @@ class Publishers:
 def make_publisher(
     readers: Sequence[Any],
     transport: str = "auto",
-    *,
-    changes: bool = False,
-    way: str = "ray",
 ) -> Publisher | Publishers:
     """The trainer's end of the transport that is asked for, with its readers connected.
 
     Args:
         readers: actor handles with ``receive_weights(version, tensors, published_s)`` and
-            ``open_weights(address)``, as `InferenceWorker` has them; and see `DirectPublisher`.
+            ``open_weights(address)``, as `InferenceWorker` has them.
         transport: shared_memory, ray, or auto: the former for readers that can reach it, that is run on this
             machine, and the latter for the others.
-        changes: send only what has changed, where that is less; shared memory only.
-        way: to the others, ray or gloo.
 
     Raises:
         InputError: shared memory is asked for and not to be had.
-        RuntimeError: gloo does not reach a reader.
         ray.exceptions.RayError: a reader has died.
     """
     if transport not in get_args(Transport):
         raise InputError(FIELD, transport, f"use one of {', '.join(get_args(Transport))}")
-    if way not in get_args(Way):
-        raise InputError(WAY, way, f"use one of {', '.join(get_args(Way))}")
     if transport != "ray" and available():
-        publisher = SharedMemoryPublisher(len(readers), changes=changes)
+        publisher = SharedMemoryPublisher(len(readers))
         try:
             answers = [reader.open_weights.remote(publisher.address) for reader in readers]
             near = [answered(answer, "open_weights", CONNECT_S) for answer in answers]
             if all(near):
                 return publisher
-            if any(near) and transport == "auto" and not changes:
+            if any(near) and transport == "auto":
                 publisher.expect(sum(near))
                 far = [reader for reader, here in zip(readers, near, strict=True) if not here]
-                return Publishers(publisher, _to_the_far(far, way))
+                return Publishers(publisher, RayPublisher(far))
         except BaseException:
             publisher.close()
             raise
         publisher.close()
     if transport == "shared_memory":
         raise InputError(FIELD, transport, "it needs Linux and all workers on one machine; use ray")
-    if changes:
-        raise InputError("trainer.publish_changes", changes, "it needs shared memory: see launch.transport")
-    return _to_the_far(readers, way)
+    return RayPublisher(readers)
 
 
 def join(publisher: Publisher | Publishers, reader: Any) -> None:
@@ -116,11 +105,3 @@ def join(publisher: Publisher | Publishers, reader: Any) -> None:
         if answered(reader.open_weights.remote(part.address), "open_weights", CONNECT_S):
             return
     raise InputError(FIELD, "shared_memory", "a worker that was started anew is elsewhere; use ray")
-
-
-def _to_the_far(readers: Sequence[Any], way: str) -> Publisher:
-    if way == "ray":
-        return RayPublisher(readers)
-    from accerl_lerobot.weights.direct import DirectPublisher
-
-    return DirectPublisher(readers)

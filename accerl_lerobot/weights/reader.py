@@ -13,17 +13,12 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
-from accerl_lerobot.transport.nameless import aligned, new_socket, same_user
-from accerl_lerobot.weights import changes as changed_words
-from accerl_lerobot.weights.changes import Changes
+from accerl_lerobot.transport.nameless import new_socket, same_user
 from accerl_lerobot.weights.channel import Tensors
 from accerl_lerobot.weights.shared_memory import (
     APPLIED,
     CONFIRMED,
     FORMAT,
-    NOT_ONLY_CHANGES,
     TALK_S,
     Message,
 )
@@ -39,12 +34,10 @@ class Received:
 
     version: int
     tensors: Tensors
-    """All of them, whole, read-only; not to be looked at any more once they are let go of."""
+    """All of them, read-only; not to be looked at any more once they are let go of."""
     published_s: float
     """When `publish` was called, on the clock `time.monotonic`."""
     release: Callable[[], None] = lambda: None
-    changed: dict[str, np.ndarray] | None = None
-    """Name → indices of the elements, flattened, that differ from the set before; None: all may."""
     nbytes: int = 0
     """Bytes that the reader has to read of it."""
 
@@ -68,9 +61,6 @@ class SharedMemoryReader:
         self._slabs: dict[int, Slab] = {}
         """By slot."""
         self._layout = Layout.of({})
-        self._own = np.zeros(0, np.uint8)
-        """The last set, if changes against it may come."""
-        self._own_version = -1
         self._closing = False
         self._socket = new_socket()
         try:
@@ -120,21 +110,9 @@ class SharedMemoryReader:
         message = Message.unpack(data)
         slab = self._slab(message, fds)
         layout = self._layout_of(message, slab)
-        if message.changed == NOT_ONLY_CHANGES:
-            whole, changes = slab.memory[: layout.size], None
-            tensors = slab.views(layout)
-        else:
-            whole, changes = self._own, _changes(message, layout, slab)
-            self._advance(message, changes)
-            tensors = layout.views(whole)
-        if digest(message.version, layout, whole) != self._confirmed(message):
+        tensors = slab.views(layout)
+        if digest(message.version, layout, slab.memory[: layout.size]) != self._confirmed(message):
             raise TornSetError(f"weights of version {message.version} are not what their digest says")
-        if message.keep:
-            if changes is None:
-                if len(self._own) != len(whole):
-                    self._own = np.empty_like(whole)
-                np.copyto(self._own, whole)
-            self._own_version = message.version
         for tensor in tensors.values():
             tensor.flags.writeable = False
         return Received(
@@ -142,8 +120,7 @@ class SharedMemoryReader:
             tensors=tensors,
             published_s=message.published_s,
             release=lambda: self._release(message.version),
-            changed=None if changes is None else changed_words.by_tensor(changes, layout),
-            nbytes=layout.size if changes is None else changes.nbytes,
+            nbytes=layout.size,
         )
 
     def _confirmed(self, message: Message) -> bytes:
@@ -181,26 +158,6 @@ class SharedMemoryReader:
             self._layout = Layout.read(text)
         return self._layout
 
-    def _advance(self, message: Message, changes: Changes) -> None:
-        """Makes the last set the new one."""
-        if self._own_version != message.base:
-            raise TornSetError(
-                f"weights of version {message.version} came as changes of {message.base}, not of "
-                f"{self._own_version}, which is here"
-            )
-        self._own_version = -1  # neither the one nor the other, until the digest has been compared
-        changed_words.apply(changes, self._own)
-
     def _release(self, version: int) -> None:
         with contextlib.suppress(OSError):  # a trainer that has gone wants nothing back
             self._socket.send(APPLIED.pack(version))
-
-
-def _changes(message: Message, layout: Layout, slab: Slab) -> Changes:
-    """Changes that the publisher put behind the layout."""
-    count, word, memory = message.changed, layout.word, slab.memory
-    start = aligned(layout.end + 4 * count)
-    return Changes(
-        memory[layout.end : layout.end + 4 * count].view(np.uint32),
-        memory[start : start + word * count].view(f"u{word}"),
-    )

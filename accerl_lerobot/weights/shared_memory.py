@@ -7,9 +7,8 @@
 
 Socket and slabs are in no file system, see `transport.nameless`: nothing is left behind whoever is killed,
 and both sides talk to processes of the same user only. A slab that a reader holds is never written to: with R
-readers there are R for them, one that is being sent, one to write to, and one to compare with if only changes
-are sent. A reader that has gone is let go of: whoever watches it knows why. One that comes later gets the
-newest set, whole.
+readers there are R for them, one that is being sent and one to write to. A reader that has gone is let go of:
+whoever watches it knows why. One that comes later gets the newest set.
 """
 
 from __future__ import annotations
@@ -22,15 +21,12 @@ import struct
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from accerl_lerobot.transport.nameless import aligned, listening, new_name, same_user
-from accerl_lerobot.weights import changes as changed_words
-from accerl_lerobot.weights.changes import LIMIT, Changes
+from accerl_lerobot.transport.nameless import listening, new_name, same_user
 from accerl_lerobot.weights.publisher import Publisher, Shipment
-from accerl_lerobot.weights.slab import Layout, Slab, digest
+from accerl_lerobot.weights.slab import Slab, digest
 
 logger = logging.getLogger(__name__)
 
-NOT_ONLY_CHANGES = -1
 TALK_S = 10.0
 """How long a message of some hundred bytes may take."""
 
@@ -45,12 +41,6 @@ class Message(NamedTuple):
     size: int
     text: int
     """Bytes of the layout, which follows the data."""
-    keep: bool
-    """Changes may follow, against this set."""
-    changed: int
-    """How many words the changes have, or `NOT_ONLY_CHANGES`."""
-    base: int
-    """The version that they are against."""
 
     def pack(self) -> bytes:
         """For the socket."""
@@ -62,7 +52,7 @@ class Message(NamedTuple):
         return cls(*FORMAT.unpack(data))
 
 
-FORMAT = struct.Struct("<QqdQQ?qq")
+FORMAT = struct.Struct("<QqdQQ")
 CONFIRMED = struct.Struct("<q16s")
 """Trailer of every message: version, and digest of the whole set."""
 APPLIED = struct.Struct("<q")
@@ -87,16 +77,13 @@ class SharedMemoryPublisher(Publisher):
 
     Args:
         readers: how many there will be to begin with.
-        changes: send only the words that changed, where these are few and the reader has the set before.
     """
 
-    def __init__(self, readers: int, *, changes: bool = False) -> None:
-        super().__init__(readers + 2 + changes, Slab.shared)
-        self._awaited, self._changes = readers, changes
+    def __init__(self, readers: int) -> None:
+        super().__init__(readers + 2, Slab.shared)
+        self._awaited = readers
         self._readers: list[_Reader] = []
         self._came = 0
-        self._base: Shipment | None = None
-        self._difference: Changes | None = None
         self.address = new_name()
         """Address on this machine that readers connect to."""
         self._listener = listening(self.address, readers)
@@ -145,7 +132,7 @@ class SharedMemoryPublisher(Publisher):
             self._came, self._awaited = self._came + 1, max(0, self._awaited - 1)
             self._readers.append(reader)
             # One that takes the place of another may be here before that one is seen to have gone.
-            self._limit = max(self._limit, len(self._readers) + 2 + self._changes)
+            self._limit = max(self._limit, len(self._readers) + 2)
         self._selector.register(connection, selectors.EVENT_READ, reader)
 
     def _let_go(self, reader: _Reader) -> None:
@@ -160,13 +147,9 @@ class SharedMemoryPublisher(Publisher):
     def _begin(self) -> None:
         """Makes the newest set ready to be sent."""
         with self._changed:
-            before, shipment = self._current, self._take()
+            shipment = self._take()
             if shipment is None:
                 return
-            if self._changes:
-                self._base = before
-        if self._changes:
-            self._difference = self._compare(shipment)
         self._send_newest()  # readers reckon the digest while it is reckoned here
         data = shipment.slab.memory[: shipment.layout.size]
         shipment.digest = digest(shipment.version, shipment.layout, data)
@@ -174,20 +157,6 @@ class SharedMemoryPublisher(Publisher):
             if reader.holds is shipment:
                 self._confirm(reader, shipment)
         self._spare()
-
-    def _compare(self, shipment: Shipment) -> Changes | None:
-        """Puts what differs from the set before behind the layout; None if that is not worth it."""
-        base, layout = self._base, shipment.layout
-        if base is None or base.layout.text != layout.text:
-            return None
-        memory, size = shipment.slab.memory, layout.size
-        found = changed_words.find(base.slab.memory[:size], memory[:size], layout.word)
-        if found is not None:
-            where, words = found
-            memory[layout.end : layout.end + where.nbytes].view(where.dtype)[:] = where
-            start = aligned(layout.end + where.nbytes)
-            memory[start : start + words.nbytes].view(words.dtype)[:] = words
-        return found
 
     def _send_newest(self) -> None:
         """To every reader that holds nothing and has not had it."""
@@ -203,8 +172,6 @@ class SharedMemoryPublisher(Publisher):
     def _announce(self, reader: _Reader, shipment: Shipment) -> bool:
         """Tells a reader of a set; False if it has gone."""
         slab, layout = shipment.slab, shipment.layout
-        base = -1 if self._base is None else self._base.version
-        found = self._difference if reader.applied == base else None
         with self._changed:
             slot = self._slabs.index(slab)
             reader.holds = shipment
@@ -214,9 +181,6 @@ class SharedMemoryPublisher(Publisher):
             published_s=shipment.published_s,
             size=layout.size,
             text=len(layout.text),
-            keep=self._changes,
-            changed=NOT_ONLY_CHANGES if found is None else len(found.where),
-            base=base,
         )
         fds = [] if slab.fd is None or reader.known.get(slot) is slab else [slab.fd]
         try:
@@ -253,14 +217,7 @@ class SharedMemoryPublisher(Publisher):
             os.eventfd_write(self._event, 1)
 
     def _held(self) -> list[Slab]:
-        shipments = [self._base, *(reader.holds for reader in self._readers)]
-        return [shipment.slab for shipment in shipments if shipment is not None]
-
-    def _size(self, layout: Layout) -> int:
-        if not self._changes:
-            return layout.end
-        words = int(LIMIT * layout.size / layout.word) + 1
-        return aligned(layout.end + 4 * words) + words * layout.word
+        return [reader.holds.slab for reader in self._readers if reader.holds is not None]
 
     def _owed(self) -> str:
         if self._version is None:

@@ -3,7 +3,6 @@
 
     data      every tensor, each at a multiple of 64 bytes
     layout    where which tensor lies, as JSON
-    changes   index and new value of what differs from an earlier set, if anybody asked for it
 
 The digest is of version, layout and data, so a set of which any part belongs to another one is noticed.
 Memory that is to be shared has no name, and goes with the last process that holds it.
@@ -81,13 +80,8 @@ class Layout:
 
     @property
     def end(self) -> int:
-        """Bytes of data and layout; changes begin here."""
+        """Bytes of data and layout."""
         return aligned(self.size + len(self.text))
-
-    @property
-    def word(self) -> int:
-        """Bytes of the smallest value of all tensors; changes are counted in words of as many."""
-        return min((np.dtype(p.dtype).itemsize for p in self.places.values()), default=1)
 
     def views(self, memory: np.ndarray) -> dict[str, np.ndarray]:
         """The tensors as they lie in `memory`, bytes."""

@@ -63,7 +63,7 @@ class CountingAdapter:
         self._leave()
         return answers
 
-    def load_trainable(self, tensors: dict[str, np.ndarray], changed: Any = None) -> None:
+    def load_trainable(self, tensors: dict[str, np.ndarray]) -> None:
         self._enter()
         if self.broken is not None:
             raise self.broken

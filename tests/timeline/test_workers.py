@@ -68,7 +68,7 @@ def test_inference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         def decide(self, requests: list[Request], version: int) -> list[Decision]:
             return [decision() for _ in requests]
 
-        def load_trainable(self, tensors: dict[str, np.ndarray], changed: Any = None) -> None:
+        def load_trainable(self, tensors: dict[str, np.ndarray]) -> None:
             pass
 
     monkeypatch.setattr(loading, "load_adapter", lambda policy: Adapter())

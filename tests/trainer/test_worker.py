@@ -228,16 +228,3 @@ def test_a_reader_that_comes_later_gets_the_weights_of_now_even_after_the_last_u
     stage.worker._publisher.flush(60)
     assert received == [3]
     stage.worker._publisher.close()
-
-
-def test_weights_go_the_way_that_is_asked_for(monkeypatch: pytest.MonkeyPatch):
-    asked: list[tuple[tuple[Any, ...], dict[str, Any]]] = []
-
-    def make(readers: Any, *arguments: Any, **options: Any) -> Prompt:
-        asked.append((arguments, options))
-        return Prompt(readers)
-
-    monkeypatch.setattr(module, "make_publisher", make)
-    stage = Stage(updates=1)
-    stage.worker.run(stage.replay, [stage.reader], "ray", "gloo")
-    assert asked == [(("ray",), {"changes": False, "way": "gloo"})]

@@ -144,8 +144,6 @@ def test_what_is_not_to_be_had_is_refused(monkeypatch: pytest.MonkeyPatch):
         make_publisher(far, "shared_memory")
     with pytest.raises(InputError, match=r"^launch.transport='nccl': use one of auto, ray, shared_memory"):
         make_publisher(far, "nccl")
-    with pytest.raises(InputError, match=r"^trainer.publish_changes=True: it needs shared memory"):
-        make_publisher(far, changes=True)
 
 
 def test_a_reader_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch):

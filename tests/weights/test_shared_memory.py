@@ -37,18 +37,17 @@ def _closed() -> Iterator[None]:
         OPEN.pop().close()
 
 
-def published(readers: int, changes: bool = False) -> SharedMemoryPublisher:
-    OPEN.append(SharedMemoryPublisher(readers, changes=changes))
+def published(readers: int) -> SharedMemoryPublisher:
+    OPEN.append(SharedMemoryPublisher(readers))
     return OPEN[-1]
 
 
 class Parameters:
-    """Copies what it receives into arrays of its own, or only what has changed, and lets it go."""
+    """Copies sets into arrays of its own, and lets them go."""
 
     def __init__(self, publisher: SharedMemoryPublisher) -> None:
         self.tensors: Tensors = {}
         self.versions: list[int] = []
-        self.partial: list[int] = []
         self.failure: BaseException | None = None
         self.gate = threading.Event()
         self.gate.set()
@@ -61,13 +60,7 @@ class Parameters:
     def apply(self, received: Received) -> None:
         assert self.gate.wait(60)
         with self.lock:
-            if received.changed is None:
-                self.tensors = {name: tensor.copy() for name, tensor in received.tensors.items()}
-            else:
-                self.tensors = {name: tensor.copy() for name, tensor in self.tensors.items()}
-                for name, index in received.changed.items():
-                    self.tensors[name].reshape(-1)[index] = received.tensors[name].reshape(-1)[index]
-                self.partial.append(received.version)
+            self.tensors = {name: tensor.copy() for name, tensor in received.tensors.items()}
             for tensor in self.tensors.values():
                 tensor.flags.writeable = False
             self.versions.append(received.version)
@@ -77,8 +70,8 @@ class Parameters:
 class Delivered(WeightChannel):
     """The publisher with two readers, as one channel: what is published has been applied by both."""
 
-    def __init__(self, changes: bool = False) -> None:
-        self.publisher = published(2, changes)
+    def __init__(self) -> None:
+        self.publisher = published(2)
         self.readers = [Parameters(self.publisher) for _ in range(2)]
 
     def publish(self, version: int, tensors: Tensors) -> None:
@@ -98,9 +91,8 @@ class Delivered(WeightChannel):
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
-@pytest.mark.parametrize("changes", [False, True], ids=["whole", "changes"])
-def test_contract(check: Check, changes: bool):
-    check(lambda: Delivered(changes))
+def test_contract(check: Check):
+    check(Delivered)
 
 
 def until(holds: Callable[[], object]) -> None:
@@ -110,10 +102,9 @@ def until(holds: Callable[[], object]) -> None:
         time.sleep(0.002)
 
 
-@pytest.mark.parametrize("changes", [False, True], ids=["whole", "changes"])
-def test_a_writer_at_full_speed_never_gives_a_mixture(changes: bool):
+def test_a_writer_at_full_speed_never_gives_a_mixture():
     """Nobody waits for anybody; each set is of one value, so a mixture shows even without a digest."""
-    publisher = published(2, changes)
+    publisher = published(2)
     seen: list[tuple[int, set[float]]] = []
 
     def check(received: Received) -> None:
@@ -204,61 +195,6 @@ def test_flush_names_readers_that_never_came():
         publisher.flush(0.3)
 
 
-def test_only_changes_are_read_where_they_are_few():
-    publisher = published(1, changes=True)
-    reader = Parameters(publisher)
-    rng = np.random.default_rng(0)
-    tensors = {name: rng.standard_normal((100, 50), dtype=np.float32) for name in "abc"}
-    for version in range(6):
-        for tensor in tensors.values():
-            tensor.reshape(-1)[rng.integers(0, tensor.size, 40)] = version
-        if version == 3:
-            tensors["a"] += 1
-            tensors["b"] += 1  # two thirds
-        publisher.publish(version, tensors)
-        publisher.flush(60)
-        for name, tensor in tensors.items():
-            np.testing.assert_array_equal(reader.tensors[name], tensor)
-    assert reader.versions == [0, 1, 2, 3, 4, 5] and reader.partial == [1, 2, 4, 5]
-
-
-def test_a_reader_with_another_base_gets_all():
-    publisher = published(2, changes=True)
-    slow, quick = Parameters(publisher), Parameters(publisher)
-    tensors = filled(0.0, size=1000)
-
-    def publish(version: int) -> None:
-        tensors["a"][0, version] = version
-        publisher.publish(version, tensors)
-        until(lambda: quick.versions[-1:] == [version])
-
-    publish(0)
-    publisher.flush(60)
-    slow.gate.clear()
-    for version in (1, 2, 3):
-        publish(version)
-    slow.gate.set()
-    publisher.flush(60)
-    # Version 1 was under way; 3 is against 2, which it never had.
-    assert slow.versions == [0, 1, 3] and slow.partial == [1]
-    assert quick.partial == [1, 2, 3]
-    for name, tensor in tensors.items():
-        np.testing.assert_array_equal(slow.tensors[name], tensor)
-
-
-def test_changes_that_do_not_make_the_whole_set_are_refused(monkeypatch: pytest.MonkeyPatch):
-    publisher = published(1, changes=True)
-    reader = Parameters(publisher)
-    tensors = filled(0.0, size=1000)
-    publisher.publish(0, tensors)
-    publisher.flush(60)
-    reader.reader._own[3] ^= 1  # as if it had been anything else than what was published
-    tensors["b"][0, 7] = 1.0
-    publisher.publish(1, tensors)
-    publisher.flush(60)
-    assert isinstance(reader.failure, TornSetError) and reader.versions == [0]
-
-
 def test_a_failure_of_the_thread_is_raised_to_the_trainer(monkeypatch: pytest.MonkeyPatch):
     publisher = published(1)
     Parameters(publisher)
@@ -309,10 +245,9 @@ def _read_for_ever(address: str, started: Any) -> None:
     reader._thread.join(120)
 
 
-@pytest.mark.parametrize("changes", [False, True], ids=["whole", "changes"])
-def test_a_reader_that_comes_later_gets_the_newest_set_at_once(changes: bool):
+def test_a_reader_that_comes_later_gets_the_newest_set_at_once():
     """As a service does that takes the place of one that was lost."""
-    publisher = published(1, changes)
+    publisher = published(1)
     first = Parameters(publisher)
     tensors = filled(0.0, size=1000)
     for version in (0, 1):
@@ -335,7 +270,7 @@ def test_a_reader_that_comes_later_gets_the_newest_set_at_once(changes: bool):
     for reader in (late, third):
         for name, tensor in tensors.items():
             np.testing.assert_array_equal(reader.tensors[name], tensor)
-    assert bool(late.partial) is changes and [reader.number for reader in publisher._readers] == [1, 2]
+    assert [reader.number for reader in publisher._readers] == [1, 2]
 
 
 def test_a_reader_that_is_killed_is_let_go_of_and_leaves_nothing():
