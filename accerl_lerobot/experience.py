@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from accerl_lerobot.snapshot import kind
+from accerl_lerobot.checkpoint.snapshot import kind
 
 Observation = dict[str, np.ndarray | str]
 """One observation under LeRobot's feature names.

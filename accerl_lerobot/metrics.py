@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.fault_points import reach
-from accerl_lerobot.ranges import Section
+from accerl_lerobot.config.ranges import Section
+from accerl_lerobot.engine.fault_points import reach
 
 METRICS = "metrics.jsonl"
 """Name of the file in a run's folder."""

@@ -7,10 +7,10 @@ import sys
 from typing import Any
 
 from accerl_lerobot.cli import exit_code, guarded, help_asked, set_up_logging
+from accerl_lerobot.cli.verbs import measure
+from accerl_lerobot.config.help import help_text
+from accerl_lerobot.config.parsing import parse
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.field_help import help_text
-from accerl_lerobot.parsing import parse
-from accerl_lerobot.verbs import measure
 from benchmarks.async_vs_sync import BenchAsyncVsSyncConfig
 from benchmarks.batching import BenchBatchingConfig
 from benchmarks.dream import BenchDreamConfig

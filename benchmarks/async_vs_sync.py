@@ -24,13 +24,13 @@ from accerl_lerobot.bench.blocks import ARMS, MOST_BUSY, Block, as_rows
 from accerl_lerobot.bench.host import floors, host, ranged, spread
 from accerl_lerobot.bench.latency import TRACE
 from accerl_lerobot.bench.tables import as_markdown, as_table, write
-from accerl_lerobot.console import Console
+from accerl_lerobot.cli.console import Console
+from accerl_lerobot.config.ranges import Positive, Range, Repeats, Seed, Steps
 from accerl_lerobot.envs.simulated import read_trace
 from accerl_lerobot.errors import InputError, output_folder
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate
-from accerl_lerobot.ranges import Positive, Range, Repeats, Seed, Steps
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
 from benchmarks.machinery import MachineryConfig
 
@@ -177,7 +177,7 @@ def _learning(config: BenchAsyncVsSyncConfig, console: Console) -> dict[str, Any
 
 
 def _success(updates: int, arm: Schedule, seed: int) -> float:
-    from accerl_lerobot.launch import RayEngine
+    from accerl_lerobot.engine.launch import RayEngine
 
     run = LEARNING.run_config(updates=updates, seed=seed)
     run = replace(run, launch=replace(run.launch, schedule=arm))

@@ -13,8 +13,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot import snapshot
-from accerl_lerobot.checkpoint import CHECKPOINTS, TRAINING_STATE, newest_whole
+from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.checkpoint.layout import CHECKPOINTS, TRAINING_STATE, newest_whole
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.buffer import ReplayCounters
 from accerl_lerobot.replay.journal import EPISODES, read_journal

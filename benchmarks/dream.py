@@ -14,9 +14,9 @@ from typing import Annotated, Any
 from rich.table import Table
 
 from accerl_lerobot.bench.measure import Memory, device_name, timed
+from accerl_lerobot.config.parsing import encode
+from accerl_lerobot.config.ranges import Device, Range, Repeats, Section, Threads
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.parsing import encode
-from accerl_lerobot.ranges import Device, Range, Repeats, Section, Threads
 from accerl_lerobot.world_model.config import PIXELS, WorldModelConfig
 from accerl_lerobot.world_model.sizes import TinyConfig
 

@@ -19,13 +19,13 @@ from typing import Annotated, Any
 from rich.table import Table
 
 from accerl_lerobot.bench.tables import as_markdown, write
-from accerl_lerobot.checkpoint import DEMOS
-from accerl_lerobot.config import RunConfig, parse
-from accerl_lerobot.console import Console
-from accerl_lerobot.dataset_config import DatasetConfig
+from accerl_lerobot.checkpoint.layout import DEMOS
+from accerl_lerobot.cli.console import Console
+from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.config.ranges import Choice, Range, Seed
+from accerl_lerobot.config.run import RunConfig, parse
 from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.evaluation.stats import mean_interval
-from accerl_lerobot.ranges import Choice, Range, Seed
 from benchmarks.study import (
     INTERVALS,
     Cell,

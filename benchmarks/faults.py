@@ -26,14 +26,14 @@ from rich.table import Table
 
 from accerl_lerobot.bench.host import host
 from accerl_lerobot.bench.tables import as_markdown, as_table, write
-from accerl_lerobot.checkpoint import CHECKPOINTS, LAST, PRETRAINED, SUMMARY
-from accerl_lerobot.config import RunConfig, encode, parse
-from accerl_lerobot.console import Console
+from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, SUMMARY
+from accerl_lerobot.cli.console import Console
+from accerl_lerobot.config.ranges import Range, Repeats, Section, Seed, Steps
+from accerl_lerobot.config.run import RunConfig, encode, parse
+from accerl_lerobot.engine.ray_environment import RAY_PROCESSES
 from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate
-from accerl_lerobot.ranges import Range, Repeats, Section, Seed, Steps
-from accerl_lerobot.ray_environment import RAY_PROCESSES
 from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.hits import FAULTS, START_S, TIDY_S, places, strike
 from benchmarks.light_run import light_config

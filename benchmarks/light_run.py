@@ -14,7 +14,7 @@ import logging
 import os
 import sys
 
-from accerl_lerobot.config import LaunchConfig, RunConfig
+from accerl_lerobot.config.run import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
@@ -72,7 +72,7 @@ def light_policy() -> Load:
 
 def main(arguments: list[str]) -> int:
     """As ``accerl train``; returns the exit code."""
-    from accerl_lerobot.verbs import train
+    from accerl_lerobot.cli.verbs import train
 
     level = os.environ.get("ACCERL_LOG", "WARNING")
     logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s")

@@ -16,13 +16,13 @@ from typing import Annotated
 import numpy as np
 
 from accerl_lerobot.bench.blocks import Measured
-from accerl_lerobot.config import LaunchConfig, RunConfig
+from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Section
+from accerl_lerobot.config.run import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.envs.simulated import read_trace
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import Load
-from accerl_lerobot.ranges import NonNegative, Positive, Range, Section
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig

@@ -22,14 +22,14 @@ import yaml
 from rich.table import Table
 
 from accerl_lerobot.bench.tables import as_table
-from accerl_lerobot.checkpoint import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY
-from accerl_lerobot.config import RunConfig, encode, parse
-from accerl_lerobot.console import Console
+from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY
+from accerl_lerobot.cli.console import Console
+from accerl_lerobot.config.ranges import Range, Section, Seed, Steps
+from accerl_lerobot.config.run import RunConfig, encode, parse
+from accerl_lerobot.engine.resume import locked
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate, mean_interval
-from accerl_lerobot.ranges import Range, Section, Seed, Steps
-from accerl_lerobot.resume import locked
 
 INTERVALS = "intervals are 95 %, over seeds where there are several"
 """For people, see `together`."""
@@ -213,7 +213,7 @@ class Study:
                 itself finds it before it begins; the folder holds runs of other settings, or is in use.
             RuntimeError: a run failed; those that were under way have ended, and what is finished is kept.
         """
-        from accerl_lerobot.preflight import check_start
+        from accerl_lerobot.engine.preflight import check_start
 
         for seed, start in self.starts.items():
             check_start(replace(start, resume=self.start(seed).exists()))  # what is there is gone on with

@@ -21,8 +21,8 @@ import numpy as np
 from rich.table import Table
 
 from accerl_lerobot.bench.host import host, spread
+from accerl_lerobot.config.ranges import Range, Repeats, Section
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.ranges import Range, Repeats, Section
 from accerl_lerobot.timeline.clock import Clock, NoClock
 from accerl_lerobot.timeline.parts import Parts
 from accerl_lerobot.timeline.states import COMPUTE, WAIT_IN

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import ray
 
-from accerl_lerobot.cluster import start_ray
+from accerl_lerobot.engine.cluster import start_ray
+from accerl_lerobot.engine.ray_environment import check_private
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.ray_environment import check_private
 from accerl_lerobot.weights.channel import Tensors, monotonic_clock
 from accerl_lerobot.weights.reader import Received, SharedMemoryReader
 

@@ -238,9 +238,9 @@ def _too_long(*_: object) -> None:
 
 def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
     """Checks that are called before anything is loaded."""
+    from accerl_lerobot.checkpoint.safety import Origin, read_json, tensor_shapes
     from accerl_lerobot.demos.dataset_files import check_data, check_info, check_metadata, check_stats
     from accerl_lerobot.policies import files
-    from accerl_lerobot.safety import Origin, read_json, tensor_shapes
 
     origin = Origin("path", "hostile")
     policy, dataset = at["policy"], at["dataset"]
@@ -273,8 +273,8 @@ def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
 
 def loaders(trial: Trial, at: dict[str, Path], times: int) -> None:
     """All of it, as a run does: in a child process first."""
-    from accerl_lerobot import isolation
-    from accerl_lerobot.config import DatasetConfig
+    from accerl_lerobot.checkpoint import isolation
+    from accerl_lerobot.config.run import DatasetConfig
     from accerl_lerobot.demos.windows import open_metadata
     from accerl_lerobot.policies.config import PolicyConfig
     from accerl_lerobot.policies.loading import load_adapter, rehearsed_config
@@ -312,8 +312,8 @@ def rows(trial: Trial, dataset: Path, times: int) -> None:
     import pyarrow.parquet as pq
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+    from accerl_lerobot.checkpoint.safety import Origin
     from accerl_lerobot.demos.dataset_files import checked
-    from accerl_lerobot.safety import Origin
 
     path = dataset / "data/chunk-000/file-000.parquet"
     good = path.read_bytes()

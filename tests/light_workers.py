@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot import snapshot
-from accerl_lerobot.checkpoint import TRAINING_STATE
+from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.rollout.worker import Report, RolloutWorker
@@ -30,7 +30,7 @@ def light_ray() -> Iterator[None]:
     """Ray for the rest of the test session; engines that find it leave it running."""
     import ray
 
-    from accerl_lerobot.cluster import start_ray
+    from accerl_lerobot.engine.cluster import start_ray
 
     if not ray.is_initialized():
         start_ray()

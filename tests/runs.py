@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.config import LaunchConfig, RunConfig
-from accerl_lerobot.engine import Engine, Progress
+from accerl_lerobot.config.run import LaunchConfig, RunConfig
+from accerl_lerobot.engine.contract import Engine, Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.config import EvaluationConfig
 from accerl_lerobot.policies.config import PolicyConfig

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from accerl_lerobot import snapshot
-from accerl_lerobot.checkpoint import (
+from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.checkpoint.layout import (
     BACKBONE,
     PRETRAINED,
     RUN_STATE,

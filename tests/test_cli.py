@@ -16,9 +16,10 @@ from typing import Any
 import pytest
 import yaml
 
-from accerl_lerobot import cli, verbs
-from accerl_lerobot.config import RunConfig, encode
-from accerl_lerobot.engine import WorkerError
+from accerl_lerobot import cli
+from accerl_lerobot.cli import verbs
+from accerl_lerobot.config.run import RunConfig, encode
+from accerl_lerobot.engine.contract import WorkerError
 from accerl_lerobot.errors import InputError, kept_traceback, one_line
 
 ROOT = Path(__file__).parents[1]
@@ -226,7 +227,7 @@ class TestTrain:
             seen.update(config=config, directory=directory)
             return {"success_before": 0.25, "success_after": 0.75, "wall_s": 3.0}
 
-        monkeypatch.setattr("accerl_lerobot.run.train", train)
+        monkeypatch.setattr("accerl_lerobot.engine.run.train", train)
         assert cli.main([*arguments, "--trainer.lr=1e-5"]) == 0
         out, err = capsys.readouterr()
         assert json.loads(out)["success_after"] == 0.75
@@ -241,7 +242,7 @@ class TestTrain:
             (directory / "config.yaml").write_text("seed: 0\n")
             raise InputError("MUJOCO_GL", "", "install it")
 
-        monkeypatch.setattr("accerl_lerobot.run.train", train)
+        monkeypatch.setattr("accerl_lerobot.engine.run.train", train)
         assert cli.main(arguments) == 2
         assert not (tmp_path / "run").exists()
 
@@ -252,7 +253,7 @@ class TestTrain:
             (directory / "demos").mkdir()
             raise InputError("sft.lr", 1.0, "lower it")
 
-        monkeypatch.setattr("accerl_lerobot.run.train", train)
+        monkeypatch.setattr("accerl_lerobot.engine.run.train", train)
         assert cli.main(arguments) == 2
         assert (tmp_path / "run" / "demos").is_dir()
 
@@ -407,7 +408,7 @@ def test_a_run_that_cannot_go_on_ends_with_one_line(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    from accerl_lerobot import run
+    from accerl_lerobot.engine import run
     from benchmarks.light_run import light_config, light_policy
 
     def fails(*arguments: object) -> None:

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from accerl_lerobot import cluster
-from accerl_lerobot.config import LaunchConfig
-from accerl_lerobot.engine import WorkerError
+from accerl_lerobot.config.run import LaunchConfig
+from accerl_lerobot.engine import cluster
+from accerl_lerobot.engine.contract import WorkerError
 from accerl_lerobot.errors import InputError
 from tests.test_placement import cluster as nodes_of
 from tests.test_placement import run, where

@@ -11,17 +11,19 @@ from typing import Annotated, Any, Literal
 import pytest
 import yaml
 
-from accerl_lerobot import cli, parsing, preflight
+from accerl_lerobot import cli
 from accerl_lerobot.algorithms import GIPOConfig, PPOConfig
-from accerl_lerobot.config import DatasetConfig, RunConfig, check_chunk, encode, parse
+from accerl_lerobot.config import parsing
+from accerl_lerobot.config.help import help_text
+from accerl_lerobot.config.ranges import Positive, Range, Share
+from accerl_lerobot.config.run import DatasetConfig, RunConfig, check_chunk, encode, parse
+from accerl_lerobot.config.verbs import DemosRun, EvalRun, SFTRun
 from accerl_lerobot.demos.sft import SFTConfig
+from accerl_lerobot.engine import preflight
+from accerl_lerobot.engine.preflight import check_sft_policy, check_start
 from accerl_lerobot.envs import LeRobotEnvConfig, MetaWorldConfig, SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.field_help import help_text
 from accerl_lerobot.policies.backbone import BackboneConfig
-from accerl_lerobot.preflight import check_sft_policy, check_start
-from accerl_lerobot.ranges import Positive, Range, Share
-from accerl_lerobot.verb_configs import DemosRun, EvalRun, SFTRun
 
 ROOT = Path(__file__).parents[1]
 RECIPE = """
@@ -272,7 +274,7 @@ def test_odd_text_stays_text() -> None:
 
 
 def test_sizes_far_beyond_the_machine_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("accerl_lerobot.doctor.total_memory_gib", lambda: 16.0)
+    monkeypatch.setattr("accerl_lerobot.cli.doctor.total_memory_gib", lambda: 16.0)
     preflight.check_machine(parse(RunConfig, ["--rollout.workers=8"]))
     with pytest.raises(InputError, match=r"rollout\.worlds=8: the run needs about .* GiB of memory"):
         preflight.check_machine(parse(RunConfig, ["--rollout.workers=100"]))

@@ -16,12 +16,13 @@ import pytest
 import yaml
 from safetensors import safe_open
 
-from accerl_lerobot import cli, doctor
-from accerl_lerobot.config import RunConfig, decode
-from accerl_lerobot.doctor import FAIL, OK, WARN, Check
+from accerl_lerobot import cli
+from accerl_lerobot.cli import doctor
+from accerl_lerobot.cli.doctor import FAIL, OK, WARN, Check
+from accerl_lerobot.config.run import RunConfig, decode
+from accerl_lerobot.engine.preflight import check_weights_fit
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.loading import policy_sizes
-from accerl_lerobot.preflight import check_weights_fit
 
 QUICKSTART = Path(__file__).parents[1] / "recipes" / "quickstart.yaml"
 

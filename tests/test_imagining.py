@@ -14,21 +14,22 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot import cli, snapshot
-from accerl_lerobot.checkpoint import TRAINING_STATE
-from accerl_lerobot.config import DatasetConfig, RunConfig
-from accerl_lerobot.console import Console
+from accerl_lerobot import cli
+from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.checkpoint.layout import TRAINING_STATE
+from accerl_lerobot.cli.console import Console
+from accerl_lerobot.config.run import DatasetConfig, RunConfig
 from accerl_lerobot.demos.export_dreams import write_dreams
 from accerl_lerobot.demos.windows import open_metadata
-from accerl_lerobot.engine import Progress
+from accerl_lerobot.engine.contract import Progress
+from accerl_lerobot.engine.local import LocalEngine
+from accerl_lerobot.engine.preflight import check_features, dataset_features, env_features
+from accerl_lerobot.engine.run import train
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Segment
-from accerl_lerobot.local import LocalEngine
-from accerl_lerobot.preflight import check_features, dataset_features, env_features
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.run import train
 from accerl_lerobot.timeline.read import shares
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, TrialConfig, WorldModelConfig
@@ -224,7 +225,7 @@ def test_dreams_of_a_copy_are_known_for_what_they_are(tiny_checkpoint: Path, wor
 
 
 def test_it_runs_asynchronously_with_two_who_dream(tiny_checkpoint: Path, world_model: Path, tmp_path: Path):
-    from accerl_lerobot.launch import RayEngine
+    from accerl_lerobot.engine.launch import RayEngine
 
     learn = OnlineLearnConfig(steps_per_episode=1.0, try_every=2, held_out=0.4, trial=LOOSE, batch=4)
     config = dreaming(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12, record=3, workers=2)
@@ -294,7 +295,7 @@ def test_one_that_hangs_is_found_when_it_is_saved(kind: type, name: str, what: s
 
 
 def test_asynchronously_a_run_ends_when_its_episodes_are_used_up(tiny_checkpoint: Path):
-    from accerl_lerobot.launch import RayEngine
+    from accerl_lerobot.engine.launch import RayEngine
 
     config = dreaming(tiny_checkpoint, share=0.0, episodes=7)
     engine = RayEngine(replace(config, rollout=replace(config.rollout, workers=2)), ("match",))
@@ -378,7 +379,7 @@ def test_rooms_that_do_not_go_together(tiny_checkpoint: Path):
 
 
 def test_the_summary_says_what_was_imagined(tiny_checkpoint: Path, tmp_path: Path):
-    from accerl_lerobot.console import Console
+    from accerl_lerobot.cli.console import Console
 
     config = dreaming(tiny_checkpoint, model="oracle")
     config = replace(config, launch=replace(config.launch, engine="local"))

@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from accerl_lerobot import isolation
+from accerl_lerobot.checkpoint import isolation
+from accerl_lerobot.checkpoint.isolation import rehearse
+from accerl_lerobot.checkpoint.safety import MIB, Origin
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.isolation import rehearse
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import rehearsed_config
-from accerl_lerobot.safety import MIB, Origin
 from tests.policies.checkpoints import edit_config
 
 ORIGIN = Origin("policy.path", "theirs")

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import pytest
 
-from accerl_lerobot.checkpoint import PRETRAINED
-from accerl_lerobot.config import RunConfig
-from accerl_lerobot.engine import Progress
+from accerl_lerobot.checkpoint.layout import PRETRAINED
+from accerl_lerobot.config.run import RunConfig
+from accerl_lerobot.engine.contract import Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.replay import ReplayConfig, lag_bound
@@ -57,7 +57,7 @@ class Story:
 
 @pytest.fixture(scope="module")
 def story(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Story]:
-    from accerl_lerobot.launch import RayEngine
+    from accerl_lerobot.engine.launch import RayEngine
 
     config = tiny_run(
         tiny_checkpoint,

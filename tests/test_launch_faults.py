@@ -18,14 +18,14 @@ from typing import Any
 import pytest
 import ray
 
-from accerl_lerobot import launch, seats
-from accerl_lerobot.config import LaunchConfig
-from accerl_lerobot.engine import Progress, WorkerError, pause_s
+from accerl_lerobot.config.run import LaunchConfig
+from accerl_lerobot.engine import launch, seats
+from accerl_lerobot.engine.contract import Progress, WorkerError, pause_s
+from accerl_lerobot.engine.launch import RayEngine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
 from accerl_lerobot.inference.worker import InferenceConfig
-from accerl_lerobot.launch import RayEngine
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout import worker as rollout_worker
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig

@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 
 from accerl_lerobot.algorithms import GIPOConfig
-from accerl_lerobot.config import RunConfig
-from accerl_lerobot.engine import Progress
+from accerl_lerobot.config.run import RunConfig
+from accerl_lerobot.engine.contract import Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.replay import ReplayConfig, decisions_under_way, lag_bound
@@ -52,7 +52,7 @@ class Story:
 
 @pytest.fixture(scope="module")
 def story(tiny_checkpoint: Path) -> Iterator[Story]:
-    from accerl_lerobot.launch import RayEngine
+    from accerl_lerobot.engine.launch import RayEngine
 
     config = tiny_run(
         tiny_checkpoint,

@@ -18,12 +18,12 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from accerl_lerobot import snapshot
-from accerl_lerobot.checkpoint import PRETRAINED, STEP, TRAINING_STATE, WEIGHTS
-from accerl_lerobot.config import RunConfig
-from accerl_lerobot.engine import WorkerError
+from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.checkpoint.layout import PRETRAINED, STEP, TRAINING_STATE, WEIGHTS
+from accerl_lerobot.config.run import RunConfig
+from accerl_lerobot.engine.contract import WorkerError
+from accerl_lerobot.engine.launch import RayEngine
 from accerl_lerobot.evaluation.config import evaluation_plans
-from accerl_lerobot.launch import RayEngine
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.runs import collect, drive, polls, tiny_run
 from tests.test_ray_environment import LOOPBACK, listening

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.algorithms import ALGORITHMS, AlgorithmConfig, GIPOConfig, PPOConfig
-from accerl_lerobot.config import RunConfig
-from accerl_lerobot.engine import Engine, Progress
+from accerl_lerobot.config.run import RunConfig
+from accerl_lerobot.engine.contract import Engine, Progress
+from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.config import evaluation_plans
-from accerl_lerobot.local import LocalEngine
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.samplers import FlowSamplerConfig
 from accerl_lerobot.replay import ReplayConfig

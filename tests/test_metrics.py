@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
-from accerl_lerobot.config import RunConfig, parse
-from accerl_lerobot.console import Console
+from accerl_lerobot.cli.console import Console
+from accerl_lerobot.config.run import RunConfig, parse
+from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.inference.batcher import BatcherStats
-from accerl_lerobot.local import LocalEngine
 from accerl_lerobot.metrics import MetricsLog, WandBConfig
 from accerl_lerobot.timeline.states import ROLES, STATES
 
@@ -184,9 +184,9 @@ def test_the_summary_is_explained() -> None:
 def test_progress_says_how_much_time_is_left(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("accerl_lerobot.console.PLAIN_EVERY_S", -1.0)
+    monkeypatch.setattr("accerl_lerobot.cli.console.PLAIN_EVERY_S", -1.0)
     now = iter(range(0, 10_000, 60))
-    monkeypatch.setattr("accerl_lerobot.console.time.monotonic", lambda: float(next(now)))
+    monkeypatch.setattr("accerl_lerobot.cli.console.time.monotonic", lambda: float(next(now)))
     with Console().stage("RL", total=500) as stage:
         stage.update(100, "resumed at 100")
         stage.update(200, "and a minute later")
@@ -200,7 +200,7 @@ def test_progress_says_how_much_time_is_left(
 def test_console_without_a_terminal_prints_lines(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("accerl_lerobot.console.PLAIN_EVERY_S", -1.0)
+    monkeypatch.setattr("accerl_lerobot.cli.console.PLAIN_EVERY_S", -1.0)
     console = Console()
     with console.stage("SFT", total=10) as stage:
         stage.update(4, "loss 0.5")

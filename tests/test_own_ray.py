@@ -12,11 +12,11 @@ from collections.abc import Iterator
 import psutil
 import pytest
 
-from accerl_lerobot import cluster, own_ray
-from accerl_lerobot.config import LaunchConfig
-from accerl_lerobot.engine import WorkerError
-from accerl_lerobot.own_ray import OwnRay, RayWatch
-from accerl_lerobot.ray_environment import kind_of
+from accerl_lerobot.config.run import LaunchConfig
+from accerl_lerobot.engine import cluster, own_ray
+from accerl_lerobot.engine.contract import WorkerError
+from accerl_lerobot.engine.own_ray import OwnRay, RayWatch
+from accerl_lerobot.engine.ray_environment import kind_of
 
 
 class Stand:
@@ -124,7 +124,7 @@ def test_who_goes_on_is_not_taken_for_stopped(raylet: psutil.Process):
 HANGS = """
 import os, signal, sys, time
 import psutil
-from accerl_lerobot import guardian, own_ray
+from accerl_lerobot.engine import guardian, own_ray
 gcs_server = psutil.Process(int(sys.argv[1]))
 own_ray.ray_processes = lambda: {gcs_server: "gcs_server"}
 own_ray.kill_ray = lambda processes: None

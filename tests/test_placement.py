@@ -11,16 +11,16 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot.config import LaunchConfig, RunConfig, decode
-from accerl_lerobot.console import Console
-from accerl_lerobot.engine import WorkerError
+from accerl_lerobot.cli.console import Console
+from accerl_lerobot.config.run import LaunchConfig, RunConfig, decode
+from accerl_lerobot.engine.contract import WorkerError
+from accerl_lerobot.engine.placement import Node, Plan, planned
+from accerl_lerobot.engine.placement_config import PlacementConfig, RoleConfig
+from accerl_lerobot.engine.run import train
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.worker import InferenceConfig
-from accerl_lerobot.placement import Node, Plan, planned
-from accerl_lerobot.placement_config import PlacementConfig, RoleConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.run import train
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 from tests.runs import tiny_run

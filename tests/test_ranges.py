@@ -12,10 +12,10 @@ from typing import Annotated, Any, Literal
 
 import pytest
 
+from accerl_lerobot.cli.verbs import CONFIGS
+from accerl_lerobot.config.parsing import choices_of, section_of
+from accerl_lerobot.config.ranges import Choice, Device, Positive, Range, Section, Share, check, hints_of
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.parsing import choices_of, section_of
-from accerl_lerobot.ranges import Choice, Device, Positive, Range, Section, Share, check, hints_of
-from accerl_lerobot.verbs import CONFIGS
 
 
 def sections(cls: type[Any]) -> Iterator[type[Any]]:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from accerl_lerobot import ray_environment
+from accerl_lerobot.engine import ray_environment
 from tests.light_workers import light_ray
 
 __all__ = ["light_ray"]
@@ -79,7 +79,7 @@ def test_a_token_was_never_open_to_others(bare: pytest.MonkeyPatch):
 @pytest.mark.parametrize("end", ["pass", "raise SystemExit(3)", "1 / 0"])
 def test_the_token_goes_with_its_process(end: str):
     code = (
-        "import os\nfrom accerl_lerobot import ray_environment\nray_environment.prepare()\n"
+        "import os\nfrom accerl_lerobot.engine import ray_environment\nray_environment.prepare()\n"
         "child = os.fork()\nif child == 0: raise SystemExit(0)\nos.waitpid(child, 0)\n"
         f"path = os.environ['RAY_AUTH_TOKEN_PATH']\nassert os.path.isfile(path)\nprint(path)\n{end}"
     )
@@ -222,9 +222,9 @@ def test_a_client_without_the_token_is_refused(light_ray: None):
 TOKENS = """
 import json, sys
 from pathlib import Path
-from accerl_lerobot import ray_environment
+from accerl_lerobot.engine import ray_environment
 ray_environment.prepare()
-from accerl_lerobot.launch import RayEngine
+from accerl_lerobot.engine.launch import RayEngine
 from accerl_lerobot.inference import worker as inference
 from accerl_lerobot.trainer import worker as trainer
 from tests.light_workers import LightInference, LightTrainer
@@ -273,8 +273,8 @@ def test_a_client_in_such_a_process_finds_no_token(tmp_path: Path):
 def test_a_ray_that_others_could_talk_to_is_not_started():
     """Ray first, `prepare` after: too late for what Ray reads when it is imported."""
     program = (
-        "import ray\nfrom accerl_lerobot import ray_environment\nray_environment.prepare()\n"
-        "from accerl_lerobot.cluster import start_ray\nstart_ray()\n"
+        "import ray\nfrom accerl_lerobot.engine import ray_environment\nray_environment.prepare()\n"
+        "from accerl_lerobot.engine.cluster import start_ray\nstart_ray()\n"
     )
     clean = {k: v for k, v in os.environ.items() if not k.startswith("RAY_")}
     done = subprocess.run(

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from accerl_lerobot.config import RunConfig, parse
-from accerl_lerobot.doctor import pins
-from accerl_lerobot.preflight import check_sft_policy
-from accerl_lerobot.verbs import CONFIGS
+from accerl_lerobot.cli.doctor import pins
+from accerl_lerobot.cli.verbs import CONFIGS
+from accerl_lerobot.config.run import RunConfig, parse
+from accerl_lerobot.engine.preflight import check_sft_policy
 from benchmarks.__main__ import CONFIGS as BENCHMARKS
 
 ROOT = Path(__file__).parents[1]

@@ -14,15 +14,16 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot import launch, snapshot
-from accerl_lerobot.checkpoint import TRAINING_STATE
-from accerl_lerobot.config import RunConfig
-from accerl_lerobot.engine import Progress
+from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.checkpoint.layout import TRAINING_STATE
+from accerl_lerobot.config.run import RunConfig
+from accerl_lerobot.engine import launch
+from accerl_lerobot.engine.contract import Progress
+from accerl_lerobot.engine.launch import RayEngine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
-from accerl_lerobot.launch import RayEngine
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer import worker as trainer_worker

@@ -11,13 +11,13 @@ import pytest
 
 from accerl_lerobot.algorithms import ChunkCriticConfig, GIPOConfig, SelfImitationConfig
 from accerl_lerobot.algorithms.decoupled import DecoupledConfig
-from accerl_lerobot.checkpoint import TRAINING_STATE
-from accerl_lerobot.config import RunConfig
-from accerl_lerobot.engine import Progress
+from accerl_lerobot.checkpoint.layout import TRAINING_STATE
+from accerl_lerobot.config.run import RunConfig
+from accerl_lerobot.engine.contract import Progress
+from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import evaluation_plans
-from accerl_lerobot.local import LocalEngine
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig

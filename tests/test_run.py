@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 import yaml
 
-from accerl_lerobot import run
-from accerl_lerobot.checkpoint import saved_version
-from accerl_lerobot.config import LaunchConfig, RunConfig, parse
-from accerl_lerobot.console import Console
-from accerl_lerobot.engine import Engine, Progress, Saved, WorkerError
+from accerl_lerobot.checkpoint.layout import saved_version
+from accerl_lerobot.cli.console import Console
+from accerl_lerobot.config.run import LaunchConfig, RunConfig, parse
+from accerl_lerobot.engine import run
+from accerl_lerobot.engine.contract import Engine, Progress, Saved, WorkerError
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
@@ -350,7 +350,7 @@ def test_a_run_that_fails_closes_the_engine_and_keeps_its_own_error(
 
 
 def test_the_engine_is_the_one_that_was_asked_for(tiny_checkpoint: Path):
-    from accerl_lerobot.local import LocalEngine
+    from accerl_lerobot.engine.local import LocalEngine
 
     config = local_run(tiny_checkpoint, None)
     engine = run.make_engine(replace(config, seed=1), ("match",), 1)

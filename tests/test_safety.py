@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from accerl_lerobot import cli, safety
-from accerl_lerobot.errors import InputError
-from accerl_lerobot.safety import (
+from accerl_lerobot import cli
+from accerl_lerobot.checkpoint import safety
+from accerl_lerobot.checkpoint.safety import (
     Origin,
     check_name,
     check_not_pickled,
@@ -32,6 +32,7 @@ from accerl_lerobot.safety import (
     safe_join,
     tensor_shapes,
 )
+from accerl_lerobot.errors import InputError
 from tests.hostile import hostile_names
 
 ORIGIN = Origin("policy.path", "runs/theirs")

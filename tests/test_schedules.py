@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot import launch
-from accerl_lerobot.config import LaunchConfig, RunConfig
-from accerl_lerobot.engine import Progress
+from accerl_lerobot.config.run import LaunchConfig, RunConfig
+from accerl_lerobot.engine import launch
+from accerl_lerobot.engine.contract import Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import evaluation_plans
@@ -142,7 +142,7 @@ def drive_counting(engine: Any, monkeypatch: pytest.MonkeyPatch) -> tuple[list[P
 @pytest.mark.parametrize("schedule", [SYNCHRONOUS, OVERLAP, ASYNCHRONOUS])
 def test_a_run_in_turn(light_ray: None, schedule: Any, monkeypatch: pytest.MonkeyPatch):
     """Episodes of one segment each, of all four worlds: a batch is exactly what they do in one round."""
-    from accerl_lerobot.launch import RayEngine
+    from accerl_lerobot.engine.launch import RayEngine
 
     load = functools.partial(load_simulated, SimulatedPolicyConfig(decide_ms=1.0, update_ms=30.0))
     engine = RayEngine(run_of(schedule), ("match",), load=load)
@@ -194,7 +194,7 @@ def test_in_turn_a_service_that_is_lost_is_waited_for_and_the_round_is_finished(
     light_ray: None, tmp_path: Path, schedule: Any, lag: float, size: int, ahead: float
 ):
     """Callers that had their answer go on, and are a decision ahead of the one that has to ask again."""
-    from accerl_lerobot.launch import RayEngine
+    from accerl_lerobot.engine.launch import RayEngine
 
     died = tmp_path / "died"
     policy = SimulatedPolicyConfig(decide_ms=1.0, update_ms=5.0)
@@ -220,7 +220,7 @@ def test_in_turn_a_service_that_is_lost_is_waited_for_and_the_round_is_finished(
 
 
 def test_several_services_share_the_worlds_out(light_ray: None, monkeypatch: pytest.MonkeyPatch):
-    from accerl_lerobot.launch import RayEngine
+    from accerl_lerobot.engine.launch import RayEngine
 
     run = run_of(SYNCHRONOUS)
     run = replace(

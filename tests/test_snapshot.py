@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot import snapshot
+from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Origin
 from tests.replay.segments import make_segment

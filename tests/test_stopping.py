@@ -8,7 +8,7 @@ import signal
 
 import pytest
 
-from accerl_lerobot.stopping import Stopping, arrived, deferred
+from accerl_lerobot.engine.stopping import Stopping, arrived, deferred
 
 
 def test_a_signal_is_noted_first_and_interrupts_when_it_comes_again():

@@ -10,8 +10,8 @@ from typing import Any
 import psutil
 import pytest
 
-from accerl_lerobot import watched
-from accerl_lerobot.watched import Watched, end
+from accerl_lerobot.engine import watched
+from accerl_lerobot.engine.watched import Watched, end
 
 
 class Stand:

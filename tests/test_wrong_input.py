@@ -15,9 +15,11 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot import cli, doctor, guardian
-from accerl_lerobot.parsing import dotted_fields
-from accerl_lerobot.verbs import CONFIGS
+from accerl_lerobot import cli
+from accerl_lerobot.cli import doctor
+from accerl_lerobot.cli.verbs import CONFIGS
+from accerl_lerobot.config.parsing import dotted_fields
+from accerl_lerobot.engine import guardian
 
 CASES = 120
 
@@ -129,7 +131,8 @@ def test_wrong_input_is_one_line_and_begins_nothing(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ):
-    from accerl_lerobot import preflight, verbs
+    from accerl_lerobot.cli import verbs
+    from accerl_lerobot.engine import preflight
 
     def right(*_: Any, **__: Any) -> None:
         raise StartedWork

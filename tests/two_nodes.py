@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot import ray_environment
+from accerl_lerobot.engine import ray_environment
 
 ray_environment.prepare()
 
@@ -26,15 +26,15 @@ import pytest  # noqa: E402
 import ray  # noqa: E402
 from ray.cluster_utils import Cluster  # noqa: E402
 
-from accerl_lerobot import cluster as joining  # noqa: E402
-from accerl_lerobot import launch  # noqa: E402
-from accerl_lerobot.config import LaunchConfig  # noqa: E402
+from accerl_lerobot.config.run import LaunchConfig  # noqa: E402
+from accerl_lerobot.engine import cluster as joining  # noqa: E402
+from accerl_lerobot.engine import launch  # noqa: E402
+from accerl_lerobot.engine.launch import RayEngine  # noqa: E402
+from accerl_lerobot.engine.placement_config import PlacementConfig, RoleConfig  # noqa: E402
 from accerl_lerobot.envs import SimulatedConfig  # noqa: E402
 from accerl_lerobot.errors import InputError  # noqa: E402
 from accerl_lerobot.evaluation.config import evaluation_plans  # noqa: E402
 from accerl_lerobot.inference import worker as inference_worker  # noqa: E402
-from accerl_lerobot.launch import RayEngine  # noqa: E402
-from accerl_lerobot.placement_config import PlacementConfig, RoleConfig  # noqa: E402
 from accerl_lerobot.rollout.runner import RolloutConfig  # noqa: E402
 from accerl_lerobot.trainer import worker as trainer_worker  # noqa: E402
 from accerl_lerobot.trainer.config import TrainerConfig  # noqa: E402

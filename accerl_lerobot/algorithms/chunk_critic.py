@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from accerl_lerobot.algorithms.contract import AlgorithmConfig, OffPolicyConfig
-from accerl_lerobot.ranges import NonNegative, Positive, Range, Share
+from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Share
 
 
 @AlgorithmConfig.register_subclass("chunk_critic")

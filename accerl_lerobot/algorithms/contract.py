@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import draccus
 
+from accerl_lerobot.config.ranges import NonNegative, Range, Section, Share
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.ranges import NonNegative, Range, Section, Share
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -26,7 +26,7 @@ from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, Loss
 from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
 from accerl_lerobot.algorithms.ppo import PPOConfig, clipped_surrogate
 from accerl_lerobot.algorithms.ratio import at_level, ratio
-from accerl_lerobot.ranges import Range
+from accerl_lerobot.config.ranges import Range
 
 
 @AlgorithmConfig.register_subclass("decoupled")

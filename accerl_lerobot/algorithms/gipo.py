@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Annotated
 from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput, RatioConfig
 from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
 from accerl_lerobot.algorithms.ratio import at_level, ratio
-from accerl_lerobot.ranges import NonNegative, Range
+from accerl_lerobot.config.ranges import NonNegative, Range
 
 if TYPE_CHECKING:
     from torch import Tensor

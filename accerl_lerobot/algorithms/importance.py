@@ -20,7 +20,7 @@ from typing import Annotated
 from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput, RatioConfig
 from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
 from accerl_lerobot.algorithms.ratio import at_level, ratio
-from accerl_lerobot.ranges import Range
+from accerl_lerobot.config.ranges import Range
 
 
 @AlgorithmConfig.register_subclass("is")

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput, RatioConfig
 from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
 from accerl_lerobot.algorithms.ratio import at_level, ratio
-from accerl_lerobot.ranges import Positive
+from accerl_lerobot.config.ranges import Positive
 
 
 @AlgorithmConfig.register_subclass("sapo")

@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from accerl_lerobot.bench.host import Processors
-from accerl_lerobot.config import RunConfig
-from accerl_lerobot.engine import Progress
+from accerl_lerobot.config.run import RunConfig
+from accerl_lerobot.engine.contract import Progress
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
 
@@ -60,10 +60,10 @@ class Measured:
     def __init__(
         self, config: RunConfig, tasks: tuple[str, ...], history: int = 1, load: Load | None = None
     ) -> None:
-        from accerl_lerobot import ray_environment
+        from accerl_lerobot.engine import ray_environment
 
         ray_environment.prepare()
-        from accerl_lerobot.launch import RayEngine
+        from accerl_lerobot.engine.launch import RayEngine
 
         self.engine = RayEngine(config, tasks, history, load=load)
         # What is collected once is learned from so often: a block has whole rounds of it.

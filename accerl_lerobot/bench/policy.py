@@ -18,8 +18,8 @@ from typing import Annotated, Any, Literal
 from rich.table import Table
 
 from accerl_lerobot.bench.measure import Memory, device_name, timed
+from accerl_lerobot.config.ranges import Choice, Device, Range, Repeats, Section
 from accerl_lerobot.policies.config import TuningConfig
-from accerl_lerobot.ranges import Choice, Device, Range, Repeats, Section
 
 STATE_DIM, ACTION_DIM, TOKENS = 8, 7, 48
 """LIBERO's sizes: end-effector state, end-effector action; length of a padded instruction."""

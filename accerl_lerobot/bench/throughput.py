@@ -17,11 +17,11 @@ from rich.table import Table
 from accerl_lerobot.bench.blocks import ARMS, Block, Measured, as_rows
 from accerl_lerobot.bench.host import host, ranged, spread
 from accerl_lerobot.bench.tables import as_markdown, as_table, write
-from accerl_lerobot.config import RunConfig, parse
-from accerl_lerobot.console import Console
+from accerl_lerobot.cli.console import Console
+from accerl_lerobot.config.ranges import Positive, Repeats, Section
+from accerl_lerobot.config.run import RunConfig, parse
 from accerl_lerobot.errors import InputError, expanded, make_folder
 from accerl_lerobot.evaluation.pictures import drawing
-from accerl_lerobot.ranges import Positive, Repeats, Section
 from accerl_lerobot.replay.pacing import decisions_under_way
 from accerl_lerobot.replay.turns import Schedule
 
@@ -63,7 +63,7 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
         InputError: the recipe or the checkpoint cannot be used.
         RuntimeError: the books do not add up.
     """
-    from accerl_lerobot.preflight import check_policy, check_world
+    from accerl_lerobot.engine.preflight import check_policy, check_world
 
     console, root = Console(), expanded(config.output_dir, "output_dir")
     run: RunConfig = parse(

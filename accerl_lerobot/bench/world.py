@@ -20,11 +20,11 @@ import numpy as np
 from rich.table import Table
 
 from accerl_lerobot.bench.host import host, spread
+from accerl_lerobot.config.ranges import Positive, Range, Repeats, Section
 from accerl_lerobot.demos.writing import simulators
 from accerl_lerobot.envs.gl import import_mujoco
 from accerl_lerobot.envs.metaworld import ACTION_DIM, MetaWorld, MetaWorldConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.ranges import Positive, Range, Repeats, Section
 from accerl_lerobot.seeds import train_seed
 
 OURS, EVERY_STEP, STOCK = "ours", "ours_every_step", "stock"

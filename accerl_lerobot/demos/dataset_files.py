@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from accerl_lerobot.errors import InputError
-from accerl_lerobot.safety import (
+from accerl_lerobot.checkpoint.safety import (
     MIB,
     Origin,
     brief,
@@ -32,6 +31,7 @@ from accerl_lerobot.safety import (
     read_json,
     safe_join,
 )
+from accerl_lerobot.errors import InputError
 
 if TYPE_CHECKING:
     import pyarrow.parquet as pq

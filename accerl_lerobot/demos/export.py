@@ -19,9 +19,12 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from accerl_lerobot.checkpoint import CONFIG
-from accerl_lerobot.config import RunConfig
-from accerl_lerobot.console import Console
+from accerl_lerobot.checkpoint.layout import CONFIG
+from accerl_lerobot.checkpoint.safety import Origin, check_folder
+from accerl_lerobot.cli.console import Console
+from accerl_lerobot.config.parsing import decode, drop_consents, read_recipe
+from accerl_lerobot.config.ranges import Choice, Range, Section, Steps
+from accerl_lerobot.config.run import RunConfig
 from accerl_lerobot.demos.expert import Episode
 from accerl_lerobot.demos.export_dreams import write_dreams
 from accerl_lerobot.demos.record import features, frames
@@ -39,10 +42,7 @@ from accerl_lerobot.envs.base import World
 from accerl_lerobot.envs.config import EnvConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL
-from accerl_lerobot.parsing import decode, drop_consents, read_recipe
-from accerl_lerobot.ranges import Choice, Range, Section, Steps
 from accerl_lerobot.replay.journal import EPISODES, Done, read_journal, whole_episodes
-from accerl_lerobot.safety import Origin, check_folder
 from accerl_lerobot.world_model.recorded import DREAMS, read_dreams
 
 SIDECAR = Path("meta") / "accerl_rollouts.json"

@@ -13,10 +13,10 @@ import contextlib
 import json
 import sys
 
+from accerl_lerobot.checkpoint.safety import Origin
 from accerl_lerobot.demos.dataset_files import checked
 from accerl_lerobot.demos.sft import CODE_REVISION, REFUSED
 from accerl_lerobot.policies.guard import guarded, input_error
-from accerl_lerobot.safety import Origin
 
 
 def main() -> None:

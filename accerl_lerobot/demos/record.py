@@ -22,6 +22,7 @@ import draccus
 import numpy as np
 from rich.progress import Progress
 
+from accerl_lerobot.config.ranges import Range, Section, Seed, Share
 from accerl_lerobot.demos.expert import Episode, make_expert, play
 from accerl_lerobot.demos.starts import Start, write_starts
 from accerl_lerobot.demos.writing import (
@@ -37,7 +38,6 @@ from accerl_lerobot.envs.base import World, WorldSpec
 from accerl_lerobot.envs.config import EnvConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE
-from accerl_lerobot.ranges import Range, Section, Seed, Share
 from accerl_lerobot.seeds import demo_seed
 
 SIDECAR = Path("meta") / "accerl_demos.json"

@@ -19,13 +19,13 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from accerl_lerobot.checkpoint import BACKBONE, displaced, relocate
+from accerl_lerobot.checkpoint.layout import BACKBONE, displaced, relocate
+from accerl_lerobot.checkpoint.safety import Origin, check_remote_code, read_json
+from accerl_lerobot.config.ranges import LearningRate, Range, Section, Steps, Threads
 from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.policies.backbone import BackboneConfig, write_backbone
 from accerl_lerobot.policies.files import fetched_checkpoint
 from accerl_lerobot.policies.plugins import discovery, register_policies
-from accerl_lerobot.ranges import LearningRate, Range, Section, Steps, Threads
-from accerl_lerobot.safety import Origin, check_remote_code, read_json
 
 logger = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from accerl_lerobot.safety import Origin, read_json, safe_join
+from accerl_lerobot.checkpoint.safety import Origin, read_json, safe_join
 from accerl_lerobot.seeds import EVAL_SEEDS
 
 Start = tuple[str, int]

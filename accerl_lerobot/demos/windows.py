@@ -5,12 +5,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from accerl_lerobot.checkpoint.safety import Origin, brief
 from accerl_lerobot.demos.dataset_files import checked
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.safety import Origin, brief
 
 if TYPE_CHECKING:
-    from accerl_lerobot.config import DatasetConfig
+    from accerl_lerobot.config.run import DatasetConfig
 
 
 def open_metadata(dataset: DatasetConfig) -> Any:

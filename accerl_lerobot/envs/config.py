@@ -9,7 +9,7 @@ from typing import Annotated, Self
 
 import draccus
 
-from accerl_lerobot.ranges import Range, Section
+from accerl_lerobot.config.ranges import Range, Section
 
 
 @dataclass(frozen=True, kw_only=True)

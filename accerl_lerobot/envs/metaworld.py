@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from accerl_lerobot.config.ranges import Range
 from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec, checked_actions
 from accerl_lerobot.envs.config import EnvConfig
 from accerl_lerobot.envs.gl import import_mujoco, new_renderer
@@ -23,7 +24,6 @@ from accerl_lerobot.envs.metaworld_tasks import description, resolve
 from accerl_lerobot.envs.shift import ShiftConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
-from accerl_lerobot.ranges import Range
 
 CAMERAS = ("topview", "corner", "corner2", "corner3", "corner4", "behindGripper", "gripperPOV")
 STATE_DIM = 4

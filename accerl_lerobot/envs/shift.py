@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
-from accerl_lerobot.ranges import Positive, Range, Section
+from accerl_lerobot.config.ranges import Positive, Range, Section
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

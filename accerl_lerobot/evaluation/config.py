@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
-from accerl_lerobot.ranges import Range, Section, Steps
+from accerl_lerobot.config.ranges import Range, Section, Steps
 from accerl_lerobot.rollout.runner import EpisodePlan
 from accerl_lerobot.seeds import eval_seed
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from accerl_lerobot.checkpoint import CHECKPOINTS, LAST, PRETRAINED, SUMMARY
+from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.kinds import POLICY, RECIPE, RUN, SUCCESS_MODEL, WORLD_MODEL, read_json
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from huggingface_hub import DatasetCard, EvalResult, ModelCard, ModelCardData
 
+from accerl_lerobot.config.imports import DISCOVER
 from accerl_lerobot.hub.around import FOLDER, Around
 from accerl_lerobot.hub.config import REPO_ID
 from accerl_lerobot.hub.contents import RECORD, Files
@@ -25,7 +26,6 @@ from accerl_lerobot.hub.kinds import (
     read_json,
 )
 from accerl_lerobot.hub.portable import AWAY
-from accerl_lerobot.imports import DISCOVER
 from accerl_lerobot.policies.plugins import discovery
 from accerl_lerobot.world_model.config import PIXELS
 

@@ -7,8 +7,8 @@ import re
 from dataclasses import dataclass, field
 from typing import Literal
 
+from accerl_lerobot.config.ranges import Section
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.ranges import Section
 
 REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 RepoType = Literal["model", "dataset"]

@@ -9,8 +9,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from accerl_lerobot import checkpoint as checkpoints
-from accerl_lerobot.checkpoint import (
+from accerl_lerobot.checkpoint import layout as checkpoints
+from accerl_lerobot.checkpoint.layout import (
     BACKBONE,
     CHECKPOINTS,
     CONFIG_FOLDERS,

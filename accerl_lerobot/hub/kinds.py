@@ -7,10 +7,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.checkpoint import CHECKPOINTS, PREPROCESSOR, PRETRAINED, SUMMARY
-from accerl_lerobot.checkpoint import CONFIG as RECIPE
+from accerl_lerobot.checkpoint.layout import CHECKPOINTS, PREPROCESSOR, PRETRAINED, SUMMARY
+from accerl_lerobot.checkpoint.layout import CONFIG as RECIPE
+from accerl_lerobot.checkpoint.safety import JSON_MOST
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.safety import JSON_MOST
 
 POLICY, WORLD_MODEL, SUCCESS_MODEL = "policy", "world model", "success model"
 DATASET, RUN = "dataset", "run"

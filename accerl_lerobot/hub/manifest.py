@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from accerl_lerobot import __version__
-from accerl_lerobot.checkpoint import digest
+from accerl_lerobot.checkpoint.layout import digest
+from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.kinds import NEEDED
-from accerl_lerobot.safety import brief
 
 MANIFEST = "accerl_manifest.json"
 CARD = "README.md"

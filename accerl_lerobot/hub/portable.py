@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 
-from accerl_lerobot.checkpoint import places_of_names
+from accerl_lerobot.checkpoint.layout import places_of_names
 
 AWAY = "LOCAL"
 """Stands for the folders above a file that was on the pusher's machine."""

@@ -23,18 +23,18 @@ from huggingface_hub import HfApi, hf_hub_download
 from huggingface_hub.errors import RepositoryNotFoundError
 from huggingface_hub.hf_api import RepoFile
 
-from accerl_lerobot.checkpoint import CHECKPOINTS, LAST, PRETRAINED, defect, relocate, write_manifest
-from accerl_lerobot.checkpoint import CONFIG as RECIPE
-from accerl_lerobot.checkpoint import MANIFEST as OF_CHECKPOINT
+from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, defect, relocate, write_manifest
+from accerl_lerobot.checkpoint.layout import CONFIG as RECIPE
+from accerl_lerobot.checkpoint.layout import MANIFEST as OF_CHECKPOINT
+from accerl_lerobot.checkpoint.safety import JSON_MOST, REVISION, Origin, brief, read_bytes, unsafe_name
+from accerl_lerobot.config.parsing import drop_consents, read_recipe
+from accerl_lerobot.engine.resume import LOCK
 from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.hub.config import REPO_TYPES, PullConfig
 from accerl_lerobot.hub.contents import RECORD
 from accerl_lerobot.hub.kinds import POLICY, RUN, recognise
 from accerl_lerobot.hub.manifest import CARD, MANIFEST, Entry, read_manifest, verify
 from accerl_lerobot.hub.trouble import ANSWERS_MOST, ANSWERS_S, REQUESTS_MOST, SLOWEST, check_commit, told
-from accerl_lerobot.parsing import drop_consents, read_recipe
-from accerl_lerobot.resume import LOCK
-from accerl_lerobot.safety import JSON_MOST, REVISION, Origin, brief, read_bytes, unsafe_name
 
 CACHE = ".cache"
 """Where the client keeps its books while it fetches into a folder."""

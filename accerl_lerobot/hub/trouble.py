@@ -30,8 +30,8 @@ from huggingface_hub.errors import (
 )
 from huggingface_hub.utils._http import default_client_factory
 
+from accerl_lerobot.checkpoint.safety import MIB, REVISION, brief
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.safety import MIB, REVISION, brief
 
 CONNECT_S, SILENT_S = 30.0, 300.0
 """Seconds until a Hub that does not answer, or stops answering, counts as unreachable. The client has no

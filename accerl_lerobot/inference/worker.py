@@ -27,13 +27,13 @@ from typing import Annotated
 
 import numpy as np
 
-from accerl_lerobot import snapshot
-from accerl_lerobot.checkpoint import WEIGHTS
+from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.checkpoint.layout import WEIGHTS
+from accerl_lerobot.config.ranges import Range, Section, Threads
+from accerl_lerobot.engine.fault_points import reach
 from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.fault_points import reach
 from accerl_lerobot.inference.batcher import Batcher, BatcherStats
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
-from accerl_lerobot.ranges import Range, Section, Threads
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.contract import Asked, Server, stopped
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from accerl_lerobot.config.ranges import Range, Section
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.ranges import Range, Section
 
 SPECIAL_TOKENS = (
     "<|pad|>", "<|im_start|>", "<|im_end|>", "<image>", "<fake_token_around_image>", "<global-img>",

@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from accerl_lerobot.checkpoint.tensors import in_parts, part_of, whole
 from accerl_lerobot.experience import TASK, Decision, Request
 from accerl_lerobot.policies.value_head import Value
-from accerl_lerobot.tensors import in_parts, part_of, whole
 
 if TYPE_CHECKING:
     from accerl_lerobot.policies.config import PolicyConfig

@@ -11,8 +11,8 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-from accerl_lerobot import snapshot
-from accerl_lerobot.checkpoint import PRETRAINED, TRAINING_STATE, WEIGHTS, relocate
+from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS, relocate
 from accerl_lerobot.policies.config import PolicyConfig
 
 

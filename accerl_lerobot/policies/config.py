@@ -8,10 +8,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from accerl_lerobot.checkpoint.safety import check_remote_code
+from accerl_lerobot.config.ranges import Device, Range, Section
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.samplers import SamplerConfig
-from accerl_lerobot.ranges import Device, Range, Section
-from accerl_lerobot.safety import check_remote_code
 
 if TYPE_CHECKING:
     from accerl_lerobot.policies.base import PolicyAdapter

@@ -13,9 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.checkpoint import BACKBONE, CONFIG_FOLDERS, PREPROCESSOR, STEP_FOLDERS
-from accerl_lerobot.errors import InputError
-from accerl_lerobot.safety import (
+from accerl_lerobot.checkpoint.layout import BACKBONE, CONFIG_FOLDERS, PREPROCESSOR, STEP_FOLDERS
+from accerl_lerobot.checkpoint.safety import (
     HUB_ID,
     Origin,
     brief,
@@ -26,6 +25,7 @@ from accerl_lerobot.safety import (
     safe_join,
     tensor_shapes,
 )
+from accerl_lerobot.errors import InputError
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 OURS, VALUE_HEAD, FAMILY = "accerl.json", "value_head.safetensors", "family.safetensors"

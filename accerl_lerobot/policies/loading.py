@@ -20,11 +20,13 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from accerl_lerobot.checkpoint import BACKBONE, relocate
+from accerl_lerobot.checkpoint.isolation import rehearse
+from accerl_lerobot.checkpoint.layout import BACKBONE, relocate
+from accerl_lerobot.checkpoint.safety import Origin, brief, read_tensors
+from accerl_lerobot.checkpoint.tensors import place, whole
+from accerl_lerobot.config.imports import imported
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK
-from accerl_lerobot.imports import imported
-from accerl_lerobot.isolation import rehearse
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Model
@@ -45,8 +47,6 @@ from accerl_lerobot.policies.samplers import SamplerConfig
 from accerl_lerobot.policies.tuning import merged_state_dict, tune
 from accerl_lerobot.policies.value_head import ValueHead
 from accerl_lerobot.policies.verify import load_weights
-from accerl_lerobot.safety import Origin, brief, read_tensors
-from accerl_lerobot.tensors import place, whole
 
 logger = logging.getLogger(__name__)
 

@@ -14,7 +14,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.checkpoint import BACKBONE, CONFIG_FOLDERS, FAST, PREPROCESSOR, STEP_FOLDERS
+from accerl_lerobot.checkpoint.layout import BACKBONE, CONFIG_FOLDERS, FAST, PREPROCESSOR, STEP_FOLDERS
 from accerl_lerobot.errors import InputError
 
 

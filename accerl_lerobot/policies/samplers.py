@@ -12,8 +12,8 @@ from typing import Annotated, Any, Literal
 
 import draccus
 
+from accerl_lerobot.config.ranges import Positive, Range, Section, Share
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.ranges import Positive, Range, Section, Share
 
 
 @dataclass(frozen=True, kw_only=True)

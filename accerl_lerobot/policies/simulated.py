@@ -18,13 +18,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from accerl_lerobot import snapshot
+from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.config.ranges import NonNegative, Range, Section
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.policies.base import OBS_STATE, Evaluation, PolicyAdapter
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.density import normal_entropy, normal_log_prob
 from accerl_lerobot.policies.value_head import Value
-from accerl_lerobot.ranges import NonNegative, Range, Section
 
 STD = 0.3
 

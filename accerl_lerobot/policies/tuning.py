@@ -8,10 +8,10 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from accerl_lerobot.checkpoint.tensors import whole
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import TuningConfig
 from accerl_lerobot.policies.family import Family, Model
-from accerl_lerobot.tensors import whole
 
 
 def tune(policy: Any, model: Model, family: Family, config: TuningConfig) -> None:

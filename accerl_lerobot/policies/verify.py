@@ -12,9 +12,9 @@ from typing import Any
 
 import torch
 
+from accerl_lerobot.checkpoint.safety import Origin, read_tensors, tensor_shapes
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.family import Model
-from accerl_lerobot.safety import Origin, read_tensors, tensor_shapes
 
 NAMED = 3
 """Tensors of a kind that an error names."""

@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
+from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.replay import pacing
 from accerl_lerobot.replay.pacing import Pace, ReplayConfig
-from accerl_lerobot.snapshot import kind
 
 KEY_MEMORY = 65_536
 """How many keys are remembered to recognise a segment that is sent twice, even after it has left the store.

@@ -26,8 +26,8 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
+from accerl_lerobot.config.ranges import Range, Section, Steps
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.ranges import Range, Section, Steps
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,9 +6,9 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
-from accerl_lerobot.checkpoint import CONFIG
+from accerl_lerobot.checkpoint.layout import CONFIG
+from accerl_lerobot.engine.resume import how_to_go_on
 from accerl_lerobot.report.read import Run
-from accerl_lerobot.resume import how_to_go_on
 
 PLUGIN = "accerl_lerobot.envs.lerobot_plugin"
 

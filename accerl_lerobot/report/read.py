@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from accerl_lerobot.checkpoint import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY
+from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY
+from accerl_lerobot.checkpoint.safety import Origin, check_folder
+from accerl_lerobot.config.parsing import check_recipe_size, load_yaml
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.metrics import METRICS
-from accerl_lerobot.parsing import check_recipe_size, load_yaml
-from accerl_lerobot.safety import Origin, check_folder
 from accerl_lerobot.world_model.imagination_config import FILMS
 
 Record = dict[str, Any]

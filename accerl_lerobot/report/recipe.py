@@ -8,9 +8,9 @@ import typing
 from collections.abc import Mapping
 from typing import Any
 
+from accerl_lerobot.config.parsing import TYPE, choices_of, decode, encode, section_of
+from accerl_lerobot.engine.staleness import lag_limits
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.parsing import TYPE, choices_of, decode, encode, section_of
-from accerl_lerobot.staleness import lag_limits
 
 Flat = dict[str, Any]
 """Dotted field → value."""

@@ -26,8 +26,8 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.experience import Segment
-from accerl_lerobot.snapshot import kind
 
 GroupAdvantage = Literal["grpo", "rloo", "grpo_no_std"]
 GroupFilter = Literal["outcome", "return", "none"]

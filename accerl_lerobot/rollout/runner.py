@@ -15,16 +15,16 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from accerl_lerobot.checkpoint.snapshot import kind
+from accerl_lerobot.config.ranges import NonNegative, Range, Section, Steps
 from accerl_lerobot.envs.base import ChunkResult, World
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Observation, Origin, Request, Segment
-from accerl_lerobot.ranges import NonNegative, Range, Section, Steps
 from accerl_lerobot.rollout.groups import GroupAdvantage, GroupFilter, Groups, Outcome, Place
 from accerl_lerobot.rollout.segments import SegmentBuilder
 from accerl_lerobot.rollout.slot import Slot
 from accerl_lerobot.rollout.tasks import TaskSampling
 from accerl_lerobot.seeds import noise_seed
-from accerl_lerobot.snapshot import kind
 
 
 @dataclass(frozen=True, kw_only=True)

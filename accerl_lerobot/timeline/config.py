@@ -6,8 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from accerl_lerobot.config.ranges import NonNegative, Positive, Section
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.ranges import NonNegative, Positive, Section
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from accerl_lerobot.checkpoint import CONFIG
+from accerl_lerobot.checkpoint.layout import CONFIG
+from accerl_lerobot.checkpoint.safety import Origin, check_folder
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.safety import Origin, check_folder
 from accerl_lerobot.timeline.parts import Section, read_sections
 from accerl_lerobot.timeline.states import CHECKPOINT, ROLES, STATES, TIMELINE, TRAINING, role_of
 

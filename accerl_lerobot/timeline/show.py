@@ -13,7 +13,7 @@ from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
-from accerl_lerobot.checkpoint import write_atomically
+from accerl_lerobot.checkpoint.layout import write_atomically
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.timeline.chrome import trace
 from accerl_lerobot.timeline.config import TimelineConfig

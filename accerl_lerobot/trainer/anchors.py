@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from accerl_lerobot.checkpoint.tensors import part_of, whole
 from accerl_lerobot.policies.base import PolicyAdapter
-from accerl_lerobot.tensors import part_of, whole
 from accerl_lerobot.trainer.sharding import swapped_in
 
 CRITIC = "value_head."

@@ -7,8 +7,8 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+from accerl_lerobot.config.ranges import Positive, Range, Section, Share, Steps, Threads
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.ranges import Positive, Range, Section, Share, Steps, Threads
 
 ZERO = ("zero2", "zero3")
 """Ways of sharing in which no rank keeps everything."""

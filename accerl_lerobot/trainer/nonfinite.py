@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from accerl_lerobot import snapshot
+from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import Segment
 
 if TYPE_CHECKING:

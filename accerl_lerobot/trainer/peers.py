@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING, Any
 import ray
 from ray.exceptions import GetTimeoutError, RayActorError, RayError
 
-from accerl_lerobot import snapshot
 from accerl_lerobot.algorithms import AlgorithmConfig
-from accerl_lerobot.checkpoint import WEIGHTS
+from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.checkpoint.layout import WEIGHTS
+from accerl_lerobot.engine.fault_points import reach
 from accerl_lerobot.experience import Segment
-from accerl_lerobot.fault_points import reach
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.trainer.config import TrainerConfig
 

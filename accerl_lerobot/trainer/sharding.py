@@ -22,10 +22,10 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 from torch.utils.checkpoint import checkpoint
 
+from accerl_lerobot.checkpoint.tensors import in_parts
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.base import Evaluation, PolicyAdapter
 from accerl_lerobot.policies.value_head import Value
-from accerl_lerobot.tensors import in_parts
 from accerl_lerobot.trainer.config import TrainerConfig
 
 

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from accerl_lerobot.snapshot import field_names, kind_named
+from accerl_lerobot.checkpoint.snapshot import field_names, kind_named
 from accerl_lerobot.transport.nameless import aligned
 
 SIZES = struct.Struct("<II")

@@ -12,9 +12,9 @@ from typing import Annotated, ClassVar, Literal
 
 import draccus
 
+from accerl_lerobot.checkpoint.safety import check_remote_code
+from accerl_lerobot.config.ranges import LearningRate, NonNegative, Positive, Range, Section, Share, Steps
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.ranges import LearningRate, NonNegative, Positive, Range, Section, Share, Steps
-from accerl_lerobot.safety import check_remote_code
 
 Objective = Literal["refiner", "edm", "flow"]
 PIXELS = "pixels"

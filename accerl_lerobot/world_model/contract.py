@@ -26,10 +26,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from accerl_lerobot.checkpoint.safety import brief
+from accerl_lerobot.checkpoint.snapshot import kind
+from accerl_lerobot.config.imports import imported
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.imports import imported
-from accerl_lerobot.safety import brief
-from accerl_lerobot.snapshot import kind
 
 if TYPE_CHECKING:
     from accerl_lerobot.envs.base import World

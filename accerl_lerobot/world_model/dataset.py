@@ -18,7 +18,7 @@ from accerl_lerobot.world_model.episodes import Episode
 from accerl_lerobot.world_model.frames import resized
 
 if TYPE_CHECKING:
-    from accerl_lerobot.dataset_config import DatasetConfig
+    from accerl_lerobot.config.dataset import DatasetConfig
 
 SUCCESS = "next.success"
 

@@ -8,13 +8,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from accerl_lerobot.config import DatasetConfig, RunConfig, journal_folder
+from accerl_lerobot.config.run import DatasetConfig, RunConfig, journal_folder
+from accerl_lerobot.engine.preflight import policy_to_be
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.loading import load_lerobot_config
-from accerl_lerobot.preflight import policy_to_be
 from accerl_lerobot.world_model.baselines import learnt_within
 from accerl_lerobot.world_model.config import TrialConfig
 from accerl_lerobot.world_model.contract import WorldModelSpec

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from accerl_lerobot.snapshot import kind
+from accerl_lerobot.checkpoint.snapshot import kind
 
 
 @kind

@@ -12,7 +12,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
-from accerl_lerobot.snapshot import kind
+from accerl_lerobot.checkpoint.snapshot import kind
 
 
 @kind

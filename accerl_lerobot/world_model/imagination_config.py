@@ -6,9 +6,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from accerl_lerobot.dataset_config import DatasetConfig
+from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.config.ranges import Choice, LearningRate, Positive, Range, Section, Share, Steps
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.ranges import Choice, LearningRate, Positive, Range, Section, Share, Steps
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.world_model.config import StandInConfig, TrialConfig
 from accerl_lerobot.world_model.kinds import KINDS, ModelKind

@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import torch
 
+from accerl_lerobot.checkpoint.optimizers import copied
 from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.experience import IMAGINED, Decision, Observation, Request, Segment
-from accerl_lerobot.optimizers import copied
 from accerl_lerobot.rollout.segments import SegmentBuilder
 from accerl_lerobot.world_model.baselines import OracleModel, ShuffledModel, learnt_within
 from accerl_lerobot.world_model.calibration import Calibration

@@ -20,9 +20,9 @@ import numpy as np
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
+from accerl_lerobot.checkpoint.safety import Origin, brief, tensor_shapes
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
-from accerl_lerobot.safety import Origin, brief, tensor_shapes
 
 DREAMS = "imagined"
 """Folder of a run's."""

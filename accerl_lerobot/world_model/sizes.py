@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from accerl_lerobot.ranges import Range
+from accerl_lerobot.config.ranges import Range
 from accerl_lerobot.world_model.config import (
     LearnableModelConfig,
     LearnConfig,

@@ -18,12 +18,19 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from accerl_lerobot.checkpoint.isolation import rehearse
+from accerl_lerobot.checkpoint.safety import (
+    Origin,
+    brief,
+    check_not_pickled,
+    read_json,
+    read_tensors,
+    safe_join,
+)
+from accerl_lerobot.config.imports import DISCOVER, discover
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.imports import DISCOVER, discover
-from accerl_lerobot.isolation import rehearse
 from accerl_lerobot.policies.files import check_origin, check_processor
 from accerl_lerobot.policies.guard import guarded, input_error
-from accerl_lerobot.safety import Origin, brief, check_not_pickled, read_json, read_tensors, safe_join
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
 if TYPE_CHECKING:

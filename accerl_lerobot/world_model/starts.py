@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.experience import Origin, Segment
-from accerl_lerobot.snapshot import kind
 from accerl_lerobot.world_model.contract import History, WorldModelSpec
 from accerl_lerobot.world_model.frames import executed, seen
 

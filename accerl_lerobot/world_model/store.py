@@ -21,11 +21,8 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import save_file
 
-from accerl_lerobot.errors import InputError
-from accerl_lerobot.imports import DISCOVER, discover
-from accerl_lerobot.isolation import rehearse
-from accerl_lerobot.policies.guard import Unfilled, guarded, input_error
-from accerl_lerobot.safety import (
+from accerl_lerobot.checkpoint.isolation import rehearse
+from accerl_lerobot.checkpoint.safety import (
     Origin,
     brief,
     check_name,
@@ -34,6 +31,9 @@ from accerl_lerobot.safety import (
     read_tensors,
     safe_join,
 )
+from accerl_lerobot.config.imports import DISCOVER, discover
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.guard import Unfilled, guarded, input_error
 from accerl_lerobot.world_model.config import LearnableModelConfig
 from accerl_lerobot.world_model.contract import Context, LearnableWorldModel, WorldModelSpec, new_learnable
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel

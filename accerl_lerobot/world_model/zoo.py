@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from accerl_lerobot.config.imports import imported
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.envs.base import WorldSpec
-from accerl_lerobot.imports import imported
 from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model.baselines import CopyModel, OracleModel, ShuffledModel
 from accerl_lerobot.world_model.contract import Means, WorldModel, WorldModelSpec

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from accerl_lerobot.config import DatasetConfig, RunConfig, encode, parse
+from accerl_lerobot.config.run import DatasetConfig, RunConfig, encode, parse
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError

@@ -16,12 +16,12 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from accerl_lerobot.config import DatasetConfig
+from accerl_lerobot.checkpoint.safety import Origin, read_json
+from accerl_lerobot.config.run import DatasetConfig
 from accerl_lerobot.demos import dataset_files
 from accerl_lerobot.demos.dataset_files import check_data, check_info, check_metadata, checked
 from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.safety import Origin, read_json
 
 ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 CAMERA = "observation.images.corner2"

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from accerl_lerobot.checkpoint.safety import Origin
 from accerl_lerobot.demos.expert import make_expert, play
 from accerl_lerobot.demos.record import SIDECAR, DemosConfig, record_demos
 from accerl_lerobot.demos.starts import read_starts
 from accerl_lerobot.envs import LeRobotEnvConfig, MetaWorldConfig, SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.safety import Origin
 from tests.rounding import assert_close
 
 TASKS = "handle-press-v3,reach-v3"

@@ -307,7 +307,7 @@ def test_a_start_that_cannot_be_fine_tuned(tmp_path: Path, stored: dict | None, 
 def test_a_moved_checkpoint_is_started_from_a_copy(
     tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    from accerl_lerobot.checkpoint import relocate
+    from accerl_lerobot.checkpoint.layout import relocate
     from accerl_lerobot.policies.config import PolicyConfig
     from accerl_lerobot.policies.loading import save_pretrained
 

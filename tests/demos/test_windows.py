@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from accerl_lerobot.config import DatasetConfig
+from accerl_lerobot.config.run import DatasetConfig
 from accerl_lerobot.demos.windows import open_metadata, task_texts
 from accerl_lerobot.errors import InputError
 

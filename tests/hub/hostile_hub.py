@@ -124,9 +124,9 @@ def main(seed: int, scratch: Path, times: int) -> dict[str, Any]:
     from huggingface_hub import constants, file_download
     from huggingface_hub.utils import _http
 
+    from accerl_lerobot.config.parsing import consents, read_recipe
     from accerl_lerobot.hub import pull, trouble
     from accerl_lerobot.hub.config import PullConfig
-    from accerl_lerobot.parsing import consents, read_recipe
 
     trouble.WINDOW_S, trouble.SILENT_S, trouble.SLOWEST = 0.5, 2.0, 1000
     constants.HF_HUB_ETAG_TIMEOUT = constants.HF_HUB_DOWNLOAD_TIMEOUT = 2

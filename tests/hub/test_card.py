@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from huggingface_hub import DatasetCard, ModelCard
 
-from accerl_lerobot.config import RunConfig, parse
+from accerl_lerobot.cli.verbs import CONFIGS
+from accerl_lerobot.config.run import RunConfig, parse
 from accerl_lerobot.hub.card import MARK
 from accerl_lerobot.hub.config import PushConfig
 from accerl_lerobot.hub.push import staged
-from accerl_lerobot.verbs import CONFIGS
 from tests.hub.folders import write_json, write_policy_folder, write_run_folder
 
 TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"

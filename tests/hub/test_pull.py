@@ -12,8 +12,9 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot import cli, doctor
-from accerl_lerobot.checkpoint import defect, write_manifest
+from accerl_lerobot import cli
+from accerl_lerobot.checkpoint.layout import defect, write_manifest
+from accerl_lerobot.cli import doctor
 from accerl_lerobot.hub import trouble
 from accerl_lerobot.hub.manifest import MANIFEST
 from tests.hub.folders import write_policy_folder, write_run_folder

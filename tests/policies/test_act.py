@@ -14,9 +14,9 @@ import pytest
 import torch
 
 from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.local import LocalEngine
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import stack_observations
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig

@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
-from accerl_lerobot.local import LocalEngine
 from accerl_lerobot.policies import diffusion
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import stack_observations

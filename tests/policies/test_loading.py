@@ -15,7 +15,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from accerl_lerobot.checkpoint import BACKBONE, PRETRAINED, save_checkpoint
+from accerl_lerobot.checkpoint.layout import BACKBONE, PRETRAINED, save_checkpoint
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig, ValueHeadConfig
 from accerl_lerobot.policies.loading import (

@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.algorithms import GIPOConfig
-from accerl_lerobot.config import RunConfig
-from accerl_lerobot.engine import Engine
+from accerl_lerobot.config.run import RunConfig
+from accerl_lerobot.engine.contract import Engine
+from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.experience import Request
-from accerl_lerobot.local import LocalEngine
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import stack_observations
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig

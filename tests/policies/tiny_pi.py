@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot.checkpoint import BACKBONE, FAST
+from accerl_lerobot.checkpoint.layout import BACKBONE, FAST
 from accerl_lerobot.policies.fast import data_only
 
 PALIGEMMA = "google/paligemma-3b-pt-224"

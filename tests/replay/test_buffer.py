@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot import snapshot
+from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay import Replay, ReplayConfig
 from accerl_lerobot.replay import buffer as buffer_module

@@ -13,12 +13,12 @@ from typing import Any
 import yaml
 
 from accerl_lerobot.algorithms import PPOConfig
-from accerl_lerobot.config import RunConfig, encode
-from accerl_lerobot.dataset_config import DatasetConfig
+from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.config.run import RunConfig, encode
+from accerl_lerobot.config.verbs import WorldModelRun
 from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig
 from accerl_lerobot.evaluation.stats import wilson_interval
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.verb_configs import WorldModelRun
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 
 HOSTILE = "<script>document.title = 'owned'</script>\"'><img src=x onerror=\"document.title = 'owned'\">"

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from accerl_lerobot.cli.verbs import CONFIGS
 from accerl_lerobot.evaluation.pictures import write_video
 from accerl_lerobot.report.config import ReportConfig
 from accerl_lerobot.report.page import write_report
-from accerl_lerobot.verbs import CONFIGS
 from tests.report.browser import Browser
 from tests.report.folders import HOSTILE, dreaming, dreams, metaworld, write_run, write_world_model
 

@@ -14,9 +14,10 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot import run
-from accerl_lerobot.config import LaunchConfig, RunConfig, parse
-from accerl_lerobot.console import Console
+from accerl_lerobot.cli.console import Console
+from accerl_lerobot.cli.verbs import CONFIGS
+from accerl_lerobot.config.run import LaunchConfig, RunConfig, parse
+from accerl_lerobot.engine import run
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
 from accerl_lerobot.report.commands import commands
@@ -24,7 +25,6 @@ from accerl_lerobot.report.config import ReportConfig
 from accerl_lerobot.report.page import write_report
 from accerl_lerobot.report.read import read_run
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.verbs import CONFIGS
 from tests.report.folders import (
     HOSTILE,
     dreaming,

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from accerl_lerobot import cli
+from accerl_lerobot.config.parsing import parse
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.parsing import parse
 from accerl_lerobot.report.config import ReportConfig
 from tests.report.folders import write_run
 
@@ -54,7 +54,7 @@ def test_one_run_under_two_names(
 
 
 def test_others_still_take_one_recipe() -> None:
-    from accerl_lerobot.config import RunConfig
+    from accerl_lerobot.config.run import RunConfig
 
     with pytest.raises(InputError, match="write --section.field=value"):
         parse(RunConfig, ["recipes/quickstart.yaml", "another"])

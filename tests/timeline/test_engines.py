@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import ray
 
-from accerl_lerobot import launch
-from accerl_lerobot.config import LaunchConfig
+from accerl_lerobot.config.run import LaunchConfig
+from accerl_lerobot.engine import launch
+from accerl_lerobot.engine.launch import RayEngine
+from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
-from accerl_lerobot.launch import RayEngine
-from accerl_lerobot.local import LocalEngine
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline import TIMELINE
 from accerl_lerobot.timeline.read import ABSENT, Timeline, read_timeline, shares

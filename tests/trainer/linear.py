@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from accerl_lerobot import snapshot
+from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import Decision, Origin, Request, Segment
 from accerl_lerobot.policies.base import Evaluation, PolicyAdapter
 from accerl_lerobot.policies.config import PolicyConfig

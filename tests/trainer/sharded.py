@@ -15,8 +15,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from accerl_lerobot import snapshot
 from accerl_lerobot.algorithms import AlgorithmConfig, DecoupledConfig, GIPOConfig, PPOConfig
+from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.base import Evaluation, PolicyAdapter
 from accerl_lerobot.policies.value_head import Value

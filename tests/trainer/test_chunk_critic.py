@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from accerl_lerobot.algorithms import ChunkCriticConfig, SelfImitationConfig
+from accerl_lerobot.engine.preflight import check_start
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Origin, Request, Segment
@@ -20,7 +21,6 @@ from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.flow import FlowContext, FlowFamily, FlowShape
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.samplers import FlowSamplerConfig
-from accerl_lerobot.preflight import check_start
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.chunk_critic import MEMBERS, ChunkCriticUpdate, Critic

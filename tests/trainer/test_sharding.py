@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot import snapshot
 from accerl_lerobot.algorithms import GIPOConfig
-from accerl_lerobot.config import LaunchConfig, RunConfig
+from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.config.run import LaunchConfig, RunConfig
 from accerl_lerobot.demos.sft import SFTConfig
+from accerl_lerobot.engine.preflight import check_start
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.preflight import check_start
 from accerl_lerobot.trainer.batch import turns
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.ranks import Ranks

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot import snapshot
 from accerl_lerobot.algorithms import GIPOConfig
+from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.checkpoint.tensors import whole
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import TuningConfig
 from accerl_lerobot.policies.loading import copy_weights
-from accerl_lerobot.tensors import whole
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.ranks import Ranks
 from accerl_lerobot.trainer.update import Update

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot import snapshot
 from accerl_lerobot.algorithms import GIPOConfig
-from accerl_lerobot.checkpoint import PRETRAINED, TRAINING_STATE
+from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig

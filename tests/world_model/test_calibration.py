@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot import snapshot
+from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request, Segment
 from accerl_lerobot.world_model.calibration import Calibration

@@ -15,9 +15,9 @@ import pytest
 import torch
 
 from accerl_lerobot import cli
+from accerl_lerobot.config.verbs import WorldModelEvalRun
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.verb_configs import WorldModelEvalRun
 from accerl_lerobot.world_model.baselines import CopyModel
 from accerl_lerobot.world_model.deciding import (
     Decided,

@@ -13,12 +13,14 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from accerl_lerobot import cli, console, isolation
-from accerl_lerobot.config import DatasetConfig, RunConfig, parse
+from accerl_lerobot import cli
+from accerl_lerobot.checkpoint import isolation
+from accerl_lerobot.cli import console
+from accerl_lerobot.config.run import DatasetConfig, RunConfig, parse
+from accerl_lerobot.config.verbs import WorldModelRun
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.verb_configs import WorldModelRun
 from accerl_lerobot.world_model import learn, offline, sources
 from accerl_lerobot.world_model.config import WorldModelConfig
 from accerl_lerobot.world_model.store import (

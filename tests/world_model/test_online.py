@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot import snapshot
+from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import IMAGINED, Segment
 from accerl_lerobot.world_model import online
 from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, TrialConfig

@@ -18,13 +18,14 @@ import pytest
 import torch
 from torch import nn
 
-from accerl_lerobot import cli, console
-from accerl_lerobot.config import parse
-from accerl_lerobot.console import Console
+from accerl_lerobot import cli
+from accerl_lerobot.cli import console
+from accerl_lerobot.cli.console import Console
+from accerl_lerobot.config.parsing import encode
+from accerl_lerobot.config.run import parse
+from accerl_lerobot.config.verbs import WorldModelEvalRun, WorldModelRun
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.parsing import encode
-from accerl_lerobot.verb_configs import WorldModelEvalRun, WorldModelRun
 from accerl_lerobot.world_model.config import (
     LearnableModelConfig,
     LearnConfig,
@@ -264,7 +265,7 @@ def test_it_goes_on_learning_in_a_run_and_is_saved_when_promoted(tiny_checkpoint
 
 
 def test_in_processes_of_their_own_they_find_it_too(tiny_checkpoint: Path, tmp_path: Path):
-    from accerl_lerobot.launch import RayEngine
+    from accerl_lerobot.engine.launch import RayEngine
 
     learn = OnlineLearnConfig(steps_per_episode=1.0, try_every=2, held_out=0.4, trial=LOOSE, batch=4)
     named = {"path": str(saved(tmp_path / "w")), "discover_packages_path": PACKAGE}

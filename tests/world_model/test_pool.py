@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from accerl_lerobot import snapshot
-from accerl_lerobot.checkpoint import TRAINING_STATE
-from accerl_lerobot.config import RunConfig, parse
+from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.checkpoint.layout import TRAINING_STATE
+from accerl_lerobot.config.run import RunConfig, parse
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 from accerl_lerobot.world_model.pool import DREAMS, check_workers, part, together

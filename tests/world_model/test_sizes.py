@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.config import RunConfig, encode, parse
+from accerl_lerobot.config.help import help_text
+from accerl_lerobot.config.run import RunConfig, encode, parse
+from accerl_lerobot.config.verbs import WorldModelRun
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.field_help import help_text
-from accerl_lerobot.verb_configs import WorldModelRun
 from accerl_lerobot.world_model.config import WorldModelConfig
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.episodes import Episode, cut, places

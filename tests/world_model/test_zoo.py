@@ -15,11 +15,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from accerl_lerobot.config import RunConfig, parse
+from accerl_lerobot.config.help import help_text
+from accerl_lerobot.config.run import RunConfig, parse
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED
-from accerl_lerobot.field_help import help_text
 from accerl_lerobot.world_model.baselines import CopyModel, OracleModel, ShuffledModel
 from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, StandInConfig
 from accerl_lerobot.world_model.contract import (

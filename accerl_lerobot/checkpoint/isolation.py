@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rehearsal of a load in a child process with a memory limit and a time limit.
+
+A config of a hundred bytes can ask for a terabyte, a tokenizer can loop for hours, and a native library can
+abort its process. The child does what the caller is about to do with files from an untrusted source. However
+it ends, the caller lives, and gets one line.
+
+The child is forked, since importing LeRobot again would take longer than most loads. It runs one thread, as
+PyTorch's data loaders do, and does not touch a GPU.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import faulthandler
+import json
+import math
+import os
+import resource
+import select
+import signal
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import cast
+
+from accerl_lerobot.checkpoint.safety import MIB, Origin, brief, safe_join, tensor_shapes
+from accerl_lerobot.errors import InputError
+
+SLACK = 1536 * MIB
+"""Bytes that a child may take beside its weights."""
+TIMES = 2
+"""Times that its weights may be held as float32: SmolVLA builds layers that it then drops."""
+CPU_S, CPU_S_PER_NUMBER = 15, 1e-7
+"""Seconds of processor time, and those for each number of its weights: a decision computes with all of them.
+Processor time, because a busy machine must not refuse a good file."""
+STALLED_S = 60
+"""Seconds without any processor time after which a child is given up, whatever it waits for."""
+LONGEST = 1000
+"""Characters of what a child says."""
+NO_MEMORY = ("MemoryError", "can't allocate", "Cannot allocate", "bad_alloc", "Unable to allocate")
+"""Words of errors, of Python, PyTorch, Linux, C++ and NumPy."""
+PR_SET_PDEATHSIG = 1
+
+
+def rehearse[T](task: Callable[[], T], folder: Path, origin: Origin) -> T:
+    """Runs `task` in a child process and gives what it returns, which JSON can say.
+
+    Where there is no ``/proc``, as on macOS, limits cannot be set, and it runs in this process.
+
+    Args:
+        task: loads what is in `folder`, on the CPU.
+        folder: its safetensors files set the limits.
+        origin: what named the folder, for the error.
+
+    Raises:
+        InputError: the one that `task` raised; or it raised something else, took too much memory or time, or
+            ended the process.
+    """
+    if not sys.platform.startswith("linux"):
+        return task()
+    names = (path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*.safetensors")))
+    headers = (tensor_shapes(safe_join(folder, name, origin), origin) for name in names)
+    numbers = sum(math.prod(shape) for header in headers for _, shape in header.values())
+    memory, cpu_s = SLACK + TIMES * 4 * numbers, round(CPU_S + CPU_S_PER_NUMBER * numbers)
+    reader, writer = os.pipe()
+    parent = os.getpid()
+    with warnings.catch_warnings():  # Python's about threads: the child runs none of the others
+        warnings.simplefilter("ignore", DeprecationWarning)
+        child = os.fork()
+    if child == 0:
+        os.close(reader)
+        _run(task, writer, parent, memory, cpu_s)
+    os.close(writer)
+    status = None
+    try:
+        said, status = _wait(child, reader)
+    finally:
+        os.close(reader)
+        if status is None:  # it may still run
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+    result, field, value, why = json.loads(said) if said else (None, None, None, _cause(status, cpu_s))
+    if any(words in why for words in NO_MEMORY):
+        field, why = None, f"takes more than {memory // MIB} MiB beside the libraries"
+    if field is not None:
+        raise InputError(field, value, why)
+    if why:
+        remedy = "its weights do not account for that; get it again, or another one"
+        raise InputError(origin.field, origin.value, f"loading it, tried in a process apart, {why}; {remedy}")
+    return cast(T, result)
+
+
+def _cause(status: int | None, cpu_s: int) -> str:
+    """Why a child said nothing."""
+    if status is None:
+        return f"waits for something since {STALLED_S} s"
+    code = os.waitstatus_to_exitcode(status)
+    if -code in (signal.SIGXCPU, signal.SIGKILL):
+        return f"takes more than {cpu_s} s of processor time"
+    return f"ends the process with {signal.Signals(-code).name if code < 0 else f'code {code}'}"
+
+
+def _run(task: Callable[[], object], writer: int, parent: int, memory: int, cpu_s: int) -> None:
+    """Runs in the child, and ends it."""
+    said = b""
+    try:
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:
+            os._exit(1)
+        _confine(memory, cpu_s)
+        said = _report(task())
+    except InputError as error:
+        value = None if error.value is None else str(error.value)[:LONGEST]
+        said = _report(None, error.field, value, error.remedy[:LONGEST])
+    except BaseException as error:  # Rust's panics are no `Exception`
+        said = _report(None, why=f"fails with {type(error).__name__}: {brief(error)}")
+    with contextlib.suppress(BaseException):
+        os.write(writer, said)
+    os._exit(0)
+
+
+def _report(result: object, field: str | None = None, value: str | None = None, why: str = "") -> bytes:
+    return json.dumps((result, field, value, why)).encode()
+
+
+def _confine(memory: int, cpu_s: int) -> None:
+    faulthandler.disable()
+    null = os.open(os.devnull, os.O_RDWR)
+    for descriptor in (0, 1, 2):
+        os.dup2(null, descriptor)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)
+    os.environ["TOKENIZERS_PARALLELISM"] = "false"
+    if (torch := sys.modules.get("torch")) is not None:
+        torch.set_num_threads(1)  # the threads of a pool are not copied by a fork
+    taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    limits = {
+        resource.RLIMIT_AS: taken + memory,
+        resource.RLIMIT_CPU: cpu_s,
+        resource.RLIMIT_CORE: 0,
+    }
+    for kind, limit in limits.items():
+        hard = resource.getrlimit(kind)[1]
+        limit = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
+        resource.setrlimit(kind, (limit, limit))
+
+
+def _wait(child: int, reader: int) -> tuple[bytes, int | None]:
+    """All that it says, and how it ended; None if it stalls."""
+    ticks, since, said = -1, time.monotonic(), b""
+    while True:
+        ready, _, _ = select.select([reader], [], [], 1.0)
+        if ready and (part := os.read(reader, select.PIPE_BUF)):
+            said += part
+            continue
+        if ready:  # it has closed its end
+            return said, os.waitpid(child, 0)[1]
+        now = _ticks(child)
+        if now != ticks:
+            ticks, since = now, time.monotonic()
+        elif time.monotonic() - since > STALLED_S:
+            return said, None
+
+
+def _ticks(child: int) -> int:
+    """Processor time of a process, in the system's units; its name, which is in brackets, may have spaces."""
+    fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
+    return int(fields[11]) + int(fields[12])

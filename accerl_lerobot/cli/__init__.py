@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The verbs. Answers ``--help`` at once; everything heavy is imported by the verb that needs it."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import importlib
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+
+from accerl_lerobot import __version__
+from accerl_lerobot.engine.stopping import TerminatedError, interrupted
+from accerl_lerobot.errors import InputError, one_line
+
+LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR")
+VERBS = {
+    "train": (
+        "verbs:train",
+        "improve a policy by online RL (demonstrations and SFT first, if the recipe says so)",
+    ),
+    "demos": ("verbs:demos", "record scripted-expert demonstrations into a LeRobotDataset"),
+    "sft": ("verbs:sft", "fine-tune on a LeRobotDataset with LeRobot's own trainer"),
+    "eval": ("verbs:evaluate", "success of a checkpoint, with its confidence interval"),
+    "world-model": ("verbs:world_model", "learn to dream a world from LeRobotDatasets, and be tried on them"),
+    "world-model-eval": ("verbs:world_model_eval", "try a world model on episodes of one or several sources"),
+    "push": ("verbs:push", "a policy, world model, dataset or run to the Hub, as one commit"),
+    "pull": ("verbs:pull", "what was pushed into a new folder, pinned and checked"),
+    "report": ("verbs:report", "one HTML page of a run, or of several beside each other, to look at"),
+    "timeline": ("verbs:timeline", "what every worker of a run did when: a picture, a trace and shares"),
+    "export": ("verbs:export", "the episodes of a run as a LeRobotDataset, with a picture at every env step"),
+    "doctor": ("doctor:main", "resolve a recipe and check this machine"),
+    "bench": ("verbs:bench", "measure this machine: accerl bench world, policy, throughput or latency"),
+}
+
+
+def usage() -> str:
+    """The text of ``accerl --help``."""
+    lines = [
+        f"accerl {__version__}: online reinforcement learning of LeRobot policies",
+        "",
+        "usage: accerl VERB [recipe.yaml] [--section.field=value …]",
+        "",
+    ]
+    lines += [f"  {verb:16} {what}" for verb, (_, what) in VERBS.items()]
+    lines += [
+        "",
+        "examples:",
+        "  accerl doctor recipes/quickstart.yaml",
+        "  accerl train --config_path=recipes/quickstart.yaml --trainer.lr=1e-5",
+        "  accerl eval --config_path=RUN/config.yaml --policy.path=RUN/checkpoints/last/pretrained_model",
+        "",
+        "accerl VERB --help lists what people change, --help=all every field. ACCERL_LOG=INFO says more.",
+    ]
+    return "\n".join(lines)
+
+
+def show_help(verb: str, rest: list[str], section: str) -> int:
+    """``accerl VERB --help``; for bench, of the measurement that is named, or a list of them."""
+    from accerl_lerobot.cli.verbs import CONFIGS
+    from accerl_lerobot.config.help import help_text
+
+    names = [name for name in CONFIGS if name.split()[0] == verb]
+    named = [name for name in names if len(names) == 1 or name.split()[-1] in rest]
+    if named:
+        text = help_text(f"accerl {named[0]}", CONFIGS[named[0]], VERBS[verb][1], section)
+    else:
+        docs = (sys.modules[CONFIGS[name].__module__].__doc__ or "" for name in names)
+        briefs = (doc.partition("\n\n")[0].replace("\n", " ")[:90] for doc in docs)
+        lines = [f"  {name.split()[-1]:16} {brief}" for name, brief in zip(names, briefs, strict=True)]
+        usage = [f"usage: accerl {verb} NAME [--field=value …]", "", *lines]
+        text = "\n".join([*usage, "", f"accerl {verb} NAME --help lists its fields."])
+    sys.stdout.write(f"{text}\n")
+    return 0
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs a verb; returns the exit code."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        sys.stdout.write(usage() + "\n")
+        return 0
+    if arguments[0] == "--version":
+        sys.stdout.write(__version__ + "\n")
+        return 0
+    verb, rest = arguments[0], arguments[1:]
+    if verb not in VERBS:
+        near = difflib.get_close_matches(verb, VERBS, n=1)
+        hint = f"did you mean {near[0]}? Otherwise " if near else ""
+        sys.stderr.write(f"accerl: no verb {verb!r}; {hint}use one of {', '.join(VERBS)}\n")
+        return 2
+    return exit_code("accerl", lambda: run(verb, rest))
+
+
+def exit_code(program: str, work: Callable[[], int]) -> int:
+    """The exit code of `work`, or of the error that ends it, which is told in one line."""
+    try:
+        code = work()
+        sys.stdout.flush()
+    except InputError as error:
+        # Ray raises a subclass whose text is a whole traceback; the error itself is inside.
+        return _refuse(program, str(getattr(error, "cause", error)))
+    except KeyboardInterrupt as stop:
+        _refuse(program, "interrupted")
+        return 143 if isinstance(stop, TerminatedError) else 130
+    except Exception as error:
+        if isinstance(error, BrokenPipeError) and not _output_is_open():
+            return 128 + signal.SIGPIPE
+        logging.getLogger(__name__).debug("%s failed", program, exc_info=error)
+        _refuse(program, one_line(error))
+        return 1
+    return code
+
+
+def run(verb: str, rest: list[str]) -> int:
+    """Runs a verb, or shows its help."""
+    set_up_logging()
+    if (section := help_asked(rest)) is not None:
+        return show_help(verb, rest, section)
+    module, _, name = VERBS[verb][0].partition(":")
+    with guarded():
+        function: Callable[[list[str]], int] = getattr(
+            importlib.import_module(f"accerl_lerobot.cli.{module}"), name
+        )
+        return function(rest)
+
+
+def help_asked(rest: list[str]) -> str | None:
+    """The section that ``--help`` names, "" for a bare one; None: it is not asked for."""
+    for argument in rest:
+        flag, _, section = argument.partition("=")
+        if flag in ("-h", "--help"):
+            return section
+    return None
+
+
+def set_up_logging() -> None:
+    """Sets the level that ``ACCERL_LOG`` names.
+
+    Raises:
+        InputError: it names none.
+    """
+    level = os.environ.get("ACCERL_LOG", "WARNING").upper()
+    if level not in LEVELS:
+        raise InputError("ACCERL_LOG", level, f"use {', '.join(LEVELS)}")
+    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s")
+
+
+@contextlib.contextmanager
+def guarded() -> Iterator[None]:
+    """Ends and removes, on the way out, whatever is started within and left behind."""
+    from accerl_lerobot.engine import guardian
+
+    guardian.start()  # before anything that it is to clean up
+    with interrupted():
+        yield
+
+
+def _refuse(program: str, text: str) -> int:
+    with contextlib.suppress(OSError):  # whoever reads it may be gone
+        sys.stderr.write(f"{program}: {text}\n")
+    return 2
+
+
+def _output_is_open() -> bool:
+    """False if the reader of the standard output has gone, as ``head`` does; then nothing more is written."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return False
+    return True

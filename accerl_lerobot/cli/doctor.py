@@ -1,0 +1,435 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``accerl doctor``: will this recipe run on this machine? Every answer that is no comes with its remedy.
+
+Nothing here is guessed: a frame is really drawn, in a process of its own, because a broken OpenGL can take a
+process down; packages are compared with the pins this version was tested with.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import importlib.util
+import math
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from accerl_lerobot.errors import InputError, expanded
+
+if TYPE_CHECKING:
+    from accerl_lerobot.config.run import RunConfig
+
+OK, WARN, FAIL = "ok", "warn", "FAIL"
+RESOLVED = "--resolved="
+DISTRIBUTION = "accerl-lerobot"
+
+GIB = 2**30
+POLICY_PROCESS_GIB, ROLLOUT_PROCESS_GIB, SIMULATOR_GIB, RAY_GIB = 1.2, 0.4, 0.17, 0.7
+"""Resident memory without a policy's weights, for which see `preflight.policy_gib`: a process with torch and
+LeRobot, a rollout process without its worlds, each task of each MetaWorld (renderers included), Ray's own
+processes."""
+DISK_GIB = 2.0
+"""Space that demonstrations, checkpoints and videos of a run may need."""
+RENDER_TIMEOUT_S = 120
+
+DRAW = """
+import time
+from accerl_lerobot.envs.gl import import_mujoco, new_renderer
+mujoco = import_mujoco()
+model = mujoco.MjModel.from_xml_string(
+    "<mujoco><worldbody><light pos='0 0 3'/><geom size='.3' rgba='1 0 0 1'/></worldbody></mujoco>"
+)
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+renderer = new_renderer(model, 64, 64)
+renderer.update_scene(data)
+renderer.render()
+started = time.perf_counter()
+renderer.update_scene(data)
+frame = renderer.render()
+print("drawn", frame.std() > 1, round(1000 * (time.perf_counter() - started), 1))
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """One answer."""
+
+    name: str
+    status: str
+    """ok, warn or FAIL; only the last makes the exit code 1."""
+    text: str
+    """The finding and, unless it is fine, the remedy."""
+
+
+def main(arguments: list[str]) -> int:
+    """``accerl doctor``; 0 if everything needed is there, otherwise 1.
+
+    ``--resolved=FILE`` also writes the whole config to which the recipe resolves.
+    """
+    files = [argument.removeprefix(RESOLVED) for argument in arguments if argument.startswith(RESOLVED)]
+    arguments = [argument for argument in arguments if not argument.startswith(RESOLVED)]
+    config, history, checks = _resolve(arguments) if arguments else (None, 1, [])
+    checks += [*pulled(arguments), *machine(config, history)]
+    if config is not None:
+        checks += [*pace(config), *dreams(config), *placement(config)]
+    for check in checks:
+        sys.stdout.write(f"{check.status:5} {check.name:10} {check.text}\n")
+    failed = sum(check.status == FAIL for check in checks)
+    sys.stdout.write(f"\n{'all good' if not failed else f'{failed} of {len(checks)} checks failed'}\n")
+    if config is not None and files:
+        from accerl_lerobot.config.run import encode
+
+        path = expanded(files[-1], RESOLVED.strip("-="))
+        try:
+            path.write_text(yaml.safe_dump(encode(config), sort_keys=False, allow_unicode=True))
+        except OSError as error:
+            remedy = f"cannot be written: {error.strerror}; name another file"
+            raise InputError(RESOLVED.strip("-="), str(path), remedy) from error
+    return 1 if failed else 0
+
+
+def machine(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
+    """Needs of any run, and those of `config` beyond; `history` is the policy's ``n_obs_steps``."""
+    yield python_version()
+    yield packages()
+    yield hugging_face_datasets()
+    yield ray_imports(joins=config is not None and config.launch.address is not None)
+    yield cuda(config)
+    yield rendering(needed=config is None or config.env.type == "metaworld")
+    yield from resources(config, history)
+
+
+def python_version() -> Check:
+    """The interpreter."""
+    fine = sys.version_info >= (3, 12)
+    return Check(
+        name="python",
+        status=OK if fine else FAIL,
+        text=f"{platform.python_version()} in {sys.prefix}" + ("" if fine else "; use 3.12 or newer"),
+    )
+
+
+def pins(requirements: list[str]) -> dict[str, tuple[str, bool]]:
+    """Package → (pinned version, whether it belongs to an extra) from requirement strings.
+
+    Example:
+        >>> pins(["lerobot[dataset]==0.6.1", 'mujoco==3.3.2; extra == "metaworld"'])
+        {'lerobot': ('0.6.1', False), 'mujoco': ('3.3.2', True)}
+    """
+    found: dict[str, tuple[str, bool]] = {}
+    for requirement in requirements:
+        match = re.match(r"([A-Za-z0-9._-]+)\s*(?:\[[^]]*\])?\s*\(?==\s*([^;\s)]+)", requirement)
+        if match and match[1] not in found:
+            found[match[1]] = (match[2], "extra ==" in requirement)
+    return found
+
+
+def packages() -> Check:
+    """Installed versions against the pins."""
+    try:
+        pinned = pins(importlib.metadata.requires(DISTRIBUTION) or [])
+    except importlib.metadata.PackageNotFoundError:
+        return Check(name="packages", status=FAIL, text=f"{DISTRIBUTION} is not installed: run make setup")
+    differing: list[str] = []
+    absent: list[str] = []
+    extras: list[str] = []
+    for name, (version, extra) in pinned.items():
+        try:
+            installed = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            (extras if extra else absent).append(name)
+            continue
+        if installed.partition("+")[0] != version:
+            differing.append(f"{name} {installed} instead of {version}")
+    if absent:
+        text = f"not installed: {', '.join(absent)}; run make setup"
+        return Check(name="packages", status=FAIL, text=text)
+    if differing:
+        text = f"{', '.join(differing)}: not the tested versions; run make setup"
+        return Check(name="packages", status=WARN, text=text)
+    text = f"{len(pinned) - len(extras)} at the tested versions, lerobot {pinned['lerobot'][0]} among them"
+    if extras:
+        text += f"; without the extras' {', '.join(extras)}"
+    return Check(name="packages", status=OK, text=text)
+
+
+def hugging_face_datasets() -> Check:
+    """A folder named ``datasets`` stands in for a package that is absent, and one with a file shadows it."""
+    spec = importlib.util.find_spec("datasets")
+    origin = None if spec is None else spec.origin
+    try:
+        version = importlib.metadata.version("datasets")
+    except importlib.metadata.PackageNotFoundError:
+        version = None
+    if version is None or origin is None:
+        text = "Hugging Face datasets is not installed, or a folder hides it; run make setup"
+        return Check(name="datasets", status=FAIL, text=text)
+    home = Path(str(importlib.metadata.distribution("datasets").locate_file("datasets"))).resolve()
+    if Path(origin).resolve().parent != home:
+        text = f"{origin} shadows Hugging Face datasets: remove or rename it"
+        return Check(name="datasets", status=FAIL, text=text)
+    return Check(name="datasets", status=OK, text=f"Hugging Face datasets {version}")
+
+
+def ray_imports(joins: bool = False) -> Check:
+    """Ray, with the environment a run would give it."""
+    from accerl_lerobot.engine import ray_environment
+
+    ray_environment.prepare(joins)
+    try:
+        import ray
+    except Exception as error:
+        return Check(name="ray", status=FAIL, text=f"cannot be imported ({_line(error)}); run make setup")
+    return Check(name="ray", status=OK, text=ray.__version__)
+
+
+def cuda(config: RunConfig | None) -> Check:
+    """Checks that torch sees a GPU, and tells if the recipe insists on one."""
+    wish = config.policy.device if config is not None else "auto"
+    try:
+        import torch
+    except Exception as error:
+        return Check(name="torch", status=FAIL, text=f"cannot be imported ({_line(error)}); run make setup")
+    if torch.cuda.is_available():
+        number, name = torch.cuda.device_count(), torch.cuda.get_device_name(0)
+        return Check(name="torch", status=OK, text=f"{torch.__version__}, {number} × {name}")
+    text = f"{torch.__version__}, no CUDA device"
+    if wish.startswith("cuda"):
+        text += f": policy.device={wish!r} cannot be had; use auto or cpu"
+        return Check(name="torch", status=FAIL, text=text)
+    return Check(name="torch", status=OK, text=f"{text}; policies run on the CPU")
+
+
+def rendering(*, needed: bool, script: str = DRAW) -> Check:
+    """Draws a frame in a process of its own.
+
+    Args:
+        needed: whether the recipe's world draws with MuJoCo; otherwise a failure is only a warning.
+        script: what draws it.
+    """
+    bad = FAIL if needed else WARN
+    if importlib.util.find_spec("mujoco") is None:
+        text = "MuJoCo is not installed; install the extra: accerl-lerobot[metaworld]"
+        return Check(name="rendering", status=bad, text=text)
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", script],
+            capture_output=True,
+            text=True,
+            timeout=RENDER_TIMEOUT_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        text = f"no frame within {RENDER_TIMEOUT_S} s; set MUJOCO_GL to osmesa or egl"
+        return Check(name="rendering", status=bad, text=text)
+    words = done.stdout.split()
+    if done.returncode == 0 and words[:2] == ["drawn", "True"]:
+        text = f"MuJoCo draws 64 × 64 pixels in {words[2]} ms ({_backend()})"
+        return Check(name="rendering", status=OK, text=text)
+    if done.returncode == 0:
+        text = "MuJoCo draws an empty picture; set MUJOCO_GL to osmesa or egl"
+        return Check(name="rendering", status=bad, text=text)
+    last = (done.stderr.strip().splitlines() or [f"ended with code {done.returncode}"])[-1]
+    return Check(name="rendering", status=bad, text=last.removeprefix("accerl_lerobot.errors.InputError: "))
+
+
+def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
+    """Cores, memory and disk, against what the recipe will take."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    text, status = f"{cores} cores", OK
+    if config is not None:
+        threads = max(config.trainer.num_threads, config.inference.num_threads)
+        text += f" for {config.rollout.workers} rollout, 1 inference, 1 trainer"
+        if config.rollout.workers > cores:
+            status, text = WARN, f"{text}: they will wait for each other; lower rollout.workers"
+        elif threads > cores:
+            status, text = WARN, f"{text}: lower trainer.num_threads and inference.num_threads to {cores}"
+    yield Check(name="cpu", status=status, text=text)
+    free = _memory_gib()
+    if free is not None:
+        text, status = f"{free:.1f} GiB free", OK
+        if config is not None:
+            need = memory_estimate_gib(config, history)
+            text += f", about {need:.1f} GiB needed"
+            if need > free:
+                remedy = "lower rollout.workers, rollout.worlds or replay.capacity, or use a smaller policy"
+                status, text = WARN, f"{text}: {remedy}"
+        yield Check(name="memory", status=status, text=text)
+    disk = shutil.disk_usage(Path.cwd()).free / GIB
+    short = disk < DISK_GIB
+    text = f"{disk:.0f} GiB free here" + (f"; a run may need {DISK_GIB:.0f}" if short else "")
+    yield Check(name="disk", status=WARN if short else OK, text=text)
+
+
+def dreams(config: RunConfig) -> Iterator[Check]:
+    """True if what is to be imagined fits the world and the policy."""
+    if not config.imagination.share:
+        return
+    from accerl_lerobot.world_model.dreaming import check_imagination
+
+    try:
+        check_imagination(config)
+    except InputError as error:
+        yield Check(name="dreams", status=FAIL, text=str(error))
+    else:
+        kind, share = config.imagination.model, config.imagination.share
+        yield Check(name="dreams", status=OK, text=f"{share:.0%} of every batch; what dreams: {kind}")
+        yield from _unwatched(config)
+
+
+def _unwatched(config: RunConfig) -> Iterator[Check]:
+    """Says so where the kill switch hardly ever trips: too few real episodes end beside dreams."""
+    imagination, episodes = config.imagination, config.rollout.episodes
+    beside = imagination.horizon is None and imagination.beginnings > 0
+    if beside and 0 < episodes <= imagination.witnesses:
+        why = f"that takes more real episodes than imagination.witnesses, {imagination.witnesses}"
+        text = f"are hardly ever switched off where they flatter: {why}, and rollout.episodes is {episodes}"
+        yield Check(name="dreams", status=WARN, text=text)
+
+
+def placement(config: RunConfig) -> Iterator[Check]:
+    """Which worker would be where; the cluster is asked if one is to be joined."""
+    from accerl_lerobot.engine.preflight import check_placement
+
+    try:
+        rows = check_placement(config)
+    except InputError as error:
+        yield Check(name="placement", status=FAIL, text=str(error))
+    else:
+        yield from (Check(name="placement", status=OK, text=row) for row in rows)
+
+
+def memory_estimate_gib(config: RunConfig, history: int = 1) -> float:
+    """Rough: processes with their libraries, the policy's weights, simulators, replay and films."""
+    from accerl_lerobot.engine.preflight import policy_gib
+
+    return policy_gib(config) + sum(memory_parts_gib(config, history).values())
+
+
+def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
+    """Field → rough memory of what it sizes."""
+    from accerl_lerobot.engine.staleness import under_way
+
+    rollout, films, local = config.rollout, config.evaluation, config.launch.engine == "local"
+    tasks = len(getattr(config.env, "tasks", ("one",)))
+    simulator = tasks * SIMULATOR_GIB if config.env.type == "metaworld" else 0.0
+    pictures = history * observation_bytes(config) / GIB
+    frames = min(films.videos, films.episodes) * config.env.max_steps / films.video_every
+    return {
+        # The driver, inference and the trainer each load torch.
+        "trainer.ranks": POLICY_PROCESS_GIB
+        if local
+        else RAY_GIB + (2 + config.trainer.ranks) * POLICY_PROCESS_GIB,
+        "inference.workers": 0.0 if local else (config.inference.workers - 1) * POLICY_PROCESS_GIB,
+        "rollout.workers": 0.0 if local else rollout.workers * ROLLOUT_PROCESS_GIB,
+        "rollout.worlds": rollout.workers * rollout.worlds * simulator,
+        "rollout.segment_length": under_way(config) * pictures,
+        "replay.capacity": config.replay.capacity * pictures,
+        **({"algorithm.memory": config.remembered * pictures} if config.remembered else {}),
+        "evaluation.videos": frames * 3 * films.video_size**2 / GIB,
+    }
+
+
+def observation_bytes(config: RunConfig) -> int:
+    """Bytes of one env step's images; what else a decision holds is small beside them."""
+    env: Any = config.env
+    side = getattr(
+        env, "image_size", 96
+    )  # LeRobot's own environments differ; PushT's pictures have 96 pixels
+    return 3 * side * side * len(getattr(env, "cameras", ("one",)))
+
+
+def pace(config: RunConfig) -> Iterator[Check]:
+    """How far apart collecting and learning may run under this recipe, and how much it collects."""
+    from accerl_lerobot.engine.staleness import executed, lag_limits, under_way
+
+    replay, trainer = config.replay, config.trainer
+    in_flight = under_way(config)
+    bound, of_pace = lag_limits(config)
+    text = f"at most {bound} updates with {in_flight} decisions under way"
+    if of_pace > bound:
+        text += (
+            f"; the pace alone allows {of_pace}, so segments may be thrown away as too old: "
+            "lower replay.capacity, replay.ahead or replay.samples_per_insert, or raise replay.max_lag"
+        )
+    yield Check(name="lag", status=WARN if of_pace > bound else OK, text=text)
+    collected = math.ceil(trainer.updates * trainer.batch_decisions / replay.samples_per_insert)
+    text = f"{trainer.updates:,} updates of {trainer.batch_decisions} on about {collected:,} decisions"
+    if actions := executed(config):
+        text += f", at most {collected * actions:,} env steps"
+    yield Check(name="work", status=OK, text=text)
+
+
+def _resolve(arguments: list[str]) -> tuple[RunConfig | None, int, list[Check]]:
+    from accerl_lerobot.config.run import RunConfig, parse
+    from accerl_lerobot.engine.preflight import check_start
+
+    try:
+        config: RunConfig = parse(RunConfig, arguments)
+        history = check_start(config)
+    except InputError as error:
+        return None, 1, [Check(name="recipe", status=FAIL, text=str(error))]
+    return config, history, [Check(name="recipe", status=OK, text="resolves")]
+
+
+def pulled(arguments: list[str]) -> Iterator[Check]:
+    """The fields that `pull` has dropped from the recipe."""
+    from accerl_lerobot.config.parsing import read_arguments
+    from accerl_lerobot.hub.contents import RECORD
+    from accerl_lerobot.hub.kinds import read_json
+
+    with contextlib.suppress(InputError):
+        recipe = read_arguments(arguments)[0]
+        for folder in recipe.absolute().parents if recipe is not None else ():
+            dropped = read_json(folder / RECORD).get("dropped")
+            name = Path(os.path.relpath(str(recipe), folder)).as_posix()
+            fields = dropped.get(name) if isinstance(dropped, dict) else None
+            if isinstance(fields, dict) and fields:
+                names = ", ".join(map(ascii, fields))
+                text = f"without {names}, which let code run: add them if you trust it"
+                yield Check(name="pulled", status=WARN, text=text)
+
+
+def total_memory_gib() -> float | None:
+    """Memory of this machine, or its container's limit; None where that is unknown."""
+    return _memory_of("MemTotal", 0)
+
+
+def _memory_gib() -> float | None:
+    """Memory that can be had, within the container's limit; None where that is unknown."""
+    return _memory_of("MemAvailable", 1)
+
+
+def _memory_of(entry: str, used: int) -> float | None:
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    entries = {line.split(":")[0]: int(line.split()[1]) * 1024 for line in lines}
+    found = float(entries.get(entry, 0))
+    group = Path("/sys/fs/cgroup")
+    with contextlib.suppress(OSError, ValueError):  # no such file, or no limit
+        limit, taken = (int((group / f"memory.{name}").read_text()) for name in ("max", "current"))
+        found = min(found, limit - used * taken)
+    return found / GIB
+
+
+def _backend() -> str:
+    from accerl_lerobot.envs.gl import choose_backend
+
+    return os.environ.get("MUJOCO_GL") or choose_backend() or "the display"
+
+
+def _line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

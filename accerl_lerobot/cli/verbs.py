@@ -1,0 +1,354 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The verbs of ``accerl``, once their arguments are parsed.
+
+Results go to the standard output, everything else to the standard error: LeRobot prints while it loads, and
+what a verb hands on should stay readable for programs.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from accerl_lerobot.bench.latency import BenchLatencyConfig
+from accerl_lerobot.bench.policy import BenchPolicyConfig
+from accerl_lerobot.bench.throughput import BenchThroughputConfig
+from accerl_lerobot.bench.world import BenchWorldConfig
+from accerl_lerobot.checkpoint.layout import CONFIG
+from accerl_lerobot.cli.console import Console
+from accerl_lerobot.config.parsing import read_arguments
+from accerl_lerobot.config.run import RunConfig, encode, parse
+from accerl_lerobot.config.verbs import DemosRun, EvalRun, SFTRun, WorldModelEvalRun, WorldModelRun
+from accerl_lerobot.demos.export import ExportConfig
+from accerl_lerobot.errors import (
+    InputError,
+    check_absent,
+    expanded,
+    is_full,
+    kept_traceback,
+    make_folder,
+)
+from accerl_lerobot.hub.config import PullConfig, PushConfig
+from accerl_lerobot.policies.config import Load
+from accerl_lerobot.report.config import ReportConfig
+from accerl_lerobot.rollout.runner import EpisodeResult
+from accerl_lerobot.timeline.config import TimelineConfig
+
+NO_DATASET = "name a LeRobotDataset, on the Hub or with dataset.root"
+
+
+def train(arguments: list[str], load: Load | None = None) -> int:
+    """``accerl train``.
+
+    Args:
+        arguments: of the command line.
+        load: makes the policy's adapter; None: of LeRobot's checkpoint.
+    """
+    config: RunConfig = parse(RunConfig, arguments)
+    from accerl_lerobot.engine import guardian, run
+    from accerl_lerobot.engine.contract import WorkerError
+    from accerl_lerobot.engine.preflight import check_start
+    from accerl_lerobot.engine.resume import begun_run, how_to_go_on, locked
+    from accerl_lerobot.engine.stopping import StoppedError
+
+    begun = begun_run(read_arguments(arguments)[0], config) if config.resume else None
+    if load is None and begun is None:
+        check_start(config)  # before there is a folder
+    console = Console()
+    directory = run.make_output_dir(config) if begun is None else begun.directory
+    console.say(f"run {directory}")
+    guardian.explain(remedy=f"to go on: {how_to_go_on(directory)}")
+    try:
+        with (
+            redirect_stdout(sys.stderr),
+            kept_traceback(directory),
+            locked(directory, "config_path", "another process goes on with it"),
+        ):
+            wanted = None if begun is None else begun.checkpoint
+            summary = run.train(config, directory, console, wanted, load)
+    except InputError:
+        if begun is None:
+            _discard_unused(directory)
+        raise
+    except StoppedError as stopped:
+        console.say(str(stopped))
+        return 128 + stopped.number
+    except BaseException as error:
+        if is_full(error):
+            console.say(f"the disk of {directory} is full; free some space, then {how_to_go_on(directory)}")
+            return 1
+        if isinstance(error, WorkerError) and "\n" not in str(error):  # without a worker's traceback
+            console.say(f"{error}; to resume: {how_to_go_on(directory)}")
+            return 1
+        how = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+        console.say(f"{how}; to resume from the last checkpoint: {how_to_go_on(directory)}")
+        raise
+    before = summary["success_before"]
+    console.say(
+        f"success {'' if before is None else f'{before:.1%} → '}{summary['success_after']:.1%} "
+        f"in {summary['wall_s']:.0f} s; see {directory / 'success_curve.png'}"
+    )
+    sys.stdout.write(json.dumps(summary, indent=2) + "\n")
+    return 0
+
+
+def demos(arguments: list[str]) -> int:
+    """``accerl demos``."""
+    config: DemosRun = parse(DemosRun, arguments, recipe_class=RunConfig)
+    from accerl_lerobot.demos.record import record_demos
+    from accerl_lerobot.engine.preflight import check_disk, check_world, demos_bytes
+
+    with redirect_stdout(sys.stderr):
+        check_disk(config.demos.root, demos_bytes(config.demos, check_world(config.env)), "demos.root")
+        path = record_demos(config.env, config.demos)
+    sys.stdout.write(f"{path}\n")
+    return 0
+
+
+def sft(arguments: list[str]) -> int:
+    """``accerl sft``."""
+    config: SFTRun = parse(SFTRun, arguments, recipe_class=RunConfig)
+    if config.dataset.repo_id is None:
+        raise InputError("dataset.repo_id", None, NO_DATASET)
+    if config.sft.steps == 0:
+        raise InputError("sft.steps", 0, "use at least 1")
+    from accerl_lerobot.demos.sft import run_sft
+    from accerl_lerobot.demos.windows import task_texts
+    from accerl_lerobot.engine import run
+    from accerl_lerobot.engine.preflight import check_disk, check_training_data, check_world, sft_policy
+    from accerl_lerobot.policies.loading import resolve_device
+
+    device = str(resolve_device(config.device, "device"))
+    policy = sft_policy(config.sft)
+    spec = None if config.env is None else check_world(config.env)
+    meta = check_training_data(config.sft, config.dataset, policy, spec, {})
+    check_disk(config.output_dir, 0)
+    directory = run.make_output_dir(config)
+    console = Console()
+    with (
+        redirect_stdout(sys.stderr),
+        kept_traceback(directory),
+        console.stage("SFT", total=config.sft.steps) as stage,
+    ):
+        path = run_sft(
+            config.sft,
+            config.dataset.repo_id,
+            config.dataset.root,
+            directory / "sft",
+            config.seed,
+            device,
+            task_texts(meta),
+            on_step=lambda step, loss: stage.update(step, f"loss {loss:.3f}"),
+            revision=config.dataset.revision,
+        )
+    sys.stdout.write(f"{path}\n")
+    return 0
+
+
+def evaluate(arguments: list[str]) -> int:
+    """``accerl eval``."""
+    config: EvalRun = parse(EvalRun, arguments, recipe_class=RunConfig)
+    out = expanded(config.output_dir, "output_dir") if config.output_dir else None
+    if out is not None:
+        check_absent(out)
+    from accerl_lerobot.engine import run
+    from accerl_lerobot.engine.loop import run_plans
+    from accerl_lerobot.engine.preflight import check_machine
+    from accerl_lerobot.evaluation.config import evaluation_plans
+    from accerl_lerobot.evaluation.summary import summarise, table
+
+    rooms = ("seed", "env", "policy", "rollout", "inference", "evaluation", "launch")
+    whole = RunConfig(**{name: getattr(config, name) for name in rooms})
+    check_machine(whole)
+    film = config.evaluation.videos if out else 0
+    console = Console()
+    with redirect_stdout(sys.stderr):
+        spec = run.check_world(whole.env)
+        tasks, history = spec.tasks, run.check_policy(whole, spec)
+        engine = run.make_engine(whole, tasks, history)
+        try:
+            episodes = config.evaluation.episodes
+            engine.plan(evaluation_plans(tasks, episodes, "eval", seed=config.seed, film=film))
+            results = run_plans(engine, config.evaluation.episodes, "eval", console)
+        finally:
+            engine.close()
+    summary: dict[str, Any] = summarise(results) | {"policy": config.policy.path}
+    console.say(f"{config.policy.path}, LeRobot's sampler")
+    console.rich.print(table(summary, "evaluation"))
+    sys.stdout.write(json.dumps(summary) + "\n")
+    if out is not None:
+        _write_evaluation(out, summary, results)
+    return 0
+
+
+def world_model(arguments: list[str]) -> int:
+    """``accerl world-model``; 1 if it fails its trial."""
+    config: WorldModelRun = parse(WorldModelRun, arguments, recipe_class=RunConfig)
+    if config.dataset.repo_id is None:
+        raise InputError("dataset.repo_id", None, NO_DATASET)
+    from accerl_lerobot.world_model.offline import learn_world_model
+
+    return _tried(config, lambda directory, console: learn_world_model(config, directory, console))
+
+
+def world_model_eval(arguments: list[str]) -> int:
+    """``accerl world-model-eval``; 1 if it fails its trial."""
+    config: WorldModelEvalRun = parse(WorldModelEvalRun, arguments, recipe_class=RunConfig)
+    from accerl_lerobot.world_model.evaluate import evaluate
+
+    return _tried(config, lambda directory, console: evaluate(config, directory, console))
+
+
+def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Console], dict[str, Any]]) -> int:
+    """Does the work in a new folder and shows the trial it ends with."""
+    from accerl_lerobot.engine.run import make_output_dir
+    from accerl_lerobot.world_model.by_source import compared
+    from accerl_lerobot.world_model.show import gates, sources_table, table
+
+    directory = make_output_dir(config)
+    (directory / CONFIG).write_text(yaml.safe_dump(encode(config), sort_keys=False))
+    console = Console()
+    console.say(f"run {directory}")
+    try:
+        with redirect_stdout(sys.stderr), kept_traceback(directory):
+            found = work(directory, console)
+    except InputError:
+        _discard_unused(directory)
+        raise
+    console.rich.print(table(found))
+    if compared(found):
+        console.rich.print(sources_table(found))
+    for line in gates(found):
+        console.say(line)
+    console.say(f"{'passed' if found['passed'] else 'FAILED'}; see {directory / 'preview.mp4'}")
+    sys.stdout.write(json.dumps(found, indent=2) + "\n")
+    return 0 if found["passed"] else 1
+
+
+def push(arguments: list[str]) -> int:
+    """``accerl push``."""
+    config: PushConfig = parse(PushConfig, arguments)
+    from accerl_lerobot.hub.push import push as to_hub
+
+    with redirect_stdout(sys.stderr):
+        found = to_hub(config)
+    done = "is there already, as" if found["unchanged"] else "is now"
+    Console().say(f"{found['kind']} {done} {found['url']} at commit {found['commit']}")
+    sys.stdout.write(json.dumps(found, indent=2) + "\n")
+    return 0
+
+
+def pull(arguments: list[str]) -> int:
+    """``accerl pull``."""
+    config: PullConfig = parse(PullConfig, arguments)
+    from accerl_lerobot.hub.pull import pull as from_hub
+
+    with redirect_stdout(sys.stderr):
+        found = from_hub(config)
+    console = Console()
+    console.say(f"{found['kind']} {found['path']} is {found['commit']}, {found['checked']} files checked")
+    for name, fields in found.get("dropped", {}).items():
+        console.say(f"dropped from {name}, as it would let code run: {', '.join(fields)}")
+    sys.stdout.write(json.dumps(found, indent=2) + "\n")
+    return 0
+
+
+def report(arguments: list[str]) -> int:
+    """``accerl report``."""
+    config: ReportConfig = parse(ReportConfig, arguments)
+    from accerl_lerobot.report.page import write_report
+
+    sys.stdout.write(f"{write_report(config, CONFIGS)}\n")
+    return 0
+
+
+def timeline(arguments: list[str]) -> int:
+    """``accerl timeline``."""
+    config: TimelineConfig = parse(TimelineConfig, arguments)
+    from accerl_lerobot.timeline.show import show_timelines, table
+
+    found = show_timelines(config)
+    Console().rich.print(table(found))
+    sys.stdout.write(json.dumps(found, indent=2) + "\n")
+    return 0
+
+
+def export(arguments: list[str]) -> int:
+    """``accerl export``."""
+    config: ExportConfig = parse(ExportConfig, arguments)
+    from accerl_lerobot.demos.export import export_episodes
+
+    console = Console()
+    with redirect_stdout(sys.stderr):
+        found = export_episodes(config, console)
+    sys.stdout.write(json.dumps(found, indent=2) + "\n")
+    return 0
+
+
+def bench(arguments: list[str]) -> int:
+    """``accerl bench NAME``; see `CONFIGS` for the names."""
+    name = arguments[0] if arguments else ""
+    if f"bench {name}" not in CONFIGS:
+        names = [verb.split()[1] for verb in CONFIGS if verb.startswith("bench ")]
+        raise InputError("bench", name, f"name what is measured: {', '.join(names)}")
+    config = parse(CONFIGS[f"bench {name}"], arguments[1:])
+    return measure(f"accerl_lerobot.bench.{name}", config)
+
+
+def measure(module_name: str, config: Any) -> int:
+    """Runs ``bench_NAME`` of the module ``….NAME``, and shows what its ``table`` makes of the result."""
+    module: Any = importlib.import_module(module_name)
+    with redirect_stdout(sys.stderr):
+        result = getattr(module, f"bench_{module_name.rpartition('.')[2]}")(config)
+    Console().rich.print(module.table(result))
+    sys.stdout.write(json.dumps(result, indent=2) + "\n")
+    return 0
+
+
+CONFIGS: dict[str, type[Any]] = {
+    "train": RunConfig,
+    "demos": DemosRun,
+    "sft": SFTRun,
+    "eval": EvalRun,
+    "world-model": WorldModelRun,
+    "world-model-eval": WorldModelEvalRun,
+    "push": PushConfig,
+    "pull": PullConfig,
+    "report": ReportConfig,
+    "timeline": TimelineConfig,
+    "export": ExportConfig,
+    "doctor": RunConfig,
+    "bench world": BenchWorldConfig,
+    "bench policy": BenchPolicyConfig,
+    "bench throughput": BenchThroughputConfig,
+    "bench latency": BenchLatencyConfig,
+}
+"""Verb → what its command line is parsed into."""
+
+
+def _write_evaluation(out: Path, summary: dict[str, Any], results: list[EpisodeResult]) -> None:
+    from accerl_lerobot.evaluation.pictures import write_video
+
+    make_folder(out, "output_dir")
+    (out / "evaluation.json").write_text(json.dumps(summary, indent=2) + "\n")
+    for result in results:
+        if result.frames:
+            outcome = "success" if result.success else "failure"
+            name = f"{result.plan.task.replace('/', '-')}_{result.plan.seed}_{outcome}.mp4"
+            write_video(out / name, [[result.frames]], fps=20)
+
+
+def _discard_unused(directory: Path) -> None:
+    """Removes the folder of a run that was refused before it did anything, so that its name is free again."""
+    from accerl_lerobot.engine.resume import LOCK
+
+    if {path.name for path in directory.iterdir()} <= {CONFIG, LOCK}:
+        shutil.rmtree(directory)

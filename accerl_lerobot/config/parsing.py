@@ -1,0 +1,540 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Command lines and recipes into configs, and every mistake in them into one line.
+
+LeRobot's conventions, decoded by LeRobot's own draccus::
+
+    accerl train --config_path=recipes/quickstart.yaml --trainer.lr=1e-5 --env.task=drawer-open-v3
+
+Reading and merging is done here and not by draccus's argument parser, for four reasons: a field of a choice
+(``--algorithm.sigma``) needs no second ``--algorithm.type``, unknown keys are named together with what they
+resemble, a key that stands twice in a file is refused instead of winning silently, and every verb can read
+the recipe of a whole run and take the sections it needs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import json
+import shlex
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import draccus
+import yaml
+
+from accerl_lerobot.config.imports import discover
+from accerl_lerobot.config.ranges import check, hints_of, is_optional, is_union, unmarked, wanted
+from accerl_lerobot.errors import InputError, expanded
+
+DEEPEST = 50
+MOST_NODES = 20_000
+LARGEST_RECIPE = 2**20
+"""Bounds of a recipe: levels, values and bytes."""
+TYPE = "type"
+"""The key that picks one config of several, as in ``env.type``."""
+LONGEST_KEY = 80
+_GROUP = "use ppo or gipo with --algorithm.advantage=group --rollout.group_size=8"
+_PUSH = "a run pushes nothing: leave it out, and use accerl push --path=RUN --repo_id=USER/NAME afterwards"
+LEROBOT = {
+    "steps": "use trainer.updates (RL) or sft.steps (fine-tuning)",
+    "batch_size": "use trainer.batch_decisions (RL) or sft.batch_size (fine-tuning)",
+    "num_workers": "use rollout.workers (RL) or sft.num_workers (fine-tuning)",
+    "save_freq": "use save_every_updates or save_every_s",
+    "save_checkpoint": "use save_every_updates and save_every_s",
+    "eval_freq": "use evaluation.every_updates",
+    "env_eval_freq": "use evaluation.every_updates",
+    "eval.n_episodes": "use evaluation.episodes",
+    "eval.batch_size": "use rollout.worlds and rollout.workers",
+    "rename_map": "use policy.rename_map",
+    "optimizer.lr": "use trainer.lr (RL) or sft.lr (fine-tuning)",
+    "optimizer.betas": "use trainer.betas",
+    "optimizer.weight_decay": "use trainer.weight_decay",
+    "optimizer.grad_clip_norm": "use trainer.grad_clip",
+    "policy.type": "use policy.path (a checkpoint) or sft.policy.type (a new policy)",
+    "policy.pretrained_path": "use policy.path",
+    "policy.pretrained_revision": "use policy.revision",
+    "policy.use_amp": "use policy.precision=bf16",
+    "policy.use_peft": "use policy.tuning.mode=lora",
+    "policy.push_to_hub": _PUSH,
+    "policy.repo_id": _PUSH,
+    "push_to_hub": _PUSH,
+    "save_checkpoint_to_hub": _PUSH,
+    "algorithm.type=grpo": f"{_GROUP}. Otherwise ",
+    "algorithm.type=rloo": f"{_GROUP} --rollout.group_advantage=rloo. Otherwise ",
+    **{
+        f"env.type={name}": f"for LeRobot's {name} use env.type=lerobot --env.name={name}. Otherwise "
+        for name in (
+            "aloha", "isaaclab_arena", "libero", "libero_plus", "pusht", "robocasa", "robomme", "robotwin",
+            "vlabench",
+        )
+    },
+}  # fmt: skip
+"""LeRobot's names of what has another name here: field, or field=value → what to do."""
+REGISTERS = "registers"
+"""In a field's metadata: the package that it names registers types of the section that the field is in."""
+CONSENT = frozenset(
+    {
+        "trust_remote_code", "code_revision", "hub_path", "discover_packages_path", "extra_args",
+        "address", "open_cluster",
+    }
+)  # fmt: skip
+"""Names of the fields that let somebody's code run with the user's rights: from the Hub, from a package, by
+further arguments of ``lerobot-train``, or from a Ray cluster, which exchanges pickles with the run. Only the
+command line can set them. A recipe may have come with the very code that it would allow."""
+
+
+def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[Any] | None = None) -> Any:
+    """Parses ``--config_path=…`` and overrides into a config.
+
+    Args:
+        config_class: what to build.
+        arguments: ``--section.field=value`` or ``--section.field value``; a bare first one is the recipe, or
+            bare ones are the entries of the field that `config_class` names in ``BARE``.
+        recipe_class: top-level keys of a *file* that this class has and `config_class` has not are ignored,
+            so that one recipe serves several verbs.
+
+    Raises:
+        InputError: a file, key, type or value is wrong, or the file sets a field in `CONSENT`.
+    """
+    path, given = read_arguments(arguments, getattr(config_class, "BARE", None))
+    tree = {} if path is None else read_recipe(path)
+    if recipe_class is not None:
+        other = _names(recipe_class) - _names(config_class)
+        tree = {key: value for key, value in tree.items() if key not in other}
+    _discover(config_class, given, ())
+    merged = _overridden(config_class, tree, given)
+    if from_file := consents(merged, given):
+        flags = " ".join(shlex.quote(f"--{name}={_as_text(value)}") for name, value in from_file.items())
+        remedy = f"a file cannot allow this, only the command line can: if you trust it, add {flags}"
+        raise InputError(next(iter(from_file)), next(iter(from_file.values())), remedy)
+    return decode(config_class, merged)
+
+
+def drop_consents(tree: dict[str, Any]) -> dict[str, Any]:
+    """Removes from a tree what `consents` finds in it; returns that."""
+    found = consents(tree, drop=True)
+    launch = tree.get("launch")
+    if "launch.address" in found and isinstance(launch, dict) and "placement" in launch:
+        found["launch.placement"] = launch.pop("placement")  # of the nodes of that cluster
+    return found
+
+
+def consents(tree: Any, given: Any = None, *, drop: bool = False) -> dict[str, Any]:
+    """Dotted field → value, of the fields in `CONSENT` that a tree sets at any depth.
+
+    Args:
+        tree: plain values, as they were read from a file.
+        given: what the command line says of the same fields; what it sets is left out.
+        drop: remove them from `tree`.
+    """
+    found: dict[str, Any] = {}
+    seen: set[int] = set()  # YAML's aliases can make a small file a tree without end
+
+    def look(below: Any, given: Any, path: tuple[str, ...]) -> None:
+        if id(below) in seen or below is given:
+            return
+        seen.add(id(below))
+        given = given if isinstance(given, dict) else {}
+        if isinstance(below, list):
+            for number, entry in enumerate(below):
+                look(entry, None, (*path, str(number)))
+        elif isinstance(below, dict):
+            for key, value in list(below.items()):
+                here = (*path, str(key))
+                if str(key).rpartition(".")[2] not in CONSENT:
+                    look(value, given.get(key), here)
+                elif value not in (None, False, "", [], {}) and key not in given:
+                    found[".".join(here)] = value
+                    if drop:
+                        del below[key]
+
+    look(tree, given, ())
+    return found
+
+
+def decode(config_class: type[Any], tree: dict[str, Any]) -> Any:
+    """Builds a config from plain values; imports nothing that they name.
+
+    Raises:
+        InputError: a key, type or value is wrong; names the field.
+    """
+    return _decoded(config_class, tree, (), config_class)
+
+
+def encode(config: Any) -> dict[str, Any]:
+    """Plain JSON types, for files and loggers; `decode` makes the same config of them."""
+    encoded: dict[str, Any] = draccus.encode(config)
+    return encoded
+
+
+def read_arguments(arguments: list[str], bare: str | None = None) -> tuple[Path | None, dict[str, Any]]:
+    """Splits a command line into the recipe's path and a tree of overrides.
+
+    Bare arguments are entries of the list that `bare` names; without it, the one there may be is the recipe.
+
+    Raises:
+        InputError: an argument is not of the form ``--section.field=value``, or there are two recipes.
+    """
+    path: str | None = None
+    given: dict[str, Any] = {}
+    entries: list[str] = []
+    rest = list(arguments)
+    while rest:
+        argument = rest.pop(0)
+        if argument.startswith("--"):
+            key, equals, value = argument[2:].partition("=")
+            if not equals:
+                if not rest or rest[0].startswith("--"):
+                    raise InputError(key or "--", "", f"give it a value: --{key}=…")
+                value = rest.pop(0)
+        elif bare is not None:
+            entries.append(argument)
+            continue
+        elif path is None and not given:
+            key, value = "config_path", argument
+        else:
+            raise InputError("argument", argument, "write --section.field=value")
+        if key == "config_path":
+            if path is not None:
+                raise InputError("config_path", value, f"there is {path} already; give one recipe")
+            path = value
+        else:
+            if not all(names := key.split(".")):
+                raise InputError("argument", argument, "write --section.field=value")
+            _set(given, names, _value(value), key)
+    if bare is not None and entries:
+        if bare in given:
+            raise InputError(bare, given[bare], f"leave out --{bare} or {entries[0]}: name them in one way")
+        given[bare] = entries
+    return (None if path is None else expanded(path, "config_path")), given
+
+
+def read_recipe(path: Path) -> dict[str, Any]:
+    """The tree in a YAML (or JSON) file.
+
+    Raises:
+        InputError: no such file, or it is not a mapping in good YAML.
+    """
+    if not path.is_file():
+        names = [p.name for p in path.parent.glob("*.y*ml")]
+        near = difflib.get_close_matches(path.name, names, n=3)
+        hint = f"did you mean {' or '.join(str(path.parent / name) for name in near)}?" if near else ""
+        raise InputError("config_path", str(path), f"no such file; {hint or 'see recipes/'}")
+    try:
+        check_recipe_size(path, "config_path")
+        tree = load_yaml(path.read_text())
+    except InputError:
+        raise
+    except (yaml.YAMLError, ValueError) as error:
+        raise InputError("config_path", str(path), f"not good YAML: {_where(error)}") from error
+    except OSError as error:
+        raise InputError("config_path", str(path), f"cannot be read: {error.strerror}") from error
+    if tree is None:
+        return {}
+    if not isinstance(tree, dict):
+        raise InputError("config_path", str(path), "a recipe is a mapping such as 'env: {type: metaworld}'")
+    return tree
+
+
+def section_of(hint: Any) -> type[Any] | None:
+    """The config class behind a field's annotation, ``X`` or ``X | None``; None for a plain value."""
+    options = [a for a in typing.get_args(hint) if a is not type(None)] if is_union(hint) else [hint]
+    if len(options) == 1 and isinstance(options[0], type) and dataclasses.is_dataclass(options[0]):
+        return options[0]
+    return None
+
+
+def choices_of(section: type[Any]) -> dict[str, type[Any]]:
+    """Registered name → config class, where `section` is the root of a choice; otherwise empty."""
+    return dict(section.get_known_choices()) if draccus.ChoiceRegistry in section.__bases__ else {}
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML that refuses a key given twice, of which PyYAML silently keeps the last, and oversized values."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._nodes = self._depth = 0
+        self._sizes: dict[int, int] = {}
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Counts nodes; an alias counts as often as the nodes that it repeats."""
+        before, event = self._nodes, self.peek_event()
+        mark: Any = event.start_mark
+        self._depth += 1
+        node = super().compose_node(parent, index) if self._depth <= DEEPEST else None
+        self._depth -= 1
+        if isinstance(event, yaml.AliasEvent) and id(node) not in self._sizes:
+            raise yaml.constructor.ConstructorError(None, None, "an alias within itself", mark)
+        self._nodes += self._sizes.get(id(node), 1)
+        self._sizes.setdefault(id(node), self._nodes - before)
+        if node is None or self._nodes > MOST_NODES:
+            problem = f"more than {MOST_NODES:,} values" if node else f"nested more than {DEEPEST} deep"
+            raise yaml.constructor.ConstructorError(None, None, problem, mark)
+        return node
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key_node, _ in node.value:
+            if not isinstance(key_node, yaml.ScalarNode):
+                raise yaml.constructor.ConstructorError(None, None, "a key is not text", key_node.start_mark)
+            if key_node.value in seen and key_node.tag != "tag:yaml.org,2002:merge":
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"{key_node.value} is given twice", key_node.start_mark
+                )
+            seen.add(key_node.value)
+        return super().construct_mapping(node, deep)
+
+
+def check_recipe_size(path: Path, field: str) -> None:
+    """Refuses a recipe of more than `LARGEST_RECIPE` bytes, which is never read.
+
+    Raises:
+        InputError: names `field` and the size.
+        OSError: the file cannot be looked at.
+    """
+    if (size := path.stat().st_size) > LARGEST_RECIPE:
+        raise InputError(field, str(path), f"{size:,} bytes; a recipe has a few thousand")
+
+
+def load_yaml(text: str) -> Any:
+    """The value in a YAML text, within `DEEPEST` and `MOST_NODES`.
+
+    Raises:
+        yaml.YAMLError: it is not good YAML, or beyond these bounds.
+    """
+    try:
+        return yaml.load(text, _Loader)
+    except yaml.YAMLError:
+        raise
+    except Exception as error:  # PyYAML's own, of a number such as 0x_ or a date such as 2024-13-45
+        raise yaml.YAMLError(f"{type(error).__name__}: {error}") from error
+
+
+def _as_text(value: Any) -> str:
+    """A value as it can be typed on a command line; control characters are escaped."""
+    return value if isinstance(value, str) and value.isprintable() else json.dumps(value, default=str)
+
+
+def _where(error: Exception) -> str:
+    mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
+    if mark is None or problem is None:
+        return str(error)
+    return f"line {mark.line + 1}: {problem}"
+
+
+def _value(text: str) -> Any:
+    """A value as YAML reads it; text that is not YAML is text."""
+    if text == "":
+        return text
+    try:
+        return load_yaml(text)
+    except yaml.YAMLError:
+        return text
+
+
+def _set(tree: dict[str, Any], keys: list[str], value: Any, dotted: str) -> None:
+    for key in keys[:-1]:
+        below = tree.get(key)
+        if below is None:
+            below = tree[key] = {}
+        if not isinstance(below, dict):
+            raise InputError(dotted, value, f"{key} is set to {below!r} already")
+        tree = below
+    if keys[-1] in tree:
+        raise InputError(dotted, value, f"it is set to {tree[keys[-1]]!r} already; give it once")
+    tree[keys[-1]] = value
+
+
+def _overridden(config_class: type[Any], tree: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    """`tree` with `given` laid over it.
+
+    Where `given` picks another type than the file's, what the file says about fields that the new type does
+    not have is dropped: ``--algorithm.type=ppo`` replaces GIPO together with its ``sigma``.
+    """
+    merged = _merged(tree, given)
+    hints = hints_of(config_class)
+    for field in dataclasses.fields(config_class):
+        section, over, under = section_of(hints[field.name]), given.get(field.name), tree.get(field.name)
+        if section is None or not isinstance(over, dict) or not isinstance(under, dict):
+            continue
+        before = under.get(TYPE, _default_type(field))
+        now = over.get(TYPE, before)
+        kind = choices_of(section).get(str(now), section)
+        if now != before and kind is not section:
+            under = {k: v for k, v in under.items() if k in _names(kind)}
+        merged[field.name] = _overridden(kind, under, over)
+    return merged
+
+
+def _discover(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...]) -> None:
+    """Imports the packages that register types of what is to be decoded, as LeRobot's parser does."""
+    for field in dataclasses.fields(cls):
+        value, section = tree.get(field.name), section_of(hints_of(cls)[field.name])
+        if field.metadata.get(REGISTERS) and value is not None:
+            discover(str(value), ".".join(path))
+        elif section is not None and isinstance(value, dict):
+            _discover(section, value, (*path, field.name))
+
+
+def _merged(tree: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(tree)
+    for key, value in given.items():
+        under = merged.get(key)
+        both = isinstance(under, dict) and isinstance(value, dict)
+        merged[key] = _merged(typing.cast(dict[str, Any], under), value) if both else value
+    return merged
+
+
+def _decoded(cls: type[Any], tree: dict[str, Any], path: tuple[str, ...], whole: type[Any]) -> Any:
+    """A config section, once all keys in `tree` are known to exist and all values fit."""
+    hints, by_name = hints_of(cls), {field.name: field for field in dataclasses.fields(cls)}
+    values = {}
+    for key, value in tree.items():
+        here = (*path, str(key))
+        if key not in by_name:
+            raise _unknown(str(key), value, path, list(by_name), whole)
+        section = section_of(hints[key])
+        if section is None:
+            values[key] = _leaf(hints[key], value, ".".join(here))
+        elif value is None and is_optional(hints[key]):
+            values[key] = None
+        elif not isinstance(value, dict | None):
+            raise InputError(".".join(here), value, f"a config section; use --{here[-1]}.field=value")
+        else:
+            values[key] = _section(section, value or {}, here, by_name[key], whole)
+    for field in by_name.values():
+        if field.name not in values and field.default is field.default_factory is dataclasses.MISSING:
+            raise InputError(".".join((*path, field.name)), None, f"use {wanted(hints[field.name])}")
+    try:
+        return cls(**values)
+    except InputError as error:
+        # A section that stands in several places, such as a replay, has one name for itself.
+        usual, actual = (f"{name}." for name in (getattr(cls, "SECTION", ""), ".".join(path)))
+        if usual in (".", actual) or not error.field.startswith(usual):
+            raise
+        moved = f"{actual}{error.field.removeprefix(usual)}"
+        raise InputError(moved, error.value, error.remedy.replace(usual, actual)) from error
+    except (TypeError, ValueError) as error:  # of a class that is not ours
+        raise InputError(".".join(path) or "config", type(error).__name__, str(error)) from error
+
+
+def _section(
+    section: type[Any], value: dict[str, Any], here: tuple[str, ...], field: Any, whole: type[Any]
+) -> Any:
+    choices, usual = choices_of(section), _default_type(field)
+    if not choices:
+        return _decoded(section, _merged(_apart(field, section), value), here, whole)
+    kind = value.get(TYPE, usual)
+    if not isinstance(kind, str) or kind not in choices:
+        near = difflib.get_close_matches(str(kind), choices, n=1)
+        hint = f"did you mean {near[0]}? Otherwise " if near else ""
+        hint = LEROBOT.get(f"{here[-1]}.{TYPE}={kind}", "") or hint
+        raise InputError(".".join((*here, TYPE)), kind, f"{hint}use one of {', '.join(sorted(choices))}")
+    rest = {k: v for k, v in value.items() if k != TYPE}
+    if kind == usual:
+        rest = _merged(_apart(field, choices[kind]), rest)
+    return _decoded(choices[kind], rest, here, whole)
+
+
+def _leaf(hint: Any, value: Any, field: str) -> Any:
+    """A plain value, decoded by draccus unless draccus would quietly turn it into something else."""
+    plain, value = unmarked(hint), _as_list(unmarked(hint), value)
+    kinds = _kinds(plain)
+    wrong = (
+        (value is None and plain is not Any and not is_optional(plain))
+        or (isinstance(value, bool) and not kinds & {bool, Any})
+        or (isinstance(value, (list, dict)) and kinds <= {str, int, float, bool, type(None)})
+    )
+    lists = [kind for kind in kinds if typing.get_origin(kind) in (list, tuple)]
+    if isinstance(value, list) and len(lists) == 1:
+        (entry, *_) = typing.get_args(lists[0])
+        wrong = wrong or any(isinstance(v, bool) and entry not in (bool, Any) for v in value)
+    try:
+        decoded = None if wrong else draccus.decode(plain, value)
+    except Exception:  # whatever draccus raises, the value does not fit
+        wrong = True
+    if wrong:
+        raise InputError(field, value, f"use {wanted(hint)}")
+    check(hint, decoded, field)
+    return decoded
+
+
+def _apart(field: Any, section: type[Any]) -> dict[str, Any]:
+    """Differences of a field's default of a section from the section's own class.
+
+    draccus takes the class's word for all that is not given, so one field given would change the others.
+    """
+    default = None if field.default_factory is dataclasses.MISSING else field.default_factory()
+    if default is None or default == section():
+        return {}
+    return encode(default)
+
+
+def _as_list(hint: Any, value: Any) -> Any:
+    """``a,b`` and a lone value as the list that the field holds; draccus would take text letter by letter."""
+    lists = [kind for kind in _kinds(hint) if typing.get_origin(kind) in (list, tuple)]
+    if len(lists) != 1:
+        return value
+    if isinstance(value, str):
+        entries = [entry.strip() for entry in value.split(",")]
+        return entries if typing.get_args(lists[0])[0] is str else [_value(entry) for entry in entries]
+    return [value] if isinstance(value, (bool, int, float)) else value
+
+
+def _kinds(hint: Any) -> set[Any]:
+    return set(typing.get_args(hint)) if is_union(hint) else {hint}
+
+
+def dotted_fields(cls: type[Any], path: tuple[str, ...] = ()) -> Iterator[str]:
+    """Every field as it is written on the command line, those of all choices included."""
+    hints = hints_of(cls)
+    for field in dataclasses.fields(cls):
+        section, here = section_of(hints[field.name]), (*path, field.name)
+        if section is None:
+            yield ".".join(here)
+            continue
+        for kind in choices_of(section).values() or (section,):
+            yield from dotted_fields(kind, here)
+
+
+def _unknown(key: str, value: Any, path: tuple[str, ...], names: list[str], whole: type[Any]) -> InputError:
+    """The error for a field that a config does not have: what it resembles, or where it belongs."""
+    from accerl_lerobot.cli.verbs import CONFIGS
+
+    if len(key) > LONGEST_KEY:
+        return InputError(key[:LONGEST_KEY], value, "no such field")
+    dotted, leaf = ".".join((*path, key)), value
+    while dotted not in LEROBOT and isinstance(leaf, dict) and len(leaf) == 1:
+        ((below, leaf),) = leaf.items()
+        dotted += f".{below}"
+    if dotted in LEROBOT:
+        return InputError(dotted, leaf, f"the name is LeRobot's; {LEROBOT[dotted]}")
+    near = [".".join((*path, name)) for name in difflib.get_close_matches(key, names, n=3)]
+    everywhere = list(dict.fromkeys(dotted_fields(whole)))
+    known = {*near, ".".join((*path, key))}
+    near += [f for f in everywhere if f.rpartition(".")[2] == key and f not in known]
+    having = [verb for verb, cls in CONFIGS.items() if dotted in set(dotted_fields(cls))]
+    if having and not path:
+        return InputError(dotted, leaf, f"not a field of this command, but of accerl {', '.join(having[:4])}")
+    if near:
+        remedy = f"no such field; did you mean {' or '.join(near[:4])}?"
+    else:
+        where = f"{'.'.join(path)} has" if path else "there are"
+        remedy = f"no such field; {where} {', '.join(names)}"
+    return InputError(".".join((*path, key)), value, remedy)
+
+
+def _names(cls: type[Any]) -> set[str]:
+    return {field.name for field in dataclasses.fields(cls)}
+
+
+def _default_type(field: Any) -> str | None:
+    """The type a choice has when nobody names one: that of the field's default."""
+    if field.default_factory is dataclasses.MISSING:
+        return None
+    kind: str | None = getattr(field.default_factory(), TYPE, None)
+    return kind

@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run is one dataclass per room, composed, checked and saved beside the results.
+
+YAML through ``--config_path``, any field through ``--section.field=value``, as in LeRobot. Nothing is added
+later. Each section stands beside the class it configures; what concerns two sections is checked here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from accerl_lerobot.algorithms import (
+    AlgorithmConfig,
+    ChunkCriticConfig,
+    GIPOConfig,
+    OffPolicyConfig,
+    RatioConfig,
+)
+from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.config.parsing import decode, encode, parse
+from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Section, Seed, Steps, check
+from accerl_lerobot.demos.record import DemosConfig
+from accerl_lerobot.demos.sft import SFTConfig
+from accerl_lerobot.engine.placement_config import PlacementConfig
+from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.config import EvaluationConfig
+from accerl_lerobot.inference.worker import InferenceConfig
+from accerl_lerobot.metrics import WandBConfig
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.replay.pacing import ReplayConfig
+from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
+from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.timeline import TIMELINE
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.transport.endpoint import Transport
+from accerl_lerobot.world_model.imagination_config import ImaginationConfig
+
+__all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "check_chunk", "decode", "encode", "parse"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LaunchConfig(Section, section="launch"):
+    """Where the workers run."""
+
+    engine: Literal["ray", "local"] = "ray"
+    """ray: asynchronous workers. local: the same parts in one process, deterministic, for tests."""
+    address: str | None = None
+    """HOST:PORT of a running Ray cluster that the workers join, or auto: the one that ``ray start`` has
+    started here. It must ask for a token, which is looked for where Ray does: RAY_AUTH_TOKEN,
+    RAY_AUTH_TOKEN_PATH, ``~/.ray/auth_token``. None: a private Ray on this machine."""
+    open_cluster: bool = False
+    """Join a cluster that asks for no token: whoever reaches it runs code in your workers."""
+    placement: PlacementConfig = field(default_factory=PlacementConfig)
+    """Which workers are on which of its nodes, and what each takes."""
+    schedule: Schedule = ASYNCHRONOUS
+    """asynchronous: nobody waits for anybody. synchronous: a batch is collected, by all worlds in lock step,
+    then learned from. overlap: the next one is collected meanwhile. These two are for measuring what the
+    first gains; with several inference services, the worlds of each are in step."""
+    transport: Transport = "auto"
+    """How rollout workers and dreams reach inference and replay, and weights reach inference. shared_memory:
+    a message is written where the other process reads it. ray: it is copied, to any node. auto: shared memory
+    between processes of one node, if the system has it, and Ray otherwise.
+    """
+    stall_s: Positive = 300.0
+    """How long, in seconds, a worker may owe an answer or a world a step, and a run stand still.
+
+    A rollout worker or an inference service is started again then; with any other, and where nothing moves,
+    all are.
+    """
+    max_recoveries: Annotated[int, Range("[0, 1000000]")] = 3
+    """How often in a row, no later update or checkpoint having been reached in between, all workers are
+    started again from the last checkpoint because one of them was lost that is not started again alone; once
+    more ends the run with its error."""
+    timeline: bool = True
+    """True if every worker records what it does when, for ``accerl timeline``: up to 8 MB each time one is
+    started."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.schedule != ASYNCHRONOUS and self.engine == "local":
+            remedy = (
+                "with launch.engine=local all is done in one process, in a schedule of its own; leave it out"
+            )
+            raise InputError("launch.schedule", self.schedule, remedy)
+        self._check_cluster()
+
+    def _check_cluster(self) -> None:
+        if self.engine == "local" and (self.address is not None or self.placement != PlacementConfig()):
+            name, value = ("address", self.address) if self.address is not None else ("placement", "…")
+            remedy = "launch.engine=local is one process, which is here; leave it out"
+            raise InputError(f"launch.{name}", value, remedy)
+        if self.address is not None and self.address != "auto":
+            host, _, port = self.address.rpartition(":")
+            if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+                remedy = "use HOST:PORT as ray start --head prints it, or auto"
+                raise InputError("launch.address", self.address, remedy)
+        if self.address is None and self.placement.elsewhere:
+            remedy = "a private Ray has one node; add --launch.address=auto, or leave the field out"
+            raise InputError("launch.placement", "…", remedy)
+        if self.address is None and self.open_cluster:
+            raise InputError("launch.open_cluster", True, "it is about the cluster of launch.address")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig(Section):
+    """Everything one run needs.
+
+    The start is one of: ``policy.path`` (a LeRobot checkpoint); ``sft`` on ``dataset``; ``sft`` on
+    demonstrations that the run records itself with ``demos``.
+    """
+
+    seed: Seed = 0
+    """Seed of demonstrations, SFT, exploration, replay and the starts of evaluation."""
+    output_dir: str | None = None
+    """Folder of the run; must not exist. None: ``outputs/<date>/<time>_<job_name>``."""
+    job_name: str = "run"
+    """Last part of the folder's name."""
+    env: EnvConfig = field(default_factory=MetaWorldConfig)
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    demos: DemosConfig = field(default_factory=DemosConfig)
+    sft: SFTConfig = field(default_factory=SFTConfig)
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    rollout: RolloutConfig = field(default_factory=RolloutConfig)
+    inference: InferenceConfig = field(default_factory=InferenceConfig)
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    algorithm: AlgorithmConfig = field(default_factory=GIPOConfig)
+    trainer: TrainerConfig = field(default_factory=TrainerConfig)
+    imagination: ImaginationConfig = field(default_factory=ImaginationConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    launch: LaunchConfig = field(default_factory=LaunchConfig)
+    wandb: WandBConfig = field(default_factory=WandBConfig)
+    save_every_updates: Steps = 0
+    """Checkpoint every so many updates; 0: none by their number."""
+    save_every_s: NonNegative = 600.0
+    """Checkpoint at least every so many seconds of training; 0: none by time. There is one at the end in any
+    case, and when the run is asked to stop; before the training there is one if there are any by number or
+    time."""
+    save_keep: Annotated[int, Range("[1, 1000000]")] = 2
+    """Checkpoints that keep what it takes to go on from them, the newest ones; the others keep
+    their policies."""
+    resume: bool = False
+    """Go on with the run whose config is ``--config_path``: ``RUN/config.yaml``, or that of one of its
+    checkpoints, ``RUN/checkpoints/last/config.yaml``."""
+
+    @property
+    def saves(self) -> bool:
+        """True if there are checkpoints on the way."""
+        return bool(self.save_every_updates or self.save_every_s)
+
+    @property
+    def remembered(self) -> int:
+        """Decisions in the trainer's own memory at the end."""
+        if not isinstance(self.algorithm, OffPolicyConfig):
+            return 0
+        return min(self.algorithm.memory, self.trainer.updates * self.trainer.batch_decisions)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.demos.seed:
+            raise InputError(
+                "demos.seed", self.demos.seed, "a run's demonstrations take its own seed; use --seed"
+            )
+        if self.policy.path is not None and self.sft.steps:
+            remedy = "add --sft.steps=0 to improve this checkpoint, or fine-tune it first with sft.init_path"
+            raise InputError("policy.path", self.policy.path, remedy)
+        if self.sft.steps and self.sft.init_path is None:
+            check_chunk(self.sft.policy)
+        if isinstance(self.algorithm, OffPolicyConfig):
+            self._check_off_policy()
+        elif (
+            isinstance(self.algorithm, RatioConfig)
+            and self.algorithm.advantage == "group"
+            and not self.rollout.group_size
+        ):
+            raise InputError("algorithm.advantage", "group", "add --rollout.group_size=8, say: 2 or more")
+        if self.trainer.hold_back >= self.replay.max_lag:
+            remedy = (
+                f"use more than trainer.hold_back, {self.trainer.hold_back}, or all is thrown away as too old"
+            )
+            raise InputError("replay.max_lag", self.replay.max_lag, remedy)
+        if self.inference.workers > 1 and self.launch.engine == "local":
+            remedy = "launch.engine=local is one process; use launch.engine=ray, or 1"
+            raise InputError("inference.workers", self.inference.workers, remedy)
+        if self.imagination.workers > 1 and self.launch.engine == "local":
+            remedy = "launch.engine=local is one process; use launch.engine=ray, or 1"
+            raise InputError("imagination.workers", self.imagination.workers, remedy)
+        if self.inference.workers > self.rollout.workers:
+            remedy = f"use at most rollout.workers, {self.rollout.workers}, or some have nobody to answer"
+            raise InputError("inference.workers", self.inference.workers, remedy)
+        if self.trainer.ranks > 1 and self.launch.engine == "local":
+            remedy = "launch.engine=local is one process; use launch.engine=ray, or 1"
+            raise InputError("trainer.ranks", self.trainer.ranks, remedy)
+        if self.trainer.cpu_offload and self.policy.device == "cpu":
+            remedy = "policy.device=cpu has everything there already; leave the field out"
+            raise InputError("trainer.cpu_offload", True, remedy)
+        batch, imagination = self.trainer.batch_decisions, self.imagination
+        if self.trainer.updates:
+            # Of both, as a batch is all real before anything is imagined, and all imagined after the last
+            # real episode.
+            self.replay.check(batch_decisions=batch, segment_decisions=self.rollout.segment_length)
+            if imagination.share:
+                # A whole dream is as long as the world lets it be: `world_model.dreaming` looks at that.
+                longest = imagination.horizon or 1
+                imagination.replay.check(
+                    batch_decisions=batch, segment_decisions=longest, field="imagination.replay"
+                )
+        if imagination.share and self.launch.schedule != ASYNCHRONOUS:
+            remedy = "use asynchronous: those who dream take no turns"
+            raise InputError("launch.schedule", self.launch.schedule, remedy)
+        for name in ("episodes", "group_size"):
+            if getattr(self.rollout, name) and self.launch.schedule != ASYNCHRONOUS:
+                remedy = (
+                    f"use asynchronous, or leave out rollout.{name}: a world that has to pause is waited for"
+                )
+                raise InputError("launch.schedule", self.launch.schedule, remedy)
+        if imagination.share and self.rollout.group_size:
+            # Nor could the episodes of a group, which bear one name, be told from each other.
+            remedy = (
+                "leave it out with imagination.share: dreams do not begin alike, so they are not compared"
+            )
+            raise InputError("rollout.group_size", self.rollout.group_size, remedy)
+
+    def _check_off_policy(self) -> None:
+        """A memory of its own stands for replay's reuse, and holds whole real episodes."""
+        offered = getattr(self.env, "environment_state", None)
+        if isinstance(self.algorithm, ChunkCriticConfig) and not offered:
+            remedy = "its critic reads the simulator's state: " + (
+                f"env.type={self.env.type} does not offer it, use gipo"
+                if offered is None
+                else "add --env.environment_state=true"
+            )
+            raise InputError("algorithm.type", self.algorithm.type, remedy)
+        only = f"algorithm.type={self.algorithm.type}"
+        for name, value, wanted, why in (
+            ("replay.samples_per_insert", self.replay.samples_per_insert, 1.0, "draws from its own memory"),
+            ("trainer.ranks", self.trainer.ranks, 1, "is learnt by one process"),
+            ("imagination.share", self.imagination.share, 0.0, "learns from real episodes only"),
+            ("rollout.group_size", self.rollout.group_size, 0, "compares no episodes"),
+            ("rollout.time_limit", self.rollout.time_limit, "fail", "sees the time that is left"),
+        ):
+            if value != wanted:
+                raise InputError(name, value, f"{only} {why}; use {wanted}")
+
+
+def journal_folder(config: RunConfig) -> Path | None:
+    """Where a run's journal is kept; None: nowhere."""
+    return None if config.output_dir is None else Path(config.output_dir).absolute()
+
+
+def timeline_folder(config: RunConfig) -> Path | None:
+    """Where the timeline of a run's workers is kept; None: nowhere."""
+    folder = journal_folder(config)
+    return folder / TIMELINE if folder is not None and config.launch.timeline else None
+
+
+def check_chunk(policy: dict[str, Any]) -> None:
+    """Refuses sizes in ``sft.policy`` that no LeRobot policy can have.
+
+    Args:
+        policy: fields of a LeRobot policy config; LeRobot itself checks the others, see `preflight`.
+
+    Raises:
+        InputError: a size is not a whole number above 0, or more is executed than predicted.
+    """
+    for name in ("chunk_size", "n_action_steps", "num_steps", "max_state_dim", "max_action_dim"):
+        check(Annotated[int, Range("[1, 10000]")], policy.get(name, 1), f"sft.policy.{name}")
+    chunk, executed = policy.get("chunk_size"), policy.get("n_action_steps")
+    if chunk is not None and executed is not None and executed > chunk:
+        raise InputError("sft.policy.n_action_steps", executed, f"use 1 to sft.policy.chunk_size, {chunk}")

@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole picture in one process, without Ray: the same parts, called in turn, deterministic for a seed.
+
+    every poll:   all worlds get a decision and step it → segments enter replay, as far as the pace allows
+                  → all dreams get a decision and are dreamt on, if the pace allows it
+                  → one update, if the pace allows it
+
+For tests and debugging. Weights reach the acting policy at once, so the lag comes from replay alone, unless
+`trainer.hold_back` asks for more.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS, WORLD_MODEL
+from accerl_lerobot.config.run import RunConfig, journal_folder, timeline_folder
+from accerl_lerobot.engine.contract import Engine, Progress, Saved, check_new, episode_key
+from accerl_lerobot.envs import make_world
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import IMAGINED, REAL, Request, Segment
+from accerl_lerobot.policies.config import Load, loader
+from accerl_lerobot.replay import MixedReplay
+from accerl_lerobot.replay.journal import EPISODES, Journal
+from accerl_lerobot.rollout.plans import EpisodePlans
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutRunner
+from accerl_lerobot.seeds import global_generators, restore_global_generators
+from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, WEIGHT_SYNC, open_clock
+from accerl_lerobot.trainer.nonfinite import keeping
+from accerl_lerobot.weights.held_back import HeldBack
+
+logger = logging.getLogger(__name__)
+
+LOCAL, DREAMS = "local", "dreams"
+"""Names of this engine's own state, and of all that imagines."""
+
+
+class LocalEngine(Engine):
+    """Single-process engine.
+
+    Args:
+        config: the run; its ``policy.path`` must be set.
+        tasks: the training tasks.
+        history: env steps that an observation holds, the policy's ``n_obs_steps``.
+        state: the ``training_state`` to go on from, as if it had never been left; None: begin.
+        load: makes the policy's adapter; None: of LeRobot's checkpoint.
+
+    Raises:
+        InputError: the state is of an asynchronous run.
+    """
+
+    def __init__(
+        self,
+        config: RunConfig,
+        tasks: tuple[str, ...],
+        history: int = 1,
+        state: Path | None = None,
+        load: Load | None = None,
+    ) -> None:
+        self._clock = open_clock(timeline_folder(config), LOCAL)
+        import torch
+
+        from accerl_lerobot.trainer.update import make_update
+
+        torch.manual_seed(config.seed)
+        torch.set_num_threads(config.trainer.num_threads)
+        self._config = config
+        self._adapter = loader(load)(config.policy)
+        self._update = make_update(self._adapter, config.algorithm, config.trainer)
+        self._held, self._acting, self._acting_version = HeldBack(config.trainer.hold_back), self._adapter, 0
+        if config.trainer.hold_back:
+            self._acting = loader(load)(config.policy)
+            self._acting.load_trainable(self._adapter.export_trainable())
+        imagination = config.imagination
+        folder, counted = journal_folder(config), config.rollout.episodes > 0
+        journal = None if folder is None else Journal(folder / EPISODES)
+        self._replay = MixedReplay(config.replay, imagination.replay, imagination.share, counted, journal)
+        self._dreams = self._world_learner = None
+        if imagination.share:
+            from accerl_lerobot.world_model.dreaming import make_imagination, make_learner
+
+            self._dreams = make_imagination(config, "dream", self._replay.insert)
+            if imagination.learns:
+                self._world_learner = make_learner(config, self._dreams.dreamer)
+        self._rng = np.random.default_rng(config.seed)
+        self._outstanding: set[tuple[str, int]] = set()
+        self._episodes: list[EpisodeResult] = []
+        self._training = False
+        self._outbox: deque[Segment] = deque()
+        count = config.rollout.worlds * config.rollout.workers
+        worlds = [make_world(config.env, history) for _ in range(count)]
+        self._plans = EpisodePlans(
+            config.rollout,
+            tasks,
+            seed=config.seed,
+            worlds=len(worlds),
+            budget=config.rollout.episodes or None,
+        )
+        self._runner = RolloutRunner(
+            worlds,
+            lambda: self._plans.next(self._exploring),
+            config.rollout,
+            "local",
+            self._outbox.append,
+            self._ended,
+            (config.evaluation.video_size, config.evaluation.video_every),
+            self._plans.groups,
+        )
+        self._due: dict[int, Request] = {}
+        if state is not None:
+            self._restore(state)
+        self._clock.enter(WAIT_IN)
+
+    def plan(self, plans: list[EpisodePlan]) -> None:
+        check_new(plans, self._outstanding)
+        self._outstanding |= {episode_key(p) for p in plans}
+        self._plans.queue(plans)
+
+    def train(self) -> None:
+        self._training = True
+
+    def poll(self) -> Progress:
+        self._clock.enter(COMPUTE)
+        self._store()
+        self._act()
+        self._store()
+        self._learn_world()
+        self._dream()
+        updates = []
+        n = self._config.trainer.batch_decisions
+        if self._exploring and self._replay.may_sample(n):
+            segments = self._replay.sample(n, self._update.version, self._rng)
+            if segments:
+                with keeping(journal_folder(self._config), self._update, segments):
+                    updates.append(self._update.step(segments) | {"update": float(self._update.version)})
+                self._publish()
+        self._clock.enter(WAIT_IN)
+        episodes = list(self._episodes)
+        self._episodes.clear()
+        self._outstanding -= {episode_key(e.plan) for e in episodes}
+        return Progress(
+            version=self._update.version,
+            done=self._training and not self._exploring,
+            updates=updates,
+            episodes=episodes,
+            rollout={k: float(v) for k, v in asdict(self._runner.counters).items()},
+            replay=self._replay.metrics(),
+            imagination=self._imagined(),
+            inference={"version": float(self._acting_version)},
+        )
+
+    def save(self, directory: Path) -> Saved:
+        self._clock.enter(CHECKPOINT)
+        self._adapter.save(directory / PRETRAINED, self._config.policy, self._adapter.copy_weights())
+        state = directory / TRAINING_STATE
+        snapshot.save(state / WEIGHTS, self._adapter.export_trainable())
+        snapshot.save(state / "trainer", self._update.state())
+        snapshot.save(state / "replay", self._replay.state())
+        acting = None if self._acting is self._adapter else self._acting.export_trainable()
+        engine = {
+            "generators": global_generators(),
+            "rng": self._rng,
+            "acting": (self._acting_version, acting),
+            "held_back": self._held.state(),
+            "outstanding": sorted(self._outstanding),
+            "outbox": list(self._outbox),
+            "plans": self._plans.state(),
+            "runner": self._runner.state(),
+        }
+        snapshot.save(state / LOCAL, engine)
+        if self._dreams is not None:
+            learner = None if self._world_learner is None else self._world_learner.state()
+            snapshot.save(state / DREAMS, {"dreams": self._dreams.state(), "learner": learner})
+            self._dreams.save_promoted(directory / WORLD_MODEL)
+        self._clock.enter(WAIT_IN)
+        return Saved(self._update.version, [])
+
+    def _restore(self, directory: Path) -> None:
+        if not (directory / f"{LOCAL}.json").is_file():
+            raise InputError(
+                "launch.engine", "local", "this run was asynchronous; go on with launch.engine=ray"
+            )
+        self._adapter.load_trainable(snapshot.load(directory / WEIGHTS))
+        self._update.restore(snapshot.load(directory / "trainer"))
+        self._replay.restore(snapshot.load(directory / "replay"))
+        engine = snapshot.load(directory / LOCAL)
+        self._rng = engine["rng"]
+        self._acting_version, acting = engine["acting"]
+        if acting is not None:
+            self._acting.load_trainable(acting)
+        self._held.restore(engine["held_back"])
+        self._outstanding = set(engine["outstanding"])
+        self._outbox.extend(engine["outbox"])
+        self._plans.restore(engine["plans"])
+        self._runner.restore(engine["runner"])
+        requests = ((slot, self._runner.request(slot)) for slot in range(len(self._runner)))
+        self._due = {slot: request for slot, request in requests if request is not None}
+        if self._dreams is not None:
+            imagined = snapshot.load(directory / DREAMS)
+            self._dreams.restore(imagined["dreams"])
+            if self._world_learner is not None:
+                self._world_learner.restore(imagined["learner"])
+        restore_global_generators(engine["generators"])
+
+    def close(self) -> None:
+        try:
+            self._clock.close()
+            self._runner.close()
+            if self._dreams is not None:
+                self._dreams.close()
+        except Exception:
+            logger.exception("could not close all worlds")
+
+    @property
+    def _exploring(self) -> bool:
+        """True if learning goes on."""
+        if not self._training or self._update.version >= self._config.trainer.updates:
+            return False
+        return not self._replay.exhausted(self._config.trainer.batch_decisions)
+
+    def _act(self) -> None:
+        """One decision in every world that may go on."""
+        if not self._exploring:
+            self._runner.abandon_groups()
+        for slot in range(len(self._runner)):
+            request = self._due.get(slot)
+            if request is None or (request.explore and not self._exploring):
+                self._due.pop(slot, None)
+                fresh = self._runner.start(slot)
+                if fresh is not None:
+                    self._due[slot] = fresh
+        may_explore = self._replay.may_insert()
+        slots = [s for s, r in self._due.items() if may_explore or not r.explore]
+        if not slots:
+            return
+        decisions = self._acting.decide([self._due[s] for s in slots], self._acting_version)
+        for slot, decision in zip(slots, decisions, strict=True):
+            request = self._runner.advance(slot, decision)
+            if request is None:
+                del self._due[slot]
+            else:
+                self._due[slot] = request
+
+    def _dream(self) -> None:
+        """One decision in every dream, if any is wanted."""
+        if self._dreams is None or not self._training:
+            return
+        if self._replay.real_ended:
+            self._dreams.end_real()
+        learner, on = self._world_learner, self._dreams.on
+        awaited = learner is not None and learner.promising(self._replay.real_ended)
+        awaited = awaited or self._dreams.prepares
+        self._replay.mix(self._config.imagination.share if on else 0.0, on or awaited)
+        if not self._exploring:
+            return
+        if self._replay.may_insert(IMAGINED) and (requests := self._dreams.requests()):
+            self._dreams.advance(self._acting.decide(requests, self._acting_version))
+
+    def _learn_world(self) -> None:
+        """One gradient step of the world model, or its trial, if either is due."""
+        learner, last = self._world_learner, self._replay.real_ended
+        if learner is None or self._dreams is None or not self._training:
+            return
+        if learner.owed >= 1:
+            learner.step()
+        elif learner.due(last) and (promotion := learner.promote(last)):
+            self._dreams.swap(promotion)
+            learner.handed_over()
+        self._replay.hold(learner.due(last=False) and not last)
+
+    def _publish(self) -> None:
+        """Hands weights to the policy that acts, which is the trainer's own unless they are held back."""
+        version, updates = self._update.version, self._config.trainer.updates
+        if self._acting is self._adapter:
+            self._acting_version = version
+            return
+        self._clock.enter(WEIGHT_SYNC)
+        last = version == updates or not self._exploring
+        weights = self._adapter.export_trainable()
+        for number, tensors in self._held.push(version, weights, last=last):
+            self._acting.load_trainable(tensors)
+            self._acting_version = number
+
+    def _store(self) -> None:
+        """Lets in what stands at the door, one segment at a time: a group's come all at once."""
+        while self._outbox and self._replay.may_insert(REAL):
+            segment = self._outbox.popleft()
+            if not self._replay.insert(segment):
+                continue
+            if self._dreams is not None:
+                self._dreams.remember(segment)
+            if self._world_learner is not None:
+                self._world_learner.add(segment)
+        if self._plans.spent and not self._outbox and not self._runner.exploring:
+            self._replay.end_real()
+
+    def _imagined(self) -> dict[str, float]:
+        learner = {} if self._world_learner is None else self._world_learner.metrics()
+        return {} if self._dreams is None else self._dreams.metrics() | learner
+
+    def _ended(self, result: EpisodeResult) -> None:
+        self._plans.report(result)
+        self._episodes.append(result)

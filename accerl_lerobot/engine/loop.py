@@ -1,0 +1,390 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The run once its engine stands: evaluation, training, checkpoints, and what is written of them."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.checkpoint.layout import (
+    CHECKPOINTS,
+    CONFIG,
+    PRETRAINED,
+    RUN_STATE,
+    SUMMARY,
+    TRAINING_STATE,
+    let_go,
+    save_checkpoint,
+    saved_version,
+    write_atomically,
+)
+from accerl_lerobot.cli.console import Console
+from accerl_lerobot.config.run import RunConfig
+from accerl_lerobot.engine.contract import Engine, Progress
+from accerl_lerobot.engine.resume import heed_stop
+from accerl_lerobot.engine.stopping import Stopping
+from accerl_lerobot.evaluation.config import evaluation_plans
+from accerl_lerobot.evaluation.pictures import before_after, success_curve
+from accerl_lerobot.evaluation.summary import summarise
+from accerl_lerobot.metrics import MetricsLog, plain
+from accerl_lerobot.rollout.runner import EpisodeResult
+from accerl_lerobot.timeline import CHECKPOINT, EVALUATION, TIMELINE, TRAINING, Clock, NoClock
+from accerl_lerobot.timeline.watch import Watch
+
+FILMED = ".before"
+"""Name of the filmed episodes of the evaluation before, kept until the video is made."""
+FRUITLESS_GROUPS = 50
+"""So many groups thrown away in a row are said aloud: no update is made of them."""
+DREAMT = 10
+"""Updates between two records of the workers' counters when no episode ends."""
+RECENT = 100
+"""Exploring episodes over which the training success of the curve is averaged."""
+_STATE = (
+    "before", "evaluations", "curve", "recent", "explored", "lags", "lag_max", "mismatch_max", "during",
+    "base", "groups", "steps", "evaluated", "saved",
+)  # fmt: skip
+
+
+def run_plans(
+    engine: Engine,
+    count: int,
+    group: str,
+    console: Console,
+    on_progress: Callable[[Progress], object] = lambda progress: None,
+) -> list[EpisodeResult]:
+    """Waits for `count` planned episodes of `group`; `on_progress` sees what else happens meanwhile."""
+    results: list[EpisodeResult] = []
+    with console.stage(f"evaluation ({group})", total=count) as stage:
+        while len(results) < count:
+            progress = engine.poll()
+            results += [e for e in progress.episodes if e.plan.group == group]
+            on_progress(progress)
+            stage.update(len(results), f"{np.mean([r.success for r in results]):.0%}" if results else "")
+    return sorted(results, key=lambda r: r.plan.index)
+
+
+@dataclass(kw_only=True)
+class Times:
+    """Where a run's seconds go, those before it was left included."""
+
+    started: float
+    """When this process began, by the monotonic clock."""
+    warm_s: float
+    """Warm start."""
+    rl_s: float = 0.0
+    """Training, in processes before this one."""
+    before_s: float | None = 0.0
+    """All, in processes before this one; None: the checkpoint will tell."""
+    furthest: int = 0
+    """The latest update that has been made in this process, whether or not it was lost since."""
+    clock: Clock = field(default_factory=NoClock)
+    """The driver's row of the timeline."""
+
+    @property
+    def wall_s(self) -> float:
+        """All of them."""
+        return (self.before_s or 0.0) + time.monotonic() - self.started
+
+
+class Loop:
+    """The run once its engine stands: evaluates, trains, saves, and writes what came of it.
+
+    Args:
+        config: the run.
+        directory: its folder.
+        console: progress for people.
+        engine: does the work.
+        log: of all numbers.
+        tasks: the training tasks.
+        times: so far.
+        stop: says when to save and end.
+    """
+
+    def __init__(
+        self,
+        config: RunConfig,
+        directory: Path,
+        console: Console,
+        engine: Engine,
+        log: MetricsLog,
+        tasks: tuple[str, ...],
+        times: Times,
+        stop: Stopping,
+    ) -> None:
+        self.config, self.directory, self.console = config, directory, console
+        self.engine, self.log, self.tasks = engine, log, tasks
+        self.times, self.stop = times, stop
+        self.before: dict[str, Any] | None = None
+        """The evaluation before training, where there was one."""
+        self.evaluations: list[dict[str, Any]] = []
+        self.curve: list[tuple[float, float]] = []
+        self.recent: list[bool] = []
+        self.explored = 0
+        """Exploring episodes that have ended."""
+        self.lags: list[float] = []
+        self.lag_max = self.mismatch_max = 0.0
+        self.during: dict[str, list[EpisodeResult]] = {}
+        self.base: dict[str, float] = {}
+        self.groups = (0.0, 0.0)
+        """Kept so far, and thrown away when that was last said or one was kept."""
+        self.steps = math.inf
+        """Env steps of the training, once it has ended."""
+        self.evaluated = self.saved = 0
+        """Evaluations and checkpoints that were due by the number of updates."""
+        self._began_at: str | None = None
+        self._training_since: float | None = None
+        self._saved_at = time.monotonic()
+        self._watch = Watch(directory / TIMELINE)
+
+    def run(self, state: Path | None) -> dict[str, Any]:
+        """Does it, or does what is left of it; returns the summary.
+
+        Args:
+            state: the ``training_state`` to go on from; None: begin.
+
+        Raises:
+            StoppedError: it was asked to stop.
+        """
+        evaluation = self.config.evaluation
+        filmed: list[EpisodeResult] = []
+        if state is not None:
+            self._began_at = state.parent.name
+            self._restore(snapshot.load(state / RUN_STATE), saved_version(state))
+            if (self.directory / f"{FILMED}.json").is_file():
+                filmed = snapshot.load(self.directory / FILMED)
+        else:
+            if evaluation.before:
+                self.before, filmed = self._evaluate("before", evaluation.episodes, 0.0)
+                snapshot.save(self.directory / FILMED, [result for result in filmed if result.frames])
+            self.base = self.engine.poll().rollout
+            if self.config.saves:
+                self._save()
+        last = self._train()
+        self.steps = self._steps(last)
+        self._save()
+        after, results = self._evaluate("after", evaluation.episodes, self.steps)
+        if any(result.frames for result in filmed):
+            film = self.directory / "before_after.mp4"
+            before_after(film, (filmed, self.before), (results, after), fps=20)
+        success_curve(self.directory / "success_curve.png", self.evaluations, self.curve)
+        summary = plain(self._summary(self.before, after, last))
+        write_atomically(self.directory / SUMMARY, json.dumps(summary, indent=2) + "\n")
+        for left in self.directory.glob(f"{FILMED}.*"):
+            left.unlink()
+        let_go(self.directory / CHECKPOINTS, self.config.save_keep)  # nobody begins again any more
+        return dict(summary)
+
+    def _state(self) -> dict[str, Any]:
+        """All that `_restore` needs; see `snapshot`."""
+        spent = {"rl_s": self._rl_s, "wall_s": self.times.wall_s, "warm_s": self.times.warm_s}
+        return {name: getattr(self, name) for name in _STATE} | {"log": self.log.state(), "times": spent}
+
+    def _restore(self, state: dict[str, Any], version: int) -> None:
+        for name in _STATE:
+            setattr(self, name, state[name])
+        self.log.restore(state["log"], version)
+        times = state["times"]
+        self.times.rl_s, self.times.warm_s = times["rl_s"], times["warm_s"]
+        if self.times.before_s is None:
+            self.times.before_s = times["wall_s"]
+        if version < self.config.trainer.updates:  # more are asked for than were when it ended
+            self.steps = math.inf
+        evaluate, save = self.config.evaluation.every_updates, self.config.save_every_updates
+        self.evaluated = min(self.evaluated, version // evaluate if evaluate else 0)
+        self.saved = min(self.saved, version // save if save else 0)
+
+    def _summary(
+        self, before: dict[str, Any] | None, after: dict[str, Any], last: Progress
+    ) -> dict[str, Any]:
+        before = before or {}
+        summary = {
+            "success_before": before.get("success"),
+            "success_after": after["success"],
+            "n": after["n"],
+            "ci95": {"before": before.get("ci95"), "after": after["ci95"]},
+            "n_before": before.get("n"),
+            "n_after": after["n"],
+            "ci95_before": before.get("ci95"),
+            "ci95_after": after["ci95"],
+            "tasks_before": before.get("tasks"),
+            "tasks_after": after["tasks"],
+            "env_steps": int(self.steps),
+            "decisions": int(self._since(last, "decisions")),
+            "episodes": int(self._since(last, "episodes")),
+            "updates": last.version,
+            "trained_decisions": int(last.replay.get("trained_decisions", 0)),
+            "unique_decisions": int(last.replay.get("unique_decisions", 0)),
+            "dropped_nonfinite": int(self._since(last, "dropped_nonfinite")),
+            "restarts": int(last.rollout.get("restarts", 0)),
+            "lag_mean": float(np.mean(self.lags)) if self.lags else 0.0,
+            "lag_max": self.lag_max,
+            "ratio_max_dev": self.mismatch_max,
+            "wall_s": self.times.wall_s,
+            "warm_start_s": self.times.warm_s,
+            "rl_s": self.times.rl_s,
+            "episodes_explored": self.explored,
+            "imagination": last.imagination,
+            "algorithm": self.config.algorithm.type,
+            "tasks": list(self.tasks),
+            "seed": self.config.seed,
+        }
+        return summary
+
+    def _train(self) -> Progress:
+        config = self.config
+        self.engine.train()
+        self.times.clock.enter(TRAINING)
+        self._watch.news()  # what was before is not of the first record
+        self._training_since = self._saved_at = time.monotonic()
+        with self.console.stage(f"RL ({config.algorithm.type})", total=config.trainer.updates) as stage:
+            while True:
+                progress = self.engine.poll()
+                self._record(progress)
+                stage.update(progress.version, self._status(progress))
+                if progress.done:
+                    self.times.rl_s, self._training_since = self._rl_s, None
+                    return progress
+                self._heed_groups(progress.rollout)
+                every = config.evaluation.every_updates
+                if every and progress.version // every > self.evaluated:
+                    self.evaluated = progress.version // every
+                    self._plan_during(self.evaluated)
+                asked = self.stop.asked is not None
+                if self._is_due(progress.version) or asked:
+                    self._save()
+                if asked:
+                    heed_stop(self.stop, self.directory)
+
+    @property
+    def _rl_s(self) -> float:
+        """Seconds of training so far."""
+        since = self._training_since
+        return self.times.rl_s + (0.0 if since is None else time.monotonic() - since)
+
+    def _is_due(self, version: int) -> bool:
+        """True if it is time for a checkpoint."""
+        updates, seconds = self.config.save_every_updates, self.config.save_every_s
+        if updates and version // updates > self.saved:
+            return True
+        return bool(seconds) and time.monotonic() - self._saved_at > seconds
+
+    def _record_updates(self, updates: list[dict[str, float]]) -> None:
+        for metrics in updates:
+            self.lags.append(metrics["lag_mean"])
+            self.lag_max = max(self.lag_max, metrics["lag_max"])
+            self.mismatch_max = max(self.mismatch_max, metrics.get("ratio_max_dev", 0.0))
+            self.log.write("train", int(metrics["update"]), metrics)
+            self.times.furthest = max(self.times.furthest, int(metrics["update"]))
+
+    def _record(self, progress: Progress) -> None:
+        self.times.clock.beat()
+        self._record_updates(progress.updates)
+        explored = [e for e in progress.episodes if e.plan.explore]
+        self.explored += len(explored)
+        self.recent = (self.recent + [e.success for e in explored])[-RECENT:]
+        share = float(np.mean(self.recent)) if self.recent else math.nan
+        # The first episodes to end are the short ones, which are successes.
+        if explored and len(self.recent) >= RECENT // 4:
+            self.curve.append((self._steps(progress), share))
+        # Once all real episodes have been played, dreams and the learning from them go on.
+        if explored or any(metrics["update"] % DREAMT == 0 for metrics in progress.updates):
+            values = progress.rollout | {"success_exploring": share}
+            for part in ("replay", "inference", "imagination"):
+                values |= {f"{part}_{k}": v for k, v in getattr(progress, part).items()}
+            self.log.write("rollout", progress.version, values | self._watch.news())
+        for episode in progress.episodes:
+            results = self.during.get(episode.plan.group)
+            if results is not None:
+                results.append(episode)
+                if len(results) == self.config.evaluation.episodes_during:
+                    self._report(episode.plan.group, results, self._steps(progress), progress.version)
+
+    def _heed_groups(self, counters: dict[str, float]) -> None:
+        """Says so when groups of equal starts have nothing to compare, or the run would seem to hang."""
+        kept, dropped = counters.get("groups_kept", 0.0), counters.get("groups_dropped", 0.0)
+        if kept > self.groups[0]:
+            self.groups = (kept, dropped)
+        elif dropped - self.groups[1] >= FRUITLESS_GROUPS:
+            self.groups = (kept, dropped)
+            success = f"{np.mean(self.recent):.0%}" if self.recent else "unknown"
+            self.console.say(
+                f"{FRUITLESS_GROUPS} groups in a row were thrown away, and nothing is learnt from them: they "
+                f"had nothing to compare under rollout.group_filter={self.config.rollout.group_filter} "
+                f"(success while exploring {success}); stop the run, or choose tasks that succeed sometimes"
+            )
+
+    def _plan_during(self, number: int) -> None:
+        group = f"during-{number}"
+        self.during[group] = []
+        episodes = self.config.evaluation.episodes_during
+        self.engine.plan(evaluation_plans(self.tasks, episodes, group, seed=self.config.seed))
+
+    def _evaluate(
+        self, group: str, episodes: int, steps: float
+    ) -> tuple[dict[str, Any], list[EpisodeResult]]:
+        self.times.clock.enter(EVALUATION)
+        film = self.config.evaluation.videos
+        self.engine.plan(evaluation_plans(self.tasks, episodes, group, seed=self.config.seed, film=film))
+        # An evaluation planned while training may end only now.
+        results = run_plans(self.engine, episodes, group, self.console, self._meanwhile)
+        return self._report(group, results, steps, results[0].versions[1]), results
+
+    def _meanwhile(self, progress: Progress) -> None:
+        self._record(progress)
+        heed_stop(self.stop, self.directory)
+
+    def _report(self, group: str, results: list[EpisodeResult], steps: float, version: int) -> dict[str, Any]:
+        summary = summarise(results) | {"env_steps": steps, "group": group}
+        self.evaluations.append(summary)
+        self.log.write("evaluation", version, summary)
+        low, high = summary["ci95"]
+        self.console.say(
+            f"{group}: success {summary['success']:.1%} [{low:.1%}, {high:.1%}] n={summary['n']} "
+            f"weights {summary['version_min']}–{summary['version_max']}"
+        )
+        return summary
+
+    def _save(self) -> None:
+        """Writes a checkpoint of now."""
+
+        def write(folder: Path) -> int:
+            saved = self.engine.save(folder)
+            self._record_updates(saved.updates)
+            every = self.config.save_every_updates
+            self.saved = saved.version // every if every else 0
+            shutil.copyfile(self.directory / CONFIG, folder / CONFIG)
+            snapshot.save(folder / TRAINING_STATE / RUN_STATE, self._state())
+            return saved.version
+
+        with self.times.clock.during(CHECKPOINT):
+            path = save_checkpoint(self.directory / CHECKPOINTS, write)
+        let_go(self.directory / CHECKPOINTS, self.config.save_keep, self._began_at)
+        self._saved_at = time.monotonic()
+        self.console.say(f"checkpoint {path / PRETRAINED}")
+
+    def _since(self, progress: Progress, key: str) -> float:
+        """A rollout counter since training began, evaluation episodes while training included."""
+        return progress.rollout.get(key, 0.0) - self.base.get(key, 0.0)
+
+    def _steps(self, progress: Progress) -> float:
+        return min(self.steps, self._since(progress, "env_steps"))
+
+    def _status(self, progress: Progress) -> str:
+        success = f"{np.mean(self.recent):.0%}" if self.recent else "…"
+        lag = f"{self.lags[-1]:.0f}" if self.lags else "…"
+        words = (
+            f"exploring success {success} · lag {lag} · {self._since(progress, 'decisions'):.0f} decisions"
+        )
+        if self.evaluations:
+            newest = self.evaluations[-1]
+            words += f" · evaluation {newest['success']:.0%} at update {newest['version_max']}"
+        return words

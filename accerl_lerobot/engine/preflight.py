@@ -1,0 +1,553 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks of a run before any work begins: devices, logins, disk, and that its parts fit each other.
+
+`config` checks what plain numbers can say; this asks LeRobot, the environment and the machine.
+"""
+
+from __future__ import annotations
+
+import copy
+import difflib
+import logging
+import math
+import os
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import draccus
+
+from accerl_lerobot.algorithms import OffPolicyConfig, RatioConfig
+from accerl_lerobot.config.ranges import Range, check
+from accerl_lerobot.engine import ray_environment
+from accerl_lerobot.envs import EnvConfig, WorldSpec, make_world
+from accerl_lerobot.errors import InputError, check_absent, expanded
+
+LARGEST_FIELD = 10**6
+"""Largest number in a policy config; LeRobot has no size or number of steps beyond."""
+ABSURD = 2
+"""Times this machine's memory that a rough estimate may be; ``accerl doctor`` warns long before."""
+
+if TYPE_CHECKING:
+    from accerl_lerobot.config.run import DatasetConfig, RunConfig
+    from accerl_lerobot.demos.record import DemosConfig
+    from accerl_lerobot.demos.sft import SFTConfig
+    from accerl_lerobot.metrics import WandBConfig
+
+logger = logging.getLogger(__name__)
+
+STATE, ENV_STATE, ACTION = "observation.state", "observation.environment_state", "action"
+RESIZERS = ("resize_imgs_with_padding", "image_resolution", "resize_shape")
+"""Fields of LeRobot's policy configs: where one is set, the policy resizes its images by itself."""
+SLACK_BYTES = 128 * 2**20
+"""Disk space for metrics, the timeline, the journal and videos."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Features:
+    """Inputs and outputs of an environment, a dataset or a policy, by LeRobot's names."""
+
+    shapes: dict[str, tuple[int, ...]]
+    """Name → shape; images are (channels, height, width)."""
+    any_size: bool = False
+    """Images of any height and width fit."""
+    fps: float | None = None
+    """Control rate in Hz; None: not known."""
+    tasks: tuple[str, ...] = ()
+    """Instructions; empty: not known."""
+
+
+def env_features(spec: WorldSpec) -> Features:
+    """Features that an environment offers."""
+    shapes: dict[str, tuple[int, ...]] = {name: (c, h, w) for name, (h, w, c) in spec.images.items()}
+    shapes |= {STATE: (spec.state_dim,), ACTION: (spec.action_dim,)}
+    return Features(shapes=shapes, fps=spec.fps, tasks=spec.instructions)
+
+
+def policy_features(policy: Any) -> Features:
+    """Features that a policy needs, from LeRobot's config of it."""
+    features = (policy.input_features or {}) | (policy.output_features or {})
+    return Features(shapes=_shapes(features), any_size=resizes(policy))
+
+
+def resizes(policy: Any) -> bool:
+    """True if a policy resizes its images by itself, by LeRobot's config of it."""
+    return any(getattr(policy, field, None) for field in RESIZERS)
+
+
+def dataset_features(meta: Any) -> Features:
+    """Features of a LeRobotDataset, which a policy trained on it needs."""
+    from lerobot.utils.feature_utils import dataset_to_policy_features
+
+    shapes = _shapes(dataset_to_policy_features(meta.features))
+    return Features(shapes=shapes, fps=meta.fps, tasks=tuple(map(str, meta.tasks.index)))
+
+
+def _shapes(features: dict[str, Any]) -> dict[str, tuple[int, ...]]:
+    """Shapes of the features that policies read or write."""
+    named = {k: f for k, f in features.items() if f.type.name == "VISUAL" or k in (STATE, ENV_STATE, ACTION)}
+    return {k: tuple(f.shape) for k, f in named.items() if ".empty_camera_" not in k}
+
+
+def check_features(
+    needed: Features,
+    offered: Features,
+    rename_map: dict[str, str],
+    field: str,
+    value: object,
+    offerer: str = "environment",
+) -> None:
+    """Compares two parties of a run.
+
+    Args:
+        needed: by a policy, or by the policy that a dataset makes.
+        offered: by an environment, or by the dataset that a policy is trained on.
+        rename_map: offered name → needed name.
+        field: blamed in the error, with its `value`.
+        offerer: ``environment`` or ``dataset``.
+
+    Raises:
+        InputError: a feature is missing or of another shape, the rates differ, none of the environment's
+            tasks is in the dataset, or `rename_map` renames nothing or gives two features one name.
+    """
+    renames = "policy.rename_map"
+    sources = {name for name in offered.shapes if name != ACTION}
+    for name in rename_map.keys() - sources:
+        names = ", ".join(sorted(sources))
+        raise InputError(renames, name, f"the {offerer} has no such feature; it offers {names}")
+    shapes: dict[str, tuple[int, ...]] = {}
+    for name, shape in offered.shapes.items():
+        new = rename_map.get(name, name)
+        if new in shapes:
+            raise InputError(renames, rename_map, f"two features of the {offerer} would be {new}")
+        shapes[new] = shape
+    for name, shape in needed.shapes.items():
+        image = len(shape) == 3
+        if name not in shapes:
+            same = [k for k, other in shapes.items() if len(other) == len(shape) and k != ACTION]
+            remedy = "; choose env.camera accordingly, or map names with policy.rename_map" if image else ""
+            offers = ", ".join(same) or "none"
+            raise InputError(field, value, f"no {name} in the {offerer}, which offers {offers}{remedy}")
+        skip = 1 if image and needed.any_size else len(shape)
+        if shapes[name][:skip] != shape[:skip]:
+            remedy = "give both one image size" if image else "choose parties that were made for each other"
+            raise InputError(
+                field, value, f"its {name} is {shape}, but {shapes[name]} in the {offerer}; {remedy}"
+            )
+    if needed.fps and offered.fps and not math.isclose(needed.fps, offered.fps):
+        remedy = "its actions would be executed at another rate; use a dataset of this rate"
+        raise InputError(field, value, f"recorded at {needed.fps:g} Hz, but the environment runs at "
+                         f"{offered.fps:g} Hz: {remedy}")  # fmt: skip
+    _check_tasks(needed.tasks, offered.tasks, field, value)
+
+
+def _check_tasks(recorded: tuple[str, ...], wanted: tuple[str, ...], field: str, value: object) -> None:
+    """Compares instructions; letter case, spaces and a full stop do not count."""
+    known = {_plain(text) for text in recorded}
+    missing = [text for text in wanted if _plain(text) not in known]
+    if not known or not missing:
+        return
+    has = ", ".join(map(repr, recorded[:4])) + (" …" if len(recorded) > 4 else "")
+    said = f"no episode of {', '.join(map(repr, missing[:4]))}, the environment's task: it has {has}"
+    if len(missing) == len(wanted):
+        raise InputError(field, value, f"{said}; choose env.task accordingly")
+    logger.warning("%s=%r: %s", field, value, said)
+
+
+def _plain(text: str) -> str:
+    return " ".join(text.lower().split()).rstrip(".")
+
+
+def check_world(env: EnvConfig) -> WorldSpec:
+    """Builds and resets an environment once, so that what is wrong with it shows before anything long.
+
+    Raises:
+        InputError: its simulator is not installed or cannot draw here, or it refuses its options.
+    """
+    world = make_world(env)
+    try:
+        world.reset(0, world.spec.tasks[0])
+        return world.spec
+    finally:
+        world.close()
+
+
+def check_policy(config: RunConfig, spec: WorldSpec | None = None, *, own: bool = False) -> int:
+    """Refuses a checkpoint that does not fit the environment; returns its ``n_obs_steps``.
+
+    Args:
+        config: with ``policy.path``.
+        spec: of the environment; None: it is built to see.
+        own: the run has written this checkpoint itself, or has tried its files already.
+    """
+    from accerl_lerobot.policies.loading import load_lerobot_config, rehearsed_config
+
+    policy = (load_lerobot_config if own else rehearsed_config)(config.policy)
+    offered = env_features(spec or check_world(config.env))
+    check_features(
+        policy_features(policy), offered, config.policy.rename_map, "policy.path", config.policy.path
+    )
+    return int(policy.n_obs_steps)
+
+
+def check_start(config: RunConfig) -> int:
+    """Refuses a run that could not begin or whose outcome could not be used; what can be is checked here.
+
+    Returns:
+        The policy's ``n_obs_steps``.
+
+    Raises:
+        InputError: no policy, dataset or device; parts that do not fit each other, see `check_features`; more
+            ranks than GPUs, or no GPU to offload from; too little memory; no login to wandb; too little disk
+            space; also what `check_sft_policy` raises.
+    """
+    from accerl_lerobot.policies.loading import resolve_device
+
+    if config.output_dir is not None and not config.resume:
+        check_absent(expanded(config.output_dir, "output_dir"))
+    check_machine(config)
+    if config.policy.path is None and not config.sft.steps:
+        remedy = "give a LeRobot checkpoint, or sft.steps > 0 to make one; recipes/quickstart.yaml does"
+        raise InputError("policy.path", None, remedy)
+    device = resolve_device(config.policy.device).type
+    if config.trainer.ranks > 1 and config.policy.device != "cpu" and config.launch.address is None:
+        import torch
+
+        config.trainer.gpu_shares(torch.cuda.device_count(), others=1)
+    if config.trainer.cpu_offload and device == "cpu":
+        remedy = "there is no GPU here, and the CPU's memory has everything already; leave the field out"
+        raise InputError("trainer.cpu_offload", True, remedy)
+    check_wandb(config.wandb)
+    policy = policy_to_be(config)
+    check_weights_fit(config)
+    spec = check_world(config.env)
+    if isinstance(config.algorithm, OffPolicyConfig):
+        _check_off_policy(config, spec, policy)
+    renames, offered = config.policy.rename_map, env_features(spec)
+    if config.policy.path is not None:
+        check_features(policy_features(policy), offered, renames, "policy.path", config.policy.path)
+    else:
+        check_training_data(config.sft, config.dataset, policy, spec, renames)
+    check_disk(config.output_dir, disk_bytes(config, spec, int(policy.n_obs_steps)))
+    return int(policy.n_obs_steps)
+
+
+def check_training_data(
+    sft: SFTConfig, dataset: DatasetConfig, policy: Any, spec: WorldSpec | None, rename_map: dict[str, str]
+) -> Any:
+    """Compares dataset, policy and environment of an SFT.
+
+    Args:
+        sft: makes the policy.
+        dataset: without a name, demonstrations will be recorded in the environment.
+        policy: LeRobot's config of it, see `check_sft_policy`; of the checkpoint, where it starts from one.
+        spec: of the environment; None: there is none to act in.
+        rename_map: environment's name → policy's name.
+
+    Returns:
+        LeRobot's metadata of the dataset; None without a name.
+
+    Raises:
+        InputError: see `check_features`; LeRobot's policy refuses these features.
+    """
+    from accerl_lerobot.demos.windows import open_metadata
+
+    meta = None if dataset.repo_id is None else open_metadata(dataset)
+    offered = None if spec is None else env_features(spec)
+    about = "dataset.repo_id", dataset.repo_id
+    data = None if meta is None else replace(dataset_features(meta), any_size=resizes(policy))
+    if sft.init_path is not None:
+        needs = policy_features(policy)
+        if offered is not None:
+            check_features(needs, offered, rename_map, "sft.init_path", sft.init_path)
+        if data is not None and not any(arg.startswith("--rename_map") for arg in sft.extra_args):
+            check_features(needs, data, {}, "sft.init_path", sft.init_path, "dataset")
+        if data is not None:  # cameras may have names of their own in it
+            vectors = {k: shape for k, shape in data.shapes.items() if k in (STATE, ACTION)}
+            data = replace(data, shapes=vectors)
+    if offered is not None and data is not None:
+        check_features(data, offered, rename_map if sft.init_path is None else {}, *about)
+    source = data or offered
+    if sft.init_path is None and source is not None:
+        _check_new_policy(policy, source, sft)
+    return meta
+
+
+def _check_new_policy(policy: Any, source: Features, sft: SFTConfig) -> None:
+    """Gives a new policy the features that LeRobot will give it, and has LeRobot check them.
+
+    SmolVLA and π0 pad states and actions to a size of their own, and LeRobot does not compare it with theirs.
+    """
+    from lerobot.configs.types import FeatureType, PolicyFeature
+
+    for name, most in ((STATE, "max_state_dim"), (ACTION, "max_action_dim")):
+        limit, shape = getattr(policy, most, None), source.shapes.get(name, (0,))
+        if limit is not None and limit < shape[0]:
+            raise InputError(f"sft.policy.{most}", limit, f"{name} has {shape[0]} numbers; use at least that")
+    kinds = {STATE: FeatureType.STATE, ENV_STATE: FeatureType.ENV, ACTION: FeatureType.ACTION}
+    features = {
+        name: PolicyFeature(type=kinds.get(name, FeatureType.VISUAL), shape=shape)
+        for name, shape in source.shapes.items()
+    }
+    policy = copy.deepcopy(policy)
+    policy.output_features = {ACTION: features.pop(ACTION)} if ACTION in features else {}
+    policy.input_features = policy.input_features or features
+    try:
+        policy.validate_features()
+    except ValueError as error:
+        raise InputError("sft.policy", sft.policy, f"LeRobot says: {error}") from error
+
+
+def check_wandb(config: WandBConfig) -> None:
+    """Refuses logging to Weights & Biases where nobody is logged in.
+
+    Raises:
+        InputError: see above; or its package is not installed.
+    """
+    if not config.enable or os.environ.get("WANDB_MODE") in ("offline", "disabled", "dryrun"):
+        return
+    try:
+        import wandb
+    except ImportError as error:
+        raise InputError("wandb.enable", True, "wandb is not installed; pip install wandb") from error
+    if not wandb.api.api_key:
+        remedy = "this machine is not logged in: run wandb login, or set WANDB_API_KEY or WANDB_MODE=offline"
+        raise InputError("wandb.enable", True, remedy)
+
+
+def demos_bytes(config: DemosConfig, spec: WorldSpec) -> int:
+    """Disk space that demonstrations take, if half of the env steps are made and PNG halves the images."""
+    steps = min(spec.max_steps, config.max_steps)
+    return config.episodes * steps * sum(map(math.prod, spec.images.values())) // 4
+
+
+def disk_bytes(config: RunConfig, spec: WorldSpec, history: int) -> int:
+    """Disk space that a run takes at least, as far as it is known before; weights made by SFT are not."""
+    picture = sum(map(math.prod, spec.images.values()))
+    replay = (config.replay.capacity + config.remembered) * history * picture
+    policies = 1 + bool(config.saves)
+    if config.save_every_updates:
+        policies = 2 + config.trainer.updates // config.save_every_updates
+    whole = 1 + min(config.save_keep, policies)  # one more than is kept while it is written
+    records = config.policy.path is None and config.dataset.repo_id is None
+    made = demos_bytes(config.demos, spec) if records else 0
+    weights = 0
+    for path in (config.policy.path, config.sft.init_path):
+        if path is not None:
+            weights = sum(f.stat().st_size for f in Path(path).expanduser().glob("*.safetensors"))
+    return made + whole * replay + policies * weights
+
+
+def check_disk(folder: str | None, needed: int, field: str = "output_dir") -> None:
+    """Refuses a folder on a disk with too little space for `needed` bytes and small files; blames `field`.
+
+    Raises:
+        InputError: see above.
+    """
+    path = expanded(folder or ".", field).absolute()
+    while not path.exists():
+        path = path.parent
+    free = shutil.disk_usage(path).free
+    if free < needed + SLACK_BYTES:
+        remedy = f"{(needed + SLACK_BYTES) / 2**30:.2f} GiB are needed and {free / 2**30:.2f} GiB are free"
+        raise InputError(field, folder, f"{remedy} on this disk; make room or choose another")
+
+
+def check_machine(config: RunConfig) -> None:
+    """Refuses sizes far beyond this machine's memory.
+
+    Raises:
+        InputError: names the field that takes most memory.
+    """
+    if config.launch.address is not None:  # the other nodes may have more
+        return
+    from accerl_lerobot.cli.doctor import memory_parts_gib, total_memory_gib
+
+    parts, total = memory_parts_gib(config), total_memory_gib()
+    needed, largest = sum(parts.values()), max(parts, key=lambda name: parts[name])
+    if total is not None and needed > ABSURD * total:
+        remedy = f"the run needs about {needed:,.0f} GiB of memory, this machine has {total:.0f}; lower it"
+        section, _, name = largest.partition(".")
+        raise InputError(largest, getattr(getattr(config, section), name), remedy)
+
+
+def check_weights_fit(config: RunConfig) -> None:
+    """Refuses a policy whose weights this machine's memory cannot hold.
+
+    Raises:
+        InputError: see above.
+    """
+    from accerl_lerobot.cli.doctor import total_memory_gib
+
+    need, total = policy_gib(config), total_memory_gib()
+    if total is not None and need > total and config.launch.address is None:
+        remedy = "use a smaller policy, a GPU, launch.engine=local or policy.tuning.mode=lora"
+        said = f"its weights take {need:.1f} GiB in the processes of this run, this machine has {total:.1f}"
+        raise InputError("policy.path", config.policy.path, f"{said}; {remedy}")
+
+
+def policy_gib(config: RunConfig) -> float:
+    """Memory that the weights of ``policy.path`` take in all processes of a run; activations come on top.
+
+    On a GPU they are not in the machine's memory. Nothing is known of a policy that an SFT will make.
+
+    Raises:
+        InputError: see `policy_to_be`.
+    """
+    from accerl_lerobot.policies.loading import policy_sizes, rehearsed_config, resolve_device
+
+    if config.policy.path is None or resolve_device(config.policy.device).type != "cpu":
+        return 0.0
+    rehearsed_config(config.policy)
+    sizes, trainer, algorithm = policy_sizes(config.policy), config.trainer, config.algorithm
+    copies = 3  # the gradient and Adam's two moments
+    if isinstance(algorithm, RatioConfig):  # and copies of older weights
+        older = (trainer.probe_every, algorithm.reference_coef, algorithm.proximal_updates)
+        copies += sum(map(bool, older))
+    processes = 2 if trainer.hold_back else 1
+    if config.launch.engine != "local":
+        processes, copies = trainer.ranks + config.inference.workers, copies + 2  # two sets are published
+    return 4 * (sizes.policy * processes + sizes.trained * copies) / 2**30
+
+
+def _check_off_policy(config: RunConfig, spec: WorldSpec, policy: Any) -> None:
+    """Refuses policies whose chunks have no gradient, and segments that are not whole episodes."""
+    from accerl_lerobot.policies.loading import sampler_config
+
+    sampler = sampler_config(config.policy, policy.type)
+    if sampler.type not in ("flow", "gaussian") or getattr(sampler, "stochastic", "last") == "one":
+        remedy = "use flow (with stochastic=last) or gaussian, or another algorithm.type"
+        raise InputError(
+            "policy.sampler.type", sampler.type, f"algorithm.type={config.algorithm.type}: {remedy}"
+        )
+    decisions = math.ceil(spec.max_steps / getattr(policy, "n_action_steps", 1))
+    if config.rollout.segment_length < decisions:
+        remedy = f"algorithm.type={config.algorithm.type} looks at whole episodes; use at least {decisions}"
+        raise InputError("rollout.segment_length", config.rollout.segment_length, remedy)
+
+
+def policy_to_be(config: RunConfig) -> Any:
+    """LeRobot's config of the policy that a run will act with, as far as it is known before an SFT.
+
+    Raises:
+        InputError: there is no such checkpoint; RL has no likelihood for it; what `check_sft_policy` raises.
+    """
+    from accerl_lerobot.policies.loading import (
+        check_observations,
+        check_type,
+        override,
+        rehearsed_config,
+        sampler_config,
+    )
+
+    if config.policy.path is not None:
+        return rehearsed_config(config.policy)
+    if config.sft.init_path is not None:  # fine-tuning changes its weights alone
+        start = replace(config.policy, path=config.sft.init_path, revision=None)
+        try:
+            return rehearsed_config(start)
+        except InputError as error:
+            if error.field not in ("policy.path", "policy.type", "policy.n_obs_steps"):
+                raise
+            said = (
+                ""
+                if error.field == "policy.path"
+                else f"{error.field.removeprefix('policy.')}={error.value}: "
+            )
+            raise InputError("sft.init_path", start.path, said + error.remedy) from error
+    policy_config = check_sft_policy(config.sft)
+    kind = check_type(config.sft.policy["type"], "sft.policy.type", "RL needs a likelihood: ")
+    sampler = sampler_config(config.policy, kind)
+    override(policy_config, config.policy)
+    sampler.override(policy_config)
+    check_observations(policy_config, "sft.policy.n_obs_steps")
+    return policy_config
+
+
+def check_sft_policy(config: SFTConfig) -> Any:
+    """Lets LeRobot build the policy config that the SFT would ask for, and returns it.
+
+    Raises:
+        InputError: LeRobot has no such policy, no such field, or refuses a value; or cannot fine-tune it.
+    """
+    from lerobot.configs.policies import PreTrainedConfig
+
+    from accerl_lerobot.demos.sft import policy_fields
+
+    fields: dict[str, Any] = {k: v for k, v in config.policy.items() if k != "type"}
+    kind = config.policy["type"]
+    names = policy_fields(kind, "sft.policy.type")
+    if config.backbone is not None and "vlm_model_name" not in names:
+        remedy = f"{kind} has no vision-language backbone; leave the section out"
+        raise InputError("sft.backbone", config.backbone, remedy)
+    for key, value in fields.items():
+        if key not in names:
+            near = " or ".join(difflib.get_close_matches(key, names, n=3))
+            remedy = f"LeRobot's {kind} has no such field{f'; did you mean {near}?' if near else ''}"
+            raise InputError(f"sft.policy.{key}", value, remedy)
+    for key, value in fields.items():
+        if isinstance(value, int):
+            check(
+                Annotated[int, Range(f"[-1, {LARGEST_FIELD}]")],
+                int(value),
+                f"sft.policy.{key}",
+            )
+    try:
+        # Without a device LeRobot looks for one.
+        return draccus.decode(PreTrainedConfig.get_choice_class(kind), {"device": "cpu"} | fields)
+    except draccus.utils.DraccusException as error:
+        raise _as_input_error(error, fields) from error
+
+
+def sft_policy(config: SFTConfig) -> Any:
+    """LeRobot's config of the policy that an SFT trains, of any of LeRobot's types.
+
+    Raises:
+        InputError: what `check_sft_policy` raises; the checkpoint to start from cannot be read.
+    """
+    if config.init_path is None:
+        return check_sft_policy(config)
+    from lerobot.configs.policies import PreTrainedConfig
+
+    from accerl_lerobot.checkpoint.safety import brief
+    from accerl_lerobot.policies.files import fetched_checkpoint
+    from accerl_lerobot.policies.plugins import register_policies
+
+    register_policies()
+    folder = fetched_checkpoint(config.init_path, None, "sft.init_path")
+    try:
+        return PreTrainedConfig.from_pretrained(folder)
+    except Exception as error:  # LeRobot takes the file at its word, and may fail over any of it
+        remedy = f"its config.json is not one of this LeRobot's policies ({brief(error)})"
+        raise InputError("sft.init_path", config.init_path, remedy) from error
+
+
+def _as_input_error(error: BaseException, fields: dict[str, Any]) -> InputError:
+    chain = [error]
+    while (cause := chain[-1].__cause__ or chain[-1].__context__) is not None:
+        chain.append(cause)
+    located = next((e for e in chain if getattr(e, "key_path", ())), None)
+    text = " ".join(str(chain[-1]).split())
+    if located is None:
+        return InputError("sft.policy", fields, f"LeRobot says: {text}")
+    key = located.key_path[0]  # type: ignore[attr-defined]
+    return InputError(f"sft.policy.{key}", fields.get(key), f"LeRobot says: {text}")
+
+
+def check_placement(config: RunConfig) -> list[str]:
+    """Plans where the workers will be, so that what does not fit is refused before anything long; as lines.
+
+    Raises:
+        InputError: they do not fit, or the cluster that is to be joined is not as it has to be.
+    """
+    if config.launch.engine == "local":
+        return []
+    if config.launch.address is None:
+        from accerl_lerobot.engine.placement import planned, this_machine
+
+        return list(planned([this_machine()], config).rows())
+    ray_environment.prepare(joins=True)
+    from accerl_lerobot.engine.cluster import rehearse
+
+    return rehearse(config)
