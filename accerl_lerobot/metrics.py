@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from accerl_lerobot.config.ranges import Section
-from accerl_lerobot.engine.fault_points import reach
+from accerl_lerobot.fault_points import reach
 
 METRICS = "metrics.jsonl"
 """Name of the file in a run's folder."""
@@ -138,3 +138,8 @@ def plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {k: plain(v) for k, v in value.items()}
     return [plain(v) for v in value] if isinstance(value, (list, tuple)) else value
+
+
+def numbered(name: str, count: int) -> list[str]:
+    """Names of so many workers of a kind; of a single one, its kind's."""
+    return [name] if count == 1 else [f"{name} {i}" for i in range(count)]

@@ -20,11 +20,11 @@ from rich.table import Table
 
 from accerl_lerobot.bench.tables import as_markdown, write
 from accerl_lerobot.checkpoint.layout import DEMOS
-from accerl_lerobot.cli.console import Console
 from accerl_lerobot.config.dataset import DatasetConfig
 from accerl_lerobot.config.ranges import Choice, Range, Seed
-from accerl_lerobot.config.run import RunConfig, parse
+from accerl_lerobot.console import Console
 from accerl_lerobot.demos.windows import open_metadata
+from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.evaluation.stats import mean_interval
 from benchmarks.study import (
     INTERVALS,
@@ -120,7 +120,7 @@ def bench_efficiency(config: BenchEfficiencyConfig) -> dict[str, Any]:
         InputError: see `Study.run`.
         RuntimeError: see there.
     """
-    from accerl_lerobot.world_model.dreaming import check_imagination
+    from accerl_lerobot.engine.dreaming import check_imagination
 
     recipe = parse(RunConfig, [f"--config_path={config.recipe}"])
     study, console = Study(config, cells(config, recipe)), Console()

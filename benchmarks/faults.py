@@ -27,9 +27,9 @@ from rich.table import Table
 from accerl_lerobot.bench.host import host
 from accerl_lerobot.bench.tables import as_markdown, as_table, write
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, SUMMARY
-from accerl_lerobot.cli.console import Console
 from accerl_lerobot.config.ranges import Range, Repeats, Section, Seed, Steps
-from accerl_lerobot.config.run import RunConfig, encode, parse
+from accerl_lerobot.console import Console
+from accerl_lerobot.engine.config import RunConfig, encode, parse
 from accerl_lerobot.engine.ray_environment import RAY_PROCESSES
 from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.evaluation.pictures import drawing

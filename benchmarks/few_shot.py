@@ -16,8 +16,8 @@ from typing import Any
 from rich.table import Table
 
 from accerl_lerobot.bench.tables import as_markdown, as_table, write
-from accerl_lerobot.cli.console import Console
 from accerl_lerobot.config.ranges import Steps
+from accerl_lerobot.console import Console
 from accerl_lerobot.errors import output_folder
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate, mean_interval

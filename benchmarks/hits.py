@@ -16,8 +16,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from accerl_lerobot.engine.fault_points import FULL, NAN, POINTS, TORN, order, proof, withdraw
 from accerl_lerobot.engine.ray_environment import NEEDED, RAY_PROCESSES
+from accerl_lerobot.fault_points import FULL, NAN, POINTS, TORN, order, proof, withdraw
 from benchmarks.audit import audit_updates
 from benchmarks.study import last_words
 from benchmarks.victims import DRIVER, EVERYTHING, Victim, alive, await_hit, hit

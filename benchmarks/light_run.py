@@ -14,7 +14,7 @@ import logging
 import os
 import sys
 
-from accerl_lerobot.config.run import LaunchConfig, RunConfig
+from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig

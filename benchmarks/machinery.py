@@ -17,7 +17,7 @@ import numpy as np
 
 from accerl_lerobot.bench.blocks import Measured
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Section
-from accerl_lerobot.config.run import LaunchConfig, RunConfig
+from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.envs.simulated import read_trace
 from accerl_lerobot.errors import InputError

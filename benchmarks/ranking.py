@@ -16,8 +16,8 @@ from typing import Annotated, Any
 
 from rich.table import Table
 
-from accerl_lerobot.cli.console import Console
 from accerl_lerobot.config.ranges import Device, Range, Section, Threads
+from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
 from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.evaluation.pictures import drawing

@@ -23,8 +23,8 @@ from rich.console import Group
 
 from accerl_lerobot.bench.host import host, ranged, spread
 from accerl_lerobot.bench.tables import as_markdown, as_table, write
-from accerl_lerobot.cli.console import Console
 from accerl_lerobot.config.ranges import Positive, Range, Section, Seed
+from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.metrics import METRICS, MetricsLog, WandBConfig
 from accerl_lerobot.replay.journal import EPISODES

@@ -23,9 +23,9 @@ from rich.table import Table
 
 from accerl_lerobot.bench.tables import as_table
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY
-from accerl_lerobot.cli.console import Console
 from accerl_lerobot.config.ranges import Range, Section, Seed, Steps
-from accerl_lerobot.config.run import RunConfig, encode, parse
+from accerl_lerobot.console import Console
+from accerl_lerobot.engine.config import RunConfig, encode, parse
 from accerl_lerobot.engine.resume import locked
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.evaluation.pictures import drawing

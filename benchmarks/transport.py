@@ -27,8 +27,8 @@ import numpy as np
 from rich.table import Table
 
 from accerl_lerobot.bench.host import host, spread
-from accerl_lerobot.cli.console import Console
 from accerl_lerobot.config.ranges import Choice, Range, Repeats, Section, Seed
+from accerl_lerobot.console import Console
 from accerl_lerobot.engine import ray_environment
 from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.evaluation.pictures import drawing

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from accerl_lerobot.checkpoint.layout import CONFIG
-from accerl_lerobot.engine.fault_points import VARIABLE
 from accerl_lerobot.engine.ray_environment import RAY_PROCESSES, kind_of
+from accerl_lerobot.fault_points import VARIABLE
 from accerl_lerobot.metrics import METRICS
 from benchmarks.study import last_words
 
@@ -135,9 +135,7 @@ class Victim:
     def kill(self) -> list[int]:
         """Ends it and all below it, whatever they do, but for guardians, which clean up; who they were."""
         below = [
-            pid
-            for pid in descendants(self.process.pid)
-            if "accerl_lerobot/engine/guardian.py" not in title(pid)
+            pid for pid in descendants(self.process.pid) if "accerl_lerobot/guardian.py" not in title(pid)
         ]
         everyone = [self.process.pid, *below]
         for pid in everyone:

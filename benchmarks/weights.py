@@ -25,8 +25,8 @@ from rich.table import Table
 
 from accerl_lerobot.bench.host import host, ranged, spread
 from accerl_lerobot.bench.tables import as_markdown, as_table, write
-from accerl_lerobot.cli.console import Console
 from accerl_lerobot.config.ranges import Range, Repeats, Section, Seed
+from accerl_lerobot.console import Console
 from accerl_lerobot.engine import ray_environment
 from accerl_lerobot.errors import check_absent, make_folder
 from benchmarks.study import named

@@ -18,7 +18,7 @@ import yaml
 
 from accerl_lerobot import cli
 from accerl_lerobot.cli import verbs
-from accerl_lerobot.config.run import RunConfig, encode
+from accerl_lerobot.engine.config import RunConfig, encode
 from accerl_lerobot.engine.contract import WorkerError
 from accerl_lerobot.errors import InputError, kept_traceback, one_line
 

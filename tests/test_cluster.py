@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from accerl_lerobot.config.run import LaunchConfig
 from accerl_lerobot.engine import cluster
+from accerl_lerobot.engine.config import LaunchConfig
 from accerl_lerobot.engine.contract import WorkerError
 from accerl_lerobot.errors import InputError
 from tests.test_placement import cluster as nodes_of

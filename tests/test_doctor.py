@@ -19,7 +19,7 @@ from safetensors import safe_open
 from accerl_lerobot import cli
 from accerl_lerobot.cli import doctor
 from accerl_lerobot.cli.doctor import FAIL, OK, WARN, Check
-from accerl_lerobot.config.run import RunConfig, decode
+from accerl_lerobot.engine.config import RunConfig, decode
 from accerl_lerobot.engine.preflight import check_weights_fit
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.loading import policy_sizes

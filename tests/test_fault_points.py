@@ -14,8 +14,9 @@ from pathlib import Path
 import pytest
 
 import accerl_lerobot
-from accerl_lerobot.engine import fault_points
-from accerl_lerobot.engine.fault_points import (
+from accerl_lerobot import fault_points
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.fault_points import (
     CRASHES,
     POINTS,
     VARIABLE,
@@ -25,12 +26,11 @@ from accerl_lerobot.engine.fault_points import (
     reach,
     withdraw,
 )
-from accerl_lerobot.errors import InputError
 
 COMES_BY = """
 import sys
 from pathlib import Path
-from accerl_lerobot.engine.fault_points import reach
+from accerl_lerobot.fault_points import reach
 for _ in range(int(sys.argv[2])):
     reach(sys.argv[1], Path(sys.argv[3]))
 print("went on")

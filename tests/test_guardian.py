@@ -19,7 +19,7 @@ from accerl_lerobot.demos.writing import simulators
 PARENT = """
 import multiprocessing, os, signal, subprocess, sys, time
 from pathlib import Path
-from accerl_lerobot.engine import guardian
+from accerl_lerobot import guardian
 
 def child(semaphore):
     subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])  # it has no parent soon

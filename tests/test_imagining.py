@@ -17,17 +17,18 @@ import torch
 from accerl_lerobot import cli
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
-from accerl_lerobot.cli.console import Console
-from accerl_lerobot.config.run import DatasetConfig, RunConfig
-from accerl_lerobot.demos.export_dreams import write_dreams
+from accerl_lerobot.console import Console
 from accerl_lerobot.demos.windows import open_metadata
+from accerl_lerobot.engine.config import DatasetConfig, RunConfig
 from accerl_lerobot.engine.contract import Progress
+from accerl_lerobot.engine.dream_workers import DreamWorker, WorldLearningWorker
 from accerl_lerobot.engine.local import LocalEngine
-from accerl_lerobot.engine.preflight import check_features, dataset_features, env_features
 from accerl_lerobot.engine.run import train
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Segment
+from accerl_lerobot.export.dreams import write_dreams
+from accerl_lerobot.policies.features import check_features, dataset_features, env_features
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline.read import shares
@@ -40,7 +41,6 @@ from accerl_lerobot.world_model.recorded import DREAMS as DREAMT
 from accerl_lerobot.world_model.recorded import read_dreams
 from accerl_lerobot.world_model.store import save_world_model
 from accerl_lerobot.world_model.success import new_success_model
-from accerl_lerobot.world_model.worker import DreamWorker, WorldLearningWorker
 from tests.runs import drive, polls, tiny_run
 
 # About half of all episodes succeed when it is acted at random.
@@ -379,7 +379,7 @@ def test_rooms_that_do_not_go_together(tiny_checkpoint: Path):
 
 
 def test_the_summary_says_what_was_imagined(tiny_checkpoint: Path, tmp_path: Path):
-    from accerl_lerobot.cli.console import Console
+    from accerl_lerobot.console import Console
 
     config = dreaming(tiny_checkpoint, model="oracle")
     config = replace(config, launch=replace(config.launch, engine="local"))

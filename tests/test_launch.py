@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from accerl_lerobot.checkpoint.layout import PRETRAINED
-from accerl_lerobot.config.run import RunConfig
+from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.config import evaluation_plans

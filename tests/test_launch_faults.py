@@ -18,8 +18,8 @@ from typing import Any
 import pytest
 import ray
 
-from accerl_lerobot.config.run import LaunchConfig
 from accerl_lerobot.engine import launch, seats
+from accerl_lerobot.engine.config import LaunchConfig
 from accerl_lerobot.engine.contract import Progress, WorkerError, pause_s
 from accerl_lerobot.engine.launch import RayEngine
 from accerl_lerobot.envs import SimulatedConfig

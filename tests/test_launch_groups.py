@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from accerl_lerobot.algorithms import GIPOConfig
-from accerl_lerobot.config.run import RunConfig
+from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.config import evaluation_plans

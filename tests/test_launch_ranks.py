@@ -20,7 +20,7 @@ from safetensors.torch import load_file
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, STEP, TRAINING_STATE, WEIGHTS
-from accerl_lerobot.config.run import RunConfig
+from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import WorkerError
 from accerl_lerobot.engine.launch import RayEngine
 from accerl_lerobot.evaluation.config import evaluation_plans

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.algorithms import ALGORITHMS, AlgorithmConfig, GIPOConfig, PPOConfig
-from accerl_lerobot.config.run import RunConfig
+from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Engine, Progress
 from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig

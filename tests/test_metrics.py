@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
-from accerl_lerobot.cli.console import Console
-from accerl_lerobot.config.run import RunConfig, parse
+from accerl_lerobot.console import Console
+from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.metrics import MetricsLog, WandBConfig

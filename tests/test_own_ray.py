@@ -12,8 +12,8 @@ from collections.abc import Iterator
 import psutil
 import pytest
 
-from accerl_lerobot.config.run import LaunchConfig
 from accerl_lerobot.engine import cluster, own_ray
+from accerl_lerobot.engine.config import LaunchConfig
 from accerl_lerobot.engine.contract import WorkerError
 from accerl_lerobot.engine.own_ray import OwnRay, RayWatch
 from accerl_lerobot.engine.ray_environment import kind_of
@@ -124,7 +124,8 @@ def test_who_goes_on_is_not_taken_for_stopped(raylet: psutil.Process):
 HANGS = """
 import os, signal, sys, time
 import psutil
-from accerl_lerobot.engine import guardian, own_ray
+from accerl_lerobot import guardian
+from accerl_lerobot.engine import own_ray
 gcs_server = psutil.Process(int(sys.argv[1]))
 own_ray.ray_processes = lambda: {gcs_server: "gcs_server"}
 own_ray.kill_ray = lambda processes: None

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot.cli.console import Console
-from accerl_lerobot.config.run import LaunchConfig, RunConfig, decode
+from accerl_lerobot.console import Console
+from accerl_lerobot.engine.config import LaunchConfig, RunConfig, decode
 from accerl_lerobot.engine.contract import WorkerError
 from accerl_lerobot.engine.placement import Node, Plan, planned
 from accerl_lerobot.engine.placement_config import PlacementConfig, RoleConfig

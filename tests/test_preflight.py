@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from accerl_lerobot import cli
-from accerl_lerobot.engine.preflight import Features, check_features, env_features, policy_features
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies.features import Features, check_features, env_features, policy_features
 from tests.policies.checkpoints import write_act, write_diffusion, write_gaussian_actor
 
 ROOT = Path(__file__).parents[1]

@@ -16,7 +16,7 @@ import pytest
 
 from accerl_lerobot.cli.doctor import pins
 from accerl_lerobot.cli.verbs import CONFIGS
-from accerl_lerobot.config.run import RunConfig, parse
+from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.engine.preflight import check_sft_policy
 from benchmarks.__main__ import CONFIGS as BENCHMARKS
 
@@ -25,12 +25,17 @@ PACKAGE = ROOT / "accerl_lerobot"
 
 HEADER = "# SPDX-License-Identifier: Apache-2.0\n"
 LONGEST_FILE = 600
-WAYS = {"direct.py", "pair.py", "ray_channel.py", "ray_calls.py", "transport_ends.py"}
-RAYS = WAYS | {"peers.py", "weights_readers.py"}
 CONDUCTOR = {"launch.py", "cluster.py", "own_ray.py", "seats.py", "services.py", "watched.py"}
-SHELLS = CONDUCTOR | {"doctor.py", "worker.py"} | RAYS
+SHELLS = CONDUCTOR | {
+    "doctor.py",
+    "worker.py",
+    "dream_workers.py",
+    "peers.py",
+    "ray_channel.py",
+    "ray_calls.py",
+}
 """Files that may import Ray; all others are testable without it."""
-DISTRIBUTED = {"meeting.py", "pair.py", "ranks.py", "sharding.py", "tensors.py"}
+DISTRIBUTED = {"meeting.py", "ranks.py", "sharding.py", "tensors.py"}
 """Files that may know of other processes of a `torch.distributed` group."""
 
 LIGHT = [
@@ -91,6 +96,23 @@ def test_no_file_is_too_long() -> None:
 def test_every_module_says_what_it_is() -> None:
     silent = [str(p.relative_to(ROOT)) for p in sources() if not ast.get_docstring(ast.parse(p.read_text()))]
     assert silent == []
+
+
+def test_packages_form_layers() -> None:
+    """No package, and no module beside them, needs itself by way of others."""
+    needs: dict[str, set[str]] = {}
+    for path in sources():
+        unit = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+        named = {
+            name.split(".")[1] for name in imports(path, top_level=True) if name.startswith("accerl_lerobot.")
+        }
+        needs.setdefault(unit, set()).update(named - {unit})
+    loose = [path.name for path in PACKAGE.glob("*.py")]
+    assert len(loose) <= 8, loose
+    needs.pop("__init__")
+    while free := {unit for unit, others in needs.items() if not others & needs.keys()}:
+        needs = {unit: others for unit, others in needs.items() if unit not in free}
+    assert needs == {}
 
 
 def test_docstrings_begin_with_a_noun_or_a_verb() -> None:

@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from accerl_lerobot.cli import main
-from accerl_lerobot.config.run import LaunchConfig, encode
+from accerl_lerobot.engine.config import LaunchConfig, encode
 from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.config import EvaluationConfig

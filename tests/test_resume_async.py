@@ -16,8 +16,8 @@ import pytest
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
-from accerl_lerobot.config.run import RunConfig
 from accerl_lerobot.engine import launch
+from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Progress
 from accerl_lerobot.engine.launch import RayEngine
 from accerl_lerobot.envs import SimulatedConfig

@@ -12,7 +12,7 @@ import pytest
 from accerl_lerobot.algorithms import ChunkCriticConfig, GIPOConfig, SelfImitationConfig
 from accerl_lerobot.algorithms.decoupled import DecoupledConfig
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
-from accerl_lerobot.config.run import RunConfig
+from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Progress
 from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig

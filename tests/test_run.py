@@ -12,9 +12,9 @@ import pytest
 import yaml
 
 from accerl_lerobot.checkpoint.layout import saved_version
-from accerl_lerobot.cli.console import Console
-from accerl_lerobot.config.run import LaunchConfig, RunConfig, parse
+from accerl_lerobot.console import Console
 from accerl_lerobot.engine import run
+from accerl_lerobot.engine.config import LaunchConfig, RunConfig, parse
 from accerl_lerobot.engine.contract import Engine, Progress, Saved, WorkerError
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.config.run import LaunchConfig, RunConfig
 from accerl_lerobot.engine import launch
+from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.contract import Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError

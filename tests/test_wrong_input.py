@@ -15,11 +15,10 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot import cli
+from accerl_lerobot import cli, guardian
 from accerl_lerobot.cli import doctor
 from accerl_lerobot.cli.verbs import CONFIGS
 from accerl_lerobot.config.parsing import dotted_fields
-from accerl_lerobot.engine import guardian
 
 CASES = 120
 

@@ -26,9 +26,9 @@ import pytest  # noqa: E402
 import ray  # noqa: E402
 from ray.cluster_utils import Cluster  # noqa: E402
 
-from accerl_lerobot.config.run import LaunchConfig  # noqa: E402
 from accerl_lerobot.engine import cluster as joining  # noqa: E402
 from accerl_lerobot.engine import launch  # noqa: E402
+from accerl_lerobot.engine.config import LaunchConfig  # noqa: E402
 from accerl_lerobot.engine.launch import RayEngine  # noqa: E402
 from accerl_lerobot.engine.placement_config import PlacementConfig, RoleConfig  # noqa: E402
 from accerl_lerobot.envs import SimulatedConfig  # noqa: E402

@@ -21,8 +21,8 @@ from rich.table import Table
 
 from accerl_lerobot.bench.host import host
 from accerl_lerobot.bench.tables import as_markdown, as_table, write
-from accerl_lerobot.cli.console import Console
 from accerl_lerobot.config.ranges import Range, Section, Seed
+from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, World, make_world
 from accerl_lerobot.envs.simulated import RESET
 from accerl_lerobot.errors import output_folder

@@ -17,9 +17,9 @@ from rich.table import Table
 from accerl_lerobot.bench.blocks import ARMS, Block, Measured, as_rows
 from accerl_lerobot.bench.host import host, ranged, spread
 from accerl_lerobot.bench.tables import as_markdown, as_table, write
-from accerl_lerobot.cli.console import Console
 from accerl_lerobot.config.ranges import Positive, Repeats, Section
-from accerl_lerobot.config.run import RunConfig, parse
+from accerl_lerobot.console import Console
+from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.errors import InputError, expanded, make_folder
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.replay.pacing import decisions_under_way

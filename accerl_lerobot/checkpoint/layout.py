@@ -25,8 +25,8 @@ from pathlib import Path
 from typing import Any
 
 from accerl_lerobot.checkpoint.safety import Origin, safe_join
-from accerl_lerobot.engine.fault_points import reach
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.fault_points import reach
 
 PRETRAINED, TRAINING_STATE, WORLD_MODEL = "pretrained_model", "training_state", "world_model"
 CHECKPOINTS = "checkpoints"
@@ -46,6 +46,8 @@ FORMAT = 2
 """Format of the manifest and the training state; another one is refused."""
 UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError)
 """Exceptions of reading a broken manifest."""
+AWAY = "LOCAL"
+"""Stands for the folders above a file that was on the pusher's machine."""
 BACKBONE = "backbone"
 """Folder beside the weights with the vision-language backbone's config and tokenisers."""
 FAST = f"{BACKBONE}/fast"

@@ -152,7 +152,7 @@ def set_up_logging() -> None:
 @contextlib.contextmanager
 def guarded() -> Iterator[None]:
     """Ends and removes, on the way out, whatever is started within and left behind."""
-    from accerl_lerobot.engine import guardian
+    from accerl_lerobot import guardian
 
     guardian.start()  # before anything that it is to clean up
     with interrupted():

@@ -27,7 +27,7 @@ import yaml
 from accerl_lerobot.errors import InputError, expanded
 
 if TYPE_CHECKING:
-    from accerl_lerobot.config.run import RunConfig
+    from accerl_lerobot.engine.config import RunConfig
 
 OK, WARN, FAIL = "ok", "warn", "FAIL"
 RESOLVED = "--resolved="
@@ -88,7 +88,7 @@ def main(arguments: list[str]) -> int:
     failed = sum(check.status == FAIL for check in checks)
     sys.stdout.write(f"\n{'all good' if not failed else f'{failed} of {len(checks)} checks failed'}\n")
     if config is not None and files:
-        from accerl_lerobot.config.run import encode
+        from accerl_lerobot.engine.config import encode
 
         path = expanded(files[-1], RESOLVED.strip("-="))
         try:
@@ -276,7 +276,7 @@ def dreams(config: RunConfig) -> Iterator[Check]:
     """True if what is to be imagined fits the world and the policy."""
     if not config.imagination.share:
         return
-    from accerl_lerobot.world_model.dreaming import check_imagination
+    from accerl_lerobot.engine.dreaming import check_imagination
 
     try:
         check_imagination(config)
@@ -372,7 +372,7 @@ def pace(config: RunConfig) -> Iterator[Check]:
 
 
 def _resolve(arguments: list[str]) -> tuple[RunConfig | None, int, list[Check]]:
-    from accerl_lerobot.config.run import RunConfig, parse
+    from accerl_lerobot.engine.config import RunConfig, parse
     from accerl_lerobot.engine.preflight import check_start
 
     try:

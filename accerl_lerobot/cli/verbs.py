@@ -23,11 +23,10 @@ from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.throughput import BenchThroughputConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
 from accerl_lerobot.checkpoint.layout import CONFIG
-from accerl_lerobot.cli.console import Console
+from accerl_lerobot.cli.configs import DemosRun, EvalRun, SFTRun, WorldModelEvalRun, WorldModelRun
 from accerl_lerobot.config.parsing import read_arguments
-from accerl_lerobot.config.run import RunConfig, encode, parse
-from accerl_lerobot.config.verbs import DemosRun, EvalRun, SFTRun, WorldModelEvalRun, WorldModelRun
-from accerl_lerobot.demos.export import ExportConfig
+from accerl_lerobot.console import Console
+from accerl_lerobot.engine.config import RunConfig, encode, parse
 from accerl_lerobot.errors import (
     InputError,
     check_absent,
@@ -36,6 +35,7 @@ from accerl_lerobot.errors import (
     kept_traceback,
     make_folder,
 )
+from accerl_lerobot.export.episodes import ExportConfig
 from accerl_lerobot.hub.config import PullConfig, PushConfig
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.report.config import ReportConfig
@@ -53,7 +53,8 @@ def train(arguments: list[str], load: Load | None = None) -> int:
         load: makes the policy's adapter; None: of LeRobot's checkpoint.
     """
     config: RunConfig = parse(RunConfig, arguments)
-    from accerl_lerobot.engine import guardian, run
+    from accerl_lerobot import guardian
+    from accerl_lerobot.engine import run
     from accerl_lerobot.engine.contract import WorkerError
     from accerl_lerobot.engine.preflight import check_start
     from accerl_lerobot.engine.resume import begun_run, how_to_go_on, locked
@@ -284,7 +285,7 @@ def timeline(arguments: list[str]) -> int:
 def export(arguments: list[str]) -> int:
     """``accerl export``."""
     config: ExportConfig = parse(ExportConfig, arguments)
-    from accerl_lerobot.demos.export import export_episodes
+    from accerl_lerobot.export.episodes import export_episodes
 
     console = Console()
     with redirect_stdout(sys.stderr):

@@ -10,7 +10,7 @@ from accerl_lerobot.demos.dataset_files import checked
 from accerl_lerobot.errors import InputError
 
 if TYPE_CHECKING:
-    from accerl_lerobot.config.run import DatasetConfig
+    from accerl_lerobot.engine.config import DatasetConfig
 
 
 def open_metadata(dataset: DatasetConfig) -> Any:

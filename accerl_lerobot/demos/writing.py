@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.engine import guardian
+from accerl_lerobot import guardian
 from accerl_lerobot.errors import InputError, check_absent, expanded
 
 

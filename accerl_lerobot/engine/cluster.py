@@ -30,7 +30,7 @@ from ray._private.state import available_resources_per_node, total_resources_per
 from ray.exceptions import AuthenticationError, GetTimeoutError, RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from accerl_lerobot.config.run import LaunchConfig, RunConfig
+from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.contract import WorkerError, pause_s
 from accerl_lerobot.engine.placement import Node, Place, Plan, asked, candidates, planned
 from accerl_lerobot.engine.placement_config import WHERE

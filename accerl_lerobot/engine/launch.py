@@ -30,15 +30,15 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, saved_version
-from accerl_lerobot.config.run import RunConfig, journal_folder, timeline_folder
 from accerl_lerobot.engine.cluster import on, placed
+from accerl_lerobot.engine.config import RunConfig, journal_folder, timeline_folder
 from accerl_lerobot.engine.contract import Engine, Progress, Saved, WorkerError
 from accerl_lerobot.engine.own_ray import OwnRay
-from accerl_lerobot.engine.placement import numbered
 from accerl_lerobot.engine.seats import START_S, Seats
 from accerl_lerobot.engine.services import Services
 from accerl_lerobot.engine.watched import Watched, end
 from accerl_lerobot.inference.batcher import BatcherStats
+from accerl_lerobot.metrics import numbered
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
@@ -240,7 +240,7 @@ class RayEngine(Engine):
         self._ranks = [self._other(*rank) for rank in zip(peers, ranks, strict=True)]
         self._trainer = self._other("trainer", trainer)
         if imagination.share:
-            from accerl_lerobot.world_model.worker import DreamWorker, WorldLearningWorker
+            from accerl_lerobot.engine.dream_workers import DreamWorker, WorldLearningWorker
 
             for i, n in enumerate(numbered("dream", imagination.workers)):
                 dreams = make(n, DreamWorker, 4, c, self._state, timeline, i)

@@ -20,7 +20,7 @@ import numpy as np
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS, WORLD_MODEL
-from accerl_lerobot.config.run import RunConfig, journal_folder, timeline_folder
+from accerl_lerobot.engine.config import RunConfig, journal_folder, timeline_folder
 from accerl_lerobot.engine.contract import Engine, Progress, Saved, check_new, episode_key
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
@@ -83,7 +83,7 @@ class LocalEngine(Engine):
         self._replay = MixedReplay(config.replay, imagination.replay, imagination.share, counted, journal)
         self._dreams = self._world_learner = None
         if imagination.share:
-            from accerl_lerobot.world_model.dreaming import make_imagination, make_learner
+            from accerl_lerobot.engine.dreaming import make_imagination, make_learner
 
             self._dreams = make_imagination(config, "dream", self._replay.insert)
             if imagination.learns:

@@ -27,8 +27,8 @@ from accerl_lerobot.checkpoint.layout import (
     saved_version,
     write_atomically,
 )
-from accerl_lerobot.cli.console import Console
-from accerl_lerobot.config.run import RunConfig
+from accerl_lerobot.console import Console
+from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Engine, Progress
 from accerl_lerobot.engine.resume import heed_stop
 from accerl_lerobot.engine.stopping import Stopping

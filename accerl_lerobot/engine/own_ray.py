@@ -19,9 +19,9 @@ import psutil
 import ray
 from ray.exceptions import GetTimeoutError, RayError
 
-from accerl_lerobot.config.run import LaunchConfig
-from accerl_lerobot.engine import guardian
+from accerl_lerobot import guardian
 from accerl_lerobot.engine.cluster import kill_ray, ray_processes, start_ray
+from accerl_lerobot.engine.config import LaunchConfig
 from accerl_lerobot.engine.ray_environment import NEEDED
 from accerl_lerobot.engine.stopping import arrived
 

@@ -23,10 +23,11 @@ from typing import TYPE_CHECKING, NamedTuple
 from accerl_lerobot.engine.contract import WorkerError
 from accerl_lerobot.engine.placement_config import WHERE, RoleConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.metrics import numbered
 from accerl_lerobot.transport.endpoint import FIELD
 
 if TYPE_CHECKING:
-    from accerl_lerobot.config.run import RunConfig
+    from accerl_lerobot.engine.config import RunConfig
 
 ALL = "all"
 TINY = 1e-6
@@ -155,11 +156,6 @@ def asked(config: RunConfig) -> list[Asked]:
         found.append(Asked("imagination", (*names, *learns), placement.imagination))
     rollouts = tuple(f"rollout {i}" for i in range(c.rollout.workers))
     return [*found, Asked("rollout", rollouts, placement.rollout, network=False)]
-
-
-def numbered(name: str, count: int) -> list[str]:
-    """Names of so many workers of a kind; of a single one, its kind's."""
-    return [name] if count == 1 else [f"{name} {i}" for i in range(count)]
 
 
 def candidates(nodes: Sequence[Node], selector: str | None, field: str) -> list[Node]:

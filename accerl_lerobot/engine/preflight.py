@@ -12,7 +12,7 @@ import logging
 import math
 import os
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,6 +23,17 @@ from accerl_lerobot.config.ranges import Range, check
 from accerl_lerobot.engine import ray_environment
 from accerl_lerobot.envs import EnvConfig, WorldSpec, make_world
 from accerl_lerobot.errors import InputError, check_absent, expanded
+from accerl_lerobot.policies.features import (
+    ACTION,
+    ENV_STATE,
+    STATE,
+    Features,
+    check_features,
+    dataset_features,
+    env_features,
+    policy_features,
+    resizes,
+)
 
 LARGEST_FIELD = 10**6
 """Largest number in a policy config; LeRobot has no size or number of steps beyond."""
@@ -30,133 +41,15 @@ ABSURD = 2
 """Times this machine's memory that a rough estimate may be; ``accerl doctor`` warns long before."""
 
 if TYPE_CHECKING:
-    from accerl_lerobot.config.run import DatasetConfig, RunConfig
     from accerl_lerobot.demos.record import DemosConfig
     from accerl_lerobot.demos.sft import SFTConfig
+    from accerl_lerobot.engine.config import DatasetConfig, RunConfig
     from accerl_lerobot.metrics import WandBConfig
 
 logger = logging.getLogger(__name__)
 
-STATE, ENV_STATE, ACTION = "observation.state", "observation.environment_state", "action"
-RESIZERS = ("resize_imgs_with_padding", "image_resolution", "resize_shape")
-"""Fields of LeRobot's policy configs: where one is set, the policy resizes its images by itself."""
 SLACK_BYTES = 128 * 2**20
 """Disk space for metrics, the timeline, the journal and videos."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Features:
-    """Inputs and outputs of an environment, a dataset or a policy, by LeRobot's names."""
-
-    shapes: dict[str, tuple[int, ...]]
-    """Name → shape; images are (channels, height, width)."""
-    any_size: bool = False
-    """Images of any height and width fit."""
-    fps: float | None = None
-    """Control rate in Hz; None: not known."""
-    tasks: tuple[str, ...] = ()
-    """Instructions; empty: not known."""
-
-
-def env_features(spec: WorldSpec) -> Features:
-    """Features that an environment offers."""
-    shapes: dict[str, tuple[int, ...]] = {name: (c, h, w) for name, (h, w, c) in spec.images.items()}
-    shapes |= {STATE: (spec.state_dim,), ACTION: (spec.action_dim,)}
-    return Features(shapes=shapes, fps=spec.fps, tasks=spec.instructions)
-
-
-def policy_features(policy: Any) -> Features:
-    """Features that a policy needs, from LeRobot's config of it."""
-    features = (policy.input_features or {}) | (policy.output_features or {})
-    return Features(shapes=_shapes(features), any_size=resizes(policy))
-
-
-def resizes(policy: Any) -> bool:
-    """True if a policy resizes its images by itself, by LeRobot's config of it."""
-    return any(getattr(policy, field, None) for field in RESIZERS)
-
-
-def dataset_features(meta: Any) -> Features:
-    """Features of a LeRobotDataset, which a policy trained on it needs."""
-    from lerobot.utils.feature_utils import dataset_to_policy_features
-
-    shapes = _shapes(dataset_to_policy_features(meta.features))
-    return Features(shapes=shapes, fps=meta.fps, tasks=tuple(map(str, meta.tasks.index)))
-
-
-def _shapes(features: dict[str, Any]) -> dict[str, tuple[int, ...]]:
-    """Shapes of the features that policies read or write."""
-    named = {k: f for k, f in features.items() if f.type.name == "VISUAL" or k in (STATE, ENV_STATE, ACTION)}
-    return {k: tuple(f.shape) for k, f in named.items() if ".empty_camera_" not in k}
-
-
-def check_features(
-    needed: Features,
-    offered: Features,
-    rename_map: dict[str, str],
-    field: str,
-    value: object,
-    offerer: str = "environment",
-) -> None:
-    """Compares two parties of a run.
-
-    Args:
-        needed: by a policy, or by the policy that a dataset makes.
-        offered: by an environment, or by the dataset that a policy is trained on.
-        rename_map: offered name → needed name.
-        field: blamed in the error, with its `value`.
-        offerer: ``environment`` or ``dataset``.
-
-    Raises:
-        InputError: a feature is missing or of another shape, the rates differ, none of the environment's
-            tasks is in the dataset, or `rename_map` renames nothing or gives two features one name.
-    """
-    renames = "policy.rename_map"
-    sources = {name for name in offered.shapes if name != ACTION}
-    for name in rename_map.keys() - sources:
-        names = ", ".join(sorted(sources))
-        raise InputError(renames, name, f"the {offerer} has no such feature; it offers {names}")
-    shapes: dict[str, tuple[int, ...]] = {}
-    for name, shape in offered.shapes.items():
-        new = rename_map.get(name, name)
-        if new in shapes:
-            raise InputError(renames, rename_map, f"two features of the {offerer} would be {new}")
-        shapes[new] = shape
-    for name, shape in needed.shapes.items():
-        image = len(shape) == 3
-        if name not in shapes:
-            same = [k for k, other in shapes.items() if len(other) == len(shape) and k != ACTION]
-            remedy = "; choose env.camera accordingly, or map names with policy.rename_map" if image else ""
-            offers = ", ".join(same) or "none"
-            raise InputError(field, value, f"no {name} in the {offerer}, which offers {offers}{remedy}")
-        skip = 1 if image and needed.any_size else len(shape)
-        if shapes[name][:skip] != shape[:skip]:
-            remedy = "give both one image size" if image else "choose parties that were made for each other"
-            raise InputError(
-                field, value, f"its {name} is {shape}, but {shapes[name]} in the {offerer}; {remedy}"
-            )
-    if needed.fps and offered.fps and not math.isclose(needed.fps, offered.fps):
-        remedy = "its actions would be executed at another rate; use a dataset of this rate"
-        raise InputError(field, value, f"recorded at {needed.fps:g} Hz, but the environment runs at "
-                         f"{offered.fps:g} Hz: {remedy}")  # fmt: skip
-    _check_tasks(needed.tasks, offered.tasks, field, value)
-
-
-def _check_tasks(recorded: tuple[str, ...], wanted: tuple[str, ...], field: str, value: object) -> None:
-    """Compares instructions; letter case, spaces and a full stop do not count."""
-    known = {_plain(text) for text in recorded}
-    missing = [text for text in wanted if _plain(text) not in known]
-    if not known or not missing:
-        return
-    has = ", ".join(map(repr, recorded[:4])) + (" …" if len(recorded) > 4 else "")
-    said = f"no episode of {', '.join(map(repr, missing[:4]))}, the environment's task: it has {has}"
-    if len(missing) == len(wanted):
-        raise InputError(field, value, f"{said}; choose env.task accordingly")
-    logger.warning("%s=%r: %s", field, value, said)
-
-
-def _plain(text: str) -> str:
-    return " ".join(text.lower().split()).rstrip(".")
 
 
 def check_world(env: EnvConfig) -> WorldSpec:

@@ -18,7 +18,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from accerl_lerobot.engine import guardian
+from accerl_lerobot import guardian
 
 WORKERS = {
     # Several CPU workers share the cores: spinning threads would cost more than they give.

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, LAST, SUMMARY
 from accerl_lerobot.checkpoint.safety import Origin, check_folder, check_number, read_json
 from accerl_lerobot.config.parsing import CONSENT, decode, read_recipe
-from accerl_lerobot.config.run import RunConfig, encode
+from accerl_lerobot.engine.config import RunConfig, encode
 from accerl_lerobot.engine.stopping import StoppedError, Stopping
 from accerl_lerobot.errors import InputError, make_folder
 

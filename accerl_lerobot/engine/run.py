@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import yaml
 
 from accerl_lerobot.checkpoint.layout import (
+    AWAY,
     CHECKPOINTS,
     CONFIG,
     DEMOS,
@@ -37,16 +38,15 @@ from accerl_lerobot.checkpoint.layout import (
     newest_whole,
     write_atomically,
 )
-from accerl_lerobot.cli.console import Console
-from accerl_lerobot.config.run import LaunchConfig, RunConfig, encode, timeline_folder
+from accerl_lerobot.console import Console
 from accerl_lerobot.engine import ray_environment
+from accerl_lerobot.engine.config import LaunchConfig, RunConfig, encode, timeline_folder
 from accerl_lerobot.engine.contract import Engine, WorkerError, pause_s
 from accerl_lerobot.engine.loop import Loop, Times
 from accerl_lerobot.engine.preflight import check_placement, check_policy, check_start, check_world
 from accerl_lerobot.engine.resume import heed_stop
 from accerl_lerobot.engine.stopping import Stopping
 from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, make_folder
-from accerl_lerobot.hub.portable import AWAY
 from accerl_lerobot.metrics import METRICS, MetricsLog
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.journal import EPISODES
@@ -352,7 +352,7 @@ def _start(config: RunConfig, directory: Path) -> str | None:
 
 def _check_imagination(config: RunConfig, going_on: bool) -> None:
     if config.imagination.share:
-        from accerl_lerobot.world_model.dreaming import check_imagination
+        from accerl_lerobot.engine.dreaming import check_imagination
 
         path = config.imagination.path
         if going_on and path is not None and not Path(path).expanduser().is_dir():

@@ -18,8 +18,8 @@ import ray
 from ray.exceptions import ActorUnavailableError, RayActorError, RayError
 
 from accerl_lerobot.checkpoint import snapshot
-from accerl_lerobot.config.run import RunConfig, timeline_folder
 from accerl_lerobot.engine.cluster import alive, on
+from accerl_lerobot.engine.config import RunConfig, timeline_folder
 from accerl_lerobot.engine.contract import WorkerError, check_new, episode_key
 from accerl_lerobot.engine.placement import Plan
 from accerl_lerobot.engine.ray_environment import TOKENLESS

@@ -22,8 +22,8 @@ from typing import Any
 import ray
 from ray.exceptions import RayActorError, RayError
 
-from accerl_lerobot.config.run import RunConfig, timeline_folder
 from accerl_lerobot.engine.cluster import alive, on
+from accerl_lerobot.engine.config import RunConfig, timeline_folder
 from accerl_lerobot.engine.contract import WorkerError, pause_s
 from accerl_lerobot.engine.placement import Plan
 from accerl_lerobot.engine.seats import START_S

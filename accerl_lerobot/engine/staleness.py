@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from accerl_lerobot.replay.pacing import decisions_under_way, lag_bound
 
 if TYPE_CHECKING:
-    from accerl_lerobot.config.run import RunConfig
+    from accerl_lerobot.engine.config import RunConfig
 
 
 def lag_limits(config: RunConfig) -> tuple[int, int]:

@@ -10,6 +10,7 @@ from typing import Any
 
 from huggingface_hub import DatasetCard, EvalResult, ModelCard, ModelCardData
 
+from accerl_lerobot.checkpoint.layout import AWAY
 from accerl_lerobot.config.imports import DISCOVER
 from accerl_lerobot.hub.around import FOLDER, Around
 from accerl_lerobot.hub.config import REPO_ID
@@ -25,7 +26,6 @@ from accerl_lerobot.hub.kinds import (
     WORLD_MODEL,
     read_json,
 )
-from accerl_lerobot.hub.portable import AWAY
 from accerl_lerobot.policies.plugins import discovery
 from accerl_lerobot.world_model.config import PIXELS
 

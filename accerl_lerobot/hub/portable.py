@@ -14,10 +14,8 @@ from typing import Any
 
 import yaml
 
-from accerl_lerobot.checkpoint.layout import places_of_names
+from accerl_lerobot.checkpoint.layout import AWAY, places_of_names
 
-AWAY = "LOCAL"
-"""Stands for the folders above a file that was on the pusher's machine."""
 RECORDS = (".json", ".jsonl", ".yaml", ".yml", ".md", ".txt", ".log", ".csv", ".html")
 VOCABULARIES = ("tokenizer.json", "vocab.json", "merges.txt", "added_tokens.json", "special_tokens_map.json")
 PATH = re.compile(r"(?<![\w:/.~}>\-])(?:~|)(?:/[\w.+@%,\-]+){2,}/?")

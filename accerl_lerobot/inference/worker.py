@@ -30,8 +30,8 @@ import numpy as np
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import WEIGHTS
 from accerl_lerobot.config.ranges import Range, Section, Threads
-from accerl_lerobot.engine.fault_points import reach
 from accerl_lerobot.experience import Decision, Request
+from accerl_lerobot.fault_points import reach
 from accerl_lerobot.inference.batcher import Batcher, BatcherStats
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.engine.fault_points import reach
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Origin, Segment
+from accerl_lerobot.fault_points import reach
 from accerl_lerobot.metrics import cut_back
 
 EPISODES = "episodes.jsonl"

@@ -23,8 +23,8 @@ from typing import NamedTuple
 import numpy as np
 
 from accerl_lerobot.checkpoint import snapshot
-from accerl_lerobot.engine.fault_points import reach
 from accerl_lerobot.experience import REAL, Segment
+from accerl_lerobot.fault_points import reach
 from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.replay.mixed import MixedReplay
 from accerl_lerobot.replay.pacing import ReplayConfig

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from accerl_lerobot.console import rate
 from accerl_lerobot.report.charts import Chart, Drawn, draw, drawable
-from accerl_lerobot.report.words import rate
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from accerl_lerobot.report.words import number, percent
+from accerl_lerobot.console import number, percent
 
 W, H = 1000, 400
 SPANS = 100

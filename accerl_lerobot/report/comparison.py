@@ -6,13 +6,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from accerl_lerobot.console import count, duration, number, percent
 from accerl_lerobot.report.blocks import Block, Cell, Page, Table, Words, figures, rated, section
 from accerl_lerobot.report.charts import COLOURS, WHOLE, Chart, Series, line
 from accerl_lerobot.report.notes import notes, status
 from accerl_lerobot.report.read import Record, Run, column, newest
 from accerl_lerobot.report.recipe import apart
 from accerl_lerobot.report.run_page import algorithm, evaluated, evaluations, exploring, shown
-from accerl_lerobot.report.words import count, duration, number, percent
 from accerl_lerobot.report.world_model_page import DEPTH, estimates
 
 

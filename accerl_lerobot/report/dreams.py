@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from accerl_lerobot.console import count, number, percent
 from accerl_lerobot.report.blocks import Block, Cell, Film, Table, Words, figures
 from accerl_lerobot.report.charts import WHOLE, Chart, line
 from accerl_lerobot.report.read import Record, column, has, newest
-from accerl_lerobot.report.words import count, number, percent
 
 GATE = "imagination_gate_"
 MEANING = {

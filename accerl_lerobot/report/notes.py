@@ -6,8 +6,8 @@ from __future__ import annotations
 import datetime
 from collections.abc import Iterator
 
+from accerl_lerobot.console import count, duration, number, percent
 from accerl_lerobot.report.read import Run, column, newest
-from accerl_lerobot.report.words import count, duration, number, percent
 
 RECENT_S = 120.0
 """A run that has written something since is taken to be going on."""

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from accerl_lerobot.console import count, duration, number, percent, rate
 from accerl_lerobot.report.blocks import (
     Block,
     Cell,
@@ -35,7 +36,6 @@ from accerl_lerobot.report.notes import notes, status
 from accerl_lerobot.report.read import Record, Run, column, newest
 from accerl_lerobot.report.recipe import differences, lag_bound, unreadable
 from accerl_lerobot.report.speed import speed_charts, time_blocks
-from accerl_lerobot.report.words import count, duration, number, percent, rate
 
 FEW = 25
 """Exploring episodes below which their success says nothing."""

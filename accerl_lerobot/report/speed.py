@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from accerl_lerobot.console import duration, number, percent
 from accerl_lerobot.report.blocks import Bar, Bars, Block, Part, Words, figures
 from accerl_lerobot.report.charts import Chart, line, rates
 from accerl_lerobot.report.read import Record, column, has, newest
-from accerl_lerobot.report.words import duration, number, percent
 from accerl_lerobot.timeline.states import ROLES, STATES
 
 SOME, MOST = 0.1, 0.8

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from accerl_lerobot.console import ABSENT, count, duration, number
 from accerl_lerobot.report.blocks import Block, Cell, Commands, Page, Table, Tile, figures, section
 from accerl_lerobot.report.charts import Chart, Series, line
 from accerl_lerobot.report.commands import commands
@@ -15,7 +16,6 @@ from accerl_lerobot.report.dreams import gate_table
 from accerl_lerobot.report.notes import notes, status
 from accerl_lerobot.report.read import Record, Run, column, has
 from accerl_lerobot.report.run_page import films, recipe_blocks
-from accerl_lerobot.report.words import ABSENT, count, duration, number
 from accerl_lerobot.world_model.by_source import compared, every_source, source_rows
 
 DEPTH = "depth of the dream in chunks"

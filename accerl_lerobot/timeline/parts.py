@@ -23,8 +23,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from accerl_lerobot.engine.fault_points import reach
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.fault_points import reach
 from accerl_lerobot.timeline.states import RECOVERY, STATES, role_of
 
 FORMAT = 1

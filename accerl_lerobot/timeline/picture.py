@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.report.words import percent
+from accerl_lerobot.console import percent
 from accerl_lerobot.timeline.read import Row, Timeline, Window
 from accerl_lerobot.timeline.states import STATES, bubble
 

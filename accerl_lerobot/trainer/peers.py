@@ -24,8 +24,8 @@ from ray.exceptions import GetTimeoutError, RayActorError, RayError
 from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import WEIGHTS
-from accerl_lerobot.engine.fault_points import reach
 from accerl_lerobot.experience import Segment
+from accerl_lerobot.fault_points import reach
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.trainer.config import TrainerConfig
 

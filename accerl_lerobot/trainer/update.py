@@ -38,8 +38,8 @@ from accerl_lerobot.algorithms.normalise import moments, normalise
 from accerl_lerobot.algorithms.ratio import present
 from accerl_lerobot.checkpoint.optimizers import optimizer_state, restore_optimizer
 from accerl_lerobot.checkpoint.tensors import whole
-from accerl_lerobot.engine.fault_points import reach
 from accerl_lerobot.experience import Segment
+from accerl_lerobot.fault_points import reach
 from accerl_lerobot.policies.base import PolicyAdapter
 from accerl_lerobot.trainer.anchors import CRITIC, Anchors
 from accerl_lerobot.trainer.batch import Batch, Part, collate, pick, turns

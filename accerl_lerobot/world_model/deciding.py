@@ -22,12 +22,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from accerl_lerobot.engine.preflight import check_features, env_features, policy_features
 from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.base import PolicyAdapter
 from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.features import check_features, env_features, policy_features
 from accerl_lerobot.world_model import fit
 from accerl_lerobot.world_model.contract import WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.episodes import Episode, Place, longest

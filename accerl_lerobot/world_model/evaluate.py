@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from accerl_lerobot.cli.console import Console
+from accerl_lerobot.console import Console
 from accerl_lerobot.demos.starts import Start, read_starts
 from accerl_lerobot.demos.windows import origin_of
 from accerl_lerobot.envs import World, WorldSpec, make_world
@@ -55,7 +55,7 @@ from accerl_lerobot.world_model.store import (
 )
 
 if TYPE_CHECKING:
-    from accerl_lerobot.config.verbs import WorldModelEvalRun
+    from accerl_lerobot.cli.configs import WorldModelEvalRun
 
 
 class _Part(NamedTuple):

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import torch
 
-from accerl_lerobot.cli.console import Console
-from accerl_lerobot.config.run import DatasetConfig
+from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.loading import resolve_device
@@ -51,7 +51,7 @@ from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import Suc
 from accerl_lerobot.world_model.trial import calibrate
 
 if TYPE_CHECKING:
-    from accerl_lerobot.config.verbs import WorldModelRun
+    from accerl_lerobot.cli.configs import WorldModelRun
 
 EVERY = 20
 """Steps between two lines of losses of what is learnt."""

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from accerl_lerobot.cli.console import Console
+from accerl_lerobot.console import Console
 from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.dataset import check_metadata, fingerprint
@@ -22,8 +22,8 @@ from accerl_lerobot.world_model.films import film
 from accerl_lerobot.world_model.trial import try_out
 
 if TYPE_CHECKING:
+    from accerl_lerobot.cli.configs import WorldModelEvalRun, WorldModelRun
     from accerl_lerobot.config.dataset import DatasetConfig
-    from accerl_lerobot.config.verbs import WorldModelEvalRun, WorldModelRun
     from accerl_lerobot.world_model.config import TrialConfig
     from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModelSpec
     from accerl_lerobot.world_model.inverse import InverseProbe

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.bench.latency import BenchLatencyConfig, bench_latency, described, table
-from accerl_lerobot.cli.console import Console
+from accerl_lerobot.console import Console
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.envs.simulated import read_trace
 from accerl_lerobot.errors import InputError

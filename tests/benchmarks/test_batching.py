@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from accerl_lerobot.cli.console import Console
+from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.batcher import GRAIN, Batcher, quantile
 from benchmarks import batching, replay

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 import yaml
 
-from accerl_lerobot.config.run import DatasetConfig, RunConfig, encode, parse
 from accerl_lerobot.demos.record import DemosConfig, record_demos
+from accerl_lerobot.engine.config import DatasetConfig, RunConfig, encode, parse
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.stats import Rate

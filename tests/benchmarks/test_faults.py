@@ -17,9 +17,9 @@ import yaml
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, TRAINING_STATE, save_checkpoint
-from accerl_lerobot.config.run import encode
-from accerl_lerobot.engine.fault_points import POINTS
+from accerl_lerobot.engine.config import encode
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.fault_points import POINTS
 from accerl_lerobot.replay import MixedReplay, ReplayConfig
 from accerl_lerobot.replay.journal import EPISODES, Journal
 from benchmarks.audit import audit_segments, audit_updates

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import yaml
 
-from accerl_lerobot.config.run import RunConfig, encode, parse
+from accerl_lerobot.engine.config import RunConfig, encode, parse
 from accerl_lerobot.errors import InputError
 from benchmarks import lag as bench
 from benchmarks import study as studies

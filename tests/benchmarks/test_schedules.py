@@ -13,8 +13,8 @@ from accerl_lerobot.bench import blocks
 from accerl_lerobot.bench.blocks import Block
 from accerl_lerobot.bench.host import Processors, floors, host, spread
 from accerl_lerobot.bench.throughput import BenchThroughputConfig, bench_throughput, books
-from accerl_lerobot.cli.console import Console
-from accerl_lerobot.config.run import RunConfig
+from accerl_lerobot.console import Console
+from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.rollout.runner import RolloutConfig
 from benchmarks import async_vs_sync

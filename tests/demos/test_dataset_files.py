@@ -17,10 +17,10 @@ import pytest
 from PIL import Image
 
 from accerl_lerobot.checkpoint.safety import Origin, read_json
-from accerl_lerobot.config.run import DatasetConfig
 from accerl_lerobot.demos import dataset_files
 from accerl_lerobot.demos.dataset_files import check_data, check_info, check_metadata, checked
 from accerl_lerobot.demos.windows import open_metadata
+from accerl_lerobot.engine.config import DatasetConfig
 from accerl_lerobot.errors import InputError
 
 ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"

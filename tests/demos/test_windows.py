@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from accerl_lerobot.config.run import DatasetConfig
 from accerl_lerobot.demos.windows import open_metadata, task_texts
+from accerl_lerobot.engine.config import DatasetConfig
 from accerl_lerobot.errors import InputError
 
 ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"

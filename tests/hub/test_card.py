@@ -10,7 +10,7 @@ import pytest
 from huggingface_hub import DatasetCard, ModelCard
 
 from accerl_lerobot.cli.verbs import CONFIGS
-from accerl_lerobot.config.run import RunConfig, parse
+from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.hub.card import MARK
 from accerl_lerobot.hub.config import PushConfig
 from accerl_lerobot.hub.push import staged

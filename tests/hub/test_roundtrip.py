@@ -19,8 +19,8 @@ from safetensors.torch import load_file
 
 from accerl_lerobot import cli
 from accerl_lerobot.checkpoint.layout import defect, save_checkpoint
-from accerl_lerobot.config.run import LaunchConfig, encode
 from accerl_lerobot.demos.sft import SFTConfig, sft_command
+from accerl_lerobot.engine.config import LaunchConfig, encode
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig

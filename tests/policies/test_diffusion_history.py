@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.cli.console import Console
-from accerl_lerobot.config.run import LaunchConfig, RunConfig
+from accerl_lerobot.console import Console
 from accerl_lerobot.engine import run
+from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.evaluation.config import EvaluationConfig
 from accerl_lerobot.experience import TASK, Request

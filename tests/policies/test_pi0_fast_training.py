@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.algorithms import GIPOConfig
-from accerl_lerobot.config.run import RunConfig
+from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Engine
 from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig

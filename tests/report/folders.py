@@ -13,9 +13,9 @@ from typing import Any
 import yaml
 
 from accerl_lerobot.algorithms import PPOConfig
+from accerl_lerobot.cli.configs import WorldModelRun
 from accerl_lerobot.config.dataset import DatasetConfig
-from accerl_lerobot.config.run import RunConfig, encode
-from accerl_lerobot.config.verbs import WorldModelRun
+from accerl_lerobot.engine.config import RunConfig, encode
 from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig
 from accerl_lerobot.evaluation.stats import wilson_interval
 from accerl_lerobot.trainer.config import TrainerConfig

@@ -14,10 +14,10 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot.cli.console import Console
 from accerl_lerobot.cli.verbs import CONFIGS
-from accerl_lerobot.config.run import LaunchConfig, RunConfig, parse
+from accerl_lerobot.console import Console
 from accerl_lerobot.engine import run
+from accerl_lerobot.engine.config import LaunchConfig, RunConfig, parse
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
 from accerl_lerobot.report.commands import commands

@@ -54,7 +54,7 @@ def test_one_run_under_two_names(
 
 
 def test_others_still_take_one_recipe() -> None:
-    from accerl_lerobot.config.run import RunConfig
+    from accerl_lerobot.engine.config import RunConfig
 
     with pytest.raises(InputError, match="write --section.field=value"):
         parse(RunConfig, ["recipes/quickstart.yaml", "another"])

@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from accerl_lerobot.report.words import count, duration, number, percent, rate
+from accerl_lerobot.console import count, duration, number, percent, rate
 
 
 @pytest.mark.parametrize(

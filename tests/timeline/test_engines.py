@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import ray
 
-from accerl_lerobot.config.run import LaunchConfig
 from accerl_lerobot.engine import launch
+from accerl_lerobot.engine.config import LaunchConfig
 from accerl_lerobot.engine.launch import RayEngine
 from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig

@@ -17,8 +17,8 @@ import torch
 
 from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.checkpoint import snapshot
-from accerl_lerobot.config.run import LaunchConfig, RunConfig
 from accerl_lerobot.demos.sft import SFTConfig
+from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.preflight import check_start
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.config.run import DatasetConfig
 from accerl_lerobot.demos.record import DemosConfig, record_demos
+from accerl_lerobot.engine.config import DatasetConfig
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model import dataset as module

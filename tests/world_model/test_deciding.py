@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from accerl_lerobot import cli
-from accerl_lerobot.config.verbs import WorldModelEvalRun
+from accerl_lerobot.cli.configs import WorldModelEvalRun
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.world_model.baselines import CopyModel

@@ -10,16 +10,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from accerl_lerobot.config.run import DatasetConfig, RunConfig
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.demos.windows import open_metadata
+from accerl_lerobot.engine.config import DatasetConfig, RunConfig
+from accerl_lerobot.engine.dreaming import check_imagination, make_imagination, make_learner
 from accerl_lerobot.engine.preflight import check_start
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, WorldModelConfig
 from accerl_lerobot.world_model.dataset import fingerprint
-from accerl_lerobot.world_model.dreaming import check_imagination, make_imagination, make_learner
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig, OnlineLearnConfig
 from accerl_lerobot.world_model.offline import world_spec
 from accerl_lerobot.world_model.online import Promotion

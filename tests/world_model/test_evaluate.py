@@ -14,10 +14,10 @@ import torch
 
 from accerl_lerobot import cli
 from accerl_lerobot.checkpoint.safety import Origin
-from accerl_lerobot.config.run import DatasetConfig
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.demos.starts import STARTS, read_starts
 from accerl_lerobot.demos.windows import open_metadata
+from accerl_lerobot.engine.config import DatasetConfig
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model import evaluate

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from accerl_lerobot import cli
-from accerl_lerobot.config.verbs import WorldModelEvalRun, WorldModelRun
+from accerl_lerobot.cli.configs import WorldModelEvalRun, WorldModelRun
 from accerl_lerobot.world_model import evaluate, offline
 
 

@@ -13,12 +13,11 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from accerl_lerobot import cli
+from accerl_lerobot import cli, console
 from accerl_lerobot.checkpoint import isolation
-from accerl_lerobot.cli import console
-from accerl_lerobot.config.run import DatasetConfig, RunConfig, parse
-from accerl_lerobot.config.verbs import WorldModelRun
+from accerl_lerobot.cli.configs import WorldModelRun
 from accerl_lerobot.demos.record import DemosConfig, record_demos
+from accerl_lerobot.engine.config import DatasetConfig, RunConfig, parse
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model import learn, offline, sources

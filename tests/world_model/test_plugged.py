@@ -18,12 +18,11 @@ import pytest
 import torch
 from torch import nn
 
-from accerl_lerobot import cli
-from accerl_lerobot.cli import console
-from accerl_lerobot.cli.console import Console
+from accerl_lerobot import cli, console
+from accerl_lerobot.cli.configs import WorldModelEvalRun, WorldModelRun
 from accerl_lerobot.config.parsing import encode
-from accerl_lerobot.config.run import parse
-from accerl_lerobot.config.verbs import WorldModelEvalRun, WorldModelRun
+from accerl_lerobot.console import Console
+from accerl_lerobot.engine.config import parse
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import (

@@ -11,11 +11,11 @@ import pytest
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
-from accerl_lerobot.config.run import RunConfig, parse
+from accerl_lerobot.engine.config import RunConfig, parse
+from accerl_lerobot.engine.dream_workers import DreamWorker
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 from accerl_lerobot.world_model.pool import DREAMS, check_workers, part, together
-from accerl_lerobot.world_model.worker import DreamWorker
 from tests.test_imagining import dreaming
 
 

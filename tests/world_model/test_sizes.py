@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from accerl_lerobot.cli.configs import WorldModelRun
 from accerl_lerobot.config.help import help_text
-from accerl_lerobot.config.run import RunConfig, encode, parse
-from accerl_lerobot.config.verbs import WorldModelRun
+from accerl_lerobot.engine.config import RunConfig, encode, parse
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import WorldModelConfig
 from accerl_lerobot.world_model.contract import WorldModelSpec

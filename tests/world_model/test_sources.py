@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot.cli.console import Console
-from accerl_lerobot.config.run import DatasetConfig
+from accerl_lerobot.console import Console
 from accerl_lerobot.demos.record import DemosConfig, record_demos
+from accerl_lerobot.engine.config import DatasetConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model import sources

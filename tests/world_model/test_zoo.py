@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.config.help import help_text
-from accerl_lerobot.config.run import RunConfig, parse
+from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED

@@ -21,12 +21,10 @@ import numpy as np
 
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.checkpoint.safety import Origin, check_folder
-from accerl_lerobot.cli.console import Console
 from accerl_lerobot.config.parsing import decode, drop_consents, read_recipe
 from accerl_lerobot.config.ranges import Choice, Range, Section, Steps
-from accerl_lerobot.config.run import RunConfig
+from accerl_lerobot.console import Console
 from accerl_lerobot.demos.expert import Episode
-from accerl_lerobot.demos.export_dreams import write_dreams
 from accerl_lerobot.demos.record import features, frames
 from accerl_lerobot.demos.starts import Start, write_starts
 from accerl_lerobot.demos.writing import (
@@ -37,11 +35,13 @@ from accerl_lerobot.demos.writing import (
     new_dataset,
     simulators,
 )
+from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import World
 from accerl_lerobot.envs.config import EnvConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL
+from accerl_lerobot.export.dreams import write_dreams
 from accerl_lerobot.replay.journal import EPISODES, Done, read_journal, whole_episodes
 from accerl_lerobot.world_model.recorded import DREAMS, read_dreams
 

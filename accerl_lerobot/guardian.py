@@ -32,7 +32,7 @@ LOOK_S = 1.0
 """Seconds between two looks at whether the parent is still there, where a fork of it keeps the pipe open."""
 END_S = 10.0
 """Longest time for ending all processes."""
-SELF_ENDING = ("multiprocessing.resource_tracker", "accerl_lerobot/engine/guardian.py")
+SELF_ENDING = ("multiprocessing.resource_tracker", "accerl_lerobot/guardian.py")
 """Words of the command lines of processes that clean up and then end by themselves."""
 
 _process: subprocess.Popen[bytes] | None = None

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from accerl_lerobot.config.run import DatasetConfig, RunConfig, journal_folder
+from accerl_lerobot.engine.config import DatasetConfig, RunConfig, journal_folder
 from accerl_lerobot.engine.preflight import policy_to_be
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import WorldSpec

@@ -6,9 +6,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from accerl_lerobot.config.ranges import Device, Section, Seed
-from accerl_lerobot.config.run import DatasetConfig, LaunchConfig, check_chunk
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
+from accerl_lerobot.engine.config import DatasetConfig, LaunchConfig, check_chunk
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig

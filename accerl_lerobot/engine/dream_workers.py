@@ -27,18 +27,18 @@ import ray
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, WORLD_MODEL
-from accerl_lerobot.engine.fault_points import reach
-from accerl_lerobot.engine.placement import numbered
+from accerl_lerobot.engine.dreaming import make_imagination, make_learner
 from accerl_lerobot.experience import Segment
+from accerl_lerobot.fault_points import reach
+from accerl_lerobot.metrics import numbered
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.transport.lasting import LastingCaller
-from accerl_lerobot.world_model.dreaming import make_imagination, make_learner
 from accerl_lerobot.world_model.online import Promotion
 from accerl_lerobot.world_model.pool import DREAMS, check_workers
 
 if TYPE_CHECKING:
-    from accerl_lerobot.config.run import RunConfig
+    from accerl_lerobot.engine.config import RunConfig
 
 AT_THE_DOOR = 2
 """Messages to replay that may be waiting before dreams pause."""

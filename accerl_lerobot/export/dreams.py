@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.cli.console import Console
+from accerl_lerobot.console import Console
 from accerl_lerobot.demos.writing import new_dataset
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.recorded import Dreamt

@@ -202,7 +202,7 @@ class RunConfig(Section):
             # real episode.
             self.replay.check(batch_decisions=batch, segment_decisions=self.rollout.segment_length)
             if imagination.share:
-                # A whole dream is as long as the world lets it be: `world_model.dreaming` looks at that.
+                # A whole dream is as long as the world lets it be: `engine.dreaming` looks at that.
                 longest = imagination.horizon or 1
                 imagination.replay.check(
                     batch_decisions=batch, segment_decisions=longest, field="imagination.replay"
