@@ -16,8 +16,6 @@ from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.world_model.config import (
-    InverseConfig,
-    PerturbedConfig,
     StandInConfig,
     TrialConfig,
     WorldModelConfig,
@@ -107,27 +105,17 @@ class WorldModelEvalRun(Section):
     job_name: str = "world_model_eval"
     """Last part of the folder's name."""
     device: Device = "auto"
-    """cpu, cuda, or auto: where the world model dreams and successes are told. What reads actions off frames
-    is small and stays on the CPU; `policies` are on CUDA when there is one."""
+    """cpu, cuda, or auto: where the world model dreams and successes are told."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """Episodes it has not learnt from; of the dataset that it has, those that were held out are taken."""
     online: DatasetConfig = field(default_factory=DatasetConfig)
     """Episodes of a policy, as ``accerl export`` writes them, of which the same is true; without a name there
     are none."""
-    perturbed: PerturbedConfig = field(default_factory=PerturbedConfig)
-    """Episodes of `dataset`, played again in `env` with other actions."""
-    env: EnvConfig = field(default_factory=MetaWorldConfig)
-    """The world that `dataset` was recorded in; only where it is played again."""
     success: StandInConfig = field(default_factory=StandInConfig)
     """A reward model that tells successes in place of the one beside the world model."""
     trial: TrialConfig = field(default_factory=TrialConfig)
-    inverse: InverseConfig = field(default_factory=InverseConfig)
-    policies: tuple[str, ...] = ()
-    """Checkpoints that decide on what is dreamt and on what was seen: do they do the same?"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.path is None:
             raise InputError("path", None, "name the folder world_model of an accerl world-model run")
-        if len(set(self.policies)) < len(self.policies):
-            raise InputError("policies", self.policies, "name none of them twice")

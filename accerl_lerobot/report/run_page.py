@@ -54,10 +54,6 @@ FILMS = {
         "Dreams of a policy's episodes",
         "The same of episodes that a policy lived through.",
     ),
-    "preview_perturbed.mp4": (
-        "Dreams of perturbed episodes",
-        "The same of episodes that were played again with noise on their actions.",
-    ),
 }
 """Title and caption of the videos that runs make."""
 

@@ -30,7 +30,6 @@ ARMS = {
 BY_SOURCE: tuple[tuple[str, str, tuple[float | None, float | None]], ...] = (
     ("Skill where pixels changed", "skill_changed", (None, 1.0)),
     ("Sensitivity to another episode's actions", "sensitivity_shuffled", (0.0, None)),
-    ("The change of actions, read off the dreams", "legible_change", (None, 1.0)),
     ("AUROC of the chunk", "auroc_dreamt", (None, 1.0)),
 )
 """Title, measure and limits of a chart with a line per source."""
@@ -104,22 +103,6 @@ def depth_charts(depths: Sequence[Record]) -> list[Chart]:
             series=tuple(
                 estimates(depths, f"sensitivity_{arm}", ARMS[arm], i)
                 for i, arm in enumerate(("shuffled", "zero", "opposite"))
-            ),
-        ),
-        Chart(
-            title="Actions read off the frames",
-            unit="R²",
-            x_label=DEPTH,
-            limits=(None, 1.0),
-            note="By a probe that has learnt on real frames. The change is that from its own actions to "
-            "another episode's: a model that ignores them has 0.",
-            series=tuple(
-                estimates(depths, f"legible_{of}", called, colour)
-                for of, called, colour in (
-                    ("real", "off reality", 7),
-                    ("true", "off dreams with its own actions", 0),
-                    ("change", "the change, with another episode's", 1),
-                )
             ),
         ),
         Chart(

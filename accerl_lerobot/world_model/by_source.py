@@ -15,7 +15,7 @@ def every_source(found: dict[str, Any]) -> list[dict[str, Any]]:
 
 def compared(found: dict[str, Any]) -> bool:
     """True if there is more to tell by source than of one trial."""
-    return bool(found.get("sources") or found.get("alike"))
+    return bool(found.get("sources"))
 
 
 def source_rows(every: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
@@ -27,15 +27,8 @@ def source_rows(every: Sequence[dict[str, Any]]) -> list[tuple[str, list[str]]]:
         ("skill, changed pixels, first chunk", 0, "skill_changed"),
         ("last chunk", -1, "skill_changed"),
         ("sensitivity, other actions", 0, "sensitivity_shuffled"),
-        ("actions read off reality", 0, "legible_real"),
-        ("off dreams with the same", 0, "legible_true"),
-        ("change of what is read", 0, "legible_change"),
     ):
         rows.append((name, [estimate((one["depths"] or [{}])[depth].get(key)) for one in every]))
-    for name, key in (("first chunk", "first"), ("whole dreams", "whole")):
-        rows.append(
-            (f"policies decide alike, {name}", [estimate((one.get("alike") or {}).get(key)) for one in every])
-        )
     rows.append(("successes, failures dreamt", [_ended(o) for o in ends]))
     rows.append(("AUROC of how they end", [estimate(o.get("auroc")) for o in ends]))
     for name, key in (("false success", "false_success"), ("recall", "recall")):

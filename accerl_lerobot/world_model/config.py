@@ -211,33 +211,6 @@ class TrialConfig(Section, section="world_model.trial"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class InverseConfig(Section, section="inverse"):
-    """How the probe is learnt that reads actions off frames, see `inverse.py`."""
-
-    steps: Steps = 400
-    """Gradient steps; 0: there is no probe."""
-    batch: Annotated[int, Range("[2, 65536]")] = 64
-    """Pairs of frames in each."""
-    lr: LearningRate = 2e-3
-    """Falls to 0 by a cosine."""
-    episodes: Annotated[int, Range("[1, 1000000]")] = 40
-    """Episodes that it learns from at most: such as the world model has learnt from, or, of a
-    dataset that it does not know, half of all. On those it is not read."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PerturbedConfig(Section, section="perturbed"):
-    """Episodes that are played again with other actions, see `perturbed.py`."""
-
-    episodes: Annotated[int, Range("[0, 1000000]")] = 0
-    """How many of the dataset's that are tried, at most; 0: none."""
-    noise: Positive = 0.4
-    """Standard deviation of what is added to each action, in halves of its range."""
-    hold: Annotated[int, Range("[1, 1000000]")] = 10
-    """Env steps for which it stays the same."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class StandInConfig(Section, section="success"):
     """A reward model of LeRobot that tells successes, see `stand_in.py`."""
 

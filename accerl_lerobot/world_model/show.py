@@ -10,16 +10,13 @@ from rich.table import Table
 from accerl_lerobot.world_model.by_source import estimate, every_source, number, source_rows
 from accerl_lerobot.world_model.trial import NEVER
 
-READ = ("real", "true", "change")
-"""Off what the actions are read."""
-
 
 def table(found: dict[str, Any]) -> Table:
     """A trial for people."""
     outcome = "passed" if found["passed"] else "FAILED"
     shown = Table(title=f"{found['trials']} trials: {outcome}")
     columns = (
-        "depth", "trials", "skill, changed pixels", "sensitivity", "read: real, dreamt, change",
+        "depth", "trials", "skill, changed pixels", "sensitivity",
         "PSNR", "AUROC", "false success: true", "none",
     )  # fmt: skip
     for column in columns:
@@ -30,7 +27,6 @@ def table(found: dict[str, Any]) -> Table:
             str(row["trials"]),
             estimate(row.get("skill_changed")),
             estimate(row.get("sensitivity_shuffled")),
-            " ".join(number((row.get(f"legible_{of}") or {}).get("value"), 2) for of in READ),
             number(row.get("psnr"), 1),
             estimate(row.get("auroc_dreamt")),
             *(number(row.get(f"false_success_{arm}"), 2) for arm in NEVER),

@@ -3,7 +3,6 @@
 
 held out    of the dataset that it has learnt from, those that it has not; or dataset: all of another one
 online      what a policy lived through, as ``accerl export`` writes it; of that, too, what was held out
-perturbed   episodes of the first source, played again in the world with noise on their actions
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
     from accerl_lerobot.config.dataset import DatasetConfig
     from accerl_lerobot.world_model.config import TrialConfig
     from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModelSpec
-    from accerl_lerobot.world_model.inverse import InverseProbe
     from accerl_lerobot.world_model.stand_in import SuccessModel
 
 HELD_OUT, DATASET, ONLINE = "held out", "dataset", "online"
@@ -46,7 +44,6 @@ def try_sources(
     fresh: str | None = None,
     kept: bool = False,
     seed: int = 0,
-    probe: InverseProbe | None = None,
 ) -> dict[str, Any]:
     """Tries a world model on each of them, and films it.
 
@@ -62,7 +59,6 @@ def try_sources(
             other sources are judged by the threshold there is.
         kept: whether what is set on all of `fresh` is the threshold from then on, for the other sources too.
         seed: of what is drawn.
-        probe: what reads actions off frames, if anything does.
 
     Returns:
         What `try_out` found on the first, with its ``name`` and how many episodes were ``tried``; and
@@ -71,14 +67,11 @@ def try_sources(
     """
     first, *others = sources
     found: dict[str, dict[str, Any]] = {}
-    known = frozenset() if probe is None else probe.known
     for name in sorted(sources, key=lambda name: name != fresh):
         episodes = sources[name]
-        if probe is not None:
-            probe.known = known if name == first else frozenset()  # they are of the first
         there = None if success is None else success.config.threshold
         with console.stage(f"trial, {name}"):
-            told = try_out(model, episodes, config, success, seed, name == fresh, probe)
+            told = try_out(model, episodes, config, success, seed, name == fresh)
             found[name] = {"name": name} | told | {"tried": amount(episodes)}
             video = directory / (PREVIEW if name == first else f"preview_{name}.mp4")
             film(video, model, episodes, config, seed)

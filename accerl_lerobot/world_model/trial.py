@@ -25,7 +25,6 @@ from accerl_lerobot.world_model import judge
 from accerl_lerobot.world_model.config import TrialConfig
 from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModel
 from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, held
-from accerl_lerobot.world_model.inverse import InverseProbe
 from accerl_lerobot.world_model.outcomes import drawn, judged, scores, spaced, threshold
 from accerl_lerobot.world_model.replayed import Dreams, cut_alike, dream, made
 from accerl_lerobot.world_model.stand_in import SuccessModel
@@ -35,8 +34,6 @@ ARMS = ("true", "shuffled", "zero", "opposite", "failed")
 """Which actions are dreamt with."""
 PAIRS = 400
 """Real pairs of frames that the success model is tried on, half of them successes."""
-LEGIBLE = ("true", "shuffled")
-"""Arms whose actions are read off the dreams, and compared."""
 NEVER = ("true", "zero")
 """Arms that cannot succeed, the first one from failures. Actions of other episodes may well do so."""
 
@@ -89,7 +86,6 @@ def try_out(
     success: SuccessModel | None = None,
     seed: int = 0,
     fresh: bool = False,
-    probe: InverseProbe | None = None,
 ) -> dict[str, Any]:
     """Tries a model on episodes it has not learnt from.
 
@@ -100,15 +96,13 @@ def try_out(
         success: what tells successes, if anything does.
         seed: of what is drawn.
         fresh: whether the success model has just been learnt: its threshold is set, on these episodes.
-        probe: what reads actions off frames, if anything does.
 
     Returns:
         ``depths``: a row per depth with `judge`'s estimates of skill and sensitivity, errors in pixels and
-        state, with a probe ``legible_real``, ``legible_true`` and ``legible_change``, see `inverse.py`, and
-        with a success model AUROC on the chunk dreamt there and the share of them taken for a success under
-        each arm's actions; ``auroc_real``, of the success model on real pairs, its ``threshold``, and
-        ``outcomes``, see `outcomes.judged`; ``gates``: each with its value and whether it holds; ``passed``;
-        ``trials``, of so many ``episodes``.
+        state, and with a success model AUROC on the chunk dreamt there and the share of them taken for a
+        success under each arm's actions; ``auroc_real``, of the success model on real pairs, its
+        ``threshold``, and ``outcomes``, see `outcomes.judged`; ``gates``: each with its value and whether it
+        holds; ``passed``; ``trials``, of so many ``episodes``.
     """
     rng = np.random.default_rng((seed, 1))
     ended: dict[str, Any] = {}
@@ -149,8 +143,6 @@ def try_out(
                 row["state_error"] = float(np.abs(robots - there).mean())
                 row["state_error_copy"] = float(np.abs(windows.state[fits, context - 1] - there).mean())
             row["uncertainty"] = float(arms["true"].uncertainty[fits, d].mean())
-        if probe is not None:
-            row |= _legible(probe, arms, given, windows, fits, d)
         if success is not None:
             row |= _judged(success, arms, windows, made(windows)[:, d] & ahead, theirs, newest, d)
         rows.append(row)
@@ -188,36 +180,6 @@ def _pixels(
             f"sensitivity_{arm}": judge.sensitivity(errors["true"], errors[arm], groups)._asdict()
             for arm in wrong
         },
-    }
-
-
-def _legible(
-    probe: InverseProbe,
-    arms: dict[str, Dreams],
-    given: dict[str, np.ndarray],
-    windows: Windows,
-    fits: np.ndarray,
-    d: int,
-) -> dict[str, Any]:
-    """How well the actions of the chunk at this depth can be read off real frames, and off dreams."""
-    new = np.array([e not in probe.known for e in windows.episode])
-    rows, groups = fits & new, windows.episode[fits & new]
-    if len(groups) < 2:
-        return {}
-    real, context = windows.frames[rows], windows.context
-
-    def read(frames: np.ndarray, after: np.ndarray) -> np.ndarray:
-        return probe.read(real[:, context - 1] if d == 0 else frames[:, d - 1], after)
-
-    asked = {arm: given[arm][rows, d].mean(1) for arm in LEGIBLE}
-    frames = {arm: arms[arm].frames[rows] for arm in LEGIBLE}
-    said = {arm: read(frames[arm], frames[arm][:, d]) for arm in LEGIBLE}
-    seen = probe.read(real[:, context - 1 + d], real[:, context + d])
-    changed, wanted = (of["shuffled"] - of["true"] for of in (said, asked))
-    return {
-        "legible_real": probe.legibility(seen, asked["true"], groups)._asdict(),
-        "legible_true": probe.legibility(said["true"], asked["true"], groups)._asdict(),
-        "legible_change": probe.legibility(changed, wanted, groups, of_changes=True)._asdict(),
     }
 
 

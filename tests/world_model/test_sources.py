@@ -26,12 +26,12 @@ class Tried:
     """In place of a trial: what each source was judged by, in order."""
 
     def __init__(self) -> None:
-        self.judged: list[tuple[str, float, bool, frozenset[int]]] = []
+        self.judged: list[tuple[str, float, bool]] = []
 
     def __call__(
-        self, model: Any, episodes: Any, config: Any, success: Any, seed: int, fresh: bool, probe: Any
+        self, model: Any, episodes: Any, config: Any, success: Any, seed: int, fresh: bool
     ) -> dict[str, Any]:
-        self.judged.append((episodes, success.config.threshold, fresh, probe.known))
+        self.judged.append((episodes, success.config.threshold, fresh))
         if fresh:
             success.config.threshold = SET
         gate = {"value": 1.0, "wanted": "above 0", "holds": episodes != "fails"}
@@ -49,9 +49,8 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> Tried:
 
 def told(tmp_path: Path, of: dict[str, Any], **options: Any) -> tuple[dict[str, Any], float]:
     success: Any = SimpleNamespace(config=SimpleNamespace(threshold=SAVED))
-    probe: Any = SimpleNamespace(known=frozenset({3}))
     found = try_sources(
-        None, of, TrialConfig(), success, tmp_path, Console(), probe=probe, **options  # type: ignore[arg-type]
+        None, of, TrialConfig(), success, tmp_path, Console(), **options  # type: ignore[arg-type]
     )  # fmt: skip
     return found, success.config.threshold
 
@@ -62,8 +61,8 @@ def test_what_is_set_on_a_policys_episodes_is_kept_and_judges_the_others(tried: 
     found, threshold = told(tmp_path, of, learnt=of, fresh=ONLINE, kept=True)
     assert threshold == SET
     assert tried.judged == [
-        ("policy's", SAVED, True, frozenset()),
-        ("demos", SET, False, frozenset({3})),
+        ("policy's", SAVED, True),
+        ("demos", SET, False),
     ]
     assert found["name"] == HELD_OUT and list(found["sources"]) == [ONLINE]
     assert {path.name for path in tmp_path.iterdir()} == {"preview.mp4", "preview_online.mp4"}
@@ -74,9 +73,9 @@ def test_a_threshold_that_was_saved_is_only_set_anew_where_it_comes_from(tried: 
     found, threshold = told(tmp_path, of, learnt=[HELD_OUT], fresh=HELD_OUT)
     assert threshold == SAVED and found["threshold"] == SET
     assert tried.judged == [
-        ("demos", SAVED, True, frozenset({3})),
-        ("another policy's", SAVED, False, frozenset()),
-        ("again", SAVED, False, frozenset()),
+        ("demos", SAVED, True),
+        ("another policy's", SAVED, False),
+        ("again", SAVED, False),
     ]
 
 
