@@ -169,7 +169,7 @@ def test_every_role_and_state_of_the_timeline_is_explained() -> None:
 
 
 def test_the_summary_is_explained() -> None:
-    source = (ROOT / "accerl_lerobot" / "loop.py").read_text()
+    source = (ROOT / "accerl_lerobot" / "engine" / "loop.py").read_text()
     assignments = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.Assign)]
     (value,) = [
         n.value for n in assignments if ast.unparse(n.targets[0]) == "summary" and "wall_s" in ast.unparse(n)
@@ -184,9 +184,9 @@ def test_the_summary_is_explained() -> None:
 def test_progress_says_how_much_time_is_left(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("accerl_lerobot.cli.console.PLAIN_EVERY_S", -1.0)
+    monkeypatch.setattr("accerl_lerobot.console.PLAIN_EVERY_S", -1.0)
     now = iter(range(0, 10_000, 60))
-    monkeypatch.setattr("accerl_lerobot.cli.console.time.monotonic", lambda: float(next(now)))
+    monkeypatch.setattr("accerl_lerobot.console.time.monotonic", lambda: float(next(now)))
     with Console().stage("RL", total=500) as stage:
         stage.update(100, "resumed at 100")
         stage.update(200, "and a minute later")
@@ -200,7 +200,7 @@ def test_progress_says_how_much_time_is_left(
 def test_console_without_a_terminal_prints_lines(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("accerl_lerobot.cli.console.PLAIN_EVERY_S", -1.0)
+    monkeypatch.setattr("accerl_lerobot.console.PLAIN_EVERY_S", -1.0)
     console = Console()
     with console.stage("SFT", total=10) as stage:
         stage.update(4, "loss 0.5")

@@ -3,7 +3,7 @@
 
 ``RUN/episodes.jsonl`` has one line per segment that replay has stored: where it begins, the actions that were
 executed, what they brought and whose they were. Pictures are not in it; a world that is given the same seed
-and actions shows the same again, at every env step and in any size. That is what `demos.export` does.
+and actions shows the same again, at every env step and in any size. That is what `export.episodes` does.
 """
 
 from __future__ import annotations
