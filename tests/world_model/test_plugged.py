@@ -192,8 +192,8 @@ def test_whoever_does_not_name_its_package_is_told_to(tmp_path: Path):
         make_dreamer(config, ENV, None, 4, "cpu")  # type: ignore[arg-type]  # only an oracle asks
     with pytest.raises(InputError, match=f"^path=.*{wanted}discover_packages_path$"):
         load_world_model(tmp_path / "w")
-    for reader in (WorldModelEvalRun, BenchRankingConfig):
-        options = [f"--path={path}", f"--discover_packages_path={PACKAGE}", "--policies=a"]
+    for reader, more in ((WorldModelEvalRun, []), (BenchRankingConfig, ["--policies=a"])):
+        options = [f"--path={path}", f"--discover_packages_path={PACKAGE}", *more]
         assert parse(reader, options).discover_packages_path == PACKAGE and PACKAGE not in sys.modules
 
 
