@@ -8,7 +8,7 @@ from typing import Any
 
 from accerl_lerobot.cli import exit_code, guarded, help_asked, set_up_logging
 from accerl_lerobot.cli.verbs import measure
-from accerl_lerobot.config.help import help_text
+from accerl_lerobot.config.help import brief, help_text
 from accerl_lerobot.config.parsing import parse
 from accerl_lerobot.errors import InputError
 from benchmarks.async_vs_sync import BenchAsyncVsSyncConfig
@@ -47,7 +47,7 @@ CONFIGS: dict[str, type[Any]] = {
 
 def usage() -> str:
     """The list of all benchmarks."""
-    lines = [f"  {name:14} {_brief(config)}" for name, config in CONFIGS.items()]
+    lines = [f"  {name:14} {brief(config).rstrip('.')}" for name, config in CONFIGS.items()]
     return "\n".join(["usage: python -m benchmarks NAME [--field=value …]", "", *lines])
 
 
@@ -62,7 +62,9 @@ def run(name: str, rest: list[str]) -> int:
         raise InputError("NAME", name, f"use one of {', '.join(CONFIGS)}")
     if (section := help_asked(rest)) is not None:
         config_class = CONFIGS[name]
-        text = help_text(f"python -m benchmarks {name}", config_class, _brief(config_class), section)
+        text = help_text(
+            f"python -m benchmarks {name}", config_class, brief(config_class).rstrip("."), section
+        )
         sys.stdout.write(f"{text}\n")
         return 0
     with guarded():
@@ -76,12 +78,6 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stdout.write(f"{usage()}\n")
         return 0
     return exit_code("benchmarks", lambda: run(name, rest))
-
-
-def _brief(config_class: type[Any]) -> str:
-    """The first sentence of the module that a config is in."""
-    doc = sys.modules[config_class.__module__].__doc__ or ""
-    return doc.partition("\n\n")[0].replace("\n", " ").rstrip(".")
 
 
 if __name__ == "__main__":

@@ -61,16 +61,14 @@ def usage() -> str:
 def show_help(verb: str, rest: list[str], section: str) -> int:
     """``accerl VERB --help``; for bench, of the measurement that is named, or a list of them."""
     from accerl_lerobot.cli.verbs import CONFIGS
-    from accerl_lerobot.config.help import help_text
+    from accerl_lerobot.config.help import brief, help_text
 
     names = [name for name in CONFIGS if name.split()[0] == verb]
     named = [name for name in names if len(names) == 1 or name.split()[-1] in rest]
     if named:
         text = help_text(f"accerl {named[0]}", CONFIGS[named[0]], VERBS[verb][1], section)
     else:
-        docs = (sys.modules[CONFIGS[name].__module__].__doc__ or "" for name in names)
-        briefs = (doc.partition("\n\n")[0].replace("\n", " ")[:90] for doc in docs)
-        lines = [f"  {name.split()[-1]:16} {brief}" for name, brief in zip(names, briefs, strict=True)]
+        lines = [f"  {name.split()[-1]:16} {brief(CONFIGS[name])[:90]}" for name in names]
         usage = [f"usage: accerl {verb} NAME [--field=value …]", "", *lines]
         text = "\n".join([*usage, "", f"accerl {verb} NAME --help lists its fields."])
     sys.stdout.write(f"{text}\n")

@@ -6,6 +6,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
+import sys
 import textwrap
 import typing
 from typing import Any
@@ -65,6 +66,12 @@ def help_text(command: str, config_class: type[Any], what: str, section: str = "
         if section_class is not None:
             lines.append(f"  {name:12}{_summary(section_class)}"[:WIDTH])
     return "\n".join(lines)
+
+
+def brief(config_class: type[Any]) -> str:
+    """The first sentence of the module that a config is in, on one line."""
+    doc = sys.modules[config_class.__module__].__doc__ or ""
+    return doc.partition("\n\n")[0].replace("\n", " ")
 
 
 def _of_section(every: list[str], section: str, config_class: type[Any]) -> list[str]:

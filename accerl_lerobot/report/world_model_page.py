@@ -129,7 +129,7 @@ def depth_charts(depths: Sequence[Record]) -> list[Chart]:
 
 
 def source_blocks(found: Record) -> list[list[Block]]:
-    """A table and charts of the trials on several sources; nothing where there was one and no policy."""
+    """A table and charts of the trials on several sources; nothing where there was one."""
     if not compared(found):
         return []
     every = every_source(found)

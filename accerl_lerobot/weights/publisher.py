@@ -81,7 +81,7 @@ class Publisher(ABC):
         if not self._layout.fits(tensors):
             self._layout = Layout.of(tensors)
         layout = self._layout
-        self._writing = self._free(self._size(layout))
+        self._writing = self._free(layout.end)
         self._writing.fill(layout, tensors)
         with self._changed:
             self._pending = Shipment(version, layout, self._writing, now)
@@ -139,10 +139,6 @@ class Publisher(ABC):
         """Slabs that readers or the thread still need, besides the current one. Called with the lock."""
         return []
 
-    def _size(self, layout: Layout) -> int:
-        """Bytes of a slab for such a set."""
-        return layout.end
-
     def _run(self) -> None:
         try:
             self._serve()
@@ -171,7 +167,7 @@ class Publisher(ABC):
             free = self._unused()
             if free or self._current is None or len(self._slabs) >= self._limit:
                 return
-            size = self._size(self._current.layout)
+            size = self._current.layout.end
         made = self._make(size)
         with self._changed:
             self._slabs.append(made)

@@ -9,7 +9,6 @@ for the store nor for a reader. One that dies is let go of, and one that comes l
 from __future__ import annotations
 
 import logging
-from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -39,36 +38,7 @@ class _Reader:
     """Version of the last one."""
 
 
-class CallingPublisher(Publisher):
-    """Base of publishers whose readers are called through Ray, one call to each under way."""
-
-    _readers: list[Any]
-
-    def _wait_for_work(self) -> bool:
-        """Waits for a set, or until there are readers to look after; False: it is over."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._closing or self._pending is not None or self._busy())
-            return not self._closing
-
-    @abstractmethod
-    def _busy(self) -> bool:
-        """True if a reader has been sent something, or has come and is owed the newest set."""
-
-    def _wake(self) -> None:
-        self._changed.notify_all()
-
-    def _let_go(self, reader: Any, error: Exception) -> None:
-        """Forgets a reader that has died. One that lives and cannot be reached is ended: another takes its
-        place."""
-        with self._changed:
-            self._readers.remove(reader)
-            self._changed.notify_all()
-        logger.warning("reader %d of the weights has gone: %s", reader.number, error)
-        if not isinstance(error, ActorDiedError):
-            ray.kill(reader.handle)
-
-
-class RayPublisher(CallingPublisher):
+class RayPublisher(Publisher):
     """The trainer's end; the readers' end is `InferenceWorker.receive_weights`.
 
     Args:
@@ -90,6 +60,25 @@ class RayPublisher(CallingPublisher):
             self._readers.append(_Reader(self._came, reader))
             self._came += 1
             self._wake()
+
+    def _wait_for_work(self) -> bool:
+        """Waits for a set, or until there are readers to look after; False: it is over."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closing or self._pending is not None or self._busy())
+            return not self._closing
+
+    def _wake(self) -> None:
+        self._changed.notify_all()
+
+    def _let_go(self, reader: Any, error: Exception) -> None:
+        """Forgets a reader that has died. One that lives and cannot be reached is ended: another takes its
+        place."""
+        with self._changed:
+            self._readers.remove(reader)
+            self._changed.notify_all()
+        logger.warning("reader %d of the weights has gone: %s", reader.number, error)
+        if not isinstance(error, ActorDiedError):
+            ray.kill(reader.handle)
 
     def _serve(self) -> None:
         while self._wait_for_work():
