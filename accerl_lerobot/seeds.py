@@ -60,6 +60,11 @@ def noise_seed(episode_seed: int, member: int, decision: int) -> int:
     return (member * _ALL_SEEDS + episode_seed) * _DECISIONS_PER_EPISODE + decision
 
 
+def episode_of(noise_seed: int) -> int:
+    """A number that all decisions of an episode share, and no others; from the `noise_seed` of one."""
+    return noise_seed // _DECISIONS_PER_EPISODE
+
+
 def eval_seed(run_seed: int, index: int) -> int:
     """Seed of the `index`-th evaluation episode of a task.
 

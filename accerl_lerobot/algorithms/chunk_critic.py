@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Off-policy learning of chunks from a critic over (simulator state, executed chunk): the settings.
+"""Off-policy learning from a critic over (simulator state, executed chunk) and a teacher: the settings.
 
-    critic   y = (1 − m)·[Σ_{j<n} γ^j r_j + γ^n min_{i∈2} Q'_i(s_n, π(o_n))] + m·R    for each Q_i(s, c)
-    policy   L = E[(k·std_i Q_i − mean_i Q_i)(s, π(o)) / scale + a·‖π(o) − c̄‖² / 0.3²] + b·L_imitation
+    critic   y = (1 − m)·[Σ_{j<n} γ^j r_j + γ^n (mean Q' − k·std Q')(s_n, μ(s_n))] + m·R   for each Q_i(s, c)
+    teacher  L = E[(k·std Q − mean Q)(s, μ(s))] / E|Q| + b·E_successes ‖μ(s) − c‖² / 0.3²
+    policy   L = E[imitation loss of π(o) on μ(s)] + p·E‖h(features(o)) − s‖²
 
-s is what the simulator says of itself, ``observation.environment_state``; only the critic reads it, so the
-checkpoint stays a policy of pixels (asymmetric actor-critic, arXiv 1710.06542). π(o) is the chunk without
-exploration from a fixed noise, differentiable through all denoising steps, and c̄ the chunk that the policy
-proposed for the same observation and noise a while ago: without that term the policy leaves what the critic
-knows, and collapses. R is the discounted return that was observed, and *scale* its mean, so that rare success
-is not outweighed by the distance. What is imitated are own successes. Related: TD3+BC (arXiv 2106.06860),
-RLPD (2302.02948), Q-chunking (2507.07969).
+s is the state of the simulator, ``observation.environment_state``; the policy never reads it, so the
+checkpoint stays a policy of images (asymmetric actor-critic, arXiv 1710.06542). The teacher μ is a small
+network of s: it learns in a hundred episodes what a policy that has to learn to see cannot, acts in part of
+the exploring episodes, and labels every observation in the memory, the policy's own ones too (DAgger, arXiv
+1011.0686). h is a linear map that exists only while training: reading the state off the policy's features
+teaches them where things are. Related: TD3+BC (arXiv 2106.06860), RLPD (2302.02948), Q-chunking (2507.07969).
 """
 
 from __future__ import annotations
@@ -37,11 +37,15 @@ class ChunkCriticConfig(OffPolicyConfig):
     """Decisions ahead after which the critic's target bootstraps."""
     monte_carlo: Share = 0.25
     """Share of the observed return in the critic's target."""
-    critic_steps: Positive = 1.0
-    """Gradient steps of the critic for each new decision."""
+    critic_steps: Positive = 2.0
+    """Gradient steps of the critic for each new decision; the teacher makes half as many."""
     pessimism: NonNegative = 1.0
     """Standard deviations of the ensemble that are taken off Q."""
-    anchor: NonNegative = 1.0
-    """Weight of the squared distance from the chunk that the policy proposed a while ago."""
-    imitation: NonNegative = 0.4
-    """Weight of the imitation loss on own successes."""
+    imitation: NonNegative = 0.5
+    """Weight of the teacher's distance from what succeeded."""
+    teacher_episodes: Share = 0.5
+    """Share of exploring episodes in which the teacher acts, after ``trainer.value_warmup_updates``."""
+    teacher_noise: NonNegative = 0.25
+    """Standard deviation of the teacher's exploration, in normalised action units."""
+    perception: NonNegative = 0.5
+    """Weight of reading the simulator's state off the policy's features."""

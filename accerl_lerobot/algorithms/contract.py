@@ -75,7 +75,7 @@ class RatioConfig(AlgorithmConfig):
 class OffPolicyConfig(AlgorithmConfig):
     """Base of the algorithms that learn from a memory of all episodes and need no likelihood."""
 
-    policy_steps: NonNegative = 0.08
+    policy_steps: NonNegative = 0.3
     """Gradient steps of the policy for each new decision, after ``trainer.value_warmup_updates``."""
     memory: Annotated[int, Range("[1000, 100000000]")] = 100_000
     """Decisions that the trainer remembers; the oldest leave first. At images of 64 pixels, 100,000 are

@@ -305,12 +305,12 @@ def policy_gib(config: RunConfig) -> float:
 
 
 def _check_off_policy(config: RunConfig, spec: WorldSpec, policy: Any) -> None:
-    """Refuses policies whose chunks have no gradient, and segments that are not whole episodes."""
+    """Refuses policies that cannot imitate a chunk, and segments that are not whole episodes."""
     from accerl_lerobot.policies.loading import sampler_config
 
     sampler = sampler_config(config.policy, policy.type)
-    if sampler.type not in ("flow", "gaussian") or getattr(sampler, "stochastic", "last") == "one":
-        remedy = "use flow (with stochastic=last) or gaussian, or another algorithm.type"
+    if sampler.type not in ("flow", "gaussian"):
+        remedy = "use flow or gaussian, or another algorithm.type"
         raise InputError(
             "policy.sampler.type", sampler.type, f"algorithm.type={config.algorithm.type}: {remedy}"
         )

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import yaml
 
+from accerl_lerobot.algorithms import ChunkCriticConfig
 from accerl_lerobot.checkpoint.layout import (
     AWAY,
     CHECKPOINTS,
@@ -48,7 +49,7 @@ from accerl_lerobot.engine.resume import heed_stop
 from accerl_lerobot.engine.stopping import Stopping
 from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, make_folder
 from accerl_lerobot.metrics import METRICS, MetricsLog
-from accerl_lerobot.policies.config import Load
+from accerl_lerobot.policies.config import Load, loader
 from accerl_lerobot.replay.journal import EPISODES
 from accerl_lerobot.timeline import RECOVERY, open_clock
 
@@ -109,6 +110,11 @@ def make_engine(
         load: makes the policy's adapter; None: of LeRobot's checkpoint.
         own: the Ray to use, which outlives the engine; None: one that ends with it.
     """
+    if isinstance(config.algorithm, ChunkCriticConfig):
+        from accerl_lerobot.policies.teacher import WithTeacher
+
+        size, algorithm = history * config.env.state_size, config.algorithm
+        load = WithTeacher(loader(load), size, algorithm.teacher_episodes, algorithm.teacher_noise)
     if config.launch.engine == "local":
         from accerl_lerobot.engine.local import LocalEngine
 

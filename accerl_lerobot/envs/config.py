@@ -29,6 +29,11 @@ class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
         """The registered name."""
         return self.get_choice_name(self.__class__)
 
+    @property
+    def state_size(self) -> int:
+        """Numbers of ``observation.environment_state``; 0 where observations hold none."""
+        return 0
+
     def shortened(self, max_steps: int) -> Self:
         """This config with its episode limit lowered to `max_steps`, if it is longer."""
         return dataclasses.replace(self, max_steps=min(self.max_steps, max_steps))

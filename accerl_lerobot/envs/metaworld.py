@@ -27,6 +27,8 @@ from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 
 CAMERAS = ("topview", "corner", "corner2", "corner3", "corner4", "behindGripper", "gripperPOV")
 STATE_DIM = 4
+RAW_DIM = 39
+"""Numbers of MetaWorld's own observation."""
 ACTION_DIM = 4
 FPS = 80
 STEP_LIMIT = 500
@@ -70,6 +72,11 @@ class MetaWorldConfig(EnvConfig):
             raise InputError("env.camera", self.camera, "name each camera once, separated by commas")
         if unknown := [name for name in self.cameras if name not in CAMERAS]:
             raise InputError("env.camera", self.camera, f"{unknown[0]!r} is none of: {', '.join(CAMERAS)}")
+
+    @property
+    def state_size(self) -> int:
+        """See the base class."""
+        return RAW_DIM + 1 if self.environment_state else 0
 
     def nominal(self) -> MetaWorldConfig:
         """See the base class."""

@@ -78,6 +78,11 @@ class SimulatedConfig(EnvConfig):
     nan_after: Steps = 0
     """Env steps of this instance after which one state is NaN and its episode ends; 0 for never."""
 
+    @property
+    def state_size(self) -> int:
+        """See the base class."""
+        return self.state_dim + 1 if self.environment_state else 0
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.tasks or any(name not in INSTRUCTIONS for name in self.tasks):

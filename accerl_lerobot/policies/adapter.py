@@ -18,6 +18,7 @@ from accerl_lerobot.policies.base import Evaluation, PolicyAdapter, stack_observ
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Encoded, Family, Model
 from accerl_lerobot.policies.processing import Processing, example_observations, example_requests
+from accerl_lerobot.policies.teacher import PREFIX, Teacher
 from accerl_lerobot.policies.value_head import Value, ValueHead
 
 SELF_CHECK_TOLERANCE = 1e-5
@@ -51,6 +52,8 @@ class LeRobotAdapter(PolicyAdapter):
         self.family, self.value_head = family.to(self.device), value_head.to(self.device)
         self.precision = precision
         self.policy.eval()
+        self.teacher: Teacher | None = None
+        """Acts in its place in part of the exploring episodes; given by `teacher.WithTeacher`."""
 
     def encode(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Encoded:
         """Reads raw observations, each (B, ...), and B instructions, for the family; differentiable."""
@@ -79,7 +82,10 @@ class LeRobotAdapter(PolicyAdapter):
             encoded = self.encode(arrays, tasks)
             action = self.family.act(encoded, requests)
         value = self._value(encoded).mean.cpu().numpy()
-        chunk = self.processing.unnormalise(action.chunk.float()).cpu().numpy()
+        executed = action.chunk.float()
+        if self.teacher is not None:
+            executed = self.teacher.replace(executed, requests)
+        chunk = self.processing.unnormalise(executed).cpu().numpy()
         latent = {k: v.cpu().numpy() for k, v in action.latent.items()}
         log_prob = action.log_prob.float().cpu().numpy()
         return [
@@ -116,12 +122,14 @@ class LeRobotAdapter(PolicyAdapter):
     def trainable(self) -> dict[str, nn.Parameter]:
         """See the base class; `tuning` has decided what of the policy that is."""
         parts = {"policy": self.policy, "family": self.family, "value_head": self.value_head}
-        return {
+        named = {
             f"{part}.{name}": parameter
             for part, module in parts.items()
             for name, parameter in module.named_parameters()
             if parameter.requires_grad
         }
+        teacher = {} if self.teacher is None else dict(self.teacher.named_parameters())
+        return named | {PREFIX + name: parameter for name, parameter in teacher.items()}
 
     def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
         """See the base class."""

@@ -92,8 +92,8 @@ class Family(nn.Module, ABC):
 
     frozen: ClassVar[bool] = False
     """True: only the family's own parameters are trained, never the policy's."""
-    proposes: ClassVar[bool] = False
-    """True if chunks are differentiable functions of the weights: `propose`, `executed`, `imitation_loss`."""
+    imitates: ClassVar[bool] = False
+    """True if it has an `imitation_loss`."""
 
     @abstractmethod
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
@@ -107,28 +107,12 @@ class Family(nn.Module, ABC):
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
         """Largest difference, in normalised units, between our sampler at rest and LeRobot's own."""
 
-    def propose(self, encoded: Encoded, noise: Tensor) -> Tensor:
-        """Chunks (B, K, A) that would be executed without exploring, differentiable, in normalised units.
-
-        Args:
-            encoded: of B observations.
-            noise: (B, *noise_size), standard normal.
+    def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
+        """LeRobot's training loss (B,) on chunks (B, K, A) of as many actions as are executed, normalised.
 
         Raises:
-            NotImplementedError: they are no differentiable function of the weights.
+            NotImplementedError: see `imitates`.
         """
-        raise NotImplementedError
-
-    def noise_size(self) -> tuple[int, ...]:
-        """Shape of the noise of one proposal; without elements where a proposal needs none."""
-        raise NotImplementedError
-
-    def executed(self, latent: dict[str, Tensor]) -> Tensor:
-        """Chunks (B, K, A) that stored latents stand for, in normalised units."""
-        raise NotImplementedError
-
-    def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
-        """LeRobot's training loss (B,) on executed chunks (B, K, A), in normalised units."""
         raise NotImplementedError
 
     @property

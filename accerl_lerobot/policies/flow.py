@@ -318,7 +318,7 @@ class FlowFamily(Family):
         sampler: how it explores.
     """
 
-    proposes = True
+    imitates = True
 
     def __init__(self, model: FlowModel, sampler: FlowSamplerConfig) -> None:
         super().__init__()
@@ -345,27 +345,9 @@ class FlowFamily(Family):
         """See the base class."""
         return difference(self.model, batch, encoded)
 
-    def propose(self, encoded: Encoded, noise: Tensor) -> Tensor:
-        """See the base class; the noise is x₀."""
-        return self._executed_part(integrate(encoded.context.velocity, noise, self.shape))
-
-    def noise_size(self) -> tuple[int, ...]:
-        """See the base class."""
-        return self.shape.chunk_size, self.shape.padded_dim
-
-    def executed(self, latent: dict[str, Tensor]) -> Tensor:
-        """See the base class.
-
-        Raises:
-            NotImplementedError: under ``stochastic=one`` the path's end is not stored.
-        """
-        if self.sampler.stochastic == "one":
-            raise NotImplementedError
-        return self._executed_part(latent["path"][:, -1])
-
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
         """See the base class: flow matching at a time from LeRobot's Beta(1.5, 1), executed entries only."""
-        target = chunk.new_zeros(len(chunk), *self.noise_size())
+        target = chunk.new_zeros(len(chunk), self.shape.chunk_size, self.shape.padded_dim)
         self._executed_part(target).copy_(chunk)
         noise = torch.randn_like(target)
         t = torch.distributions.Beta(1.5, 1.0).sample((len(chunk),)).to(chunk) * 0.999 + 0.001

@@ -92,7 +92,7 @@ class GaussianFamily(Family):
         sampler: how wide the noise is.
     """
 
-    proposes = True
+    imitates = True
 
     def __init__(self, model: GaussianModel, sampler: GaussianSamplerConfig) -> None:
         super().__init__()
@@ -132,21 +132,9 @@ class GaussianFamily(Family):
         u = mean if eps is None else mean + std * eps[:, :executed]
         return float((self._action(u) - stock[:, :executed]).abs().max())
 
-    def propose(self, encoded: Encoded, noise: Tensor) -> Tensor:
-        """See the base class; no noise is needed."""
-        return self._action(self._gaussian(encoded)[0])
-
-    def noise_size(self) -> tuple[int, ...]:
-        """See the base class."""
-        return (0,)
-
-    def executed(self, latent: dict[str, Tensor]) -> Tensor:
-        """See the base class."""
-        return self._action(latent["u"])
-
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
         """See the base class: the mean absolute error, ACT's reconstruction loss."""
-        return (self.propose(encoded, chunk) - chunk).abs().mean((1, 2))
+        return (self._action(self._gaussian(encoded)[0]) - chunk).abs().mean((1, 2))
 
     @property
     def actions(self) -> int:

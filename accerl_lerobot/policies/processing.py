@@ -55,6 +55,12 @@ class Processing:
         """(B, K, A) from normalised to environment units."""
         return self.postprocessor(chunk)
 
+    def normalise(self, chunk: Tensor) -> Tensor:
+        """(B, K, A) from environment to normalised units; every normalisation that LeRobot has is affine."""
+        ends = torch.stack([torch.zeros_like(chunk[0]), torch.ones_like(chunk[0])])
+        zero, one = self.unnormalise(ends.to(self.device)).to(chunk)
+        return (chunk - zero) / (one - zero)
+
 
 def example_observations(
     policy_config: Any, rename_map: dict[str, str]

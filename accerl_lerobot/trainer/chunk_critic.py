@@ -1,77 +1,74 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Updates from an off-policy critic over chunks; `algorithms.chunk_critic` has the formulas.
+"""Updates from an off-policy critic and a teacher that see the simulator's state.
 
-    new episodes → memory → steps of the critic → steps of the policy, both so many for each new decision
+    new episodes → memory → steps of critic and teacher → steps of the policy, so many for each new decision
 
-Each row of the memory keeps a *proposal*, the chunk that the policy would execute there without exploring,
-from a noise kept with it: the critic's target bootstraps from it and the policy is held near it. Proposals
-are computed again in turn, all of them once in `RENEWED_IN` steps of the policy.
+`algorithms.chunk_critic` has the formulas.
 
-Shapes: M members of the ensemble, B rows, S numbers of a state, C = K · A of a chunk.
+Until ``trainer.value_warmup_updates`` the policy explores alone. Then the teacher first learns to do what has
+been done so far, and from there what the critic says.
+
+Shapes: M members of the ensemble, B rows, S numbers of a state, (K, A) of a chunk.
 """
 
 from __future__ import annotations
 
 import copy
 import math
+from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from accerl_lerobot.algorithms import ChunkCriticConfig
 from accerl_lerobot.checkpoint.optimizers import copied, optimizer_state, restore_optimizer
+from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded
+from accerl_lerobot.policies.teacher import Ensemble, Teacher
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.off_policy import OffPolicyUpdate, mean
 
-MEMBERS, WIDTH = 6, 256
-CRITIC_BATCH = 256
-"""Rows of one step of the critic."""
+MEMBERS = 6
+BATCH = 256
+"""Rows of one step of critic or teacher."""
 TAU = 0.01
 """Share of the critic's weights that its slow copy takes over in a step."""
 SMOOTHING = 0.1
-"""Std of the noise on proposals within the critic's target, as in TD3."""
+"""Std of the noise on the teacher's chunks within the critic's target, as in TD3."""
 DISTANCE = 0.3
-"""Normalised action units in which the distance from a proposal is measured."""
-RENEWED_IN = 80
-"""Steps of the policy in which all proposals are computed again."""
+"""Normalised action units in which the teacher's distance from successes is measured."""
+TEACHER_LR = 3e-4
+READER_LR = 1e-3
+LAST = 50
+"""Exploring episodes that ``teacher_success`` and ``policy_success`` are of."""
+FIRST_STEPS = 2000
+"""Steps in which the teacher learns what was done before it may act."""
+MARGIN = 0.05
+"""Share of the explored range of actions that the teacher may go beyond it."""
 SMALLEST_SCALE = 0.02
-"""Smallest mean return that Q is divided by."""
+"""Smallest mean |Q| that Q is divided by."""
 
 
 class Critic(nn.Module):
     """An ensemble of Q(state, chunk).
 
     Args:
-        state: S.
-        chunk: C.
+        teacher: scales states.
     """
 
-    mean: Tensor
-    std: Tensor
-
-    def __init__(self, state: int, chunk: int) -> None:
+    def __init__(self, teacher: Teacher) -> None:
         super().__init__()
-        sizes = ((state + chunk, WIDTH), (WIDTH, WIDTH), (WIDTH, 1))
-        self.weights = nn.ParameterList((torch.rand(MEMBERS, i, o) * 2 - 1) / i**0.5 for i, o in sizes)
-        self.biases = nn.ParameterList(torch.zeros(MEMBERS, 1, o) for _, o in sizes)
-        self.register_buffer("mean", torch.zeros(state))
-        self.register_buffer("std", torch.ones(state))
+        inputs = len(teacher.mean) + math.prod(teacher.chunk)
+        self.network = Ensemble(inputs, 1, MEMBERS)
 
-    def forward(self, state: Tensor, chunk: Tensor, members: Tensor | slice = slice(None)) -> Tensor:
-        """(B, S) and (B, K, A) to (M, B), of the given members."""
-        x = torch.cat([(state - self.mean) / self.std, chunk.flatten(1)], -1)
-        layers = [(w[members], b[members]) for w, b in zip(self.weights, self.biases, strict=True)]
-        x = x.expand(len(layers[0][0]), -1, -1)
-        for weight, bias in layers[:-1]:
-            x = torch.baddbmm(bias, x, weight)
-            x = functional.silu(functional.layer_norm(x, x.shape[-1:]))
-        weight, bias = layers[-1]
-        return torch.baddbmm(bias, x, weight)[..., 0]
+    def forward(self, state: Tensor, chunk: Tensor) -> Tensor:
+        """(B, S), scaled, and (B, K, A) to (M, B)."""
+        q: Tensor = self.network(torch.cat([state, chunk.flatten(1)], -1))[..., 0]
+        return q
 
 
 class ChunkCriticUpdate(OffPolicyUpdate):
@@ -80,133 +77,166 @@ class ChunkCriticUpdate(OffPolicyUpdate):
     def __init__(self, adapter: LeRobotAdapter, algorithm: ChunkCriticConfig, config: TrainerConfig) -> None:
         self.n_step = algorithm.n_step
         super().__init__(adapter, algorithm, config)
-        self.algorithm = algorithm
-        self._renewed = 0
-        self._scale = 1.0
-        self._critic: Critic | None = None
+        assert adapter.teacher is not None
+        self.algorithm, self.teacher = algorithm, adapter.teacher
+        device = adapter.device
+        self.critic = Critic(self.teacher).to(device)
+        self.slow = copy.deepcopy(self.critic).requires_grad_(False)
+        self.reader = nn.Linear(adapter.model.width, len(self.teacher.mean)).to(device)
+        """Reads the scaled state off the policy's features."""
+        self.optimizers = {
+            "critic": torch.optim.AdamW(self.critic.parameters(), lr=config.value_lr, weight_decay=1e-3),
+            "teacher": torch.optim.AdamW(self.teacher.network.parameters(), lr=TEACHER_LR, weight_decay=1e-4),
+        }
+        names = ("policy_success", "teacher_success")
+        self._outcomes: dict[str, deque[bool]] = {name: deque(maxlen=LAST) for name in names}
+        """Success of the last exploring episodes, by who acted in them."""
+        self.optimizer.add_param_group({"params": list(self.reader.parameters()), "lr": READER_LR})
 
-    def added(self, rows: np.ndarray) -> None:
+    def step(self, segments: Sequence[Segment]) -> dict[str, float]:
         """See the base class."""
-        self._propose(rows)
+        for segment in segments:
+            taught = bool(self.teacher.ready) and self.teacher.plays(segment.origin.seed)
+            self._outcomes["teacher_success" if taught else "policy_success"].append(segment.success)
+        outcomes = {name: sum(last) / max(1, len(last)) for name, last in self._outcomes.items()}
+        return super().step(segments) | outcomes
 
     def learn(self, new: int) -> dict[str, float]:
         """See the base class."""
-        if self._critic is None:
-            self._make_critic()
-        assert self._critic is not None
-        states, returns = self.memory["state"], self.memory["return"]
-        for critic in (self._critic, self._slow):
-            critic.mean.copy_(torch.from_numpy(states.mean(0)))
-            critic.std.copy_(torch.from_numpy(states.std(0).clip(1e-3)))
-        value_lr = self.config.value_lr * self.config.lr_share(self.version, updates=self._schedule_updates)
-        self._critic_optimizer.param_groups[0]["lr"] = value_lr
+        if self.version < self.config.value_warmup_updates:
+            return {}
+        self._scale_states()
+        if not self.teacher.ready:
+            self._begin()
+        returns = self.memory["return"]
         bounds = float(returns.min()), float(returns.max())
-        due = self.steps("critic", self.algorithm.critic_steps, new)
-        metrics = {"value_lr": value_lr} | mean(self._critic_step(bounds) for _ in due)
-        self._scale = max(float(np.abs(returns).mean()), SMALLEST_SCALE)
-        metrics |= self.policy_learns(new)
-        if self.version >= self.config.value_warmup_updates:
-            share = self.policy_steps / RENEWED_IN * len(self.memory)
-            due = self.steps("proposals", share, new)[: len(self.memory)]
-            self._propose((self._renewed + np.array(due, int)) % len(self.memory))
-            self._renewed = (self._renewed + len(due)) % len(self.memory)
-        return metrics
+        won = np.flatnonzero(self.memory["success"])
+        metrics = mean(
+            self._critic_step(bounds) for _ in self.steps("critic", self.algorithm.critic_steps, new)
+        )
+        due = self.steps("teacher", self.algorithm.critic_steps / 2, new)
+        metrics |= mean(self._teacher_step(won) for _ in due)
+        return metrics | self.policy_learns(new)
 
-    def loss(self, rows: np.ndarray, encoded: Encoded, imitation: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def imitable(self) -> np.ndarray:
+        """See the base class: every observation has a label."""
+        return np.arange(len(self.memory))
+
+    @torch.no_grad()
+    def target(self, rows: np.ndarray) -> Tensor:
         """See the base class."""
-        assert self._critic is not None
-        algorithm = self.algorithm
-        with self.adapter.autocast():
-            chunk = self.adapter.family.propose(encoded, self.tensor("noise", rows)).float()
-        proposal, state = self.tensor("proposal", rows), self.tensor("state", rows)
-        q = self._critic(state, chunk)
-        pessimistic = q.mean(0) - algorithm.pessimism * q.std(0)
-        distance = (chunk - proposal).square().mean((1, 2)) / DISTANCE**2
-        climb = (algorithm.anchor * distance - pessimistic / self._scale).mean()
-        with torch.no_grad():
-            gain = (q - self._critic(state, proposal)).mean() / self._scale
-        return climb + algorithm.imitation * imitation, {
-            "distance": distance.mean(),
-            "disagreement": q.std(0).mean() / self._scale,
-            "gain": gain,
-        }
+        chunk: Tensor = self.teacher(self.tensor("state", rows))
+        return chunk
+
+    def auxiliary(self, rows: np.ndarray, encoded: Encoded) -> dict[str, Tensor]:
+        """See the base class."""
+        weight = self.algorithm.perception
+        if not weight:
+            return {}
+        features = (encoded.features * encoded.mask[..., None]).float().mean(1)
+        state = self.teacher.scaled(self.tensor("state", rows))
+        return {"perception_loss": weight * (self.reader(features) - state).square().mean()}
 
     def state(self) -> dict[str, Any]:
         """See the base class."""
-        critic = self._critic and {
-            "weights": copied(self._critic),
-            "slow": copied(self._slow),
-            "optimizer": optimizer_state(self._critic_optimizer),
-        }
-        return super().state() | {"renewed": self._renewed, "critic": critic}
+        networks = {name: copied(module) for name, module in self._networks().items()}
+        optimizers = {name: optimizer_state(optimizer) for name, optimizer in self.optimizers.items()}
+        outcomes = {name: list(last) for name, last in self._outcomes.items()}
+        return super().state() | {"networks": networks, "optimizers": optimizers, "outcomes": outcomes}
 
     def restore(self, state: dict[str, Any]) -> None:
         """See the base class."""
         super().restore(state)
-        self._renewed = state["renewed"]
-        if state["critic"] is not None:
-            self._make_critic()
-            assert self._critic is not None
-            self._critic.load_state_dict(state["critic"]["weights"])
-            self._slow.load_state_dict(state["critic"]["slow"])
-            restore_optimizer(self._critic_optimizer, state["critic"]["optimizer"])
+        for name, module in self._networks().items():
+            module.load_state_dict(state["networks"][name])
+        for name, optimizer in self.optimizers.items():
+            restore_optimizer(optimizer, state["optimizers"][name])
+        for name, last in self._outcomes.items():
+            last.extend(state["outcomes"][name])
 
-    def _make_critic(self) -> None:
-        """Once the sizes are known."""
-        state, chunk = self.memory["state"].shape[1], int(np.prod(self.memory["chunk"].shape[1:]))
-        self._critic = Critic(state, chunk).to(self.adapter.device)
-        self._slow = copy.deepcopy(self._critic).requires_grad_(False)
-        self._critic_optimizer = torch.optim.AdamW(
-            self._critic.parameters(), lr=self.config.value_lr, weight_decay=1e-3
-        )
+    def _networks(self) -> dict[str, nn.Module]:
+        """All but the teacher, which lies beside the policy's weights."""
+        return {"critic": self.critic, "slow": self.slow, "reader": self.reader}
+
+    @torch.no_grad()
+    def _scale_states(self) -> None:
+        states = self.memory["state"]
+        self.teacher.mean.copy_(torch.from_numpy(states.mean(0)))
+        self.teacher.std.copy_(torch.from_numpy(states.std(0).clip(1e-3)))
+
+    def _begin(self) -> None:
+        """The teacher learns to do what was done so far."""
+        chunks = self.memory["chunk"]
+        low, high = (torch.from_numpy(end) for end in (chunks.min((0, 1)), chunks.max((0, 1))))
+        margin = MARGIN * (high - low) + MARGIN
+        with torch.no_grad():
+            self.teacher.low.copy_(low - margin)
+            self.teacher.high.copy_(high + margin)
+        for _ in range(FIRST_STEPS):
+            rows = self._draw()
+            loss = (self.teacher(self.tensor("state", rows)) - self.tensor("chunk", rows)).square().mean()
+            self._descend("teacher", loss)
+        with torch.no_grad():
+            self.teacher.ready.fill_(1)
+
+    def _draw(self) -> np.ndarray:
+        return torch.randint(len(self.memory), (BATCH,)).numpy()
 
     def _critic_step(self, bounds: tuple[float, float]) -> dict[str, float]:
         """One gradient step of the ensemble; ``bounds`` of the returns seen, which no target leaves."""
-        assert self._critic is not None
-        rows = self.draw(CRITIC_BATCH)
-        state, chunk, reward, discount, returns = (
-            self.tensor(name, rows) for name in ("state", "chunk", "reward", "discount", "return")
-        )
-        following = self.memory["following"][rows]
+        rows = self._draw()
+        names = ("state", "chunk", "reward", "discount", "return")
+        state, chunk, reward, discount, returns = (self.tensor(name, rows) for name in names)
+        following = self.tensor("state", self.memory["following"][rows])
         with torch.no_grad():
-            proposal = self.tensor("proposal", following)
-            proposal = proposal + SMOOTHING * torch.randn_like(proposal)
-            two = torch.randperm(MEMBERS)[:2]
-            bootstrap = self._slow(self.tensor("state", following), proposal, two).min(0).values
+            planned = self.teacher(following)
+            planned = planned + SMOOTHING * torch.randn_like(planned)
+            bootstrap = self._pessimistic(self.slow(self.teacher.scaled(following), planned))
             m = self.algorithm.monte_carlo
             target = (1 - m) * (reward + discount * bootstrap.clamp(*bounds)) + m * returns
-        q = self._critic(state, chunk)
+        q = self.critic(self.teacher.scaled(state), chunk)
         loss = (q - target).square().mean(1).sum()
-        self._critic_optimizer.zero_grad()
-        loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self._critic.parameters(), math.inf)
-        if math.isfinite(float(loss.detach() + norm)):
-            self._critic_optimizer.step()
+        norm = self._descend("critic", loss, clip=math.inf)
         with torch.no_grad():
-            for slow, fast in zip(self._slow.parameters(), self._critic.parameters(), strict=True):
+            for slow, fast in zip(self.slow.parameters(), self.critic.parameters(), strict=True):
                 slow.lerp_(fast, TAU)
             q = q.mean(0)
             unexplained = (returns - q).var() / returns.var().clamp(min=1e-8)
         return {
             "value_loss": float(loss.detach()) / MEMBERS,
-            "value_grad_norm": float(norm),
+            "value_grad_norm": norm,
             "value_mean": float(q.mean()),
             "return_mean": float(returns.mean()),
             "explained_variance": float(1 - unexplained),
         }
 
-    @torch.no_grad()
-    def _propose(self, rows: np.ndarray) -> None:
-        """Writes the proposals of now, from fresh noise."""
-        for part in np.array_split(rows, max(1, math.ceil(len(rows) / (2 * CRITIC_BATCH)))):
-            if not len(part):
-                return
-            noise = torch.randn(len(part), *self.adapter.family.noise_size())
-            with self.adapter.autocast():
-                encoded = self.adapter.encode(*self.memory.observations(part))
-                chunk = self.adapter.family.propose(encoded, noise.to(self.adapter.device))
-            self.memory.write("noise", part, noise.numpy())
-            self.memory.write("proposal", part, chunk.float().cpu().numpy())
+    def _teacher_step(self, won: np.ndarray) -> dict[str, float]:
+        """One gradient step of the teacher; `won` are the rows of successful episodes."""
+        state = self.tensor("state", self._draw())
+        q = self.critic(self.teacher.scaled(state), self.teacher(state))
+        loss = -self._pessimistic(q).mean() / q.detach().abs().mean().clamp(min=SMALLEST_SCALE)
+        metrics = {"teacher_value": q.mean(), "disagreement": q.std(0).mean()}
+        if len(won):
+            rows = won[torch.randint(len(won), (BATCH,)).numpy()]
+            gap = self.teacher(self.tensor("state", rows)) - self.tensor("chunk", rows)
+            metrics["distance"] = gap.square().mean() / DISTANCE**2
+            loss = loss + self.algorithm.imitation * metrics["distance"]
+        self._descend("teacher", loss)
+        return {name: float(value.detach()) for name, value in metrics.items()}
+
+    def _pessimistic(self, q: Tensor) -> Tensor:
+        """(M, B) to (B,)."""
+        return q.mean(0) - self.algorithm.pessimism * q.std(0)
+
+    def _descend(self, name: str, loss: Tensor, clip: float = 1.0) -> float:
+        """A step of one optimiser, left out where it is not finite; the gradient's norm."""
+        optimizer = self.optimizers[name]
+        optimizer.zero_grad()
+        loss.backward()
+        norm = float(torch.nn.utils.clip_grad_norm_(optimizer.param_groups[0]["params"], clip))
+        if math.isfinite(float(loss.detach()) + norm):
+            optimizer.step()
+        return norm
 
 
 OFF_POLICY: dict[str, Any] = {"chunk_critic": ChunkCriticUpdate, "self_imitation": OffPolicyUpdate}

@@ -6,16 +6,14 @@ Shapes: B rows, E numbers of the environment state, K executed actions of A dims
 
 from __future__ import annotations
 
-import hashlib
 from typing import Any
 
 import numpy as np
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, Segment
+from accerl_lerobot.policies.teacher import TASK_BITS, task_code
 
-CODE = 16
-"""Numbers that stand for a task."""
 FIRST = 1024
 """Rows that memory is asked for at first; doubled when they are full."""
 
@@ -83,9 +81,9 @@ class Memory:
         seen = {name: values[:-1] for name, values in segment.observations.items()}
         environment = seen.pop(ENVIRONMENT_STATE, np.empty((t, 0))).reshape(t, -1)
         if segment.task not in self._codes:
-            self._codes[segment.task] = _code(segment.task)
+            self._codes[segment.task] = task_code(segment.task)
             self.tasks.append(segment.task)
-        code = np.broadcast_to(self._codes[segment.task], (t, CODE))
+        code = np.broadcast_to(self._codes[segment.task], (t, TASK_BITS))
         columns: dict[str, Any] = {
             "state": np.concatenate([environment, code], 1).astype(np.float32),
             "chunk": chunk,
@@ -136,10 +134,4 @@ class Memory:
     def restore(self, state: dict[str, Any]) -> None:
         """Goes on from what `state` gave."""
         self.total, self.tasks, self._columns = state["total"], list(state["tasks"]), dict(state["columns"])
-        self._codes = {task: _code(task) for task in self.tasks}
-
-
-def _code(task: str) -> np.ndarray:
-    """±1 for each of 16 bits of the instruction's hash: known without a list of all tasks."""
-    bits = np.frombuffer(hashlib.sha256(task.encode()).digest(), np.uint8)[:CODE]
-    return np.where(bits & 1, 1.0, -1.0).astype(np.float32)
+        self._codes = {task: task_code(task) for task in self.tasks}

@@ -21,13 +21,14 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded
+from accerl_lerobot.policies.teacher import PREFIX
 from accerl_lerobot.trainer.anchors import CRITIC
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.memory import Memory
 from accerl_lerobot.trainer.nonfinite import NonFiniteError
 
 POLICY_BATCH = 128
-"""Rows of one step of the policy. Half of them are drawn from successful episodes."""
+"""Rows of one step of the policy."""
 
 
 class OffPolicyUpdate:
@@ -39,14 +40,14 @@ class OffPolicyUpdate:
         config: the optimiser; ``batch_decisions`` of new experience make one update.
 
     Raises:
-        InputError: the policy's chunks are no differentiable function of its weights.
+        InputError: the policy cannot be trained to imitate a chunk.
     """
 
     n_step = 1
     """Decisions after which a target bootstraps."""
 
     def __init__(self, adapter: LeRobotAdapter, algorithm: OffPolicyConfig, config: TrainerConfig) -> None:
-        if not adapter.family.proposes:
+        if not adapter.family.imitates:
             remedy = "needs a policy that explores by flow or gaussian; use gipo"
             raise InputError("algorithm.type", algorithm.type, remedy)
         self.adapter, self.config = adapter, config
@@ -55,7 +56,7 @@ class OffPolicyUpdate:
         self.version = self.skipped = self._skipped_in_a_row = 0
         self._owed: dict[str, float] = {}
         self._schedule_updates = config.updates
-        self._policy = [p for k, p in adapter.trainable().items() if not k.startswith(CRITIC)]
+        self._policy = [p for k, p in adapter.trainable().items() if not k.startswith((CRITIC, PREFIX))]
         self.optimizer = torch.optim.AdamW(
             self._policy, lr=config.lr, betas=config.betas, weight_decay=config.weight_decay
         )
@@ -72,8 +73,8 @@ class OffPolicyUpdate:
         """
         for segment in segments:
             if not segment.truncated:  # the simulator diverged: nothing follows, and nothing failed
-                latent = {k: torch.from_numpy(v) for k, v in segment.latent.items()}
-                self.added(self.memory.add(segment, self.adapter.family.executed(latent).numpy()))
+                executed = self.adapter.processing.normalise(torch.from_numpy(segment.actions))
+                self.memory.add(segment, executed.numpy())
         metrics = {"decisions": float(sum(map(len, segments))), "memory_decisions": float(len(self.memory))}
         rewards = np.concatenate([segment.reward for segment in segments])
         metrics |= {"reward_mean": float(rewards.mean())}
@@ -84,22 +85,26 @@ class OffPolicyUpdate:
         self.version += 1
         return metrics | {"skipped": float(self.skipped)}
 
-    def added(self, rows: np.ndarray) -> None:
-        """Completes new rows of the memory."""
-
     def learn(self, new: int) -> dict[str, float]:
         """Makes all steps that so many new decisions allow."""
         return self.policy_learns(new)
 
-    def loss(self, rows: np.ndarray, encoded: Encoded, imitation: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """The objective of a step of the policy, and further metrics.
+    def imitable(self) -> np.ndarray:
+        """Rows of the memory that the policy imitates."""
+        return np.flatnonzero(self.memory["success"])
+
+    def target(self, rows: np.ndarray) -> Tensor:
+        """Chunks (B, K, A) for the policy to imitate, in normalised units."""
+        return self.tensor("chunk", rows)
+
+    def auxiliary(self, rows: np.ndarray, encoded: Encoded) -> dict[str, Tensor]:
+        """Further losses of a step of the policy, by name, already weighted.
 
         Args:
             rows: (B,) of the memory.
             encoded: their observations, differentiable.
-            imitation: scalar, the mean imitation loss on those of them that belong to successful episodes.
         """
-        return imitation, {}
+        return {}
 
     def state(self) -> dict[str, Any]:
         """A copy of all that `restore` needs, the policy's weights apart; see `snapshot`."""
@@ -133,31 +138,22 @@ class OffPolicyUpdate:
         lr = self.config.lr * self.config.lr_share(self.version, start=start, updates=self._schedule_updates)
         self.optimizer.param_groups[0]["lr"] = lr
         metrics = {"lr": lr}
-        if self.version >= start:
-            won = np.flatnonzero(self.memory["success"])
-            metrics |= mean(self._policy_step(won) for _ in self.steps("policy", self.policy_steps, new))
+        if self.version >= start and len(rows := self.imitable()):
+            metrics |= mean(self._policy_step(rows) for _ in self.steps("policy", self.policy_steps, new))
         return metrics
-
-    def draw(self, count: int) -> np.ndarray:
-        """Rows of the memory, any of them."""
-        return torch.randint(len(self.memory), (count,)).numpy()
 
     def tensor(self, name: str, rows: np.ndarray) -> Tensor:
         """Rows of a column, where the policy lives."""
         return torch.from_numpy(self.memory[name][rows]).to(self.adapter.device)
 
-    def _policy_step(self, won: np.ndarray) -> dict[str, float]:
-        """One gradient step; `won` are the rows of successful episodes."""
-        rows = self.draw(POLICY_BATCH)
-        if len(won):
-            half = POLICY_BATCH // 2
-            rows[:half] = won[torch.randint(len(won), (half,)).numpy()]
-        success = self.tensor("success", rows).float()
+    def _policy_step(self, imitable: np.ndarray) -> dict[str, float]:
+        """One gradient step on rows drawn from `imitable`."""
+        rows = imitable[torch.randint(len(imitable), (POLICY_BATCH,)).numpy()]
         with self.adapter.autocast():
             encoded = self.adapter.encode(*self.memory.observations(rows))
-            error = self.adapter.family.imitation_loss(encoded, self.tensor("chunk", rows)).float()
-        imitation = (error * success).sum() / success.sum().clamp(min=1)
-        loss, metrics = self.loss(rows, encoded, imitation)
+            imitation = self.adapter.family.imitation_loss(encoded, self.target(rows)).float().mean()
+        metrics = {"imitation_loss": imitation} | self.auxiliary(rows, encoded)
+        loss = torch.stack(list(metrics.values())).sum()
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         norm = float(torch.nn.utils.clip_grad_norm_(self._policy, self.config.grad_clip))
@@ -166,7 +162,7 @@ class OffPolicyUpdate:
             self._skipped_in_a_row = 0
         else:
             self._skip(float(loss.detach()), norm)
-        metrics |= {"policy_loss": loss, "imitation_loss": imitation}
+        metrics |= {"policy_loss": loss}
         return {name: float(value.detach()) for name, value in metrics.items()} | {"grad_norm": norm}
 
     def _skip(self, loss: float, norm: float) -> None:

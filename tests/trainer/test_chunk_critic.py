@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -21,11 +21,13 @@ from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.flow import FlowContext, FlowFamily, FlowShape
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.samplers import FlowSamplerConfig
+from accerl_lerobot.policies.teacher import TASK_BITS, Ensemble, Teacher, WithTeacher, state_of
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.trainer.chunk_critic import MEMBERS, ChunkCriticUpdate, Critic
+from accerl_lerobot.seeds import noise_seed
+from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate, Critic
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.memory import CODE, Memory
+from accerl_lerobot.trainer.memory import Memory
 from accerl_lerobot.trainer.nonfinite import NonFiniteError
 from accerl_lerobot.trainer.off_policy import OffPolicyUpdate
 from tests.runs import tiny_run
@@ -34,9 +36,7 @@ GAMMA = 0.9
 ENV = SimulatedConfig(max_steps=16, environment_state=True)
 
 
-def episode(
-    rewards: list[float], *, first: float = 0.0, latent: dict[str, np.ndarray] | None = None
-) -> Segment:
+def episode(rewards: list[float], *, first: float = 0.0, actions: np.ndarray | None = None) -> Segment:
     """An episode whose environment state counts its decisions from `first`."""
     t = len(rewards)
     counts = first + np.arange(t + 1, dtype=np.float32)
@@ -47,10 +47,10 @@ def episode(
             ENVIRONMENT_STATE: counts[:, None],
         },
         task="Match the target",
-        latent=latent or {"path": np.zeros((t, 2, 4, 2), np.float32)},
+        latent={},
         log_prob=np.zeros((t, 4), np.float32),
         value=np.zeros(t, np.float32),
-        actions=np.zeros((t, 4, 2), np.float32),
+        actions=np.zeros((t, 4, 2), np.float32) if actions is None else actions,
         reward=np.array(rewards, np.float32),
         version=np.zeros(t, np.int64),
         steps=np.full(t, 4),
@@ -67,10 +67,16 @@ def chunks(segment: Segment) -> np.ndarray:
     return np.zeros((len(segment), 4, 2), np.float32)
 
 
+def taught(checkpoint: Path, precision: Literal["fp32", "bf16"] = "fp32") -> LeRobotAdapter:
+    """A policy and a teacher that sees one number and the task."""
+    load = WithTeacher(load_adapter, state=1, share=0.5, noise=0.1)
+    return load(PolicyConfig(path=str(checkpoint), device="cpu", precision=precision))
+
+
 def learner(
     checkpoint: Path, algorithm: ChunkCriticConfig | None = None, **trainer: Any
 ) -> ChunkCriticUpdate:
-    adapter = load_adapter(PolicyConfig(path=str(checkpoint), device="cpu"))
+    adapter = taught(checkpoint)
     config = TrainerConfig(**{"warmup_updates": 0, "value_warmup_updates": 0} | trainer)
     return ChunkCriticUpdate(adapter, algorithm or ChunkCriticConfig(), config)
 
@@ -103,7 +109,7 @@ class TestMemory:
             segment = episode([0.0, 1.0])
             segment.task = name
             memory.add(segment, chunks(segment))
-        assert memory["state"].shape == (4, 1 + CODE)
+        assert memory["state"].shape == (4, 1 + TASK_BITS)
         assert (memory["state"][0, 1:] != memory["state"][2, 1:]).any()
         again = Memory(1000, GAMMA, n_step=2)
         again.restore(memory.state())
@@ -123,22 +129,33 @@ class TestMemory:
 
 def test_the_ensemble_equals_a_slow_one():
     torch.manual_seed(0)
-    critic = Critic(state=3, chunk=8)
-    critic.mean.copy_(torch.tensor([1.0, 2.0, 3.0]))
-    critic.std.copy_(torch.tensor([0.5, 1.0, 2.0]))
-    state, chunk = torch.randn(5, 3), torch.randn(5, 4, 2)
-    x = np.concatenate([(state.numpy() - [1, 2, 3]) / [0.5, 1, 2], chunk.numpy().reshape(5, 8)], 1)
-    for member in range(MEMBERS):
-        h = x
-        weights = [w[member].detach().double().numpy() for w in critic.weights]
+    ensemble = Ensemble(inputs=11, outputs=2, members=3)
+    x = torch.randn(5, 11)
+    for member in range(3):
+        h = x.double().numpy()
+        weights = [w[member].detach().double().numpy() for w in ensemble.weights]
         for weight in weights[:-1]:
             h = h @ weight
             h = (h - h.mean(1, keepdims=True)) / np.sqrt(h.var(1, keepdims=True) + 1e-5)
             h = h / (1 + np.exp(-h))
-        expected = (h @ weights[-1])[:, 0]
-        np.testing.assert_allclose(critic(state, chunk)[member].detach(), expected, rtol=1e-4, atol=1e-5)
-    two = torch.tensor([4, 1])
-    torch.testing.assert_close(critic(state, chunk, two), critic(state, chunk)[two])
+        np.testing.assert_allclose(ensemble(x)[member].detach(), h @ weights[-1], rtol=1e-4, atol=1e-5)
+
+
+def test_a_teacher_keeps_to_its_range_and_scales_what_it_sees():
+    torch.manual_seed(0)
+    teacher = Teacher(state=2, chunk=(3, 2), share=1.0, noise=0.0)
+    with torch.no_grad():
+        teacher.low.copy_(torch.tensor([-1.0, 2.0]))
+        teacher.high.copy_(torch.tensor([0.0, 4.0]))
+        teacher.mean.copy_(torch.tensor([1.0, 2.0]))
+        teacher.std.copy_(torch.tensor([0.5, 4.0]))
+        teacher.network.weights[-1].mul_(1000)
+    scaled = teacher.scaled(torch.tensor([[2.0, 2.0], [1.0, 99.0]]))
+    np.testing.assert_allclose(scaled.detach(), [[2, 0], [0, 10]])
+    chunk = teacher(100 * torch.randn(50, 2)).detach()
+    assert chunk.shape == (50, 3, 2)
+    assert (chunk.amin((0, 1)) >= teacher.low).all() and (chunk.amax((0, 1)) <= teacher.high).all()
+    assert chunk[..., 1].max() > 3.9 and chunk[..., 0].min() < -0.9
 
 
 def requests(adapter: LeRobotAdapter, count: int) -> list[Request]:
@@ -146,28 +163,59 @@ def requests(adapter: LeRobotAdapter, count: int) -> list[Request]:
     return [Request(observation=world.reset(i, "match"), noise_seed=i) for i in range(count)]
 
 
-def test_what_is_executed_and_proposed_is_what_the_policy_does(tiny_checkpoint: Path):
-    adapter = load_adapter(PolicyConfig(path=str(tiny_checkpoint), device="cpu"))
-    asked = requests(adapter, 3)
-    decided = adapter.decide(asked, 0)
-    latent = [d.latent for d in decided]
-    stacked = {k: torch.from_numpy(np.stack([each[k] for each in latent])) for k in latent[0]}
-    executed = adapter.processing.unnormalise(adapter.family.executed(stacked))
-    np.testing.assert_array_equal(executed, np.stack([d.chunk for d in decided]))
+class TestActing:
+    def test_whole_episodes_are_the_teachers_once_it_is_ready(self, tiny_checkpoint: Path):
+        adapter = WithTeacher(load_adapter, ENV.state_size, share=0.5, noise=0.0)(
+            PolicyConfig(path=str(tiny_checkpoint), device="cpu")
+        )
+        assert adapter.teacher is not None
+        observation = requests(adapter, 1)[0].observation
+        asked = [
+            Request(observation=observation, noise_seed=noise_seed(episode, 0, decision), explore=explore)
+            for episode in range(200)
+            for decision in (0, 1)
+            for explore in (True, False)
+        ]
+        assert not any(map(adapter.teacher.acts, asked)), "an untrained teacher does not act"
+        own = adapter.decide(asked[:8], 0)
+        with torch.no_grad():
+            adapter.teacher.ready.fill_(1)
+        acts = np.array(list(map(adapter.teacher.acts, asked))).reshape(200, 2, 2)
+        assert not acts[..., 1].any(), "evaluation is the policy's"
+        np.testing.assert_array_equal(acts[:, 0, 0], acts[:, 1, 0])
+        assert 70 < acts[:, 0, 0].sum() < 130
+        state = torch.from_numpy(state_of(observation))[None]
+        wanted = adapter.processing.unnormalise(adapter.teacher(state).detach())[0].numpy()
+        for i, (decision, before) in enumerate(zip(adapter.decide(asked[:8], 0), own, strict=True)):
+            expected = wanted if acts.reshape(-1)[i] else before.chunk
+            np.testing.assert_allclose(decision.chunk, expected, atol=1e-6)
 
-    rest = adapter.decide(
-        [Request(observation=r.observation, noise_seed=r.noise_seed, explore=False) for r in asked], 0
-    )
-    x0 = torch.from_numpy(np.stack([d.latent["path"][0] for d in rest]))
-    seen = {k: np.stack([r.observation[k] for r in asked]) for k in asked[0].observation if k != TASK}
-    proposed = adapter.family.propose(adapter.encode(seen, ["Match the target"] * 3), x0)
-    assert proposed.requires_grad
-    np.testing.assert_allclose(
-        adapter.processing.unnormalise(proposed.detach()), np.stack([d.chunk for d in rest]), atol=1e-6
-    )
-    del seen[ENVIRONMENT_STATE]
-    blind = adapter.family.propose(adapter.encode(seen, ["Match the target"] * 3), x0)
-    assert torch.equal(blind, proposed), "the policy does not read the simulator's state"
+    def test_its_noise_belongs_to_the_request(self):
+        teacher = Teacher(state=ENV.state_size + TASK_BITS, chunk=(4, 2), share=1.0, noise=0.5)
+        with torch.no_grad():
+            teacher.ready.fill_(1)
+        observation = make_world(ENV).reset(0, "match")
+        asked = [Request(observation=observation, noise_seed=i) for i in range(400)]
+        chunk = teacher.replace(torch.zeros(400, 4, 2), asked)
+        torch.testing.assert_close(teacher.replace(torch.zeros(3, 4, 2), asked[7:10]), chunk[7:10])
+        noise = chunk - teacher(torch.from_numpy(state_of(observation))[None]).detach()
+        assert abs(float(noise.std()) - 0.5) < 0.03
+
+    def test_published_weights_bring_the_teacher_along(self, tiny_checkpoint: Path):
+        one, other = taught(tiny_checkpoint), taught(tiny_checkpoint)
+        assert one.teacher is not None and other.teacher is not None
+        with torch.no_grad():
+            one.teacher.ready.fill_(1)
+            one.teacher.mean.fill_(3)
+        other.load_trainable(one.export_trainable())
+        for mine, theirs in zip(one.teacher.parameters(), other.teacher.parameters(), strict=True):
+            assert torch.equal(mine, theirs)
+
+
+def test_actions_are_normalised_as_they_are_unnormalised(tiny_checkpoint: Path):
+    processing = load_adapter(PolicyConfig(path=str(tiny_checkpoint), device="cpu")).processing
+    chunk = torch.randn(5, 4, 2)
+    torch.testing.assert_close(processing.normalise(processing.unnormalise(chunk)), chunk)
 
 
 def test_imitation_is_flow_matching():
@@ -191,28 +239,63 @@ def test_imitation_is_flow_matching():
         torch.testing.assert_close(loss, torch.full((64,), off), atol=1e-3, rtol=1e-3)
 
 
-def test_the_policy_climbs_the_critic(tiny_checkpoint: Path):
-    """Reward is how far the first action of a chunk goes up; the state says nothing."""
+def first_action(update: OffPolicyUpdate) -> float:
+    """Mean over noise of the first number that the policy does without exploring."""
+    state = np.zeros(4, np.float32)
+    observation: Any = {"observation.state": state, TASK: "Match the target", ENVIRONMENT_STATE: state[:1]}
+    observation |= {"observation.images.front": np.zeros((32, 32, 3), np.uint8)}
+    asked = [Request(observation=observation, noise_seed=i, explore=False) for i in range(64)]
+    return float(np.mean([decision.chunk[0, 0] for decision in update.adapter.decide(asked, 0)]))
+
+
+def test_teacher_and_policy_go_where_the_critic_leads(tiny_checkpoint: Path):
+    """Reward is how far the first action goes up; the state says nothing."""
     torch.manual_seed(0)
-    algorithm = ChunkCriticConfig(critic_steps=2.0, policy_steps=0.2, imitation=0.0, anchor=0.1)
-    update = learner(tiny_checkpoint, algorithm, lr=3e-4, value_lr=1e-3, value_warmup_updates=4)
-    rng = np.random.default_rng(0)
-
-    def proposed() -> float:
-        return float(update.memory["proposal"][:64, 0, 0].mean())
-
-    for _ in range(12):
+    algorithm = ChunkCriticConfig(critic_steps=6.0, policy_steps=0.5, imitation=0.0)
+    update = learner(tiny_checkpoint, algorithm, lr=1e-3, value_lr=1e-3, value_warmup_updates=2)
+    rng, metrics = np.random.default_rng(0), {}
+    before = first_action(update)
+    for _ in range(10):
         segments = []
         for _ in range(32):
-            path = rng.standard_normal((1, 2, 4, 2)).astype(np.float32)
-            reward = float(path[0, 1, 0, 0] > 0)
-            segments.append(episode([reward], latent={"path": path}))
+            actions = rng.uniform(-1, 1, (1, 4, 2)).astype(np.float32)
+            segments.append(episode([(1 + float(actions[0, 0, 0])) / 2], actions=actions))
         metrics = update.step(segments)
-        if update.version == 1:
-            before = proposed()
-    assert proposed() > before + 0.3
-    assert metrics["explained_variance"] > 0.5 and metrics["gain"] > 0
-    assert metrics["memory_decisions"] == 12 * 32
+        assert bool(update.teacher.ready) == (update.version > 2)
+    state = update.tensor("state", np.arange(1))
+    taught_action = update.adapter.processing.unnormalise(update.teacher(state).detach())[0, 0, 0]
+    assert taught_action > 0.3
+    assert first_action(update) > before + 0.2
+    assert metrics["explained_variance"] > 0.5 and metrics["memory_decisions"] == 10 * 32
+
+
+def test_a_success_holds_the_teacher_near_it(tiny_checkpoint: Path):
+    distances = []
+    for imitation in (0.0, 50.0):
+        torch.manual_seed(0)
+        update = learner(tiny_checkpoint, ChunkCriticConfig(imitation=imitation, policy_steps=0.0))
+        rng, metrics = np.random.default_rng(0), {}
+        for _ in range(4):
+            actions = rng.uniform(-1, 1, (16, 1, 4, 2)).astype(np.float32)
+            metrics = update.step([episode([float(a[0, 0, 0] > 0)], actions=a) for a in actions])
+        distances.append(metrics["distance"])
+    assert distances[1] < 0.8 * distances[0]
+
+
+def test_what_was_learnt_is_restored_to_the_last_bit(tiny_checkpoint: Path):
+    def steps(update: ChunkCriticUpdate, seed: int) -> dict[str, float]:
+        torch.manual_seed(seed)
+        actions = np.random.default_rng(seed).uniform(-1, 1, (8, 3, 4, 2)).astype(np.float32)
+        return update.step([episode([0.0, 0.0, float(a[0, 0, 0] > 0)], actions=a) for a in actions])
+
+    one = learner(tiny_checkpoint)
+    steps(one, 0)
+    other = learner(tiny_checkpoint)
+    other.adapter.load_trainable(one.adapter.export_trainable())
+    other.restore(one.state())
+    assert steps(one, 1) == steps(other, 1)
+    left, right = one.adapter.export_trainable(), other.adapter.export_trainable()
+    assert all(np.array_equal(left[name], right[name]) for name in left)
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["with the simulator's state", "without"])
@@ -224,26 +307,20 @@ def test_self_imitation_goes_where_successes_are(tiny_checkpoint: Path, known: b
     update = OffPolicyUpdate(adapter, SelfImitationConfig(policy_steps=0.5), config)
     rng = np.random.default_rng(0)
 
-    def proposed() -> float:
-        observations, tasks = update.memory.observations(np.zeros(64, int))
-        with torch.no_grad():
-            encoded = adapter.encode(observations, tasks)
-            noise = torch.randn(64, *adapter.family.noise_size())
-            return float(adapter.family.propose(encoded, noise)[:, 0, 0].mean())
-
     for _ in range(6):
         segments = []
         for _ in range(32):
-            path = rng.standard_normal((1, 2, 4, 2)).astype(np.float32)
-            segments.append(episode([float(path[0, 1, 0, 0] > 0)], latent={"path": path}))
+            actions = rng.uniform(-1, 1, (1, 4, 2)).astype(np.float32)
+            segments.append(episode([float(actions[0, 0, 0] > 0)], actions=actions))
             if not known:
                 del segments[-1].observations[ENVIRONMENT_STATE]
         metrics = update.step(segments)
         if update.version == 1:
-            first, before = metrics["imitation_loss"], proposed()
+            first, before = metrics["imitation_loss"], first_action(update)
     assert metrics["imitation_loss"] < first
-    mean_of_successes = (2 / np.pi) ** 0.5
-    assert proposed() == pytest.approx(mean_of_successes, abs=0.3) and proposed() > before + 0.1
+    mean_of_successes = 0.5
+    after = first_action(update)
+    assert after == pytest.approx(mean_of_successes, abs=0.2) and after > before + 0.1
 
 
 def test_a_step_imitates_successes_only(tiny_checkpoint: Path):
@@ -255,24 +332,11 @@ def test_a_step_imitates_successes_only(tiny_checkpoint: Path):
     family.imitation_loss = lambda encoded, chunk: chunk[:, 0, 0] + 0 * encoded.features.sum((1, 2))
     segments = []
     for value, reward in ((1.0, 1.0), (3.0, 1.0), (100.0, 0.0), (200.0, 0.0)):
-        path = np.full((1, 2, 4, 2), value, np.float32)
-        segments.append(episode([reward], latent={"path": path}))
+        actions = np.full((1, 4, 2), value, np.float32)
+        segments.append(episode([reward], actions=actions))
     loss = update.step(segments)["imitation_loss"]
-    assert 1.0 < loss < 3.0
-
-
-def test_without_an_anchor_the_policy_moves_further(tiny_checkpoint: Path):
-    moved = []
-    for anchor in (0.0, 10.0):
-        torch.manual_seed(0)
-        update = learner(tiny_checkpoint, ChunkCriticConfig(anchor=anchor, policy_steps=0.5), lr=3e-4)
-        rng = np.random.default_rng(0)
-        for _ in range(4):
-            paths = rng.standard_normal((16, 1, 2, 4, 2)).astype(np.float32)
-            segments = [episode([float(p[0, 1, 0, 0] > 0)], latent={"path": p}) for p in paths]
-            metrics = update.step(segments)
-        moved.append(metrics["distance"])
-    assert moved[0] > 2 * moved[1]
+    low, high = (adapter.processing.normalise(torch.full((1, 4, 2), v))[0, 0, 0] for v in (1.0, 3.0))
+    assert low < loss < high
 
 
 def test_the_critic_computes_in_fp32_beside_a_policy_in_bf16(
@@ -281,15 +345,14 @@ def test_the_critic_computes_in_fp32_beside_a_policy_in_bf16(
     seen = set()
     forward = Critic.forward
 
-    def spy(self: Critic, *inputs: Any) -> torch.Tensor:
+    def spy(self: Critic, *inputs: torch.Tensor) -> torch.Tensor:
         q = forward(self, *inputs)
         seen.add((torch.is_autocast_enabled("cpu"), q.dtype))
         return q
 
     monkeypatch.setattr(Critic, "forward", spy)
-    adapter = load_adapter(PolicyConfig(path=str(tiny_checkpoint), device="cpu", precision="bf16"))
     config = TrainerConfig(warmup_updates=0, value_warmup_updates=0)
-    update = ChunkCriticUpdate(adapter, ChunkCriticConfig(policy_steps=0.5), config)
+    update = ChunkCriticUpdate(taught(tiny_checkpoint, "bf16"), ChunkCriticConfig(policy_steps=0.5), config)
     metrics = update.step([episode([0.0, 0.0, 0.0, 1.0])])
     assert np.isfinite(metrics["policy_loss"]) and seen == {(False, torch.float32)}
 
@@ -298,9 +361,11 @@ def test_what_is_not_finite_is_skipped_and_ends_the_run(tiny_checkpoint: Path):
     update = learner(tiny_checkpoint, ChunkCriticConfig(policy_steps=1.0), max_nonfinite=3)
     before = update.adapter.export_trainable()
     with pytest.raises(NonFiniteError, match="3 steps in a row"):
-        update.step([episode([0.0, 0.0, 0.0, float("nan")])])
+        with torch.no_grad():
+            update.teacher.network.biases[0].fill_(float("nan"))
+        update.step([episode([0.0, 0.0, 0.0, 1.0])])
     after = update.adapter.export_trainable()
-    assert all(np.array_equal(before[name], after[name]) for name in before)
+    assert all(np.array_equal(before[name], after[name]) for name in before if name.startswith("policy."))
 
 
 ROOMS: dict[str, Any] = {
@@ -320,13 +385,9 @@ ROOMS: dict[str, Any] = {
         ({"rollout": RolloutConfig(group_size=4)}, r"rollout\.group_size=4: .*use 0"),
         ({"trainer": TrainerConfig(ranks=2, sharding="ddp")}, r"trainer\.ranks=2: .*use 1"),
         ({"rollout": RolloutConfig(segment_length=3)}, r"rollout\.segment_length=3: .*use at least 4"),
-        (
-            {"policy": {"sampler": FlowSamplerConfig(stochastic="one")}},
-            r"policy\.sampler\.type='flow': .*stochastic=last",
-        ),
     ],
 )
 def test_what_it_cannot_learn_from_is_refused(tiny_checkpoint: Path, rooms: dict[str, Any], message: str):
-    policy = PolicyConfig(path=str(tiny_checkpoint), device="cpu", **rooms.pop("policy", {}))
+    policy = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
     with pytest.raises(InputError, match=message):
         check_start(tiny_run(tiny_checkpoint, **ROOMS | {"policy": policy} | rooms))

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A teacher that sees the simulator's state and acts in part of the exploring episodes.
+
+The policy sees images. The teacher is a small network from the simulator's state to a chunk, learnt
+off-policy by `trainer.chunk_critic`; the policy imitates it wherever either has been (DAgger, arXiv
+1011.0686; asymmetric actor-critic, arXiv 1710.06542). It is never part of a checkpoint that LeRobot loads.
+
+Shapes: M networks side by side, B rows, S numbers of a state, K actions of A dims.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation, Request
+from accerl_lerobot.policies.config import Load, PolicyConfig
+from accerl_lerobot.seeds import episode_of
+
+WIDTH = 256
+TASK_BITS = 16
+"""Numbers of a state that stand for the task."""
+PREFIX = "teacher."
+"""How names of its weights begin among those that are published."""
+
+
+class Ensemble(nn.Module):
+    """M networks of three layers with LayerNorm and SiLU, computed at once.
+
+    Args:
+        inputs: width of the input.
+        outputs: width of the output.
+        members: M.
+    """
+
+    def __init__(self, inputs: int, outputs: int, members: int) -> None:
+        super().__init__()
+        sizes = ((inputs, WIDTH), (WIDTH, WIDTH), (WIDTH, outputs))
+        self.weights = nn.ParameterList((torch.rand(members, i, o) * 2 - 1) / i**0.5 for i, o in sizes)
+        self.biases = nn.ParameterList(torch.zeros(members, 1, o) for _, o in sizes)
+        with torch.no_grad():
+            self.weights[-1].mul_(0.1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, inputs) to (M, B, outputs)."""
+        x = x.expand(len(self.weights[0]), -1, -1)
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            x = torch.baddbmm(bias, x, weight)
+            x = functional.silu(functional.layer_norm(x, x.shape[-1:]))
+        return torch.baddbmm(self.biases[-1], x, self.weights[-1])
+
+
+class Teacher(nn.Module):
+    """Chunks from the simulator's state.
+
+    All its tensors are parameters, so that they are published with the policy's weights; those that no
+    gradient reaches are set by the trainer.
+
+    Args:
+        state: S.
+        chunk: (K, A).
+        share: share of exploring episodes in which it acts, once it is `ready`.
+        noise: standard deviation of its exploration, in normalised action units.
+    """
+
+    def __init__(self, state: int, chunk: tuple[int, int], share: float, noise: float) -> None:
+        super().__init__()
+        self.chunk, self.share, self.noise = chunk, share, noise
+        self.network = Ensemble(state, chunk[0] * chunk[1], 1)
+        self.mean = nn.Parameter(torch.zeros(state), requires_grad=False)
+        self.std = nn.Parameter(torch.ones(state), requires_grad=False)
+        self.low = nn.Parameter(-torch.ones(chunk[1]), requires_grad=False)
+        """(A,), smallest action that it gives, in normalised units; with `high`, the range that was explored.
+        Beyond it the critic knows nothing, and where demonstrations hardly move, a unit is almost 0."""
+        self.high = nn.Parameter(torch.ones(chunk[1]), requires_grad=False)
+        self.ready = nn.Parameter(torch.zeros(()), requires_grad=False)
+        """1 once it may act."""
+
+    def scaled(self, state: Tensor) -> Tensor:
+        """States (B, S) in units of what has been seen."""
+        return ((state - self.mean) / self.std).clamp(-10, 10)
+
+    def forward(self, state: Tensor) -> Tensor:
+        """(B, S) to chunks (B, K, A) in the policy's normalised units."""
+        middle, half = (self.low + self.high) / 2, (self.high - self.low) / 2
+        raw = self.network(self.scaled(state))[0].unflatten(-1, self.chunk)
+        return middle + half * torch.tanh(raw)
+
+    def acts(self, request: Request) -> bool:
+        """True if this decision is the teacher's."""
+        return request.explore and bool(self.ready) and self.plays(episode_of(request.noise_seed))
+
+    def plays(self, episode: int) -> bool:
+        """True if, once ready, it makes all decisions of this exploring episode; see `seeds.episode_of`."""
+        return float(np.random.default_rng((episode, 4)).random()) < self.share
+
+    @torch.no_grad()
+    def replace(self, chunk: Tensor, requests: Sequence[Request]) -> Tensor:
+        """The chunks (B, K, A) of a batch, the teacher's where it acts, with noise of the request's seed."""
+        rows = [i for i, request in enumerate(requests) if self.acts(request)]
+        if not rows:
+            return chunk
+        states = np.stack([state_of(requests[i].observation) for i in rows])
+        noise = [np.random.default_rng((requests[i].noise_seed, 5)).standard_normal(self.chunk) for i in rows]
+        own = self(torch.from_numpy(states).to(chunk.device)).cpu()
+        own = own + self.noise * torch.from_numpy(np.stack(noise).astype(np.float32))
+        chunk = chunk.clone()
+        chunk[rows] = own.to(chunk)
+        return chunk
+
+
+def state_of(observation: Observation) -> np.ndarray:
+    """float32 (S,): what the simulator says of itself, and what stands for the task."""
+    environment = np.asarray(observation[ENVIRONMENT_STATE], np.float32).reshape(-1)
+    return np.concatenate([environment, task_code(str(observation[TASK]))])
+
+
+def task_code(task: str) -> np.ndarray:
+    """±1 for each of 16 bits of the instruction's hash: known without a list of all tasks."""
+    bits = np.frombuffer(hashlib.sha256(task.encode()).digest(), np.uint8)[:TASK_BITS]
+    return np.where(bits & 1, 1.0, -1.0).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class WithTeacher:
+    """Loads a policy and gives it an untrained teacher.
+
+    Args:
+        load: makes the adapter.
+        state: numbers of ``observation.environment_state``.
+        share: see `Teacher`.
+        noise: see `Teacher`.
+    """
+
+    load: Load
+    state: int
+    share: float
+    noise: float
+
+    def __call__(self, config: PolicyConfig) -> Any:
+        """The adapter, with its teacher."""
+        adapter: Any = self.load(config)
+        policy = adapter.policy.config
+        chunk = policy.n_action_steps, policy.action_feature.shape[0]
+        teacher = Teacher(self.state + TASK_BITS, chunk, self.share, self.noise)
+        adapter.teacher = teacher.to(adapter.device)
+        return adapter
