@@ -110,7 +110,8 @@ def hostile_names(rng: random.Random) -> Iterator[str]:
 def write_examples(scratch: Path) -> dict[str, Path]:
     """A small world model, a small checkpoint and a dataset, all of them good."""
     from accerl_lerobot.policies.config import PolicyConfig
-    from accerl_lerobot.policies.loading import load_adapter, save_pretrained
+    from accerl_lerobot.policies.loading import load_adapter
+    from accerl_lerobot.policies.saving import save_pretrained
     from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig
     from accerl_lerobot.world_model.contract import WorldModelSpec
     from accerl_lerobot.world_model.pixels import PixelWorldModel
@@ -240,7 +241,7 @@ def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
     """Checks that are called before anything is loaded."""
     from accerl_lerobot.checkpoint.safety import Origin, read_json, tensor_shapes
     from accerl_lerobot.demos.dataset_files import check_data, check_info, check_metadata, check_stats
-    from accerl_lerobot.policies import files
+    from accerl_lerobot.policies import guard as files
 
     origin = Origin("path", "hostile")
     policy, dataset = at["policy"], at["dataset"]

@@ -18,16 +18,17 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.checkpoint.layout import BACKBONE, PRETRAINED, save_checkpoint
+from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig, run_sft, sft_command
 from accerl_lerobot.engine.preflight import check_sft_policy
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.backbone import BackboneConfig
-from accerl_lerobot.policies.base import stack_observations
+from accerl_lerobot.policies.adapter import stack_observations
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.loading import load_adapter, save_pretrained
-from accerl_lerobot.policies.plugins import PLUGINS, discovery, register_policies
+from accerl_lerobot.policies.loading import load_adapter
+from accerl_lerobot.policies.registry import PLUGINS, discovery, register_policies
+from accerl_lerobot.policies.saving import save_pretrained
+from tests.policies.checkpoints import write_bins
 from tests.policies.tiny import adapter_at, log_ratio, perturb, requests
-from tests.policies.tiny_bins import write_bins
 from tests.rounding import assert_close
 
 DATASET = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"

@@ -16,8 +16,9 @@ from accerl_lerobot.checkpoint.layout import BACKBONE
 from accerl_lerobot.checkpoint.safety import Origin
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.files import check_checkpoint
-from accerl_lerobot.policies.loading import load_adapter, save_pretrained
+from accerl_lerobot.policies.guard import check_checkpoint
+from accerl_lerobot.policies.loading import load_adapter
+from accerl_lerobot.policies.saving import save_pretrained
 from tests.policies.checkpoints import edit_config, write_gaussian_actor
 
 PRE = "policy_preprocessor.json"

@@ -20,11 +20,7 @@ from accerl_lerobot.policies.gaussian import GaussianContext, GaussianModel
 
 
 class GaussianActor(GaussianModel):
-    """Drives LeRobot's `GaussianActorPolicy`.
-
-    Args:
-        policy: a loaded one.
-    """
+    """Drives LeRobot's `GaussianActorPolicy`."""
 
     squashed = True
     executed = 1
@@ -45,7 +41,7 @@ class GaussianActor(GaussianModel):
             self.idle = ("encoder_critic.",)
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
-        """See the base class; the features are the encoder's output, one token.
+        """The features are the encoder's output, one token.
 
         Unlike in LeRobot's SAC, whose critic shapes a shared image encoder, the log-prob's gradient reaches
         it: our critic reads features and does not shape them, so nobody else would.
@@ -62,7 +58,7 @@ class GaussianActor(GaussianModel):
         )
 
     def stock(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """See the base class; LeRobot draws from the global generator, which is put back."""
+        """LeRobot draws from the global generator, which is put back."""
         device = next(self.policy.parameters()).device
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             torch.manual_seed(0)

@@ -22,17 +22,21 @@ position: about 1 MB a token in float32, several times over for the gradient.
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
+import shutil
 from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.family import Encoded
-from accerl_lerobot.policies.fast import data_only
-from accerl_lerobot.policies.models.options import refuse_options
+from accerl_lerobot.policies.flow import refuse_options
 from accerl_lerobot.policies.tokens import Choose, TokenContext, TokenModel
 
 logger = logging.getLogger(__name__)
@@ -40,12 +44,100 @@ logger = logging.getLogger(__name__)
 END = "|"
 
 
-class Pi0Fast(TokenModel):
-    """Drives LeRobot's `PI0FastPolicy`.
+@dataclass(frozen=True, kw_only=True)
+class FastTokenizer:
+    """FAST's action tokeniser (Pertsch et al., arXiv 2501.09747), with the methods that LeRobot calls.
 
-    Args:
-        policy: a loaded one.
+    A chunk is transformed along time (orthonormal DCT-II), scaled and rounded; the coefficients, row by row
+    of frequency, become characters, which byte-pair encoding merges into tokens. On the Hub such a tokeniser
+    comes as JSON beside a Python file, and LeRobot runs the newest version of that file with full rights. The
+    JSON is enough, so `data_only` has LeRobot use this class instead.
     """
+
+    bpe_tokenizer: Any
+    """Merges characters into tokens, a `PreTrainedTokenizerFast`."""
+    scale: float
+    """By which coefficients are multiplied before they are rounded."""
+    min_token: int
+    """The coefficient that character 0 stands for."""
+    folder: Path
+    """Where its files are."""
+
+    @classmethod
+    def from_pretrained(cls, name: str, **options: Any) -> FastTokenizer:
+        """Reads a folder, or the JSON files of a Hub repository; no option changes that.
+
+        Raises:
+            OSError: it is neither, or has no tokeniser in it.
+        """
+        from huggingface_hub import snapshot_download
+        from transformers import PreTrainedTokenizerFast
+
+        from accerl_lerobot.hub.trouble import guard_client
+
+        guard_client()
+        folder = Path(name)
+        if not folder.is_dir():
+            folder = Path(snapshot_download(name, allow_patterns=["*.json"]))
+        config = json.loads((folder / "processor_config.json").read_text())
+        return cls(
+            bpe_tokenizer=PreTrainedTokenizerFast.from_pretrained(folder),
+            scale=config["scale"],
+            min_token=config["min_token"],
+            folder=folder,
+        )
+
+    def __call__(self, chunks: Any) -> list[list[int]]:
+        """Tokens of each of the chunks (B, K, A)."""
+        chunks = np.asarray(chunks, dtype=np.float64)
+        coefficients = np.around(_dct(chunks.shape[-2]) @ chunks * self.scale)
+        characters = np.maximum(coefficients - self.min_token, 0).astype(int)
+        texts = ["".join(map(chr, each.flatten())) for each in characters]
+        return [self.bpe_tokenizer(text)["input_ids"] for text in texts]
+
+    def save_pretrained(self, directory: Path) -> None:
+        """Copies its files; code, where it lies beside them, for those who run it."""
+        directory.mkdir(parents=True, exist_ok=True)
+        for file in self.folder.iterdir():
+            if file.suffix in (".json", ".py") and not (directory / file.name).exists():
+                shutil.copyfile(file, directory / file.name)
+
+
+@contextlib.contextmanager
+def data_only() -> Iterator[None]:
+    """While it lasts, LeRobot reads the tokenisers of π0-FAST and runs no code that comes with them."""
+    from lerobot.policies.pi0_fast import modeling_pi0_fast
+    from lerobot.processor import tokenizer_processor
+
+    modules = (modeling_pi0_fast, tokenizer_processor)
+    kept = [(module.AutoProcessor, module.AutoTokenizer) for module in modules]
+    for module in modules:
+        module.AutoProcessor, module.AutoTokenizer = FastTokenizer, _TextTokenizer
+    try:
+        yield
+    finally:
+        for module, (processor, tokenizer) in zip(modules, kept, strict=True):
+            module.AutoProcessor, module.AutoTokenizer = processor, tokenizer
+
+
+class _TextTokenizer:
+    @staticmethod
+    def from_pretrained(name: str, **options: Any) -> Any:
+        from transformers import AutoTokenizer
+
+        return AutoTokenizer.from_pretrained(name, **options | {"trust_remote_code": False})
+
+
+def _dct(size: int) -> np.ndarray:
+    """Orthonormal DCT-II as a matrix (size, size): frequencies by times."""
+    times, frequencies = np.arange(size) + 0.5, np.arange(size)[:, None]
+    matrix = np.cos(np.pi / size * frequencies * times) * np.sqrt(2 / size)
+    matrix[0] /= np.sqrt(2)
+    return matrix
+
+
+class Pi0Fast(TokenModel):
+    """Drives LeRobot's `PI0FastPolicy`."""
 
     parallel = False
     rows = None
@@ -66,7 +158,7 @@ class Pi0Fast(TokenModel):
             raise InputError("policy.text_tokenizer_name", config.text_tokenizer_name, f"knows only {known}")
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
-        """See the base class; the features are the prefix's: images, prompt, BOS."""
+        """The features are the prefix's: images, prompt, BOS."""
         from lerobot.policies.common.vla_utils import clone_past_key_values, prepare_attention_masks_4d
         from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 
@@ -124,7 +216,6 @@ class Pi0Fast(TokenModel):
         return Encoded(features=features, mask=pad, context=TokenContext(logits=logits, generate=generate))
 
     def chunk(self, tokens: Tensor) -> Tensor:
-        """See the base class."""
         config = self.policy.config
         with _undecodable_once():
             chunk: Tensor = self.policy.detokenize_actions(
@@ -133,13 +224,11 @@ class Pi0Fast(TokenModel):
         return chunk
 
     def stock(self, batch: dict[str, Tensor]) -> Tensor:
-        """See the base class."""
         with _undecodable_once():
             chunk: Tensor = self.policy.predict_action_chunk(batch)
         return chunk
 
     def stock_tokens(self, batch: dict[str, Tensor]) -> Tensor:
-        """See the base class."""
         from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 
         tokens: Tensor = self.policy.model.sample_actions_fast_kv_cache(

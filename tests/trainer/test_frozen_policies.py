@@ -22,11 +22,11 @@ from accerl_lerobot.algorithms import (
     PPOConfig,
     compute_loss,
 )
-from accerl_lerobot.policies.base import Evaluation
+from accerl_lerobot.policies.adapter import Evaluation
 from accerl_lerobot.trainer import update as module
-from accerl_lerobot.trainer.anchors import Anchors
 from accerl_lerobot.trainer.batch import Part, collate
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.frozen_policies import FrozenPolicies
 from accerl_lerobot.trainer.update import Update
 from tests.rounding import assert_close
 from tests.trainer.linear import LinearAdapter, decided_by, make_segments
@@ -59,23 +59,23 @@ def moved(adapter: LinearAdapter, by: float) -> None:
 
 def test_log_probs_are_those_of_the_copied_weights_whatever_happens_to_the_live_ones():
     adapter, part = LinearAdapter(), whole(make_segments(LENGTHS))
-    anchors = Anchors(adapter)
-    anchors.take("reference", 0)
+    frozen = FrozenPolicies(adapter)
+    frozen.take("reference", 0)
     then = adapter.evaluate(*part).log_prob.detach()
     moved(adapter, 0.3)
-    assert torch.equal(anchors.log_prob("reference", *part), then)
+    assert torch.equal(frozen.log_prob("reference", *part), then)
     assert not torch.equal(adapter.evaluate(*part).log_prob, then)
     moved(adapter, 0.3)
-    assert torch.equal(anchors.log_prob("reference", *part), then)
+    assert torch.equal(frozen.log_prob("reference", *part), then)
 
 
 def test_the_live_weights_are_back_afterwards_in_their_own_memory():
     adapter, part = LinearAdapter(), whole(make_segments(LENGTHS))
-    anchors = Anchors(adapter)
-    anchors.take("reference", 0)
+    frozen = FrozenPolicies(adapter)
+    frozen.take("reference", 0)
     moved(adapter, 0.3)
     before, places = adapter.copy(), {k: p.data_ptr() for k, p in adapter.trainable().items()}
-    assert not anchors.log_prob("reference", *part).requires_grad
+    assert not frozen.log_prob("reference", *part).requires_grad
     for name, parameter in adapter.trainable().items():
         assert torch.equal(parameter, before[name]) and parameter.data_ptr() == places[name]
         assert parameter.requires_grad and parameter.grad is None
@@ -86,8 +86,8 @@ def test_the_live_weights_are_back_even_after_an_error(broken: str, monkeypatch:
     adapter, part = LinearAdapter(), whole(make_segments(LENGTHS))
     adapter.second = torch.nn.Parameter(torch.ones(3))
     monkeypatch.setattr(adapter, "trainable", lambda: {"a": adapter.weight, "b": adapter.second})
-    anchors = Anchors(adapter)
-    anchors.take("reference", 0)
+    frozen = FrozenPolicies(adapter)
+    frozen.take("reference", 0)
     moved(adapter, 0.3)
     before = adapter.copy()
     seen: list[bool] = []
@@ -99,45 +99,45 @@ def test_the_live_weights_are_back_even_after_an_error(broken: str, monkeypatch:
     if broken == "evaluate":
         monkeypatch.setattr(adapter, "evaluate", evaluate)
     else:
-        anchors._copies["reference"][1].pop()  # the first parameter is swapped, then it fails
+        frozen._copies["reference"][1].pop()  # the first parameter is swapped, then it fails
     with pytest.raises((MemoryError, ValueError)):
-        anchors.log_prob("reference", *part)
+        frozen.log_prob("reference", *part)
     assert seen == ([False] if broken == "evaluate" else [])
     assert all(torch.equal(p, before[k]) for k, p in adapter.trainable().items())
 
 
 def test_the_critic_is_neither_copied_nor_swapped(monkeypatch: pytest.MonkeyPatch):
     adapter, part = LinearAdapter(), whole(make_segments(LENGTHS))
-    anchors = Anchors(adapter)
-    anchors.take("reference", 0)
-    (version, tensors), *_ = anchors._copies.values()
+    frozen = FrozenPolicies(adapter)
+    frozen.take("reference", 0)
+    (version, tensors), *_ = frozen._copies.values()
     assert version == 0 and [t.shape for t in tensors] == [adapter.weight.shape]
     moved(adapter, 0.3)
-    live, evaluate, values = adapter.evaluate(*part).value.mean.detach(), adapter.evaluate, []
+    live, evaluate, values = adapter.evaluate(*part).value.detach(), adapter.evaluate, []
 
     def watched(*arguments: Any) -> Evaluation:
         found = evaluate(*arguments)
-        values.append(found.value.mean)
+        values.append(found.value)
         return found
 
     monkeypatch.setattr(adapter, "evaluate", watched)
-    anchors.log_prob("reference", *part)
+    frozen.log_prob("reference", *part)
     assert torch.equal(values[0], live)
 
 
 def test_copies_of_one_version_share_their_memory_and_others_do_not():
     adapter = LinearAdapter()
-    anchors = Anchors(adapter)
-    anchors.take("reference", 0)
-    anchors.take("probe", 0)
-    reference, probe = (anchors._copies[name][1] for name in ("reference", "probe"))
+    frozen = FrozenPolicies(adapter)
+    frozen.take("reference", 0)
+    frozen.take("probe", 0)
+    reference, probe = (frozen._copies[name][1] for name in ("reference", "probe"))
     assert reference[0].data_ptr() == probe[0].data_ptr() != adapter.weight.data_ptr()
     first = reference[0].clone()
     moved(adapter, 0.3)
-    anchors.take("probe", 1)
-    assert torch.equal(reference[0], first) and not torch.equal(anchors._copies["probe"][1][0], first)
-    anchors.drop("probe")
-    assert "probe" not in anchors and "reference" in anchors
+    frozen.take("probe", 1)
+    assert torch.equal(reference[0], first) and not torch.equal(frozen._copies["probe"][1][0], first)
+    frozen.drop("probe")
+    assert "probe" not in frozen and "reference" in frozen
 
 
 # ---- what the trainer keeps
@@ -149,18 +149,18 @@ class Recorder:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.inputs: list[LossInputs] = []
         self.taken: list[tuple[str, int]] = []
-        take = Anchors.take
+        take = FrozenPolicies.take
 
         def compute(inputs: LossInputs, config: AlgorithmConfig) -> LossOutput:
             self.inputs.append(inputs)
             return compute_loss(inputs, config)
 
-        def counted(anchors: Anchors, name: str, version: int) -> None:
+        def counted(frozen: FrozenPolicies, name: str, version: int) -> None:
             self.taken.append((name, version))
-            take(anchors, name, version)
+            take(frozen, name, version)
 
         monkeypatch.setattr(module, "compute_loss", compute)
-        monkeypatch.setattr(Anchors, "take", counted)
+        monkeypatch.setattr(FrozenPolicies, "take", counted)
 
 
 def train(update: Update, updates: int) -> list[dict[str, Tensor]]:
@@ -184,7 +184,7 @@ def test_a_run_that_needs_no_copy_holds_none(algorithm: AlgorithmConfig, monkeyp
     recorder = Recorder(monkeypatch)
     update = Update(LinearAdapter(), algorithm, PLAIN)
     train(update, 3)
-    assert recorder.taken == [] and all(name not in update.anchors for name in ("reference", "proximal"))
+    assert recorder.taken == [] and all(name not in update.frozen for name in ("reference", "proximal"))
     assert all(i.log_prob_reference is None for i in recorder.inputs)
 
 

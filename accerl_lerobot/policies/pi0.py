@@ -22,19 +22,14 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.policies.family import Encoded
-from accerl_lerobot.policies.flow import FlowContext, FlowModel
-from accerl_lerobot.policies.models.options import flow_shape, refuse_options
+from accerl_lerobot.policies.flow import FlowContext, FlowModel, flow_shape, refuse_options
 
 VLM = "model.paligemma_with_expert.paligemma."
 LANGUAGE_MODEL = f"{VLM}model.language_model."
 
 
 class Pi05(FlowModel):
-    """Drives LeRobot's `PI05Policy`.
-
-    Args:
-        policy: a loaded one.
-    """
+    """Drives LeRobot's `PI05Policy`."""
 
     backbone = VLM
     unread = (f"{VLM}lm_head.weight", "model.paligemma_with_expert.gemma_expert.lm_head.weight")
@@ -54,7 +49,7 @@ class Pi05(FlowModel):
         self.idle = (*self.unread, f"{LANGUAGE_MODEL}norm.", *(last + part for part in parts))
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
-        """See the base class; the features are the prefix's: images and prompt."""
+        """The features are the prefix's: images and prompt."""
         from lerobot.policies.common.vla_utils import make_att_2d_masks, prepare_attention_masks_4d
         from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 
@@ -83,7 +78,6 @@ class Pi05(FlowModel):
         return Encoded(features=features, mask=pad, context=FlowContext(velocity=velocity))
 
     def stock(self, batch: dict[str, Tensor], noise: Tensor) -> Tensor:
-        """See the base class."""
         chunk: Tensor = self.policy.predict_action_chunk(batch, noise=noise)
         return chunk
 
@@ -93,11 +87,7 @@ class Pi05(FlowModel):
 
 
 class Pi0(Pi05):
-    """Drives LeRobot's `PI0Policy`.
-
-    Args:
-        policy: a loaded one.
-    """
+    """Drives LeRobot's `PI0Policy`."""
 
     def __init__(self, policy: Any) -> None:
         super().__init__(policy)

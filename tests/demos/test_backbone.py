@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from accerl_lerobot.demos.backbone import SPECIAL_TOKENS, BackboneConfig, write_backbone
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.backbone import SPECIAL_TOKENS, BackboneConfig, write_backbone
 
 TEXTS = ["Open the door", "Close the drawer"]
 

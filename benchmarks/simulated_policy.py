@@ -21,10 +21,9 @@ from torch import Tensor, nn
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.config.ranges import NonNegative, Range, Section
 from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.policies.base import OBS_STATE, Evaluation, PolicyAdapter
+from accerl_lerobot.policies.adapter import OBS_STATE, Evaluation, PolicyAdapter
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.density import normal_entropy, normal_log_prob
-from accerl_lerobot.policies.value_head import Value
+from accerl_lerobot.policies.family import normal_entropy, normal_log_prob
 
 STD = 0.3
 
@@ -94,7 +93,7 @@ class SimulatedAdapter(PolicyAdapter):
         return Evaluation(
             log_prob=normal_log_prob(latent["u"], mean, std).sum(-1),
             entropy=normal_entropy(std).sum((1, 2)),
-            value=Value(mean=self._value(len(tasks))),
+            value=self._value(len(tasks)),
         )
 
     @torch.no_grad()

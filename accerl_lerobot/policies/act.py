@@ -18,11 +18,7 @@ from accerl_lerobot.policies.gaussian import GaussianContext, GaussianModel
 
 
 class ACT(GaussianModel):
-    """Drives LeRobot's `ACTPolicy`.
-
-    Args:
-        policy: a loaded one.
-    """
+    """Drives LeRobot's `ACTPolicy`."""
 
     idle = ("model.vae_encoder", "model.encoder_latent_input_proj.weight")
 
@@ -40,7 +36,7 @@ class ACT(GaussianModel):
         self.width = self.row_width = config.dim_model
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
-        """See the base class; the features are the encoder's output: latent, state, image positions."""
+        """The features are the encoder's output: latent, state, image positions."""
         from lerobot.utils.constants import OBS_IMAGES
 
         model: Any = self.policy.model
@@ -72,5 +68,4 @@ class ACT(GaussianModel):
         )
 
     def stock(self, batch: dict[str, Tensor]) -> tuple[Tensor, None]:
-        """See the base class."""
         return self.policy.predict_action_chunk(batch), None

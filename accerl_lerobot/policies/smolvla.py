@@ -14,16 +14,12 @@ from torch import Tensor
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.family import Encoded
-from accerl_lerobot.policies.flow import FlowContext, FlowModel
-from accerl_lerobot.policies.models.options import flow_shape, refuse_options
+from accerl_lerobot.policies.flow import FlowContext, FlowModel, flow_shape, refuse_options
+from accerl_lerobot.policies.tokens import TokenContext, TokenModel
 
 
 class SmolVLA(FlowModel):
-    """Drives LeRobot's `SmolVLAPolicy`.
-
-    Args:
-        policy: a loaded one.
-    """
+    """Drives LeRobot's `SmolVLAPolicy`."""
 
     backbone = "model.vlm_with_expert.vlm."
     unread = ("model.vlm_with_expert.vlm.lm_head.weight",)
@@ -40,7 +36,7 @@ class SmolVLA(FlowModel):
         self.width = policy.model.vlm_with_expert.config.text_config.hidden_size
 
     def encode(self, batch: dict[str, Tensor]) -> Encoded:
-        """See the base class; the features are the prefix's: images, instruction, state."""
+        """The features are the prefix's: images, instruction, state."""
         from lerobot.policies.common.vla_utils import make_att_2d_masks
         from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
 
@@ -67,6 +63,34 @@ class SmolVLA(FlowModel):
         return Encoded(features=features, mask=pad, context=FlowContext(velocity=velocity))
 
     def stock(self, batch: dict[str, Tensor], noise: Tensor) -> Tensor:
-        """See the base class."""
         chunk: Tensor = self.policy.predict_action_chunk(batch, noise=noise)
+        return chunk
+
+
+class SmolVLABins(TokenModel):
+    """Drives `bins_plugin`'s policy; queries of rows that are not executed have no token."""
+
+    backbone = "model.vlm."
+    parallel = True
+    terminator = None
+
+    def __init__(self, policy: Any) -> None:
+        self.policy = policy
+        self.rows = int(policy.config.n_action_steps)
+        self.length = self.rows * policy.config.action_feature.shape[0]
+        self.width = policy.model.head.in_features
+
+    def encode(self, batch: dict[str, Tensor]) -> Encoded:
+        """The features are the queries' hidden states, as in AcceRL."""
+        hidden = self.policy.hidden(batch)
+        logits = self.policy.model.logits(hidden[:, : self.length])
+        mask = torch.ones(hidden.shape[:2], dtype=torch.bool, device=hidden.device)
+        return Encoded(features=hidden, mask=mask, context=TokenContext(logits=lambda tokens: logits))
+
+    def chunk(self, tokens: Tensor) -> Tensor:
+        chunk: Tensor = self.policy.decode_tokens(tokens).view(len(tokens), self.rows, -1)
+        return chunk
+
+    def stock(self, batch: dict[str, Tensor]) -> Tensor:
+        chunk: Tensor = self.policy.predict_action_chunk(batch)[:, : self.rows]
         return chunk

@@ -19,23 +19,23 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.checkpoint.tensors import part_of, whole
-from accerl_lerobot.policies.base import PolicyAdapter
+from accerl_lerobot.policies.adapter import PolicyAdapter
 from accerl_lerobot.trainer.sharding import swapped_in
 
 CRITIC = "value_head."
 """How names of the critic's weights begin."""
 
 
-class Anchors:
+class FrozenPolicies:
     """Copies by name.
 
     Args:
         adapter: the policy that is being trained.
 
     Example:
-        >>> anchors = Anchors(adapter)
-        >>> anchors.take("reference", version=0)
-        >>> anchors.log_prob("reference", *batch.part(rows))  # (rows, L), of version 0 for ever
+        >>> frozen = FrozenPolicies(adapter)
+        >>> frozen.take("reference", version=0)
+        >>> frozen.log_prob("reference", *batch.part(rows))  # (rows, L), of version 0 for ever
     """
 
     def __init__(self, adapter: PolicyAdapter) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Generalised advantage estimation (Schulman et al., arXiv 1506.02438), one step per decision.
+"""Advantages: generalised advantage estimation (arXiv 1506.02438) per decision, and their normalisation.
 
     δ_t = r_t + γ V_{t+1} − V_t
     Â_t = δ_t + γλ Â_{t+1}
@@ -13,6 +13,10 @@ critic that time limits are deaths.
 `values` and `bootstrap_value` must come from the critic of now: those stored with a sample are stale by its
 lag.
 
+*Normalisation* is over the global batch: each trainer rank calls `moments` on its part, sums the three
+numbers with those of the other ranks, and calls `normalise` with the sum. Normalising per rank or per
+micro-batch would compare a decision only with its neighbours.
+
 Shape letters: S segments, T decisions of the longest one.
 """
 
@@ -21,14 +25,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+STD_EPSILON = 1e-6
+"""Added to the standard deviation: advantages that are all equal become 0, and not noise of unit size."""
+
 
 def decision_mask(lengths: Tensor, t: int) -> Tensor:
-    """bool (S, t), True where a segment still has a decision.
-
-    Args:
-        lengths: int (S,), decisions of each segment.
-        t: width of the padded batch.
-    """
+    """bool (S, t), True where a segment of one of the `lengths` (S,) still has a decision."""
     return torch.arange(t, device=lengths.device) < lengths[:, None]
 
 
@@ -79,3 +81,35 @@ def gae(
     for i in reversed(range(t - 1)):
         advantages[:, i] += gamma * lam * advantages[:, i + 1]
     return advantages, (advantages + values).masked_fill(padding, 0.0)
+
+
+def moments(x: Tensor, mask: Tensor | None = None) -> Tensor:
+    """(sum, sum of squares, count) of the valid entries, float64 (3,); add them to merge batches.
+
+    float64, because the variance is the difference of two nearly equal numbers when the mean is large.
+
+    Args:
+        x: any shape; padding may hold anything, NaN included.
+        mask: bool, same shape, or None.
+    """
+    wide = x.detach().double()
+    if mask is None:
+        count = wide.new_tensor(float(x.numel()))
+    else:
+        wide, count = wide.masked_fill(~mask, 0.0), mask.sum().double()
+    return torch.stack([wide.sum(), wide.square().sum(), count])
+
+
+def normalise(x: Tensor, moments: Tensor, mask: Tensor | None = None) -> Tensor:
+    """(x − mean) / (std + `STD_EPSILON`), same shape and dtype as `x`; 0 at padding.
+
+    Args:
+        x: any shape.
+        moments: (3,), from `moments`, summed over everything that is compared with each other.
+        mask: bool, same shape as `x`, or None.
+    """
+    total, squares, count = moments.unbind()
+    mean = total / count.clamp(min=1.0)
+    std = (squares / count.clamp(min=1.0) - mean.square()).clamp(min=0.0).sqrt()
+    scaled = ((x.detach().double() - mean) / (std + STD_EPSILON)).to(x.dtype)
+    return scaled if mask is None else scaled.masked_fill(~mask, 0.0)
