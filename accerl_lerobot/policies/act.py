@@ -25,11 +25,9 @@ class ACT(GaussianModel):
     def __init__(self, policy: Any) -> None:
         config = policy.config
         if config.temporal_ensemble_coeff is not None:
+            remedy = "averaging over earlier chunks makes actions depend on more than the observation"
             raise InputError(
-                "policy.temporal_ensemble_coeff",
-                config.temporal_ensemble_coeff,
-                "averaging over earlier chunks makes actions depend on more than the observation; set it to "
-                "null in config.json",
+                "policy.temporal_ensemble_coeff", config.temporal_ensemble_coeff, f"{remedy}; set it to null"
             )
         self.policy = policy
         self.executed, self.action_dim = config.n_action_steps, config.action_feature.shape[0]

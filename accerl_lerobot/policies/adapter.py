@@ -181,9 +181,7 @@ class Processing:
 def example_requests(policy_config: Any, rename_map: dict[str, str]) -> list[Request]:
     """Two requests with random observations for this policy, and instructions of unequal length.
 
-    Args:
-        policy_config: LeRobot's; names and sizes the inputs.
-        rename_map: environment feature name → policy feature name.
+    `rename_map`: environment feature name → policy feature name.
     """
     rng = np.random.default_rng(0)
     env_name = {policy: env for env, policy in rename_map.items()}
@@ -203,15 +201,9 @@ def example_requests(policy_config: Any, rename_map: dict[str, str]) -> list[Req
 
 
 class LeRobotAdapter(PolicyAdapter):
-    """A LeRobot policy with its processors, a likelihood and a critic.
+    """A LeRobot policy with its processors, a model that runs it, a likelihood and a critic.
 
-    Args:
-        policy: the LeRobot policy; holds the weights that are exported.
-        processing: its LeRobot processors.
-        model: runs `policy`.
-        family: samples and scores.
-        value_head: the critic.
-        precision: fp32, or bf16 for the network under autocast. Densities are computed in fp32 either way.
+    With `precision` bf16 the network runs under autocast; densities are computed in fp32 either way.
     """
 
     def __init__(
@@ -249,7 +241,7 @@ class LeRobotAdapter(PolicyAdapter):
 
     @torch.no_grad()
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
-        """See the base class; each decision's noise comes from its own request's seed, whatever its batch."""
+        """Acts; each decision's noise comes from its own request's seed, whatever its batch."""
         arrays, tasks = stack_observations(requests)
         with self.autocast():
             encoded = self.encode(arrays, tasks)
@@ -284,7 +276,6 @@ class LeRobotAdapter(PolicyAdapter):
         return self._value(encoded)
 
     def trainable(self) -> dict[str, nn.Parameter]:
-        """See the base class; `tuning` decides which of the policy's parameters are."""
         parts = {"policy": self.policy, "family": self.family, "value_head": self.value_head}
         return {
             f"{part}.{name}": parameter
@@ -303,7 +294,6 @@ class LeRobotAdapter(PolicyAdapter):
         return saving.copy_weights(self)
 
     def save(self, directory: Path, config: PolicyConfig, weights: Any) -> None:
-        """See the base class; stock LeRobot loads what is written."""
         saving.save_pretrained(self, directory, config, weights)
 
     @torch.no_grad()

@@ -146,7 +146,6 @@ class DiffusionSamplerConfig(SamplerConfig):
     checkpoint's. Written into what is saved."""
 
     def override(self, policy_config: Any) -> None:
-        """See the base class."""
         if self.scheduler is not None:
             policy_config.noise_scheduler_type = self.scheduler
 

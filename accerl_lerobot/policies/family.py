@@ -110,7 +110,6 @@ class Family(nn.Module, ABC):
         """Chunks (B, K, A) that would be executed without exploring, differentiable, in normalised units.
 
         Args:
-            encoded: of B observations.
             noise: (B, *noise_size), standard normal.
 
         Raises:
@@ -136,7 +135,6 @@ class Family(nn.Module, ABC):
         """See `adapter.PolicyAdapter.actions`."""
 
     def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
-        """See `adapter.PolicyAdapter.factors`."""
         return None
 
 
@@ -155,12 +153,7 @@ def normal_entropy(std: Tensor) -> Tensor:
 
 
 class BoundedStd:
-    """A std between two bounds from a layer's output of any size, by a sigmoid between their logarithms.
-
-    Args:
-        low: above 0, what it tends to towards −∞.
-        high: what it tends to towards ∞.
-    """
+    """A std between two bounds above 0 from a layer's output, by a sigmoid between their logarithms."""
 
     def __init__(self, low: float, high: float) -> None:
         self.low, self.high = math.log(low), math.log(high)

@@ -80,8 +80,7 @@ def check_features(
         needed: by a policy, or by the policy that a dataset makes.
         offered: by an environment, or by the dataset that a policy is trained on.
         rename_map: offered name → needed name.
-        field: blamed in the error, with its `value`.
-        offerer: ``environment`` or ``dataset``.
+        field: named in the error, with its `value`.
 
     Raises:
         InputError: a feature is missing or of another shape, the rates differ, none of the environment's

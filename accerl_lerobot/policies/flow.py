@@ -312,10 +312,7 @@ def difference(model: FlowModel, batch: dict[str, Tensor], encoded: Encoded) -> 
 class NoiseHead(nn.Module):
     """The std of ``noise=learned``, per observation, step and action dim; starts at `noise_level`.
 
-    Args:
-        width: of the features it reads, without shaping them.
-        shape: how many dims and steps.
-        config: its bounds.
+    It reads features of `width` without shaping them.
     """
 
     def __init__(self, width: int, shape: FlowShape, config: FlowSamplerConfig) -> None:
@@ -372,7 +369,7 @@ class FlowFamily(Family):
         return self.shape.chunk_size, self.shape.padded_dim
 
     def executed(self, latent: dict[str, Tensor]) -> Tensor:
-        """See the base class.
+        """Chunks that stored latents stand for.
 
         Raises:
             NotImplementedError: under ``stochastic=one`` the path's end is not stored.
@@ -382,7 +379,7 @@ class FlowFamily(Family):
         return self._executed_part(latent["path"][:, -1])
 
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
-        """See the base class: flow matching at a time from LeRobot's Beta(1.5, 1), executed entries only."""
+        """Flow matching at a time from LeRobot's Beta(1.5, 1), executed entries only."""
         target = chunk.new_zeros(len(chunk), *self.noise_size())
         self._executed_part(target).copy_(chunk)
         noise = torch.randn_like(target)
@@ -455,7 +452,7 @@ class NoiseSpaceFamily(Family):
         return Score(log_prob=_noise_log_prob(latent["z"], mean, std), entropy=entropy)
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
-        """See the base class: the frozen policy is the one LeRobot runs."""
+        """Compares the frozen policy with the one LeRobot runs."""
         return difference(self.model, batch, encoded)
 
     @property

@@ -28,12 +28,8 @@ class GaussianActor(GaussianModel):
     def __init__(self, policy: Any) -> None:
         config = policy.config
         if config.num_discrete_actions is not None:
-            raise InputError(
-                "policy.num_discrete_actions",
-                config.num_discrete_actions,
-                "LeRobot takes the discrete action that a critic likes best, which has no density; use a "
-                "policy without one",
-            )
+            remedy = "LeRobot takes the discrete action that a critic likes best, which has no density"
+            raise InputError("policy.num_discrete_actions", config.num_discrete_actions, remedy)
         self.policy = policy
         self.action_dim = policy.actor.action_dim
         self.width = policy.actor.encoder.output_dim

@@ -54,8 +54,7 @@ def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
     """Where a checkpoint's files are, once checked; those of a Hub repository are fetched.
 
     Args:
-        path: a folder here, or a Hub id.
-        revision: of the latter.
+        path: a folder here, or a Hub id; `revision` is of the latter.
         field: that named it, for the error.
 
     Raises:
@@ -81,15 +80,10 @@ def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
 
 
 def check_checkpoint(folder: Path, origin: Origin, *, fetched: bool = False) -> dict[str, Any]:
-    """All files of a LeRobot checkpoint that are read, before they are.
+    """Checks all files of a LeRobot checkpoint that are read, before they are; returns its ``config.json``.
 
     Args:
-        folder: the one named ``pretrained_model``.
-        origin: what named it.
-        fetched: it is from the Hub, and names of this machine's folders have no business in it.
-
-    Returns:
-        The content of its ``config.json``.
+        fetched: it is from the Hub, and must not name folders of this machine.
 
     Raises:
         InputError: a file is not what it says, leads elsewhere, or asks for what is not there.
@@ -112,7 +106,7 @@ def check_checkpoint(folder: Path, origin: Origin, *, fetched: bool = False) -> 
 
 
 def check_processor(folder: Path, name: str, origin: Origin, *, fetched: bool = False) -> None:
-    """One of a checkpoint's processor files, and the state files it names.
+    """Checks one of a checkpoint's processor files, and the state files it names.
 
     Raises:
         InputError: a step is not one of LeRobot's registered ones, or names files elsewhere.
@@ -125,10 +119,8 @@ def check_processor(folder: Path, name: str, origin: Origin, *, fetched: bool = 
             raise origin.refuse(name, "a step is a mapping with a mapping named config")
         kind = step.get("registry_name")
         if not isinstance(kind, str) or "class" in step:
-            remedy = (
-                "only steps with a registry_name are loaded: LeRobot would import and call the class that"
-            )
-            raise origin.refuse(f"{name}: {str(step.get('class'))[:60]}", f"{remedy} stands here")
+            remedy = "only steps with a registry_name are loaded: LeRobot would import and call this class"
+            raise origin.refuse(f"{name}: {str(step.get('class'))[:60]}", remedy)
         if "state_file" in step:
             tensor_shapes(safe_join(folder, step["state_file"], origin), origin)
         if kind in STEP_FOLDERS:
@@ -151,7 +143,7 @@ def check_statistics(folder: Path, origin: Origin) -> None:
 
 
 def check_ours(ours: dict[str, Any], origin: Origin) -> None:
-    """The content of ``accerl.json``.
+    """Checks the content of ``accerl.json``.
 
     Raises:
         InputError: it is of another form than `loading.save_pretrained` writes.
@@ -162,14 +154,13 @@ def check_ours(ours: dict[str, Any], origin: Origin) -> None:
 
 
 def check_origin(name: Any, own: Path | None, what: str, origin: Origin, fetched: bool) -> None:
-    """A backbone or tokeniser is the checkpoint's own, the Hub's, or, of a local checkpoint, at a path.
+    """Checks that a backbone or tokeniser is the checkpoint's own, the Hub's, or at a path of a local one's.
 
     Args:
-        name: what its config says.
+        name: as its config says.
         own: the checkpoint's own folder of it, where it may have one.
         what: file and key that say so, for the error.
-        origin: what named the checkpoint.
-        fetched: it is from the Hub, and folders of this machine are none of its business.
+        fetched: the checkpoint is from the Hub, and must not name folders of this machine.
 
     Raises:
         InputError: it is something else.
@@ -182,10 +173,8 @@ def check_origin(name: Any, own: Path | None, what: str, origin: Origin, fetched
         return  # it is not read: the checkpoint's own goes first
     if Path(name).is_absolute():
         if fetched or ".." in Path(name).parts:
-            remedy = (
-                "a folder of this machine, which a checkpoint from elsewhere may not name; put a copy into"
-            )
-            raise origin.refuse(what, f"{name[:80]!r}: {remedy} {BACKBONE}/")
+            remedy = "a folder of this machine, which a checkpoint from elsewhere may not name"
+            raise origin.refuse(what, f"{name[:80]!r}: {remedy}; put a copy into {BACKBONE}/")
     elif not HUB_ID.fullmatch(name):
         raise origin.refuse(what, f"{name[:80]!r} is neither a Hub id nor an absolute path")
 
@@ -219,11 +208,11 @@ def _entries(content: Any, depth: int = 0) -> Iterator[tuple[str, Any]]:
 
 
 @contextlib.contextmanager
-def guarded(room: str, code_revision: str | None = None) -> Iterator[None]:
+def guarded(section: str, code_revision: str | None = None) -> Iterator[None]:
     """While it lasts, transformers runs no code that comes with a model, and PyTorch unpickles nothing.
 
     Args:
-        room: ``policy`` or ``sft``, for the error.
+        section: ``policy`` or ``sft``, for the error.
         code_revision: commit of the one Hub repository whose code may be run; None: none may.
     """
     from transformers import dynamic_module_utils as dynamic
@@ -240,10 +229,10 @@ def guarded(room: str, code_revision: str | None = None) -> Iterator[None]:
         pinned = code_revision is not None and f"snapshots/{code_revision}/" in Path(file).as_posix()
         if not pinned:
             remedy = (
-                "code that came with a model, which would run with your rights; read it, then name its commit"
+                "code that came with a model, which would run with your rights; read it, then name its "
+                f"commit: {section}.trust_remote_code=true and {section}.code_revision"
             )
-            say = f"{remedy}: {room}.trust_remote_code=true and {room}.code_revision"
-            raise InputError(f"{room}.trust_remote_code", f"{snapshot.name}/{Path(file).name}", say)
+            raise InputError(f"{section}.trust_remote_code", f"{snapshot.name}/{Path(file).name}", remedy)
         return look(file)
 
     def load_known(file: Any, *arguments: Any, **options: Any) -> Any:
@@ -253,7 +242,7 @@ def guarded(room: str, code_revision: str | None = None) -> Iterator[None]:
         )
         if not known:
             remedy = "a pickle, which may run code when it is loaded; convert it to safetensors"
-            raise InputError(f"{room}.path", str(file)[:200], f"{remedy} where you trust it")
+            raise InputError(f"{section}.path", str(file)[:200], f"{remedy} where you trust it")
         return load(file, *arguments, **options | {"weights_only": True})
 
     dynamic.get_cached_module_file, dynamic.check_imports = fetch_pinned, look_first

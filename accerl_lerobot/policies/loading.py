@@ -68,14 +68,14 @@ TEXT = f"Put the red cube on the plate {string.printable}"
 
 
 class Sizes(NamedTuple):
-    """Numbers of a policy, and those of them that a run trains, the critic's included."""
+    """Numbers of parameters: the policy's, and those that a run trains, the critic's included."""
 
     policy: int
     trained: int
 
 
 _rehearsed: dict[str, Sizes] = {}
-"""Checkpoints, and what was asked of them, that need no other rehearsal in this process."""
+"""Checkpoints and configs that need no other rehearsal in this process."""
 NAMED = 3
 """Tensors of a kind that an error names."""
 
@@ -348,10 +348,8 @@ def load_weights(policy: Any, model: type[Model], file: Path, path: str | None, 
     """Fills a policy from a file.
 
     Args:
-        policy: LeRobot's, just built.
-        model: knows which of its tensors a file may lack.
-        file: the safetensors.
-        path: what the user called the checkpoint.
+        model: knows which tensors a file may lack.
+        path: the checkpoint as the user named it.
         read: False: only names and shapes are compared.
 
     Raises:

@@ -196,7 +196,6 @@ def test_the_log_prob_reaches_the_image_encoder(tmp_path: Path, shared: bool):
     latent, _ = stored(adapter.decide(asked, 0))
     perturb(adapter, 0.1)
     adapter.evaluate(*stack_observations(asked), latent).log_prob.sum().backward()
-    assert not any("encoder_critic" in k for k in adapter.trainable())
     images = {k: p for k, p in adapter.trainable().items() if "image_encoder" in k}
     assert images and all(p.grad.abs().max() > 0 for p in images.values())
 
