@@ -58,7 +58,7 @@ class DiffusionShape:
     horizon: int
     """H rows that are denoised."""
     executed: int
-    """Rows that are sent to the world (LeRobot's n_action_steps)."""
+    """Rows that are executed in the environment (LeRobot's n_action_steps)."""
     first: int = 0
     """The first of them; those before it stand for the past (LeRobot's n_obs_steps − 1)."""
     action_dim: int

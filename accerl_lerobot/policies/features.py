@@ -124,10 +124,10 @@ def _check_tasks(recorded: tuple[str, ...], wanted: tuple[str, ...], field: str,
     if not known or not missing:
         return
     has = ", ".join(map(repr, recorded[:4])) + (" …" if len(recorded) > 4 else "")
-    said = f"no episode of {', '.join(map(repr, missing[:4]))}, the environment's task: it has {has}"
+    message = f"no episode of {', '.join(map(repr, missing[:4]))}, the environment's task: it has {has}"
     if len(missing) == len(wanted):
-        raise InputError(field, value, f"{said}; choose env.task accordingly")
-    logger.warning("%s=%r: %s", field, value, said)
+        raise InputError(field, value, f"{message}; choose env.task accordingly")
+    logger.warning("%s=%r: %s", field, value, message)
 
 
 def _plain(text: str) -> str:

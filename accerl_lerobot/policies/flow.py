@@ -73,14 +73,14 @@ class FlowShape:
     chunk_size: int
     """K rows the network denoises."""
     executed: int
-    """Rows that are sent to the world, ≤ K (LeRobot's n_action_steps)."""
+    """Rows that are executed in the environment, ≤ K (LeRobot's n_action_steps)."""
     padded_dim: int
     """D, LeRobot's max_action_dim."""
     action_dim: int
     """A real dims."""
 
     def action_mask(self) -> Tensor:
-        """(K, D) bool: the entries that reach the world."""
+        """(K, D) bool: the entries that are executed."""
         mask = torch.zeros(self.chunk_size, self.padded_dim, dtype=torch.bool)
         mask[: self.executed, : self.action_dim] = True
         return mask

@@ -60,7 +60,7 @@ class GaussianModel(Model):
     """A LeRobot policy that predicts a chunk in one pass; `Encoded.context` is a `GaussianContext`."""
 
     executed: int
-    """Rows that are sent to the world."""
+    """Rows that are executed in the environment."""
     action_dim: int
     row_width: int | None = None
     """W; None where the policy has a std of its own."""

@@ -40,7 +40,7 @@ class GaussianActor(GaussianModel):
         """The features are the encoder's output, one token.
 
         Unlike in LeRobot's SAC, whose critic shapes a shared image encoder, the log-prob's gradient reaches
-        it: our critic reads features and does not shape them, so nobody else would.
+        it: our critic reads features and does not shape them.
         """
         actor = self.policy.actor
         features = actor.encoder(batch)

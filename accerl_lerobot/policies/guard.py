@@ -5,7 +5,7 @@ LeRobot imports and calls whatever a processor's ``class`` names, with the argum
 joins ``state_file`` to the folder as it is. Names of backbones and tokenisers may be folders of this machine.
 LeRobot 0.6.1 has transformers run code from the Hub in places (`trust_remote_code=True` without a revision);
 where transformers is not told, it asks the terminal, and without safetensors it unpickles. `guarded` wraps
-the functions through which all of that goes, whoever calls them.
+the functions through which all of that goes, whoever is the caller.
 """
 
 from __future__ import annotations

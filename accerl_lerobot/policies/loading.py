@@ -155,8 +155,8 @@ def rehearsed_config(config: PolicyConfig) -> Any:
     key = _key(config, folder)
     if key not in _rehearsed:
         there = replace(config, device="cpu", precision="fp32")
-        found = rehearse(lambda: _sizes(there), folder, Origin("policy.path", config.path))
-        _rehearsed[key] = Sizes(*found)
+        sizes = rehearse(lambda: _sizes(there), folder, Origin("policy.path", config.path))
+        _rehearsed[key] = Sizes(*sizes)
     return load_lerobot_config(config)
 
 

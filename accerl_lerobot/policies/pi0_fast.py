@@ -244,7 +244,7 @@ def _refuse(config: Any) -> None:
     """Refuses settings under which LeRobot's own sampler is not what evaluation and the self-check need.
 
     Raises:
-        InputError: it samples at rest, or decodes fewer rows than were encoded.
+        InputError: it is not greedy, or decodes fewer rows than were encoded.
     """
     if config.temperature != 0:
         remedy = "LeRobot's sampler has to be greedy here: set it to 0 in config.json; exploration has a "
@@ -258,12 +258,12 @@ def _refuse(config: Any) -> None:
 class _Undecodable(logging.Filter):
     """Passes LeRobot's complaint about a sequence it cannot decode once, in our words."""
 
-    said = False
+    warned = False
 
     def filter(self, record: logging.LogRecord) -> bool:
         message = str(record.msg)
-        if message.startswith("Error decoding tokens") and not _Undecodable.said:
-            _Undecodable.said = True
+        if message.startswith("Error decoding tokens") and not _Undecodable.warned:
+            _Undecodable.warned = True
             logger.warning("tokens that FAST cannot decode were drawn; such a chunk is all zeros")
         return not message.startswith(("Error decoding tokens", "Tokens: "))
 
