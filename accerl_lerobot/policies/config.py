@@ -77,7 +77,7 @@ class NoiseSpaceSamplerConfig(SamplerConfig):
     std_max: Positive = 2.0
     """Upper bound of the learned std, above `std`."""
     bound: Positive = 2.0
-    """Largest absolute mean: noise the policy never saw in training gives actions that it was not trained for."""
+    """Largest absolute mean: from noise it never saw in training the policy makes arbitrary actions."""
     hidden: Annotated[int, Range("[1, 65536]")] = 128
     """Width of the head's hidden layer."""
     per_row: bool = False

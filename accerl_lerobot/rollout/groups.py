@@ -101,8 +101,8 @@ def open_limit(size: int, worlds: int) -> int:
     """Most groups of `size` that may be unfinished at a time: 2·⌈worlds / size⌉ + 1.
 
     It bounds the decisions held back. A world that may not begin another group is idle: with half as many
-    groups, 7 to 20 % of the time in a simulation with uniformly distributed episode lengths, since every group
-    waits for its slowest; with these, under 1 %.
+    groups, 7 to 20 % of the time in a simulation with uniformly distributed episode lengths, since every
+    group waits for its slowest; with these, under 1 %.
     """
     return 2 * math.ceil(worlds / size) + 1
 
