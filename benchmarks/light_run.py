@@ -65,7 +65,7 @@ def light_config(
 
 def light_policy() -> Load:
     """Makes the stand-in for LeRobot's policy."""
-    from accerl_lerobot.policies.simulated import SimulatedPolicyConfig, load_simulated
+    from benchmarks.simulated_policy import SimulatedPolicyConfig, load_simulated
 
     return functools.partial(load_simulated, SimulatedPolicyConfig(decide_ms=2.0, update_ms=60.0))
 

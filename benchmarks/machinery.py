@@ -147,7 +147,7 @@ class MachineryConfig(Section):
 
     def load(self) -> Load:
         """Its policy, for `RayEngine`."""
-        from accerl_lerobot.policies.simulated import SimulatedPolicyConfig, load_simulated
+        from benchmarks.simulated_policy import SimulatedPolicyConfig, load_simulated
 
         policy = SimulatedPolicyConfig(
             decide_ms=self.decide_ms,

@@ -35,7 +35,7 @@ def write_smolvla(
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
 
-    from accerl_lerobot.policies.backbone import BackboneConfig, write_backbone
+    from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
 
     sizes = BackboneConfig(
         hidden=32,

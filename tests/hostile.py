@@ -110,7 +110,8 @@ def hostile_names(rng: random.Random) -> Iterator[str]:
 def write_examples(scratch: Path) -> dict[str, Path]:
     """A small world model, a small checkpoint and a dataset, all of them good."""
     from accerl_lerobot.policies.config import PolicyConfig
-    from accerl_lerobot.policies.loading import load_adapter, save_pretrained
+    from accerl_lerobot.policies.loading import load_adapter
+    from accerl_lerobot.policies.saving import save_pretrained
     from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig
     from accerl_lerobot.world_model.contract import WorldModelSpec
     from accerl_lerobot.world_model.pixels import PixelWorldModel
@@ -240,7 +241,7 @@ def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
     """Checks that are called before anything is loaded."""
     from accerl_lerobot.checkpoint.safety import Origin, read_json, tensor_shapes
     from accerl_lerobot.demos.dataset_files import check_data, check_info, check_metadata, check_stats
-    from accerl_lerobot.policies import files
+    from accerl_lerobot.policies import guard
 
     origin = Origin("path", "hostile")
     policy, dataset = at["policy"], at["dataset"]
@@ -248,13 +249,13 @@ def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
     weights.write_bytes((policy / "value_head.safetensors").read_bytes())
     trial.files("safetensors", weights, lambda: tensor_shapes(weights, origin), 300 * times)
     ours = json.loads((policy / "accerl.json").read_text())
-    trial.trees("accerl.json", ours, lambda t: files.check_ours(t, origin), 40 * times)
+    trial.trees("accerl.json", ours, lambda t: guard.check_ours(t, origin), 40 * times)
     file = policy / "accerl.json"
     trial.files("JSON", file, lambda: read_json(file, origin), 130 * times)
     name = "policy_preprocessor.json"
-    trial.files("processor", policy / name, lambda: files.check_processor(policy, name, origin), 60 * times)
+    trial.files("processor", policy / name, lambda: guard.check_processor(policy, name, origin), 60 * times)
     trial.files(
-        "checkpoint", policy / "config.json", lambda: files.check_checkpoint(policy, origin), 5 * times
+        "checkpoint", policy / "config.json", lambda: guard.check_checkpoint(policy, origin), 5 * times
     )
     info = json.loads((dataset / "meta/info.json").read_text())
     trial.trees("info.json", info, lambda t: check_info(t, origin), 150 * times)

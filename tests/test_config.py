@@ -17,13 +17,13 @@ from accerl_lerobot.cli.configs import DemosRun, EvalRun, SFTRun
 from accerl_lerobot.config import parsing
 from accerl_lerobot.config.help import help_text
 from accerl_lerobot.config.ranges import Positive, Range, Share
+from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engine import preflight
 from accerl_lerobot.engine.config import DatasetConfig, RunConfig, check_chunk, encode, parse
 from accerl_lerobot.engine.preflight import check_sft_policy, check_start
 from accerl_lerobot.envs import LeRobotEnvConfig, MetaWorldConfig, SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.backbone import BackboneConfig
 
 ROOT = Path(__file__).parents[1]
 RECIPE = """

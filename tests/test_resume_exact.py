@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.algorithms import ChunkCriticConfig, GIPOConfig, SelfImitationConfig
-from accerl_lerobot.algorithms.decoupled import DecoupledConfig
+from accerl_lerobot.algorithms.ppo import DecoupledConfig
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Progress

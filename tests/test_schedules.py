@@ -23,12 +23,12 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.inference.pool import dealt, together
 from accerl_lerobot.inference.worker import InferenceConfig
-from accerl_lerobot.policies.simulated import SimulatedPolicyConfig, load_simulated
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Turns
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
+from benchmarks.simulated_policy import SimulatedPolicyConfig, load_simulated
 from tests.light_workers import light_ray
 from tests.replay.segments import make_segment
 from tests.replay.test_worker import BATCH, play, start, waits

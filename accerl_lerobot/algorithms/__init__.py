@@ -7,8 +7,8 @@ parsed before torch is loaded.
 
 Order of use inside an update::
 
-    advantages, returns = gae(...)                    # gae.py, with values of the current critic
-    advantages = normalise(advantages, moments)       # normalise.py, moments summed over all ranks
+    advantages, returns = gae(...)                    # advantages.py, with values of the current critic
+    advantages = normalise(advantages, moments)       # moments summed over all ranks
     output = compute_loss(LossInputs(...), config)    # one file per algorithm
     output.loss.backward()
 """
@@ -24,15 +24,13 @@ from accerl_lerobot.algorithms.contract import (
     AlgorithmConfig,
     Level,
     LossInputs,
-    LossOutput,
     OffPolicyConfig,
     RatioConfig,
     check_level,
 )
-from accerl_lerobot.algorithms.decoupled import DecoupledConfig, decoupled_loss
-from accerl_lerobot.algorithms.gipo import GIPOConfig, gipo_loss
-from accerl_lerobot.algorithms.importance import ImportanceConfig, importance_loss
-from accerl_lerobot.algorithms.ppo import PPOConfig, ppo_loss
+from accerl_lerobot.algorithms.gipo import GIPOConfig, ImportanceConfig, gipo_loss, importance_loss
+from accerl_lerobot.algorithms.objective import LossOutput
+from accerl_lerobot.algorithms.ppo import DecoupledConfig, PPOConfig, decoupled_loss, ppo_loss
 from accerl_lerobot.algorithms.sapo import SAPOConfig, sapo_loss
 from accerl_lerobot.algorithms.self_imitation import SelfImitationConfig
 

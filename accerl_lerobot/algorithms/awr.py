@@ -21,8 +21,8 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
-from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput, RatioConfig
-from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
+from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, RatioConfig
+from accerl_lerobot.algorithms.objective import LossOutput, advantage_column, assemble, mean_over_ratios
 from accerl_lerobot.algorithms.ratio import at_level
 from accerl_lerobot.config.ranges import Range
 
@@ -39,12 +39,7 @@ class AWRConfig(RatioConfig):
 
 
 def awr_loss(inputs: LossInputs, config: AWRConfig) -> LossOutput:
-    """See the top of the file. E is the mean over all factors, actions or chunks of all decisions.
-
-    Args:
-        inputs: the batch; `LossInputs` states the shapes.
-        config: temperature, cap and coefficients.
-    """
+    """See the top of the file. E is the mean over all factors, actions or chunks of all decisions."""
     log_prob = at_level(inputs.log_prob_new, inputs, config.level)
     logs = at_level(inputs.log_prob_new - inputs.log_prob_old.detach(), inputs, config.level)
     # Limited before the exponential, which would overflow at Â/β = 89.
@@ -56,5 +51,5 @@ def awr_loss(inputs: LossInputs, config: AWRConfig) -> LossOutput:
         policy_loss=-mean_over_ratios(weight * log_prob, inputs, config.level),
         log_ratio=logs,
         weight=weight,
-        pull=weight,
+        grad_weight=weight,
     )

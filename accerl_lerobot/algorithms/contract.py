@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inputs, outputs and shared settings of all objectives.
+"""Inputs and shared settings of all objectives.
 
 Shape letters: N decisions of a batch, L log-prob factors of one decision, as its policy stores them.
 """
@@ -16,8 +16,6 @@ from accerl_lerobot.errors import InputError
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    from accerl_lerobot.algorithms.diagnostics import Samples
 
 Level = Literal["token", "action", "chunk"]
 
@@ -85,10 +83,6 @@ class OffPolicyConfig(AlgorithmConfig):
 def check_level(level: Level, actions: int | None) -> None:
     """Refuses a ratio per action for a policy whose factors do not align with actions.
 
-    Args:
-        level: of the algorithm.
-        actions: see `LossInputs.actions`.
-
     Raises:
         InputError: as above.
     """
@@ -148,21 +142,3 @@ class LossInputs:
                 raise ValueError(f"{name} has shape {tuple(tensor.shape)}, not {shape}")
         if self.actions is not None and (self.actions < 1 or width % self.actions):
             raise ValueError(f"{width} factors do not fall into {self.actions} equal groups")
-
-
-@dataclass(frozen=True, kw_only=True)
-class LossOutput:
-    """Loss and metrics of one batch."""
-
-    loss: Tensor
-    """(), call ``backward`` on it."""
-    means: dict[str, Tensor]
-    """Means over decisions, scalars without gradient. Those of micro-batches, weighted by their decisions,
-    add up to that of the whole batch; ``decisions`` is a count."""
-    samples: Samples
-    """Per-decision values behind the metrics that are no means over decisions, without gradient."""
-
-    @property
-    def metrics(self) -> dict[str, Tensor]:
-        """Scalars of this batch, still on the device; `diagnostics` explains each."""
-        return self.means | self.samples.metrics()

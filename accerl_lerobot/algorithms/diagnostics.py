@@ -97,8 +97,8 @@ class Samples:
     """(N, F), 0 where a ratio does not exist."""
     weight: Tensor
     """(N, F), ω."""
-    pull: Tensor
-    """(N, F), the factor before Â∇log π."""
+    grad_weight: Tensor
+    """(N, F), factor of Â∇log π in the gradient."""
     clipped: Tensor
     """(N, F), log of the ratios that are clipped."""
     keep: Tensor
@@ -114,7 +114,7 @@ class Samples:
         """All of it on the CPU, float64 (N, 5F + 2), for `joined`."""
         import torch
 
-        wide = (self.log_ratio, self.weight, self.pull, self.clipped, self.keep)
+        wide = (self.log_ratio, self.weight, self.grad_weight, self.clipped, self.keep)
         narrow = (self.value, self.returns)
         return torch.cat([*(x.double().cpu() for x in wide), *(x.double().cpu()[:, None] for x in narrow)], 1)
 
@@ -123,7 +123,7 @@ class Samples:
         *wide, narrow = rows.split([*[self.log_ratio.shape[1]] * 5, 2], dim=1)
         value, returns = narrow.unbind(1)
         return Samples(
-            **dict(zip(("log_ratio", "weight", "pull", "clipped"), wide, strict=False)),
+            **dict(zip(("log_ratio", "weight", "grad_weight", "clipped"), wide, strict=False)),
             keep=wide[4].bool(),
             value=value,
             returns=returns,
@@ -136,7 +136,7 @@ class Samples:
         points = {"log_ratio_p05": 0.05, "log_ratio_p50": 0.5, "log_ratio_p95": 0.95}
         return {
             "approx_kl": approx_kl(self.log_ratio, self.keep),
-            "ess": ess_share(self.pull, self.keep),
+            "ess": ess_share(self.grad_weight, self.keep),
             "low_weight": share_below(self.weight, LOW_WEIGHT, self.keep),
             "clip_fraction": clip_fraction(ratio(self.clipped), *self.clip, self.keep),
             "ratio_max_dev": (rho - 1.0).abs().max(),

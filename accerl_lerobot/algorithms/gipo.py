@@ -14,6 +14,15 @@ Deviations from the paper:
     * the KL to the behaviour policy is estimated from samples (`ratio.kl_from_behaviour`), not summed over
       token bins, because a flow policy has no bins;
     * log ρ is clamped, see `ratio.LOG_RATIO_CLAMP`.
+
+Importance sampling, to compare with: ω = 1 at an infinite σ, or truncated,
+
+    L = −E[min(ρ, cap) Â]  +  the shared terms,      gradient −E[min(ρ, cap) Â ∇log π]
+
+A truncated sample keeps the weight `cap` (Ionides, *Truncated importance sampling*, 2008; the weight of
+V-trace, arXiv 1802.01561). Differentiating min(ρ, cap) itself would leave such samples no gradient, which
+is a clip. Without a cap this is unbiased at level ``chunk``, and nothing but `ratio.LOG_RATIO_CLAMP` bounds
+what one sample can do.
 """
 
 from __future__ import annotations
@@ -21,8 +30,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
-from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput, RatioConfig
-from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
+from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, RatioConfig
+from accerl_lerobot.algorithms.objective import LossOutput, advantage_column, assemble, mean_over_ratios
 from accerl_lerobot.algorithms.ratio import at_level, ratio
 from accerl_lerobot.config.ranges import NonNegative, Range
 
@@ -59,14 +68,35 @@ def trust_weight(log_ratio: Tensor, advantage: Tensor, config: GIPOConfig) -> Te
 
 
 def gipo_loss(inputs: LossInputs, config: GIPOConfig) -> LossOutput:
-    """See the top of the file. E is the mean over all ratios of all decisions.
-
-    Args:
-        inputs: the batch; `LossInputs` states the shapes.
-        config: widths and coefficients.
-    """
+    """See the top of the file. E is the mean over all ratios of all decisions."""
     advantage = advantage_column(inputs)
     logs = at_level(inputs.log_prob_new - inputs.log_prob_old.detach(), inputs, config.level)
     weight = trust_weight(logs, advantage, config)
     policy_loss = -mean_over_ratios(weight * ratio(logs) * advantage, inputs, config.level)
     return assemble(inputs, config, policy_loss=policy_loss, log_ratio=logs, weight=weight)
+
+
+@AlgorithmConfig.register_subclass("is")
+@dataclass(frozen=True, kw_only=True)
+class ImportanceConfig(RatioConfig):
+    """Settings of importance sampling."""
+
+    cap: Annotated[float, Range("[1, inf)")] | None = None
+    """Largest weight of a sample; None: unbounded."""
+
+
+def importance_loss(inputs: LossInputs, config: ImportanceConfig) -> LossOutput:
+    """See the top of the file. E is the mean over all ratios of all decisions."""
+    logs = at_level(inputs.log_prob_new - inputs.log_prob_old.detach(), inputs, config.level)
+    rho = ratio(logs)
+    weighted = rho
+    if config.cap is not None:
+        # 1 + log ρ − log ρ̄ is 1 with the gradient ∇log π, also where `ratio` is clamped and has none.
+        weighted = rho.detach().clamp(max=config.cap) * (1.0 + logs - logs.detach())
+    return assemble(
+        inputs,
+        config,
+        policy_loss=-mean_over_ratios(weighted * advantage_column(inputs), inputs, config.level),
+        log_ratio=logs,
+        weight=weighted / rho,
+    )

@@ -7,9 +7,10 @@ L = L_policy + value_coef · mean value error + kl_coef · KL(μ‖π) + referen
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from accerl_lerobot.algorithms.contract import Level, LossInputs, LossOutput, RatioConfig
+from accerl_lerobot.algorithms.contract import Level, LossInputs, RatioConfig
 from accerl_lerobot.algorithms.diagnostics import Samples
 from accerl_lerobot.algorithms.ratio import (
     at_level,
@@ -26,6 +27,24 @@ if TYPE_CHECKING:
 USUAL_CLIP = (0.2, 0.2)
 """Clip range of the reported clip fraction for an algorithm that clips nothing, so that runs can be
 compared."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LossOutput:
+    """Loss and metrics of one batch."""
+
+    loss: Tensor
+    """(), call ``backward`` on it."""
+    means: dict[str, Tensor]
+    """Means over decisions, scalars without gradient. Those of micro-batches, weighted by their decisions,
+    add up to that of the whole batch; ``decisions`` is a count."""
+    samples: Samples
+    """Per-decision values behind the metrics that are no means over decisions, without gradient."""
+
+    @property
+    def metrics(self) -> dict[str, Tensor]:
+        """Scalars of this batch, still on the device; `diagnostics` explains each."""
+        return self.means | self.samples.metrics()
 
 
 def advantage_column(inputs: LossInputs) -> Tensor:
@@ -55,7 +74,7 @@ def assemble(
     weight: Tensor,
     clip: tuple[float, float] = USUAL_CLIP,
     clipped: Tensor | None = None,
-    pull: Tensor | None = None,
+    grad_weight: Tensor | None = None,
 ) -> LossOutput:
     """Adds the shared terms to a policy loss and measures the batch.
 
@@ -67,7 +86,7 @@ def assemble(
         weight: (N, F), how much of each sample's gradient the algorithm keeps, ω.
         clip: (low, high), the clip fraction counts ratios outside [1 − low, 1 + high].
         clipped: (N, F), log of the ratios that are clipped; None: `log_ratio`.
-        pull: (N, F), what stands before Â∇log π; None: ω·ρ.
+        grad_weight: (N, F), factor of Â∇log π in the gradient; None: ω·ρ.
     """
     value_loss, mean_entropy = inputs.value_error.mean(), inputs.entropy.mean()
     kl = mean_over_ratios(kl_from_behaviour(log_ratio), inputs, config.level)
@@ -87,7 +106,7 @@ def assemble(
     samples = Samples(
         log_ratio=log_ratio.detach(),
         weight=weight.detach(),
-        pull=(weight * ratio(log_ratio) if pull is None else pull).detach(),
+        grad_weight=(weight * ratio(log_ratio) if grad_weight is None else grad_weight).detach(),
         clipped=(log_ratio if clipped is None else clipped).detach(),
         keep=log_ratio.new_ones(log_ratio.shape).bool() if keep is None else keep,
         value=inputs.value.detach(),

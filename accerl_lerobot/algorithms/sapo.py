@@ -16,8 +16,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, LossOutput, RatioConfig
-from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
+from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, RatioConfig
+from accerl_lerobot.algorithms.objective import LossOutput, advantage_column, assemble, mean_over_ratios
 from accerl_lerobot.algorithms.ratio import at_level, ratio
 from accerl_lerobot.config.ranges import Positive
 
@@ -34,12 +34,7 @@ class SAPOConfig(RatioConfig):
 
 
 def sapo_loss(inputs: LossInputs, config: SAPOConfig) -> LossOutput:
-    """See the top of the file. E is the mean over all ratios of all decisions.
-
-    Args:
-        inputs: the batch; `LossInputs` states the shapes.
-        config: temperatures and coefficients.
-    """
+    """See the top of the file. E is the mean over all ratios of all decisions."""
     advantage = advantage_column(inputs)
     logs = at_level(inputs.log_prob_new - inputs.log_prob_old.detach(), inputs, config.level)
     tau = advantage.new_full(advantage.shape, config.tau_negative)

@@ -59,7 +59,7 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
     import numpy as np
     import torch
 
-    from accerl_lerobot.policies.base import stack_observations
+    from accerl_lerobot.policies.adapter import stack_observations
     from accerl_lerobot.policies.loading import resolve_device
 
     device = resolve_device(config.device, "device")
@@ -148,11 +148,11 @@ def _adapter(config: BenchPolicyConfig, device: Any, directory: Path) -> Any:
     import torch
     from lerobot.policies.factory import get_policy_class
 
+    from accerl_lerobot.config.imports import imported
     from accerl_lerobot.policies.adapter import LeRobotAdapter
-    from accerl_lerobot.policies.config import ValueHeadConfig
+    from accerl_lerobot.policies.config import FlowSamplerConfig, ValueHeadConfig
     from accerl_lerobot.policies.flow import FlowFamily
-    from accerl_lerobot.policies.loading import POLICIES, imported, steps_field
-    from accerl_lerobot.policies.samplers import FlowSamplerConfig
+    from accerl_lerobot.policies.registry import POLICIES, steps_field
     from accerl_lerobot.policies.tuning import tune
     from accerl_lerobot.policies.value_head import ValueHead
 
@@ -215,7 +215,7 @@ def _features(config: BenchPolicyConfig) -> dict[str, Any]:
 def _smolvla(config: BenchPolicyConfig, directory: Path) -> Any:
     from lerobot.policies.factory import make_policy_config
 
-    from accerl_lerobot.policies.backbone import SMOLVLM2_500M, write_backbone
+    from accerl_lerobot.demos.backbone import SMOLVLM2_500M, write_backbone
 
     backbone = write_backbone(directory / "backbone", SMOLVLM2_500M)
     return make_policy_config(

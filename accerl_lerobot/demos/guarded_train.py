@@ -23,7 +23,7 @@ def main() -> None:
     """Runs ``lerobot-train`` on the command line's arguments."""
     from lerobot.scripts import lerobot_train
 
-    from accerl_lerobot.policies import fast
+    from accerl_lerobot.policies.pi0_fast import data_only
 
     def given(prefix: str) -> str | None:
         return next((a.removeprefix(prefix) for a in sys.argv[1:] if a.startswith(prefix)), None)
@@ -36,7 +36,7 @@ def main() -> None:
             guards.enter_context(guarded("sft", code))
             guards.enter_context(checked(origin, whole=root is not None))
             if code is None:
-                guards.enter_context(fast.data_only())
+                guards.enter_context(data_only())
             lerobot_train.main()
     except Exception as error:
         if (refused := input_error(error)) is None:

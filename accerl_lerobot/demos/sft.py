@@ -22,10 +22,10 @@ from typing import Annotated, Any
 from accerl_lerobot.checkpoint.layout import BACKBONE, displaced, relocate
 from accerl_lerobot.checkpoint.safety import Origin, check_remote_code, read_json
 from accerl_lerobot.config.ranges import LearningRate, Range, Section, Steps, Threads
+from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
 from accerl_lerobot.errors import InputError, check_absent
-from accerl_lerobot.policies.backbone import BackboneConfig, write_backbone
-from accerl_lerobot.policies.files import fetched_checkpoint
-from accerl_lerobot.policies.plugins import discovery, register_policies
+from accerl_lerobot.policies.guard import fetched_checkpoint
+from accerl_lerobot.policies.registry import discovery, register_policies
 
 logger = logging.getLogger(__name__)
 

@@ -339,10 +339,10 @@ def _going_on(config: RunConfig, directory: Path, checkpoint: Path, console: Con
     if start is None:
         start = str(directory / BASE)
         if not Path(start).is_dir():
-            from accerl_lerobot.policies.computed_back import compute_back
+            from accerl_lerobot.policies.loading import reconstruct_base
 
-            with console.stage("the policy it began from is not here: computing it back, to rounding"):
-                compute_back(config.policy, checkpoint, directory / BASE)
+            with console.stage("the policy it began from is not here: reconstructing it, up to rounding"):
+                reconstruct_base(config.policy, checkpoint, directory / BASE)
     return _improving(config, start)
 
 

@@ -26,7 +26,7 @@ from accerl_lerobot.hub.kinds import (
     WORLD_MODEL,
     read_json,
 )
-from accerl_lerobot.policies.plugins import discovery
+from accerl_lerobot.policies.registry import discovery
 from accerl_lerobot.world_model.config import PIXELS
 
 MARK = "<!-- Written by accerl push, and anew each time. Delete this line to keep what you change. -->"

@@ -1,10 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A LeRobot policy with its processors, a likelihood and a critic."""
+"""The interface of a policy to the engine, π(chunk | observation) and V(observation), and LeRobot's adapter.
+
+`decide` acts, `evaluate` re-scores what was stored; both run the same code on the same weights, so the ratio
+at equal weights is 1.
+"""
 
 from __future__ import annotations
 
 import contextlib
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,29 +18,199 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from accerl_lerobot.checkpoint.tensors import in_parts, part_of, whole
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.policies.base import Evaluation, PolicyAdapter, stack_observations
+from accerl_lerobot.experience import TASK, Decision, Request
+from accerl_lerobot.policies import saving
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Encoded, Family, Model
-from accerl_lerobot.policies.processing import Processing, example_observations, example_requests
 from accerl_lerobot.policies.teacher import PREFIX, Teacher
-from accerl_lerobot.policies.value_head import Value, ValueHead
+from accerl_lerobot.policies.value_head import ValueHead
 
+OBS_STATE = "observation.state"
+IMAGES = "observation.image"
+"""How images' names begin: ``observation.images.<camera>``, or LeRobot's name for a lone camera."""
 SELF_CHECK_TOLERANCE = 1e-5
 """Largest difference, in normalised action units, between our sampler and LeRobot's; fp32 noise is 1e-6."""
 
 
-class LeRobotAdapter(PolicyAdapter):
-    """Puts a model and a family together.
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """A batch of stored decisions under the current weights."""
 
-    Args:
-        policy: the LeRobot policy; holds the weights that are exported.
-        processing: its LeRobot processors.
-        model: runs `policy`.
-        family: samples and scores.
-        value_head: the critic.
-        precision: fp32, or bf16 for the network under autocast. Densities are computed in fp32 either way.
+    log_prob: Tensor
+    """(B, L), same factors as `Decision.log_prob`."""
+    entropy: Tensor
+    """(B,)."""
+    value: Tensor
+    """(B,), V of the observations."""
+
+
+class PolicyAdapter(nn.Module, ABC):
+    """One policy as the engine sees it: stochastic, with a density and a critic."""
+
+    device: torch.device
+
+    @property
+    @abstractmethod
+    def actions(self) -> int | None:
+        """Number of equal groups of consecutive log-prob factors, one group per action of the chunk.
+
+        None if factors do not align with actions: ratios per action are refused then.
+        """
+
+    def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
+        """bool (B, L), False for log-prob factors that a latent does not have, such as tokens after the
+        terminator; None if all latents have all of them."""
+        return None
+
+    @abstractmethod
+    def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
+        """Acts on a batch, without gradient. Answers in the order of the requests."""
+
+    @abstractmethod
+    def evaluate(
+        self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
+    ) -> Evaluation:
+        """Re-scores stored latents, differentiably.
+
+        Args:
+            observations: each (B, ...), raw, as in `Segment.observations`.
+            tasks: B instruction texts.
+            latent: each (B, ...), as `decide` returned them.
+        """
+
+    @abstractmethod
+    def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
+        """V only, (B,), without gradient."""
+
+    @abstractmethod
+    def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
+        """A few decisions as `evaluate` takes them."""
+
+    @abstractmethod
+    def trainable(self) -> dict[str, nn.Parameter]:
+        """Parameters that the trainer updates and publishes, by name; the critic's begin with
+        ``value_head.``"""
+
+    @abstractmethod
+    def copy_weights(self) -> Any:
+        """A copy of what `save` writes, unaffected by further training."""
+
+    @abstractmethod
+    def save(self, directory: Path, config: PolicyConfig, weights: Any) -> None:
+        """Writes `weights`, from `copy_weights`, as ``pretrained_model`` into `directory`."""
+
+    def load_trainable(self, tensors: dict[str, np.ndarray]) -> None:
+        """Copies published weights in place: all of them, or none when they do not fit.
+
+        Raises:
+            ValueError: names or shapes differ from `trainable`.
+        """
+        parameters = self.trainable()
+        if parameters.keys() != tensors.keys():
+            names = sorted(parameters.keys() ^ tensors.keys())[:4]
+            raise ValueError(f"published weights differ by name: {names}")
+        for name, parameter in parameters.items():
+            if (shape := tensors[name].shape) != tuple(parameter.shape):
+                raise ValueError(f"published {name} has shape {shape}, not {tuple(parameter.shape)}")
+        with torch.no_grad():
+            for name, parameter in parameters.items():
+                _copy(parameter, tensors[name])
+
+    def view_trainable(self) -> dict[str, np.ndarray]:
+        """`trainable` as NumPy arrays, to be copied before the next update.
+
+        On a CPU they are the parameters' own memory, else copies of them.
+        """
+        named = {name: whole(parameter.detach()) for name, parameter in self.trainable().items()}
+        return {name: tensor.to("cpu", torch.float32).numpy() for name, tensor in named.items()}
+
+    def export_trainable(self) -> dict[str, np.ndarray]:
+        """A copy of `trainable` as NumPy arrays, safe to hand to another thread."""
+        return {name: view.copy() for name, view in self.view_trainable().items()}
+
+
+def _copy(parameter: nn.Parameter, tensor: np.ndarray) -> None:
+    """Arrays that were received are read-only, which torch cannot express: NumPy copies where it can."""
+    if parameter.device.type == "cpu" and parameter.dtype == torch.float32 and not in_parts(parameter):
+        np.copyto(parameter.detach().numpy(), tensor)
+    else:
+        parameter.copy_(part_of(torch.tensor(tensor), parameter))
+
+
+def stack_observations(requests: Sequence[Request]) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Batches raw observations: each array (B, ...), and the B task texts."""
+    keys = [k for k in requests[0].observation if k != TASK]
+    arrays = {k: np.stack([r.observation[k] for r in requests]) for k in keys}
+    return arrays, [str(r.observation[TASK]) for r in requests]
+
+
+class Processing:
+    """LeRobot's pre- and post-processor, which tokenise and normalise, fed with raw observations.
+
+    Only observations and tasks pass through: a LeRobot preprocessor silently drops keys it does not know, so
+    log-probs, rewards and versions travel beside it.
+    """
+
+    def __init__(
+        self,
+        preprocessor: Any,
+        postprocessor: Any,
+        device: torch.device,
+        rename_map: dict[str, str] | None = None,
+    ) -> None:
+        self.preprocessor, self.postprocessor = preprocessor, postprocessor
+        self.device = device
+        self.rename_map = rename_map or {}
+
+    def prepare(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> dict[str, Tensor]:
+        """Normalises and tokenises. Images go from uint8 (..., H, W, 3) to float (..., 3, H, W) in [0, 1]."""
+        batch: dict[str, Any] = {"task": list(tasks)}
+        for key, array in observations.items():
+            tensor = torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
+            if key.startswith(IMAGES):
+                tensor = tensor.movedim(-1, -3).contiguous().float() / 255.0
+            batch[self.rename_map.get(key, key)] = tensor
+        return self.preprocessor(batch)
+
+    def unnormalise(self, chunk: Tensor) -> Tensor:
+        """(B, K, A) from normalised to environment units."""
+        return self.postprocessor(chunk)
+
+    def normalise(self, chunk: Tensor) -> Tensor:
+        """(B, K, A) from environment to normalised units; every normalisation that LeRobot has is affine."""
+        ends = torch.stack([torch.zeros_like(chunk[0]), torch.ones_like(chunk[0])])
+        zero, one = self.unnormalise(ends.to(self.device)).to(chunk)
+        return (chunk - zero) / (one - zero)
+
+
+def example_requests(policy_config: Any, rename_map: dict[str, str]) -> list[Request]:
+    """Two requests with random observations for this policy, and instructions of unequal length.
+
+    `rename_map`: environment feature name → policy feature name.
+    """
+    rng = np.random.default_rng(0)
+    env_name = {policy: env for env, policy in rename_map.items()}
+    observations: dict[str, np.ndarray] = {}
+    for key, feature in policy_config.input_features.items():
+        shape = tuple(feature.shape)
+        batch = (2,) if policy_config.n_obs_steps == 1 else (2, policy_config.n_obs_steps)
+        if key.startswith(IMAGES) and ".empty_camera_" not in key:
+            size = (*batch, *shape[1:], shape[0])
+            observations[env_name.get(key, key)] = rng.integers(0, 256, size, dtype=np.uint8)
+        elif key == OBS_STATE:
+            observations[env_name.get(key, key)] = rng.standard_normal((*batch, *shape), dtype=np.float32)
+    return [
+        Request(observation={k: v[i] for k, v in observations.items()} | {TASK: task}, noise_seed=i)
+        for i, task in enumerate(("Go", "Put the red cube on the plate"))
+    ]
+
+
+class LeRobotAdapter(PolicyAdapter):
+    """A LeRobot policy with its processors, a model that runs it, a likelihood and a critic.
+
+    With `precision` bf16 the network runs under autocast; densities are computed in fp32 either way.
     """
 
     def __init__(
@@ -67,21 +243,19 @@ class LeRobotAdapter(PolicyAdapter):
 
     @property
     def actions(self) -> int | None:
-        """See the base class."""
         return self.family.actions
 
     def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
-        """See the base class."""
         return self.family.factors(latent)
 
     @torch.no_grad()
     def decide(self, requests: Sequence[Request], version: int) -> list[Decision]:
-        """See the base class; each decision's noise is its own request's, whatever batch it lands in."""
+        """Acts; each decision's noise comes from its own request's seed, whatever its batch."""
         arrays, tasks = stack_observations(requests)
         with self.autocast():
             encoded = self.encode(arrays, tasks)
             action = self.family.act(encoded, requests)
-        value = self._value(encoded).mean.cpu().numpy()
+        value = self._value(encoded).cpu().numpy()
         executed = action.chunk.float()
         if self.teacher is not None:
             executed = self.teacher.replace(executed, requests)
@@ -102,25 +276,18 @@ class LeRobotAdapter(PolicyAdapter):
     def evaluate(
         self, observations: dict[str, np.ndarray], tasks: Sequence[str], latent: dict[str, Tensor]
     ) -> Evaluation:
-        """See the base class."""
         with self.autocast():
             encoded = self.encode(observations, tasks)
             score = self.family.score(encoded, {k: v.to(self.device) for k, v in latent.items()})
-        return Evaluation(
-            log_prob=score.log_prob,
-            entropy=score.entropy,
-            value=self._value(encoded),
-        )
+        return Evaluation(log_prob=score.log_prob, entropy=score.entropy, value=self._value(encoded))
 
     @torch.no_grad()
     def values(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Tensor:
-        """See the base class."""
         with self.autocast():
             encoded = self.encode(observations, tasks)
-        return self._value(encoded).mean
+        return self._value(encoded)
 
     def trainable(self) -> dict[str, nn.Parameter]:
-        """See the base class; `tuning` has decided what of the policy that is."""
         parts = {"policy": self.policy, "family": self.family, "value_head": self.value_head}
         named = {
             f"{part}.{name}": parameter
@@ -132,24 +299,16 @@ class LeRobotAdapter(PolicyAdapter):
         return named | {PREFIX + name: parameter for name, parameter in teacher.items()}
 
     def example(self) -> tuple[dict[str, np.ndarray], Sequence[str], dict[str, Tensor]]:
-        """See the base class."""
-        observations, tasks = example_observations(self.policy.config, self.processing.rename_map)
         requests = example_requests(self.policy.config, self.processing.rename_map)
         latents = [decision.latent for decision in self.decide(requests, 0)]
         stacked = {k: torch.from_numpy(np.stack([latent[k] for latent in latents])) for k in latents[0]}
-        return observations, tasks, stacked
+        return *stack_observations(requests), stacked
 
-    def copy_weights(self) -> Any:
-        """See the base class."""
-        from accerl_lerobot.policies.loading import copy_weights
-
-        return copy_weights(self)
+    def copy_weights(self) -> saving.Weights:
+        return saving.copy_weights(self)
 
     def save(self, directory: Path, config: PolicyConfig, weights: Any) -> None:
-        """See the base class; stock LeRobot loads it."""
-        from accerl_lerobot.policies.loading import save_pretrained
-
-        save_pretrained(self, directory, config, weights)
+        saving.save_pretrained(self, directory, config, weights)
 
     @torch.no_grad()
     def self_check(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> float:
@@ -168,15 +327,15 @@ class LeRobotAdapter(PolicyAdapter):
             raise self._incompatible(f"differs from its sampler by {difference:.2e}")
         return difference
 
-    def _value(self, encoded: Encoded) -> Value:
-        value: Value = self.value_head(encoded.features, encoded.mask)
+    def _value(self, encoded: Encoded) -> Tensor:
+        value: Tensor = self.value_head(encoded.features, encoded.mask)
         return value
 
-    def _incompatible(self, what: str) -> InputError:
+    def _incompatible(self, reason: str) -> InputError:
         import lerobot
 
         remedy = (
-            f"our adapter of {self.policy.name} does not fit LeRobot {lerobot.__version__}: it {what}, so "
+            f"our adapter of {self.policy.name} does not fit LeRobot {lerobot.__version__}: it {reason}, so "
             "log-probs would be those of another policy; install the LeRobot version that this package pins"
         )
         return InputError("lerobot", lerobot.__version__, remedy)

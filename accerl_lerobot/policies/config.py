@@ -1,46 +1,165 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which policy is improved, how it explores, what of it is trained; free of torch."""
+"""The policy section of a recipe: the checkpoint, how it explores, what is trained. Free of torch."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import draccus
 
 from accerl_lerobot.checkpoint.safety import check_remote_code
-from accerl_lerobot.config.ranges import Device, Range, Section
+from accerl_lerobot.config.imports import imported
+from accerl_lerobot.config.ranges import Device, Positive, Range, Section
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.samplers import SamplerConfig
 
 if TYPE_CHECKING:
-    from accerl_lerobot.policies.base import PolicyAdapter
+    from accerl_lerobot.policies.adapter import PolicyAdapter
+
+
+@dataclass(frozen=True, kw_only=True)
+class SamplerConfig(Section, draccus.ChoiceRegistry, section="policy.sampler"):
+    """Base of every sampler config."""
+
+    @property
+    def type(self) -> str:
+        """The registered name, that of the family."""
+        return str(self.get_choice_name(self.__class__))
+
+    def override(self, policy_config: Any) -> None:
+        """Puts what it asks of the policy itself into LeRobot's config, which is saved with the policy."""
+
+
+def _check_order(config: SamplerConfig, low: str, middle: str, high: str) -> None:
+    value = getattr(config, middle)
+    for name, right in ((low, getattr(config, low) < value), (high, value < getattr(config, high))):
+        if not right:
+            side = "below" if name == low else "above"
+            remedy = f"use a value {side} policy.sampler.{middle}, {value:g}"
+            raise InputError(f"policy.sampler.{name}", getattr(config, name), remedy)
+
+
+@SamplerConfig.register_subclass("flow")
+@dataclass(frozen=True, kw_only=True)
+class FlowSamplerConfig(SamplerConfig):
+    """Flow policies: which denoising steps are Gaussian, and how wide. `flow.py` explains the choices."""
+
+    stochastic: Literal["last", "all", "one"] = "last"
+    """Which denoising steps are Gaussian: last, all or one."""
+    noise: Literal["euler", "flow_sde", "learned"] = "euler"
+    """euler (stock mean, constant std), flow_sde (marginal-preserving, std grows with t) or learned (stock
+    mean, a std that is learned per observation, step and action dim, as in ReinFlow)."""
+    noise_level: Annotated[float, Range("(0, 2]")] = 0.2
+    """euler: total injected std in normalised action units. flow_sde: the factor a of
+    σ_t = a·√(t/(1−t)). learned: the std of each step at the start."""
+    noise_min: Annotated[float, Range("(0, 2]")] = 0.08
+    """learned: lower bound of the std, > 0 and below `noise_level`."""
+    noise_max: Annotated[float, Range("(0, 2]")] = 0.4
+    """learned: upper bound of the std, above `noise_level`."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.noise == "learned":
+            _check_order(self, "noise_min", "noise_level", "noise_max")
+
+
+@SamplerConfig.register_subclass("noise_space")
+@dataclass(frozen=True, kw_only=True)
+class NoiseSpaceSamplerConfig(SamplerConfig):
+    """A frozen flow policy, steered by the initial noise it is given (DSRL); see `flow.py`."""
+
+    std: Annotated[float, Range("(0, 2]")] = 1.0
+    """Std of the noise at the start; 1 is what the policy was trained with."""
+    std_min: Positive = 0.1
+    """Lower bound of the learned std, > 0 and below `std`."""
+    std_max: Positive = 2.0
+    """Upper bound of the learned std, above `std`."""
+    bound: Positive = 2.0
+    """Largest absolute mean: from noise it never saw in training the policy makes arbitrary actions."""
+    hidden: Annotated[int, Range("[1, 65536]")] = 128
+    """Width of the head's hidden layer."""
+    per_row: bool = False
+    """True: every row of a chunk gets a noise of its own. False: one row's noise for all, which is a far
+    smaller space to search, and not how the policy was trained."""
+    deterministic_eval: bool = True
+    """Start from the mean when not exploring. False: sample, which with `per_row` and `std` 1 is the frozen
+    policy itself as long as nothing has been learned."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_order(self, "std_min", "std", "std_max")
+
+
+@SamplerConfig.register_subclass("tokens")
+@dataclass(frozen=True, kw_only=True)
+class TokenSamplerConfig(SamplerConfig):
+    """Token policies: every token is drawn from the softmax of its logits; see `tokens.py`."""
+
+    temperature: Annotated[float, Range("(0, 10]")] = 1.0
+    """Logits are divided by it, when acting and when re-scoring: below 1 the most likely tokens are
+    drawn more often, above 1 less often."""
+
+
+@SamplerConfig.register_subclass("gaussian")
+@dataclass(frozen=True, kw_only=True)
+class GaussianSamplerConfig(SamplerConfig):
+    """Policies that predict one chunk, with a Gaussian around it; see `gaussian.py`.
+
+    A policy with a std of its own, gaussian_actor, reads only `deterministic_eval`.
+    """
+
+    std: Annotated[float, Range("(0, 2]")] = 0.2
+    """Std of every action at the start, in normalised units."""
+    std_min: Positive = 0.05
+    """With `learn_std`: lower bound of the std, > 0 and below `std`."""
+    std_max: Positive = 0.5
+    """With `learn_std`: upper bound of the std, above `std`."""
+    learn_std: bool = True
+    """True: the std is learned, per observation, row and action dim. False: it stays `std`."""
+    deterministic_eval: bool = False
+    """gaussian_actor: execute the mean when not exploring. False: sample, as LeRobot's policy does."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.learn_std:
+            _check_order(self, "std_min", "std", "std_max")
+
+
+@SamplerConfig.register_subclass("diffusion")
+@dataclass(frozen=True, kw_only=True)
+class DiffusionSamplerConfig(SamplerConfig):
+    """Diffusion policies, each denoising step a Gaussian (DPPO); see `diffusion.py`.
+
+    How many steps there are is ``policy.num_steps``.
+    """
+
+    std_min: Annotated[float, Range("(0, 1]")] = 0.1
+    """Lower bound of a step's std while exploring, in normalised units. The last step has no noise
+    of its own, so this is the executed action's std around what the chain arrives at."""
+    last_steps: Annotated[int, Range("[1, 10000]")] | None = None
+    """Explore in, and learn from, this many steps at the end of the chain; those before act as LeRobot's and
+    are left out of the ratio, which then is an approximation off-policy. None: all steps, which is exact."""
+    scheduler: Literal["DDPM", "DDIM"] | None = None
+    """DDPM or DDIM, whatever the policy was trained with: both reverse the same noising. None keeps the
+    checkpoint's. Written into what is saved."""
+
+    def override(self, policy_config: Any) -> None:
+        if self.scheduler is not None:
+            policy_config.noise_scheduler_type = self.scheduler
 
 
 @dataclass(frozen=True, kw_only=True)
 class ValueHeadConfig(Section, section="policy.value_head"):
     """The critic that sits on the policy's own features."""
 
-    pooling: Literal["attention", "mean"] = "attention"
-    """attention (a learned query over the tokens, as in AcceRL) or mean."""
     hidden: Annotated[int, Range("[1, 65536]")] = 128
     """Width of the hidden layer."""
     detach: bool = True
     """True: the critic reads the backbone without shaping it (AcceRL). False lets its gradient in; measured
     on a policy of 0.4 M parameters (MetaWorld door-open, 200 updates) that took success from 0.65 to 0.00,
     against 0.98 when detached."""
-    bins: Annotated[int, Range("[0, 100000]")] = 0
-    """0: V is one number, regressed with squared error. From 2 up: a distribution over so many returns evenly
-    spaced in `value_range`, learnt by cross-entropy with two-hot targets."""
-    value_range: tuple[float, float] = (-1.0, 1.0)
-    """With `bins`: smallest and largest return; what lies outside is taken as the nearest of them."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.bins == 1:
-            raise InputError("policy.value_head.bins", self.bins, "use 0 for a scalar, or at least 2")
-        if not self.value_range[0] < self.value_range[1]:
-            raise InputError("policy.value_head.value_range", self.value_range, "use [smallest, largest]")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,9 +227,5 @@ Load = Callable[[PolicyConfig], "PolicyAdapter"]
 
 
 def loader(load: Load | None) -> Load:
-    """Function that makes a worker's adapter: `load`, or the one that loads LeRobot's checkpoints."""
-    if load is not None:
-        return load
-    from accerl_lerobot.policies.loading import load_adapter
-
-    return load_adapter
+    """Function that makes a worker's adapter; None: the one that loads LeRobot checkpoints."""
+    return load or imported("accerl_lerobot.policies.loading:load_adapter")

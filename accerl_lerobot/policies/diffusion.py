@@ -6,7 +6,7 @@ network decides (Ren et al., arXiv 2409.00588):
 
     x̂ = clip((x − √(1−ᾱ)·ε(x)) / √ᾱ)
     DDPM   m = (√ᾱ′·β/(1−ᾱ))·x̂ + (√(1−β)·(1−ᾱ′)/(1−ᾱ))·x      s² = β·(1−ᾱ′)/(1−ᾱ),   β = 1 − ᾱ/ᾱ′
-    DDIM   m = √ᾱ′·x̂ + √(1−ᾱ′−s²)·ε(x)                          s² = η²·(the same)
+    DDIM   m = √ᾱ′·x̂ + √(1−ᾱ′−s²)·ε(x)                          s² = the same
 
 with ᾱ at the step and ᾱ′ at the one after it (arXiv 2006.11239, eq. 7; arXiv 2010.02502, eq. 12). These are
 the operations of LeRobot's scheduler, in its order. While exploring, a step's std is max(s, std_min) and its
@@ -25,19 +25,27 @@ Shapes: B batch, H horizon, A action dims, N steps, C counted steps, L factors: 
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
-from accerl_lerobot.policies.density import normal_entropy
-from accerl_lerobot.policies.family import Action, Encoded, Family, Model, Score, exploring, normal
+from accerl_lerobot.policies.config import DiffusionSamplerConfig
+from accerl_lerobot.policies.family import (
+    Action,
+    Encoded,
+    Family,
+    Model,
+    Score,
+    exploring,
+    normal_entropy,
+    standard_normal,
+)
 from accerl_lerobot.policies.flow import gaussian_log_prob
-from accerl_lerobot.policies.samplers import DiffusionSamplerConfig
 
 Network = Callable[[Tensor, int], Tensor]
 """(x (B, H, A), timestep) → what the network predicts, (B, H, A)."""
@@ -50,7 +58,7 @@ class DiffusionShape:
     horizon: int
     """H rows that are denoised."""
     executed: int
-    """Rows that are sent to the world (LeRobot's n_action_steps)."""
+    """Rows that are executed in the environment (LeRobot's n_action_steps)."""
     first: int = 0
     """The first of them; those before it stand for the past (LeRobot's n_obs_steps − 1)."""
     action_dim: int
@@ -89,7 +97,7 @@ class Schedule:
             k: counted from the noise, 0 to N − 1.
             x: (B, H, A) before the step.
             output: (B, H, A), the network's at x.
-            eta: of DDIM; DDPM has none.
+            eta: of DDIM: 0 is LeRobot's own, 1 adds as much noise as DDPM.
         """
         alpha, following = self.alphas[k], self.following[k]
         noise_share = 1 - alpha
@@ -114,7 +122,7 @@ class Schedule:
         self, k: int, x: Tensor, output: Tensor, config: DiffusionSamplerConfig
     ) -> tuple[Tensor, Tensor]:
         """Mean (B, H, A) and std (1, 1, 1) of step k while exploring; see `step`."""
-        mean, std = self.step(k, x, output, config.eta)
+        mean, std = self.step(k, x, output, eta=1.0)
         return mean, std.clamp(min=config.std_min).to(x).view(1, 1, 1)
 
 
@@ -210,26 +218,101 @@ class DiffusionContext:
     """Conditioned on the observations; output in fp32."""
 
 
-class DiffusionModel(Model):
-    """A LeRobot policy that denoises a chunk step by step; `Encoded.context` is a `DiffusionContext`."""
+class Diffusion(Model):
+    """LeRobot's `DiffusionPolicy`: reads the observations once, then runs its U-Net once per denoising step.
 
-    shape: DiffusionShape
-    schedule: Schedule
+    Never in training mode: batch norms keep their statistics, and the crop is the centre one. LeRobot's
+    `predict_action_chunk` wants a time dimension that its preprocessor does not add; `stock` adds it.
+    """
 
-    @abstractmethod
+    def __init__(self, policy: Any) -> None:
+        config = policy.config
+        if config.compile_model:
+            remedy = "a compiled sampler rounds unlike the re-scoring pass; set it to false in config.json"
+            raise InputError("policy.compile_model", True, remedy)
+        steps, most = policy.diffusion.num_inference_steps, config.num_train_timesteps
+        if steps > most:
+            raise InputError("policy.num_steps", steps, f"use at most {most}, as many as it was trained with")
+        self.policy = policy
+        self.shape = DiffusionShape(
+            horizon=config.horizon,
+            executed=min(config.n_action_steps, config.horizon - config.n_obs_steps + 1),
+            first=config.n_obs_steps - 1,
+            action_dim=config.action_feature.shape[0],
+        )
+        self.schedule = _schedule(policy.diffusion.noise_scheduler, steps, config)
+        of_images = 2 * config.spatial_softmax_num_keypoints * len(config.image_features)
+        self.width = config.n_obs_steps * (config.robot_state_feature.shape[0] + of_images)
+
+    def encode(self, batch: dict[str, Tensor]) -> Encoded:
+        """The features, one token, are the U-Net's condition: state, image keypoints."""
+        diffusion = self.policy.diffusion
+        condition = diffusion._prepare_global_conditioning(self._with_time(batch))
+
+        def network(x: Tensor, timestep: int) -> Tensor:
+            t = torch.full(x.shape[:1], timestep, dtype=torch.long, device=x.device)
+            output: Tensor = diffusion.unet(x, t, global_cond=condition)
+            return output.float()
+
+        return Encoded(
+            features=condition[:, None],
+            mask=condition.new_ones(len(condition), 1).bool(),
+            context=DiffusionContext(network=network),
+        )
+
     def stock(self, batch: dict[str, Tensor], noise: Tensor) -> tuple[Tensor, Tensor]:
-        """LeRobot's own chunk from noise (B, H, A), and the step noise (B, N, H, A) that it drew."""
+        """LeRobot's own chunk from noise (B, H, A), and the step noise (B, N, H, A) that it drew.
+
+        It draws from the global generator, which is put back.
+        """
+        eps = torch.zeros(len(self.schedule), *noise.shape, device=noise.device)
+        self.policy.reset()
+        with torch.random.fork_rng([noise.device] if noise.device.type == "cuda" else []):
+            torch.manual_seed(0)
+            chunk = self.policy.predict_action_chunk(self._with_time(batch), noise=noise)
+            torch.manual_seed(0)
+            for k, timestep in enumerate(self.schedule.timesteps):
+                if self.schedule.scheduler == "DDPM" and timestep > 0:
+                    eps[k] = torch.randn(noise.shape, device=noise.device)
+        return chunk, eps.transpose(0, 1)
+
+    def _with_time(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """As LeRobot's sampler wants it: state (B, O, S), images stacked (B, O, cameras, 3, H, W)."""
+        from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
+
+        config = self.policy.config
+        inputs = {key: batch[key] for key in (OBS_STATE, *config.image_features)}
+        if config.n_obs_steps == 1:
+            inputs = {key: value[:, None] for key, value in inputs.items()}
+        elif inputs[OBS_STATE].shape[1:-1] != (config.n_obs_steps,):
+            shape = tuple(inputs[OBS_STATE].shape)
+            raise ValueError(
+                f"observation.state is {shape}, but the policy reads {config.n_obs_steps} env steps at a "
+                "time: make worlds with history=n_obs_steps"
+            )
+        images = [inputs[key] for key in config.image_features]
+        return inputs | {OBS_IMAGES: torch.stack(images, dim=-4)}
+
+
+def _schedule(scheduler: Any, steps: int, config: Any) -> Schedule:
+    """The schedule that LeRobot's sampler goes through in so many steps."""
+    scheduler.set_timesteps(steps)
+    timesteps = tuple(int(t) for t in scheduler.timesteps)
+    alphas = scheduler.alphas_cumprod.float().cpu()[list(timesteps)]
+    return Schedule(
+        timesteps=timesteps,
+        alphas=alphas,
+        following=torch.cat([alphas[1:], torch.ones(1)]),
+        scheduler=config.noise_scheduler_type,
+        prediction=config.prediction_type,
+        clip=config.clip_sample_range if config.clip_sample else None,
+    )
 
 
 class DiffusionFamily(Family):
-    """Diffusion policies explored by the noise of their denoising steps; the functions above do the work.
+    """Diffusion policies explored by the noise of their denoising steps; the functions above do the work."""
 
-    Args:
-        model: the policy.
-        sampler: how it explores.
-    """
-
-    def __init__(self, model: DiffusionModel, sampler: DiffusionSamplerConfig) -> None:
+    def __init__(self, model: Diffusion, sampler: DiffusionSamplerConfig) -> None:
         super().__init__()
         self.model, self.sampler = model, sampler
         self.shape, self.schedule = model.shape, model.schedule
@@ -238,10 +321,10 @@ class DiffusionFamily(Family):
             raise InputError("policy.sampler.last_steps", sampler.last_steps, remedy)
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
-        """See the base class; at rest a DDPM policy still samples, as LeRobot's does."""
+        """Samples; without exploration a DDPM policy still draws step noise, as LeRobot's does."""
         size = (self.shape.horizon, self.shape.action_dim)
         device = encoded.features.device
-        x, eps = normal(requests, size, (len(self.schedule), *size), device=device)
+        x, eps = standard_normal(requests, size, (len(self.schedule), *size), device=device)
         explore = exploring(requests, device)
         x, path, logp = sample(
             encoded.context.network, x, eps, explore, self.shape, self.schedule, self.sampler
@@ -249,20 +332,18 @@ class DiffusionFamily(Family):
         return Action(chunk=x[:, self.shape.rows], latent={"path": path}, log_prob=logp)
 
     def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
-        """See the base class."""
         logp = log_prob(encoded.context.network, latent["path"], self.shape, self.schedule, self.sampler)
         constant = entropy(self.shape, self.schedule, self.sampler)
         return Score(log_prob=logp, entropy=logp.new_full((len(logp),), constant))
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
-        """See the base class."""
         size = (len(encoded.features), self.shape.horizon, self.shape.action_dim)
         device = encoded.features.device
         noise = torch.randn(size, generator=torch.Generator().manual_seed(0)).to(device)
         stock, eps = self.model.stock(batch, noise)
-        at_rest = torch.zeros(len(noise), dtype=torch.bool, device=device)
+        not_exploring = torch.zeros(len(noise), dtype=torch.bool, device=device)
         x, _, _ = sample(
-            encoded.context.network, noise, eps, at_rest, self.shape, self.schedule, self.sampler
+            encoded.context.network, noise, eps, not_exploring, self.shape, self.schedule, self.sampler
         )
         return float((x[:, self.shape.rows] - stock).abs().max())
 

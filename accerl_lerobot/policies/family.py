@@ -5,11 +5,12 @@
                                                             └──────Family.score(latent) ──► log-prob
 
 A model knows LeRobot's internals and nothing of densities; a family knows densities and asks the model for
-what its `Encoded.context` offers, a velocity field for instance. `loading.POLICIES` says which go together.
+what its `Encoded.context` offers, a velocity field for instance. `registry.POLICIES` says which go together.
 """
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -68,8 +69,6 @@ class Model(ABC):
     """Prefix of the parameters that ``policy.tuning.mode=expert`` freezes; None: it has no expert."""
     unread: ClassVar[tuple[str, ...]] = ()
     """Names of tensors that nothing is computed with; savers drop them where they are tied."""
-    processor_overrides: ClassVar[dict[str, dict[str, Any]]] = {}
-    """LeRobot processor step → options that its inference needs and its training does not."""
 
     policy: Any
     idle: tuple[str, ...] = ()
@@ -105,7 +104,7 @@ class Family(nn.Module, ABC):
 
     @abstractmethod
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
-        """Largest difference, in normalised units, between our sampler at rest and LeRobot's own."""
+        """Largest difference, normalised units, between our sampler without exploration and LeRobot's."""
 
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
         """LeRobot's training loss (B,) on chunks (B, K, A) of as many actions as are executed, normalised.
@@ -118,14 +117,52 @@ class Family(nn.Module, ABC):
     @property
     @abstractmethod
     def actions(self) -> int | None:
-        """See `base.PolicyAdapter.actions`."""
+        """See `adapter.PolicyAdapter.actions`."""
 
     def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
-        """See `base.PolicyAdapter.factors`."""
         return None
 
 
-def normal(requests: Sequence[Request], *sizes: tuple[int, ...], device: torch.device) -> list[Tensor]:
+LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+
+
+def normal_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """log N(x; mean, std²) of each entry; shapes as they broadcast."""
+    z = (x - mean) / std
+    return -0.5 * z * z - torch.log(std) - LOG_SQRT_2PI
+
+
+def normal_entropy(std: Tensor) -> Tensor:
+    """Differential entropy of N(·, std²) in nats, of each entry."""
+    return torch.log(std) + LOG_SQRT_2PI + 0.5
+
+
+class BoundedStd:
+    """A std between two bounds above 0 from a layer's output, by a sigmoid between their logarithms."""
+
+    def __init__(self, low: float, high: float) -> None:
+        self.low, self.high = math.log(low), math.log(high)
+
+    def __call__(self, raw: Tensor) -> Tensor:
+        """The std, of the shape of `raw`, in fp32."""
+        return torch.exp(self.low + (self.high - self.low) * torch.sigmoid(raw.float()))
+
+    def start(self, layer: nn.Linear, std: float) -> None:
+        """Makes the layer's std equal to `std`, between the bounds, whatever its input."""
+        share = (math.log(std) - self.low) / (self.high - self.low)
+        nn.init.zeros_(layer.weight)
+        nn.init.constant_(layer.bias, math.log(share / (1 - share)))
+
+
+def pooled(features: Tensor, weights: Tensor) -> Tensor:
+    """Weighted mean, fp32 (B, width), of features (B, P, width); weights (B, P) of any sum above 0."""
+    weights = weights / weights.sum(-1, keepdim=True)
+    return (weights[..., None] * features.float()).sum(1)
+
+
+def standard_normal(
+    requests: Sequence[Request], *sizes: tuple[int, ...], device: torch.device
+) -> list[Tensor]:
     """Standard normal tensors, each (B, *size), row i from request i's own seed, whatever its batch."""
     columns: list[list[np.ndarray]] = [[] for _ in sizes]
     for request in requests:

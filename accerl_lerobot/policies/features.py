@@ -80,8 +80,7 @@ def check_features(
         needed: by a policy, or by the policy that a dataset makes.
         offered: by an environment, or by the dataset that a policy is trained on.
         rename_map: offered name → needed name.
-        field: blamed in the error, with its `value`.
-        offerer: ``environment`` or ``dataset``.
+        field: named in the error, with its `value`.
 
     Raises:
         InputError: a feature is missing or of another shape, the rates differ, none of the environment's
@@ -125,10 +124,10 @@ def _check_tasks(recorded: tuple[str, ...], wanted: tuple[str, ...], field: str,
     if not known or not missing:
         return
     has = ", ".join(map(repr, recorded[:4])) + (" …" if len(recorded) > 4 else "")
-    said = f"no episode of {', '.join(map(repr, missing[:4]))}, the environment's task: it has {has}"
+    message = f"no episode of {', '.join(map(repr, missing[:4]))}, the environment's task: it has {has}"
     if len(missing) == len(wanted):
-        raise InputError(field, value, f"{said}; choose env.task accordingly")
-    logger.warning("%s=%r: %s", field, value, said)
+        raise InputError(field, value, f"{message}; choose env.task accordingly")
+    logger.warning("%s=%r: %s", field, value, message)
 
 
 def _plain(text: str) -> str:

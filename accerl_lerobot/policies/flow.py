@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The flow family's likelihood: a denoising path whose density is known, from a velocity without one.
+"""Likelihoods of flow policies: noise in the denoising steps, or over the initial noise (DSRL, at the end).
 
 A flow policy integrates x from t = 1 (noise) to t = 0 (action) in N Euler steps of δ = 1/N:
 x ← x − δ·v(x, t). That map has no usable density, so exploration makes some steps Gaussian and the log-prob
@@ -11,7 +11,7 @@ is that of the path. Which steps:
           out marginalises them exactly. Re-scoring replays the ODE from x₀: N velocity passes.
 ``all``   Every step is Gaussian; the path density is the sum over steps (Flow-GRPO, arXiv 2505.05470; πRL,
           arXiv 2510.25889). Exact as well; N velocity passes. Padded dims feed back into real ones, so they
-          belong to the density: see `FlowSamplerConfig.padded`.
+          get noise and belong to the density.
 ``one``   One randomly drawn step is Gaussian, the rest ODE, and re-scoring takes its start point as given:
           one velocity pass (the "mixed ODE-SDE" of MixGRPO, arXiv 2507.21802, and of πRL). The steps around
           the drawn one move with the weights too but are left out of the ratio, so weighting with it gives
@@ -22,8 +22,7 @@ Three noise laws, `FlowSamplerConfig.noise`: ``euler`` keeps the ODE's mean and 
 under ``last`` the executed mean is the stock action; it does not preserve the ODE's marginals. ``flow_sde``
 scales the noise with t and corrects the drift, so that under ``all`` it does preserve them, up to the step
 size. ``learned`` keeps the ODE's mean and learns the std within bounds (ReinFlow, arXiv 2505.22094); the
-density of x₀, which the weights do not change, is left out. Everything but `FlowFamily` is a pure function of
-tensors; the velocity is a callable.
+density of x₀, which the weights do not change, is left out.
 
 Shapes: B batch, K actions per chunk, D = max_action_dim (real dims first, then padding), A real dims,
 N steps, L log-prob factors: one per executed row under ``last``; one per row otherwise, since all rows feed
@@ -36,15 +35,28 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
-from accerl_lerobot.policies.density import BoundedStd, normal_entropy, normal_log_prob, pooled
-from accerl_lerobot.policies.family import Action, Encoded, Family, Model, Score, exploring, normal
-from accerl_lerobot.policies.samplers import FlowSamplerConfig
+from accerl_lerobot.policies.config import FlowSamplerConfig, NoiseSpaceSamplerConfig
+from accerl_lerobot.policies.family import (
+    Action,
+    BoundedStd,
+    Encoded,
+    Family,
+    Model,
+    Score,
+    exploring,
+    normal_entropy,
+    normal_log_prob,
+    pooled,
+    standard_normal,
+)
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 """(x (B, K, D), t (B,)) → v (B, K, D)."""
@@ -61,14 +73,14 @@ class FlowShape:
     chunk_size: int
     """K rows the network denoises."""
     executed: int
-    """Rows that are sent to the world, ≤ K (LeRobot's n_action_steps)."""
+    """Rows that are executed in the environment, ≤ K (LeRobot's n_action_steps)."""
     padded_dim: int
     """D, LeRobot's max_action_dim."""
     action_dim: int
     """A real dims."""
 
     def action_mask(self) -> Tensor:
-        """(K, D) bool: the entries that reach the world."""
+        """(K, D) bool: the entries that are executed."""
         mask = torch.zeros(self.chunk_size, self.padded_dim, dtype=torch.bool)
         mask[: self.executed, : self.action_dim] = True
         return mask
@@ -103,7 +115,7 @@ def transition(
         t: (B,) in (0, 1].
         shape: the sizes.
         config: the noise law.
-        std: the learnt one, needed under ``learned``.
+        std: the learned one, needed under ``learned``.
 
     Returns:
         mean (B, K, D) and std (B, 1, 1) or (B, 1, D).
@@ -159,11 +171,7 @@ def sample(
         noisy = explore & _is_stochastic(k, index, n, config)
         mean, width = transition(x, v, t, shape, config, std)
         step = torch.where(noisy[:, None, None], mean + width * eps[:, k], x + (-1.0 / n) * v)
-        if config.padded == "analytic" and config.stochastic != "last":
-            pad = step_time(k + 1, n) * x0[..., shape.action_dim :]
-            overwritten = torch.cat([step[..., : shape.action_dim], pad], -1)
-            step = torch.where(explore[:, None, None], overwritten, step)
-        counted = gaussian_log_prob(step, mean, width, _counted(k, mask, shape, config))
+        counted = gaussian_log_prob(step, mean, width, _counted(k, mask, shape))
         logp = logp + torch.where(noisy[:, None], counted, 0.0)
         x = step
         path.append(x)
@@ -187,8 +195,7 @@ def log_prob(
         # the last bit, which a sinusoidal time embedding of period 4e-3 turns into a log-prob error of 1e-4.
         t = path.new_tensor([step_time(k, n) for k in range(n)])[index]
         mean, width = transition(path[:, 0], velocity(path[:, 0], t), t, shape, config, std)
-        # The last step's density covers executed entries only; earlier ones feed back, so all of them count.
-        rows = torch.stack([_counted(k, mask, shape, config) for k in range(n)])[index]
+        rows = torch.stack([_counted(k, mask, shape) for k in range(n)])[index]
         return gaussian_log_prob(path[:, 1], mean, width, rows)
     if config.stochastic == "last":
         x = path[:, 0]
@@ -201,7 +208,7 @@ def log_prob(
     for k in range(n):
         t = path.new_full((b,), step_time(k, n))
         mean, width = transition(path[:, k], velocity(path[:, k], t), t, shape, config, std)
-        total = total + gaussian_log_prob(path[:, k + 1], mean, width, _counted(k, mask, shape, config))
+        total = total + gaussian_log_prob(path[:, k + 1], mean, width, _counted(k, mask, shape))
     return total
 
 
@@ -218,7 +225,7 @@ def entropy(
         t = path.new_full((b,), step_time(k, n))
         _, width = transition(zero, zero, t, shape, config, std)
         each = normal_entropy(width).expand(b, *mask.shape)
-        per_step.append(torch.where(_counted(k, mask, shape, config), each, 0.0).sum((1, 2)))
+        per_step.append(torch.where(_counted(k, mask, shape), each, 0.0).sum((1, 2)))
     steps = torch.stack(per_step, 1)
     if config.stochastic == "all":
         return steps.sum(1)
@@ -233,14 +240,9 @@ def _is_stochastic(k: int, index: Tensor, n: int, config: FlowSamplerConfig) -> 
     return torch.full_like(index, config.stochastic == "all" or k == n - 1, dtype=torch.bool)
 
 
-def _counted(k: int, action_mask: Tensor, shape: FlowShape, config: FlowSamplerConfig) -> Tensor:
-    """(K, D) entries of step k's outcome that belong to the density."""
-    if k == shape.num_steps - 1:
-        return action_mask
-    counted = torch.ones_like(action_mask)
-    if config.padded == "analytic":
-        counted[:, shape.action_dim :] = False
-    return counted
+def _counted(k: int, action_mask: Tensor, shape: FlowShape) -> Tensor:
+    """(K, D) entries of step k's outcome that belong to the density; all but the last's feed back."""
+    return action_mask if k == shape.num_steps - 1 else torch.ones_like(action_mask)
 
 
 def _latent(path: list[Tensor], index: Tensor, config: FlowSamplerConfig) -> dict[str, Tensor]:
@@ -272,6 +274,31 @@ class FlowModel(Model):
         """LeRobot's own chunk (B, K, A) in normalised units from noise (B, K, D)."""
 
 
+def flow_shape(config: Any, num_steps: int) -> FlowShape:
+    """The sizes in a LeRobot flow policy's config."""
+    return FlowShape(
+        num_steps=num_steps,
+        chunk_size=config.chunk_size,
+        executed=config.n_action_steps,
+        padded_dim=config.max_action_dim,
+        action_dim=config.action_feature.shape[0],
+    )
+
+
+def refuse_options(config: Any) -> None:
+    """Refuses options of LeRobot's vision-language-action policies that would change the sampler's density.
+
+    Raises:
+        InputError: real-time chunking or compilation is on.
+    """
+    if config.rtc_config is not None and config.rtc_config.enabled:
+        remedy = "real-time chunking changes the sampler's density; turn it off"
+        raise InputError("policy.rtc_config.enabled", True, remedy)
+    if config.compile_model:
+        remedy = "a compiled sampler rounds unlike the re-scoring pass; set it to false in config.json"
+        raise InputError("policy.compile_model", True, remedy)
+
+
 def difference(model: FlowModel, batch: dict[str, Tensor], encoded: Encoded) -> float:
     """Largest difference between `integrate` and LeRobot's own sampler on equal noise."""
     shape = model.shape
@@ -285,10 +312,7 @@ def difference(model: FlowModel, batch: dict[str, Tensor], encoded: Encoded) -> 
 class NoiseHead(nn.Module):
     """The std of ``noise=learned``, per observation, step and action dim; starts at `noise_level`.
 
-    Args:
-        width: of the features it reads, without shaping them.
-        shape: how many dims and steps.
-        config: its bounds.
+    It reads features of `width` without shaping them.
     """
 
     def __init__(self, width: int, shape: FlowShape, config: FlowSamplerConfig) -> None:
@@ -311,12 +335,7 @@ class NoiseHead(nn.Module):
 
 
 class FlowFamily(Family):
-    """Flow policies explored by noise in their denoising steps; the functions above do the work.
-
-    Args:
-        model: the policy.
-        sampler: how it explores.
-    """
+    """Flow policies explored by noise in their denoising steps; the functions above do the work."""
 
     imitates = True
 
@@ -326,7 +345,6 @@ class FlowFamily(Family):
         self.noise = NoiseHead(model.width, self.shape, sampler) if sampler.noise == "learned" else None
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
-        """See the base class."""
         x0, eps, index = self._noise(requests, encoded.features.device)
         explore, shape = exploring(requests, x0.device), self.shape
         velocity, std = encoded.context.velocity, self._std(encoded)
@@ -334,7 +352,6 @@ class FlowFamily(Family):
         return Action(chunk=self._executed_part(x), latent=latent, log_prob=log_prob)
 
     def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
-        """See the base class."""
         velocity, std = encoded.context.velocity, self._std(encoded)
         return Score(
             log_prob=log_prob(velocity, latent, self.shape, self.sampler, std),
@@ -342,11 +359,10 @@ class FlowFamily(Family):
         )
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
-        """See the base class."""
         return difference(self.model, batch, encoded)
 
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
-        """See the base class: flow matching at a time from LeRobot's Beta(1.5, 1), executed entries only."""
+        """Flow matching at a time from LeRobot's Beta(1.5, 1), executed entries only."""
         target = chunk.new_zeros(len(chunk), self.shape.chunk_size, self.shape.padded_dim)
         self._executed_part(target).copy_(chunk)
         noise = torch.randn_like(target)
@@ -369,6 +385,73 @@ class FlowFamily(Family):
     def _noise(self, requests: Sequence[Request], device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
         """x0 (B, K, D), eps (B, N, K, D) and the drawn step (B,), each from its own request's seed."""
         n, size = self.shape.num_steps, (self.shape.chunk_size, self.shape.padded_dim)
-        x0, eps = normal(requests, size, (n, *size), device=device)
+        x0, eps = standard_normal(requests, size, (n, *size), device=device)
         index = [np.random.default_rng((r.noise_seed, n)).integers(n) for r in requests]
         return x0, eps, torch.tensor(index, device=device)
+
+
+class NoiseSpaceFamily(Family):
+    """Steers a frozen flow policy by its initial noise (DSRL, Wagenmaker et al., arXiv 2506.15799).
+
+    The Euler loop is left as it is; a small head samples the noise that it starts from, z ~ N(m(o), s(o)²).
+    The ratio is exact and costs no velocity pass to re-score, and every objective here applies; the paper
+    uses SAC. The head lies beside the checkpoint in ``family.safetensors``; stock LeRobot loads the frozen
+    policy without it.
+    """
+
+    frozen = True
+
+    def __init__(self, model: FlowModel, sampler: NoiseSpaceSamplerConfig) -> None:
+        super().__init__()
+        self.model, self.sampler, self.shape = model, sampler, model.shape
+        self.rows = self.shape.chunk_size if sampler.per_row else 1
+        size = self.rows * self.shape.padded_dim
+        self.norm = nn.LayerNorm(model.width)
+        self.hidden = nn.Linear(model.width, sampler.hidden)
+        self.mean = nn.Linear(sampler.hidden, size)
+        self.width = nn.Linear(sampler.hidden, size)
+        nn.init.zeros_(self.mean.weight)
+        nn.init.zeros_(self.mean.bias)
+        self.bounded = BoundedStd(sampler.std_min, sampler.std_max)
+        self.bounded.start(self.width, sampler.std)
+
+    def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
+        mean, std = self._gaussian(encoded)
+        shape, size = self.shape, tuple(mean.shape[1:])
+        (eps,) = standard_normal(requests, size, device=mean.device)
+        explore = exploring(requests, mean.device)
+        noisy = explore | (not self.sampler.deterministic_eval)
+        z = torch.where(noisy[:, None, None], mean + std * eps, mean)
+        x = integrate(encoded.context.velocity, z.expand(-1, shape.chunk_size, -1), shape)
+        return Action(
+            chunk=x[:, : shape.executed, : shape.action_dim],
+            latent={"z": z},
+            log_prob=torch.where(explore[:, None], _noise_log_prob(z, mean, std), 0.0),
+        )
+
+    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
+        mean, std = self._gaussian(encoded)
+        entropy = normal_entropy(std).sum((1, 2))
+        return Score(log_prob=_noise_log_prob(latent["z"], mean, std), entropy=entropy)
+
+    def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
+        """Compares the frozen policy with the one LeRobot runs."""
+        return difference(self.model, batch, encoded)
+
+    @property
+    def actions(self) -> int:
+        """One factor per row of noise."""
+        return self.rows
+
+    def _gaussian(self, encoded: Encoded) -> tuple[Tensor, Tensor]:
+        """Mean and std of z, each (B, rows, D)."""
+        hidden = torch.relu(self.hidden(self.norm(pooled(encoded.features, encoded.mask))))
+        size = (-1, self.rows, self.shape.padded_dim)
+        bound = self.sampler.bound
+        mean = bound * torch.tanh(self.mean(hidden).float() / bound)
+        return mean.view(size), self.bounded(self.width(hidden)).view(size)
+
+
+def _noise_log_prob(z: Tensor, mean: Tensor, std: Tensor) -> Tensor:
+    """(B, rows), summed over dims; padded ones act on the others, so they are part of the choice."""
+    return normal_log_prob(z, mean, std).sum(-1)

@@ -26,9 +26,19 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from accerl_lerobot.experience import Request
-from accerl_lerobot.policies.density import BoundedStd, normal_entropy, normal_log_prob
-from accerl_lerobot.policies.family import Action, Encoded, Family, Model, Score, exploring, normal
-from accerl_lerobot.policies.samplers import GaussianSamplerConfig
+from accerl_lerobot.policies.config import GaussianSamplerConfig
+from accerl_lerobot.policies.family import (
+    Action,
+    BoundedStd,
+    Encoded,
+    Family,
+    Model,
+    Score,
+    exploring,
+    normal_entropy,
+    normal_log_prob,
+    standard_normal,
+)
 
 QUADRATURE_NODES = 32
 """For the tanh term of an entropy; off by 6e-8 at a std of 1, 2e-4 at 2, 0.003 at 3 and 0.16 (1 %) at 10."""
@@ -50,7 +60,7 @@ class GaussianModel(Model):
     """A LeRobot policy that predicts a chunk in one pass; `Encoded.context` is a `GaussianContext`."""
 
     executed: int
-    """Rows that are sent to the world."""
+    """Rows that are executed in the environment."""
     action_dim: int
     row_width: int | None = None
     """W; None where the policy has a std of its own."""
@@ -65,32 +75,22 @@ class GaussianModel(Model):
 class StdHead(nn.Module):
     """A std per observation, row and action dim, within bounds; starts at ``sampler.std`` everywhere.
 
-    Args:
-        width: of the features it reads.
-        action_dim: A.
-        sampler: its bounds.
+    It reads features of `width` without shaping them.
     """
 
     def __init__(self, width: int, action_dim: int, sampler: GaussianSamplerConfig) -> None:
         super().__init__()
-        self.detach = sampler.detach
         self.norm, self.out = nn.LayerNorm(width), nn.Linear(width, action_dim)
         self.bounded = BoundedStd(sampler.std_min, sampler.std_max)
         self.bounded.start(self.out, sampler.std)
 
     def forward(self, rows: Tensor) -> Tensor:
         """(B, K, W) to (B, K, A)."""
-        rows = rows.detach() if self.detach else rows
-        return self.bounded(self.out(self.norm(rows.float())))
+        return self.bounded(self.out(self.norm(rows.detach().float())))
 
 
 class GaussianFamily(Family):
-    """Policies explored by noise around the chunk they predict.
-
-    Args:
-        model: the policy.
-        sampler: how wide the noise is.
-    """
+    """Policies explored by noise around the chunk they predict."""
 
     imitates = True
 
@@ -102,12 +102,11 @@ class GaussianFamily(Family):
             self.std = StdHead(model.row_width, model.action_dim, sampler)
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
-        """See the base class."""
         mean, std = self._gaussian(encoded)
-        (eps,) = normal(requests, tuple(mean.shape[1:]), device=mean.device)
+        (eps,) = standard_normal(requests, tuple(mean.shape[1:]), device=mean.device)
         explore = exploring(requests, mean.device)
         noisy = explore
-        if encoded.context.std is not None and self.sampler.at_rest == "stock":
+        if encoded.context.std is not None and not self.sampler.deterministic_eval:
             noisy = torch.ones_like(explore)
         u = torch.where(noisy[:, None, None], mean + std * eps, mean)
         return Action(
@@ -117,7 +116,6 @@ class GaussianFamily(Family):
         )
 
     def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
-        """See the base class."""
         mean, std = self._gaussian(encoded)
         entropy = normal_entropy(std)
         if self.model.squashed:
@@ -125,7 +123,6 @@ class GaussianFamily(Family):
         return Score(log_prob=self._log_prob(latent["u"], mean, std), entropy=entropy.sum((1, 2)))
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
-        """See the base class."""
         mean, std = self._gaussian(encoded)
         stock, eps = self.model.stock(batch)
         executed = self.model.executed
@@ -133,7 +130,7 @@ class GaussianFamily(Family):
         return float((self._action(u) - stock[:, :executed]).abs().max())
 
     def imitation_loss(self, encoded: Encoded, chunk: Tensor) -> Tensor:
-        """See the base class: the mean absolute error, ACT's reconstruction loss."""
+        """Mean absolute error, ACT's reconstruction loss."""
         return (self._action(self._gaussian(encoded)[0]) - chunk).abs().mean((1, 2))
 
     @property

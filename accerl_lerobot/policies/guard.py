@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loading what is anybody's: no code of theirs is run, and nothing is unpickled.
+"""Policies from untrusted sources: their files are checked, no code of theirs runs, nothing is unpickled.
 
-LeRobot 0.6.1 has transformers run code from the Hub in places (`trust_remote_code=True` without a revision).
-Where transformers is not told, it asks the terminal; without safetensors it unpickles. `guarded` stands at
-the functions through which all of that goes, whoever calls them.
+LeRobot imports and calls whatever a processor's ``class`` names, with the arguments that stand beside it, and
+joins ``state_file`` to the folder as it is. Names of backbones and tokenisers may be folders of this machine.
+LeRobot 0.6.1 has transformers run code from the Hub in places (`trust_remote_code=True` without a revision);
+where transformers is not told, it asks the terminal, and without safetensors it unpickles. `guarded` wraps
+the functions through which all of that goes, whoever is the caller.
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,8 +22,26 @@ import torch
 from torch import nn
 from torch.overrides import TorchFunctionMode
 
+from accerl_lerobot.checkpoint.layout import BACKBONE, CONFIG_FOLDERS, PREPROCESSOR, STEP_FOLDERS
+from accerl_lerobot.checkpoint.safety import (
+    HUB_ID,
+    Origin,
+    brief,
+    check_not_pickled,
+    file_size,
+    read_json,
+    read_tensors,
+    safe_join,
+    tensor_shapes,
+)
 from accerl_lerobot.errors import InputError
 
+CONFIG, WEIGHTS = "config.json", "model.safetensors"
+OURS, VALUE_HEAD, FAMILY = "accerl.json", "value_head.safetensors", "family.safetensors"
+FILES = ("*.json", WEIGHTS, "policy_*.safetensors", VALUE_HEAD, FAMILY, f"{BACKBONE}/*")
+"""Files that are fetched of a checkpoint on the Hub."""
+PROCESSORS = (PREPROCESSOR, "policy_postprocessor.json")
+DEPTH_MOST = 20
 LARGE = 2**16
 """Numbers of a tensor that is not filled, see `Unfilled`."""
 FILLS = frozenset((
@@ -28,12 +50,169 @@ FILLS = frozenset((
 ))  # fmt: skip
 
 
+def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
+    """Where a checkpoint's files are, once checked; those of a Hub repository are fetched.
+
+    Args:
+        path: a folder here, or a Hub id; `revision` is of the latter.
+        field: that named it, for the error.
+
+    Raises:
+        InputError: there is no checkpoint, or it is not to be trusted, see `check_checkpoint`.
+    """
+    from huggingface_hub import snapshot_download
+
+    from accerl_lerobot.hub.trouble import guard_client
+
+    guard_client()
+    folder = Path(path).expanduser()
+    local = folder.exists()
+    if not local and not path.startswith((".", "/", "~")):
+        try:
+            folder = Path(snapshot_download(path, revision=revision, allow_patterns=list(FILES)))
+        except (OSError, ValueError) as error:
+            remedy = f"not a directory here and not loadable from the Hub ({brief(error)})"
+            raise InputError(field, path, remedy) from error
+    if not (folder / CONFIG).is_file():
+        raise InputError(field, path, "no config.json there; give the folder named pretrained_model")
+    check_checkpoint(folder, Origin(field, path), fetched=not local)
+    return folder
+
+
+def check_checkpoint(folder: Path, origin: Origin, *, fetched: bool = False) -> dict[str, Any]:
+    """Checks all files of a LeRobot checkpoint that are read, before they are; returns its ``config.json``.
+
+    Args:
+        fetched: it is from the Hub, and must not name folders of this machine.
+
+    Raises:
+        InputError: a file is not what it says, leads elsewhere, or asks for what is not there.
+    """
+    config = read_json(safe_join(folder, CONFIG, origin), origin)
+    for key, own in CONFIG_FOLDERS.items():
+        check_origin(config.get(key), folder / own, f"{CONFIG}: {key}", origin, fetched)
+    check_origin(config.get("vision_encoder_name"), None, f"{CONFIG}: vision_encoder_name", origin, fetched)
+    for name in PROCESSORS:
+        if safe_join(folder, name, origin).exists():
+            check_processor(folder, name, origin, fetched=fetched)
+    check_not_pickled(folder, WEIGHTS, origin)
+    for name in (WEIGHTS, VALUE_HEAD, FAMILY):
+        if safe_join(folder, name, origin).exists():
+            tensor_shapes(folder / name, origin)
+    if safe_join(folder, OURS, origin).exists():
+        check_ours(read_json(folder / OURS, origin), origin)
+    _check_beside(folder, origin)
+    return config
+
+
+def check_processor(folder: Path, name: str, origin: Origin, *, fetched: bool = False) -> None:
+    """Checks one of a checkpoint's processor files, and the state files it names.
+
+    Raises:
+        InputError: a step is not one of LeRobot's registered ones, or names files elsewhere.
+    """
+    steps = read_json(folder / name, origin).get("steps")
+    if not isinstance(steps, list):
+        raise origin.refuse(name, "a list of steps is wanted")
+    for step in steps:
+        if not isinstance(step, dict) or not isinstance(step.get("config", {}), dict):
+            raise origin.refuse(name, "a step is a mapping with a mapping named config")
+        kind = step.get("registry_name")
+        if not isinstance(kind, str) or "class" in step:
+            remedy = "only steps with a registry_name are loaded: LeRobot would import and call this class"
+            raise origin.refuse(f"{name}: {str(step.get('class'))[:60]}", remedy)
+        if "state_file" in step:
+            tensor_shapes(safe_join(folder, step["state_file"], origin), origin)
+        if kind in STEP_FOLDERS:
+            option, own = STEP_FOLDERS[kind]
+            named = step.get("config", {}).get(option)
+            check_origin(named, folder / own, f"{name}: {option}", origin, fetched)
+
+
+def check_statistics(folder: Path, origin: Origin) -> None:
+    """Checks the numbers that a checkpoint's processors normalise by.
+
+    Raises:
+        InputError: a number is NaN or infinite.
+    """
+    for name in PROCESSORS:
+        steps = read_json(folder / name, origin)["steps"] if (folder / name).is_file() else ()
+        for step in steps:
+            if "state_file" in step:
+                deque(read_tensors(folder / step["state_file"], origin), maxlen=0)
+
+
+def check_ours(ours: dict[str, Any], origin: Origin) -> None:
+    """Checks the content of ``accerl.json``.
+
+    Raises:
+        InputError: it is of another form than `loading.save_pretrained` writes.
+    """
+    for key in ("sampler", "value_head", "rename_map"):
+        if not isinstance(ours.get(key, {}), dict):
+            raise origin.refuse(f"{OURS}: {key}", "a mapping is wanted; remove the file to start without it")
+
+
+def check_origin(name: Any, own: Path | None, what: str, origin: Origin, fetched: bool) -> None:
+    """Checks that a backbone or tokeniser is the checkpoint's own, the Hub's, or at a path of a local one's.
+
+    Args:
+        name: as its config says.
+        own: the checkpoint's own folder of it, where it may have one.
+        what: file and key that say so, for the error.
+        fetched: the checkpoint is from the Hub, and must not name folders of this machine.
+
+    Raises:
+        InputError: it is something else.
+    """
+    if name is None:
+        return
+    if not isinstance(name, str) or len(name) > 1024 or "\x00" in name:
+        raise origin.refuse(what, "a name is wanted")
+    if own is not None and own.is_dir() and Path(name).is_absolute():
+        return  # it is not read: the checkpoint's own goes first
+    if Path(name).is_absolute():
+        if fetched or ".." in Path(name).parts:
+            remedy = "a folder of this machine, which a checkpoint from elsewhere may not name"
+            raise origin.refuse(what, f"{name[:80]!r}: {remedy}; put a copy into {BACKBONE}/")
+    elif not HUB_ID.fullmatch(name):
+        raise origin.refuse(what, f"{name[:80]!r} is neither a Hub id nor an absolute path")
+
+
+def _check_beside(folder: Path, origin: Origin) -> None:
+    """The backbone's own folder: links, what is no file, attention that is compiled code on the Hub."""
+    for path in _walk(safe_join(folder, BACKBONE, origin)):
+        name = path.relative_to(folder).as_posix()
+        file_size(safe_join(folder, name, origin), origin)
+        if path.name == CONFIG:
+            for key, value in _entries(read_json(path, origin)):
+                if "attn_implementation" in key and "/" in str(value):
+                    raise origin.refuse(name, f"{key} names code on the Hub; use sdpa or eager")
+
+
+def _walk(folder: Path) -> Iterator[Path]:
+    for directory, _, files in os.walk(folder):
+        yield from (Path(directory) / name for name in files)
+
+
+def _entries(content: Any, depth: int = 0) -> Iterator[tuple[str, Any]]:
+    if depth > DEPTH_MOST:
+        return
+    if isinstance(content, dict):
+        for key, value in content.items():
+            yield key, value
+            yield from _entries(value, depth + 1)
+    elif isinstance(content, list):
+        for value in content:
+            yield from _entries(value, depth + 1)
+
+
 @contextlib.contextmanager
-def guarded(room: str, code_revision: str | None = None) -> Iterator[None]:
+def guarded(section: str, code_revision: str | None = None) -> Iterator[None]:
     """While it lasts, transformers runs no code that comes with a model, and PyTorch unpickles nothing.
 
     Args:
-        room: ``policy`` or ``sft``, for the error.
+        section: ``policy`` or ``sft``, for the error.
         code_revision: commit of the one Hub repository whose code may be run; None: none may.
     """
     from transformers import dynamic_module_utils as dynamic
@@ -50,10 +229,10 @@ def guarded(room: str, code_revision: str | None = None) -> Iterator[None]:
         pinned = code_revision is not None and f"snapshots/{code_revision}/" in Path(file).as_posix()
         if not pinned:
             remedy = (
-                "code that came with a model, which would run with your rights; read it, then name its commit"
+                "code that came with a model, which would run with your rights; read it, then name its "
+                f"commit: {section}.trust_remote_code=true and {section}.code_revision"
             )
-            say = f"{remedy}: {room}.trust_remote_code=true and {room}.code_revision"
-            raise InputError(f"{room}.trust_remote_code", f"{snapshot.name}/{Path(file).name}", say)
+            raise InputError(f"{section}.trust_remote_code", f"{snapshot.name}/{Path(file).name}", remedy)
         return look(file)
 
     def load_known(file: Any, *arguments: Any, **options: Any) -> Any:
@@ -63,7 +242,7 @@ def guarded(room: str, code_revision: str | None = None) -> Iterator[None]:
         )
         if not known:
             remedy = "a pickle, which may run code when it is loaded; convert it to safetensors"
-            raise InputError(f"{room}.path", str(file)[:200], f"{remedy} where you trust it")
+            raise InputError(f"{section}.path", str(file)[:200], f"{remedy} where you trust it")
         return load(file, *arguments, **options | {"weights_only": True})
 
     dynamic.get_cached_module_file, dynamic.check_imports = fetch_pinned, look_first

@@ -1,75 +1,65 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A LeRobot checkpoint in, a stochastic policy out, and back into LeRobot's own format.
+"""A LeRobot checkpoint in, a stochastic policy out.
 
-Config and processors load through LeRobot's `from_pretrained`, weights by `verify.load_weights`. All is saved
-with `save_pretrained`, so stock `lerobot-eval` runs what we write. What is ours lies in ``accerl.json`` and
-``value_head.safetensors`` beside it.
+Config and processors load through LeRobot's `from_pretrained`. LeRobot's loaders of weights take what fits
+and leave the rest at random, some of them after printing what went wrong; here file and policy must hold the
+same tensors of the same shapes.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import shutil
 import string
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import draccus
 import torch
-from safetensors.torch import save_file
-from torch import Tensor
 
+from accerl_lerobot.checkpoint import layout, snapshot
 from accerl_lerobot.checkpoint.isolation import rehearse
-from accerl_lerobot.checkpoint.layout import BACKBONE, relocate
-from accerl_lerobot.checkpoint.safety import Origin, brief, read_tensors
-from accerl_lerobot.checkpoint.tensors import place, whole
+from accerl_lerobot.checkpoint.layout import BACKBONE, CONFIG_FOLDERS, PREPROCESSOR, STEP_FOLDERS
+from accerl_lerobot.checkpoint.safety import Origin, brief, read_tensors, tensor_shapes
 from accerl_lerobot.config.imports import imported
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK
-from accerl_lerobot.policies.adapter import LeRobotAdapter
-from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.adapter import (
+    LeRobotAdapter,
+    Processing,
+    example_requests,
+    stack_observations,
+)
+from accerl_lerobot.policies.config import PolicyConfig, SamplerConfig
 from accerl_lerobot.policies.family import Model
-from accerl_lerobot.policies.files import (
+from accerl_lerobot.policies.guard import (
     CONFIG,
     FAMILY,
     OURS,
     VALUE_HEAD,
     WEIGHTS,
+    Unfilled,
     check_statistics,
     fetched_checkpoint,
+    guarded,
+    input_error,
 )
-from accerl_lerobot.policies.guard import Unfilled, guarded, input_error
-from accerl_lerobot.policies.plugins import register_policies
-from accerl_lerobot.policies.portable import keep_names, save_backbone, tokenizer_overrides, use_backbone
-from accerl_lerobot.policies.processing import Processing, example_observations, example_requests
-from accerl_lerobot.policies.samplers import SamplerConfig
-from accerl_lerobot.policies.tuning import merged_state_dict, tune
+from accerl_lerobot.policies.registry import (
+    FAMILIES,
+    POLICIES,
+    check_observations,
+    check_type,
+    override,
+    register_policies,
+    sampler_config,
+)
+from accerl_lerobot.policies.saving import save_pretrained
+from accerl_lerobot.policies.tuning import subtract_adapters, tune
 from accerl_lerobot.policies.value_head import ValueHead
-from accerl_lerobot.policies.verify import load_weights
 
 logger = logging.getLogger(__name__)
-
-MODELS = "accerl_lerobot.policies.models"
-POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "smolvla": (f"{MODELS}.smolvla:SmolVLA", ("flow", "noise_space")),
-    "act": (f"{MODELS}.act:ACT", ("gaussian",)),
-    "gaussian_actor": (f"{MODELS}.gaussian_actor:GaussianActor", ("gaussian",)),
-    "diffusion": (f"{MODELS}.diffusion:Diffusion", ("diffusion",)),
-    "pi0": (f"{MODELS}.pi0:Pi0", ("flow", "noise_space")),
-    "pi05": (f"{MODELS}.pi0:Pi05", ("flow", "noise_space")),
-    "pi0_fast": (f"{MODELS}.pi0_fast:Pi0Fast", ("tokens",)),
-    "smolvla_bins": (f"{MODELS}.smolvla_bins:SmolVLABins", ("tokens",)),
-}
-"""LeRobot policy type → its model, and the families that suit it, the default one first."""
-FAMILIES = {
-    "flow": "accerl_lerobot.policies.flow:FlowFamily",
-    "noise_space": "accerl_lerobot.policies.noise_space:NoiseSpaceFamily",
-    "gaussian": "accerl_lerobot.policies.gaussian:GaussianFamily",
-    "diffusion": "accerl_lerobot.policies.diffusion:DiffusionFamily",
-    "tokens": "accerl_lerobot.policies.tokens:TokenFamily",
-}
-"""Family → class; its config is registered under the same name in `samplers`."""
 
 ACTS_MOST = 10**9
 """Parameters of a policy that acts when its load is rehearsed; π0's four billion would take minutes."""
@@ -78,21 +68,16 @@ TEXT = f"Put the red cube on the plate {string.printable}"
 
 
 class Sizes(NamedTuple):
-    """Numbers of a policy, and those of them that a run trains, the critic's included."""
+    """Numbers of parameters: the policy's, and those that a run trains, the critic's included."""
 
     policy: int
     trained: int
 
 
 _rehearsed: dict[str, Sizes] = {}
-"""Checkpoints, and what was asked of them, that need no other rehearsal in this process."""
-
-LOOK_BACK = ("diffusion",)
-"""Types that read the observations of ``n_obs_steps`` env steps; the others read one."""
-NO_DENSITY = {
-    "tdmpc": "it plans by sampling and has no action density; LeRobot trains it with its own RL objective",
-    "vqbet": "LeRobot does not return its code log-probs; use smolvla",
-}
+"""Checkpoints and configs that need no other rehearsal in this process."""
+NAMED = 3
+"""Tensors of a kind that an error names."""
 
 
 def resolve_device(name: str, field: str = "policy.device") -> torch.device:
@@ -128,45 +113,6 @@ def no_tf32(device: torch.device) -> None:
         torch.backends.cuda.matmul.allow_tf32 = False
 
 
-def check_type(policy_type: Any, field: str, prefix: str = "") -> str:
-    """Refuses a LeRobot policy type that has no likelihood here; `prefix` begins the remedy.
-
-    Raises:
-        InputError: it has none.
-    """
-    if policy_type not in POLICIES:
-        why = NO_DENSITY.get(policy_type, f"no likelihood for it here; use one of {', '.join(POLICIES)}")
-        raise InputError(field, policy_type, prefix + why)
-    return str(policy_type)
-
-
-def check_observations(policy_config: Any, field: str) -> None:
-    """Refuses a history that LeRobot's policy of this type does not read.
-
-    Raises:
-        InputError: it is to look back and cannot.
-    """
-    if policy_config.n_obs_steps != 1 and policy_config.type not in LOOK_BACK:
-        remedy = f"only {', '.join(LOOK_BACK)} looks back; a {policy_config.type} policy takes 1"
-        raise InputError(field, policy_config.n_obs_steps, remedy)
-
-
-def sampler_config(config: PolicyConfig, policy_type: str) -> SamplerConfig:
-    """How a policy of this type explores in this run.
-
-    Raises:
-        InputError: the sampler asked for is of a family that does not suit it.
-    """
-    families = POLICIES[policy_type][1]
-    if config.sampler is None:
-        default: SamplerConfig = SamplerConfig.get_choice_class(families[0])()
-        return default
-    if config.sampler.type not in families:
-        remedy = f"a {policy_type} policy explores by {' or '.join(families)}"
-        raise InputError("policy.sampler.type", config.sampler.type, remedy)
-    return config.sampler
-
-
 def load_lerobot_config(config: PolicyConfig) -> Any:
     """The checkpoint's LeRobot policy config, without its weights.
 
@@ -191,7 +137,7 @@ def load_lerobot_config(config: PolicyConfig) -> Any:
     override(lerobot_config, config)
     sampler.override(lerobot_config)
     check_observations(lerobot_config, "policy.n_obs_steps")
-    use_backbone(lerobot_config, folder, config.path)
+    _use_backbone(lerobot_config, folder, config.path)
     return lerobot_config
 
 
@@ -209,8 +155,8 @@ def rehearsed_config(config: PolicyConfig) -> Any:
     key = _key(config, folder)
     if key not in _rehearsed:
         there = replace(config, device="cpu", precision="fp32")
-        found = rehearse(lambda: _sizes(there), folder, Origin("policy.path", config.path))
-        _rehearsed[key] = Sizes(*found)
+        sizes = rehearse(lambda: _sizes(there), folder, Origin("policy.path", config.path))
+        _rehearsed[key] = Sizes(*sizes)
     return load_lerobot_config(config)
 
 
@@ -264,15 +210,15 @@ def _load(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAdapter:
     model = model_class(policy)  # type: ignore[call-arg]
     if config.precision == "fp32":
         no_tf32(device)
-    overrides = {"device_processor": {"device": str(device)}, **model.processor_overrides}
+    overrides = {"device_processor": {"device": str(device)}}
     check_statistics(folder, origin)
     try:
-        overrides |= tokenizer_overrides(lerobot_config, folder)
+        overrides |= _tokenizer_overrides(lerobot_config, folder)
         with guarded("policy", config.code_revision), model.loading():
             pre, post = make_pre_post_processors(
                 lerobot_config, pretrained_path=str(folder), preprocessor_overrides=overrides
             )
-        keep_names(lerobot_config, pre, folder)
+        _keep_names(lerobot_config, pre, folder)
     except Exception as error:
         if (ours := input_error(error)) is not None:
             raise ours from error
@@ -288,61 +234,18 @@ def _load(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAdapter:
         adapter = LeRobotAdapter(policy, processing, model, family, critic, config.precision)
         if (folder / OURS).is_file():
             _load_ours(adapter, folder, origin)
+        requests = example_requests(lerobot_config, config.rename_map)
         if not rehearsal:
-            adapter.self_check(*example_observations(lerobot_config, config.rename_map))
+            adapter.self_check(*stack_observations(requests))
         elif sum(parameter.numel() for parameter in policy.parameters()) <= ACTS_MOST:
-            asked = example_requests(lerobot_config, config.rename_map)[0]
-            adapter.decide([replace(asked, observation=asked.observation | {TASK: TEXT})], 0)
+            observation = requests[0].observation | {TASK: TEXT}
+            adapter.decide([replace(requests[0], observation=observation)], 0)
         tune(policy, model, family, config.tuning)
     except InputError:
         raise
     except Exception as error:  # what its files say fits nowhere, and may fail over any of it
         raise InputError("policy.path", config.path, f"it cannot act here ({brief(error)})") from error
     return adapter
-
-
-class Weights(NamedTuple):
-    """All of an adapter's, on the CPU, under the names that LeRobot gives them."""
-
-    policy: dict[str, Tensor]
-    value_head: dict[str, Tensor]
-    family: dict[str, Tensor]
-
-
-def copy_weights(adapter: LeRobotAdapter) -> Weights:
-    """A copy to be saved while the adapter goes on learning."""
-    modules = (adapter.value_head, adapter.family)
-    policy = merged_state_dict(adapter.policy) or adapter.policy.state_dict()
-    return Weights(_copied(policy), *(_copied(module.state_dict()) for module in modules))
-
-
-def save_pretrained(
-    adapter: LeRobotAdapter, directory: Path, config: PolicyConfig, weights: Weights | None = None
-) -> None:
-    """Writes LeRobot's ``pretrained_model`` layout, and what is ours beside it, into `directory`.
-
-    Args:
-        adapter: what is saved.
-        directory: created if it is missing.
-        config: what the adapter was loaded by.
-        weights: those to be written; None: the adapter's of now.
-    """
-    weights = weights or copy_weights(adapter)
-    directory.mkdir(parents=True, exist_ok=True)
-    save_backbone(adapter.policy.config, adapter.processing.preprocessor, directory)
-    adapter.policy.save_pretrained(directory, state_dict=weights.policy)
-    adapter.processing.preprocessor.save_pretrained(directory)
-    adapter.processing.postprocessor.save_pretrained(directory)
-    relocate(directory, directory)
-    for name, tensors in ((VALUE_HEAD, weights.value_head), (FAMILY, weights.family)):
-        if tensors:
-            save_file(tensors, directory / name)
-    ours = {
-        "sampler": draccus.encode(adapter.family.sampler, SamplerConfig),
-        "value_head": asdict(config.value_head),
-        "rename_map": config.rename_map,
-    }
-    (directory / OURS).write_text(json.dumps(ours, indent=2) + "\n")
 
 
 def _checkpoint_folder(config: PolicyConfig) -> Path:
@@ -370,13 +273,12 @@ def _load_ours(adapter: LeRobotAdapter, folder: Path, origin: Origin) -> None:
         adapter.family.load_state_dict(state)
     elif state and mine:
         logger.warning("the checkpoint's weights of the sampler are not loaded: they are of another shape")
-    there, here = ours.get("value_head", {}), asdict(adapter.value_head.config)
-    differing = [k for k in ("pooling", "hidden", "bins") if there.get(k, here[k]) != here[k]]
-    if differing:
+    hidden = ours.get("value_head", {}).get("hidden", adapter.value_head.config.hidden)
+    if hidden != adapter.value_head.config.hidden:
         logger.warning(
-            "the checkpoint's critic is not loaded, a new one starts at V = 0: %s",
-            ", ".join(f"policy.value_head.{k}={here[k]}, there {there.get(k)}" for k in differing),
-        )
+            "the checkpoint's critic is not loaded, a new one starts at V = 0: policy.value_head.hidden=%s, "
+            "there %s", adapter.value_head.config.hidden, hidden,
+        )  # fmt: skip
     elif (folder / VALUE_HEAD).is_file():
         state = dict(read_tensors(folder / VALUE_HEAD, origin))
         try:
@@ -386,37 +288,138 @@ def _load_ours(adapter: LeRobotAdapter, folder: Path, origin: Origin) -> None:
             raise origin.refuse(VALUE_HEAD, remedy) from error
 
 
-def _copied(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Copies on the CPU; what shared its memory shares it again, so that it is written once."""
-    places = {name: place(t) for name, t in tensors.items()}
-    kept = {places[name]: t for name, t in tensors.items()}
-    copies = {at: whole(t.detach()).to("cpu", copy=True).contiguous() for at, t in kept.items()}
-    return {name: copies[at] for name, at in places.items()}
+def _use_backbone(lerobot_config: Any, folder: Path, path: str | None) -> None:
+    """Points a LeRobot policy config at the checkpoint's own files, where it has them.
+
+    Raises:
+        InputError: the config names local ones that are gone.
+    """
+    for field, own in CONFIG_FOLDERS.items():
+        if not hasattr(lerobot_config, field):
+            continue
+        if (folder / own).is_dir():
+            setattr(lerobot_config, field, str((folder / own).resolve()))
+        named = Path(getattr(lerobot_config, field))
+        if named.is_absolute() and not named.is_dir():
+            what = "backbone was" if field == "vlm_model_name" else "tokeniser was"
+            remedy = f"its {what} in {named}, which is gone; put a copy into {own}/ beside config.json"
+            raise InputError("policy.path", path, remedy)
 
 
-def override(lerobot_config: Any, config: PolicyConfig) -> None:
-    """Puts a run's choices of denoising steps, executed rows and precision into the LeRobot config."""
-    if hasattr(lerobot_config, "pretrained_backbone_weights"):
-        # The checkpoint has them; LeRobot would download torchvision's first, even when told to stay offline.
-        lerobot_config.pretrained_backbone_weights = None
-    if config.num_steps is not None:
-        name = steps_field(lerobot_config)
-        if name is None:
-            remedy = f"a {lerobot_config.type} policy does not denoise; leave the field out"
-            raise InputError("policy.num_steps", config.num_steps, remedy)
-        setattr(lerobot_config, name, config.num_steps)
-    if hasattr(lerobot_config, "dtype"):
-        lerobot_config.dtype = "float32"  # see `PolicyConfig.precision`
-    if config.n_action_steps is not None:
-        chunk = int(getattr(lerobot_config, "chunk_size", 0) or getattr(lerobot_config, "horizon", 1))
-        if lerobot_config.type in LOOK_BACK:
-            chunk -= lerobot_config.n_obs_steps - 1  # rows that stand for the past
-        if config.n_action_steps > chunk:
-            remedy = f"use 1 to {chunk}, the chunk the policy predicts"
-            raise InputError("policy.n_action_steps", config.n_action_steps, remedy)
-        lerobot_config.n_action_steps = config.n_action_steps
+def _tokenizer_overrides(lerobot_config: Any, folder: Path) -> dict[str, dict[str, Any]]:
+    """Processor step → options, such that tokenisers are the checkpoint's own, where it has them."""
+    overrides: dict[str, dict[str, Any]] = {}
+    for entry in _stored_steps(folder):
+        step = entry.get("registry_name", "")
+        if step in STEP_FOLDERS and (folder / STEP_FOLDERS[step][1]).is_dir():
+            option, own = STEP_FOLDERS[step]
+            overrides[step] = {option: str((folder / own).resolve())}
+        if step == "action_tokenizer_processor":  # LeRobot does not save these two of its options
+            overrides.setdefault(step, {})["paligemma_tokenizer_name"] = lerobot_config.text_tokenizer_name
+            overrides[step]["fast_skip_tokens"] = lerobot_config.fast_skip_tokens
+    return overrides
 
 
-def steps_field(lerobot_config: Any) -> str | None:
-    """Where a policy type's config has its denoising steps; None if it does not denoise."""
-    return next((n for n in ("num_steps", "num_inference_steps") if hasattr(lerobot_config, n)), None)
+def _keep_names(lerobot_config: Any, preprocessor: Any, folder: Path) -> None:
+    """Undoes the two functions above in what will be saved, once tokenisers are loaded."""
+    stored = json.loads((folder / CONFIG).read_text())
+    for field in CONFIG_FOLDERS.keys() - {"vlm_model_name"}:
+        if hasattr(lerobot_config, field) and field in stored:
+            setattr(lerobot_config, field, stored[field])
+    for step, entry in zip(preprocessor.steps, _stored_steps(folder), strict=True):
+        if (option := STEP_FOLDERS.get(entry.get("registry_name", ""))) is not None:
+            setattr(step, option[0], entry["config"].get(option[0]))
+
+
+def _stored_steps(folder: Path) -> list[dict[str, Any]]:
+    steps: list[dict[str, Any]] = json.loads((folder / PREPROCESSOR).read_text())["steps"]
+    return steps
+
+
+class _Name(str):
+    """The name of a tensor in its place, for LeRobot's functions that rename the keys of a dict."""
+
+    def clone(self) -> _Name:
+        return self
+
+
+@torch.no_grad()
+def load_weights(policy: Any, model: type[Model], file: Path, path: str | None, *, read: bool = True) -> None:
+    """Fills a policy from a file.
+
+    Args:
+        model: knows which tensors a file may lack.
+        path: the checkpoint as the user named it.
+        read: False: only names and shapes are compared.
+
+    Raises:
+        InputError: a tensor is missing, unexpected, of another shape, or holds NaN or infinity.
+    """
+    origin = Origin("policy.path", path)
+    shapes = {name: shape for name, (_, shape) in tensor_shapes(file, origin).items()}
+    mine, stored = policy.state_dict(), _names(shapes, policy)
+    # Nor is a tensor missing that a policy holds under several names: savers keep one of them.
+    held = {mine[k].data_ptr() for k in stored.keys() & mine.keys()}
+    absent = mine.keys() - stored.keys() - set(model.unread)
+    missing = sorted(k for k in absent if mine[k].data_ptr() not in held)
+    unexpected = sorted(stored.keys() - mine.keys())
+    if missing or unexpected:
+        counts = f"{len(missing)} tensors missing {missing[:NAMED]}, {len(unexpected)} unexpected "
+        remedy = f"{counts}{unexpected[:NAMED]}; config.json and {file.name} disagree"
+        raise InputError("policy.path", path, f"the weights did not load: {remedy}")
+    places: dict[str, list[str]] = {}
+    for name, theirs in stored.items():
+        if mine[name].shape != shapes[theirs]:
+            sizes = f"{shapes[theirs]} in the file, {tuple(mine[name].shape)} in the policy"
+            remedy = f"the weights did not load: size mismatch for {name}, {sizes}"
+            raise InputError("policy.path", path, remedy)
+        places.setdefault(theirs, []).append(name)
+    if read:
+        for theirs, tensor in read_tensors(file, origin):
+            for name in places.get(theirs, ()):
+                mine[name].copy_(tensor)
+
+
+def _names(shapes: dict[str, Any], policy: Any) -> dict[str, str]:
+    """Name of a policy's tensor → name in the file, as LeRobot's loader of this policy has it.
+
+    π0's reads files of openpi as well: without the leading ``model.``, with other names for some layers, and
+    with the input embedding left out where it equals the output layer.
+    """
+    stored: dict[str, str] = {name: _Name(name) for name in shapes}
+    rename = getattr(policy, "_fix_pytorch_state_dict_keys", None)
+    if rename is None:
+        return stored
+    renamed = _prefixed(rename(stored, policy.config))
+    # What a file has under its own name goes before what is taken for it.
+    return renamed | {k: v for k, v in _prefixed(stored).items() if k in renamed}
+
+
+def _prefixed(names: dict[str, str]) -> dict[str, str]:
+    return {k if k.startswith("model.") else f"model.{k}": v for k, v in names.items()}
+
+
+def reconstruct_base(config: PolicyConfig, checkpoint: Path, directory: Path) -> None:
+    """Writes the policy that a run with low-rank adapters began from.
+
+    A checkpoint holds the policy with its adapters added in, W + s·BA, and A and B apart. Where W itself is
+    gone, it is the difference of the two, as exact as the sum was rounded.
+
+    Args:
+        config: the run's; its ``path`` does not matter.
+        checkpoint: one of the run's, with its ``training_state``.
+        directory: for a LeRobot ``pretrained_model``; appears when it is whole.
+
+    Raises:
+        InputError: the checkpoint is none of such a run.
+    """
+    path = str(checkpoint / layout.PRETRAINED)
+    adapter = load_adapter(replace(config, path=path, revision=None, device="cpu"))
+    adapter.load_trainable(snapshot.load(checkpoint / layout.TRAINING_STATE / layout.WEIGHTS))
+    with torch.no_grad():
+        subtract_adapters(adapter.policy)
+    new = directory.with_name(f".{directory.name}.new")
+    shutil.rmtree(new, ignore_errors=True)
+    save_pretrained(adapter, new, config)
+    layout.relocate(new, directory)
+    new.rename(directory)

@@ -29,8 +29,8 @@ import torch
 from torch import Tensor, nn
 
 from accerl_lerobot.experience import Request
+from accerl_lerobot.policies.config import TokenSamplerConfig
 from accerl_lerobot.policies.family import Action, Encoded, Family, Model, Score, exploring
-from accerl_lerobot.policies.samplers import TokenSamplerConfig
 
 Choose = Callable[[Tensor, int], Tensor]
 """(logits (B, V), position) → tokens (B,), int64."""
@@ -110,19 +110,14 @@ def existing(tokens: Tensor, terminator: int | None) -> Tensor:
 class TokenFamily(Family):
     """Token policies explored by sampling at a temperature; the functions above do the work.
 
-    The latent is ``tokens``, int64 (L,), the terminator from the first one on.
-
-    Args:
-        model: the policy.
-        sampler: how it explores.
-    """
+    The latent is ``tokens``, int64 (L,), the terminator from the first one on."""
 
     def __init__(self, model: TokenModel, sampler: TokenSamplerConfig) -> None:
         super().__init__()
         self.model, self.sampler = model, sampler
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
-        """See the base class; where a request does not explore, the most likely token."""
+        """Samples; where a request does not explore, the most likely token."""
         device, length = encoded.features.device, self.model.length
         explore = exploring(requests, device)
         draws = np.stack([np.random.default_rng(r.noise_seed).random(length) for r in requests])
@@ -136,7 +131,7 @@ class TokenFamily(Family):
         )
 
     def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
-        """See the base class; the entropy is that of the distributions the factors were drawn from."""
+        """Re-scores; the entropy is that of the distributions the factors were drawn from."""
         tokens = latent["tokens"]
         factors = existing(tokens, self.model.terminator)
         # Positions at which every row has ended are not computed: a logit for each of V tokens is a lot.
@@ -151,12 +146,11 @@ class TokenFamily(Family):
         )
 
     def factors(self, latent: dict[str, Tensor]) -> Tensor | None:
-        """See the base class."""
         terminator = self.model.terminator
         return None if terminator is None else existing(latent["tokens"], terminator)
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
-        """See the base class; greedy chunks and tokens are compared, then the log-probs of the two passes.
+        """Compares greedy chunks and tokens, then the log-probs of the two passes.
 
         An autoregressive model has two ways to its logits, and a policy may be trained in another layout than
         it acts in. That changes log-probs by far more than rounding does, which is what is let pass here.
@@ -179,7 +173,6 @@ class TokenFamily(Family):
 
     @property
     def actions(self) -> int | None:
-        """See the base class."""
         return self.model.rows
 
     def _decide(self, encoded: Encoded, explore: Tensor, uniform: Tensor) -> tuple[Tensor, Tensor]:

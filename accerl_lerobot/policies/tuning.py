@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which of a policy's weights are trained, and how low-rank adapters become plain weights again."""
+"""The trained part of a policy's weights, and low-rank adapters merged into plain weights."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Episodes that start alike are compared with each other: held back until all have ended, then judged.
+"""Episodes from equal starts are held back until all of their group have ended, then compared.
 
     grpo          Â = (R − mean) / (std + ε)        arXiv 2402.03300
     rloo          Â = R − mean of the others        arXiv 2402.14740
@@ -20,9 +20,8 @@ without it; a group of which fewer than two are left is thrown away.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -36,42 +35,20 @@ STD_EPSILON = 1e-6
 """Added to the standard deviation; returns that differ by less count as equal."""
 
 
-def _grpo(returns: np.ndarray) -> np.ndarray:
-    return (returns - returns.mean()) / (returns.std() + STD_EPSILON)
-
-
-def _rloo(returns: np.ndarray) -> np.ndarray:
-    return returns - (returns.sum() - returns) / (len(returns) - 1)
-
-
-def _grpo_no_std(returns: np.ndarray) -> np.ndarray:
-    return returns - returns.mean()
-
-
-_FORMS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "grpo": _grpo,
-    "rloo": _rloo,
-    "grpo_no_std": _grpo_no_std,
-}
-assert tuple(_FORMS) == get_args(GroupAdvantage)
-
-
 def group_advantages(returns: np.ndarray, form: GroupAdvantage) -> np.ndarray:
-    """How much better each episode of a group went than the others.
+    """Advantages float64 (n,), with mean 0, from undiscounted returns (n,), n ≥ 2; see the top of the file.
 
-    Args:
-        returns: float (n,), n ≥ 2, undiscounted. Their standard deviation is that of the group itself
-            (divided by n, not n − 1).
-        form: see the top of this file.
-
-    Returns:
-        float64 (n,), with mean 0.
+    The standard deviation is that of the group itself (divided by n, not n − 1).
     """
-    return _FORMS[form](np.asarray(returns, np.float64))
+    returns = np.asarray(returns, np.float64)
+    if form == "rloo":
+        return returns - (returns.sum() - returns) / (len(returns) - 1)
+    centred = returns - returns.mean()
+    return centred / (returns.std() + STD_EPSILON) if form == "grpo" else centred
 
 
 @kind
-class Outcome(NamedTuple):
+class EpisodeOutcome(NamedTuple):
     """How an episode ended."""
 
     episode_return: float
@@ -79,8 +56,8 @@ class Outcome(NamedTuple):
 
 
 @kind
-class Place(NamedTuple):
-    """Where an episode belongs."""
+class GroupSlot(NamedTuple):
+    """Slot of an episode in a group."""
 
     start: int
     """Number of the group."""
@@ -88,8 +65,8 @@ class Place(NamedTuple):
     """0 to the group's size − 1."""
 
 
-def comparable(outcomes: list[Outcome], rule: GroupFilter) -> bool:
-    """True if a group of at least two is worth learning from."""
+def comparable(outcomes: list[EpisodeOutcome], rule: GroupFilter) -> bool:
+    """True if a group of at least two has something to compare."""
     returns = [o.episode_return for o in outcomes]
     if rule == "none":
         return True
@@ -116,16 +93,16 @@ class Member:
     """An episode of a group, and its segments so far."""
 
     segments: list[Segment] = field(default_factory=list)
-    outcome: Outcome | None = None
+    outcome: EpisodeOutcome | None = None
     ended: bool = False
 
 
 def open_limit(size: int, worlds: int) -> int:
-    """How many groups of `size` may be unfinished at a time: 2·⌈worlds / size⌉ + 1.
+    """Most groups of `size` that may be unfinished at a time: 2·⌈worlds / size⌉ + 1.
 
-    Bounds what is held back. A world that may not begin another group is idle: with ⌈worlds / size⌉ + 1, 7 to
-    20 % of the time in a simulation with episode lengths drawn uniformly, since every group waits for its
-    slowest; with twice as many groups, under 1 %.
+    It bounds the decisions held back. A world that may not begin another group is idle: with half as many
+    groups, 7 to 20 % of the time in a simulation with uniformly distributed episode lengths, since every
+    group waits for its slowest; with these, under 1 %.
     """
     return 2 * math.ceil(worlds / size) + 1
 
@@ -141,7 +118,7 @@ class Groups:
         >>> groups = Groups(size=4, worlds=8)
         >>> place = groups.claim()                          # for each episode; None: wait
         >>> groups.add(place, segment)                      # each of its segments
-        >>> released = groups.end(place, Outcome(0.9, True))  # [] until the last of the group ends
+        >>> released = groups.end(place, EpisodeOutcome(0.9, True))  # [] until the last of the group ends
 
     Args:
         size: episodes per group, at least 2.
@@ -171,7 +148,7 @@ class Groups:
         members = [m for group in self._open.values() for m in group]
         return sum(len(s) for m in members for s in m.segments)
 
-    def claim(self) -> Place | None:
+    def claim(self) -> GroupSlot | None:
         """A place for one more episode, in the group that lacks some, else in a new one; None: wait."""
         if self._claimed == self.size:
             if self.open >= self.limit:
@@ -179,9 +156,9 @@ class Groups:
             self._newest, self._claimed = self._newest + 1, 0
             self._open[self._newest] = [Member() for _ in range(self.size)]
         self._claimed += 1
-        return Place(self._newest, self._claimed - 1)
+        return GroupSlot(self._newest, self._claimed - 1)
 
-    def add(self, place: Place, segment: Segment) -> None:
+    def add(self, place: GroupSlot, segment: Segment) -> None:
         """Keeps a segment until its group has ended."""
         self.counters.entered_decisions += len(segment)
         group = self._open.get(place.start)
@@ -190,7 +167,7 @@ class Groups:
         else:
             group[place.member].segments.append(segment)
 
-    def end(self, place: Place, outcome: Outcome | None) -> list[Segment]:
+    def end(self, place: GroupSlot, outcome: EpisodeOutcome | None) -> list[Segment]:
         """Says how an episode ended; None: it was thrown away.
 
         Returns:
@@ -207,7 +184,7 @@ class Groups:
         if not all(m.ended for m in group):
             return []
         del self._open[place.start]
-        return self._judge(group)
+        return self._compare(group)
 
     def abandon(self) -> None:
         """Throws all unfinished groups away; what their episodes still bring is ignored."""
@@ -218,16 +195,16 @@ class Groups:
         self._claimed = self.size
 
     def state(self) -> dict[str, Any]:
-        """All that `restore` needs; see `snapshot`."""
+        """Everything `restore` needs; see `snapshot`."""
         counters, claim = replace(self.counters), (self._newest, self._claimed)
         return {"counters": counters, "open": dict(self._open), "claim": claim}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Goes on from what `state` gave."""
+        """Resumes from what `state` returned."""
         self.counters, self._open = state["counters"], state["open"]
         self._newest, self._claimed = state["claim"]
 
-    def _judge(self, group: list[Member]) -> list[Segment]:
+    def _compare(self, group: list[Member]) -> list[Segment]:
         left = [(m, m.outcome) for m in group if m.outcome is not None]
         outcomes = [outcome for _, outcome in left]
         if len(left) < 2 or not comparable(outcomes, self._rule):

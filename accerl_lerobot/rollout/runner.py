@@ -20,7 +20,7 @@ from accerl_lerobot.config.ranges import NonNegative, Range, Section, Steps
 from accerl_lerobot.envs.base import ChunkResult, World
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Observation, Origin, Request, Segment
-from accerl_lerobot.rollout.groups import GroupAdvantage, GroupFilter, Groups, Outcome, Place
+from accerl_lerobot.rollout.groups import EpisodeOutcome, GroupAdvantage, GroupFilter, Groups, GroupSlot
 from accerl_lerobot.rollout.segments import SegmentBuilder
 from accerl_lerobot.rollout.slot import Slot
 from accerl_lerobot.rollout.tasks import TaskSampling
@@ -104,7 +104,7 @@ class EpisodePlan:
     """Position in the evaluation it belongs to."""
     group: str = "train"
     """Which evaluation it belongs to."""
-    place: Place | None = None
+    place: GroupSlot | None = None
     """Its group of equal starts and which of them it is, where exploring episodes are compared."""
     film: bool = False
     """Record frames for people. Executes a chunk in parts, which changes nothing else."""
@@ -325,9 +325,9 @@ class RolloutRunner:
                 frames=state.frames,
             )
         )
-        self._leave_group(plan, Outcome(state.episode_return, success))
+        self._leave_group(plan, EpisodeOutcome(state.episode_return, success))
 
-    def _leave_group(self, plan: EpisodePlan, outcome: Outcome | None) -> None:
+    def _leave_group(self, plan: EpisodePlan, outcome: EpisodeOutcome | None) -> None:
         if plan.place is None:
             return
         assert self._groups is not None

@@ -22,8 +22,8 @@ from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.teacher import PREFIX
-from accerl_lerobot.trainer.anchors import CRITIC
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.frozen_policies import CRITIC
 from accerl_lerobot.trainer.memory import Memory
 from accerl_lerobot.trainer.nonfinite import NonFiniteError
 

@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from accerl_lerobot.trainer.anchors import Anchors
 from accerl_lerobot.trainer.batch import Batch
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.frozen_policies import FrozenPolicies
 from accerl_lerobot.trainer.ranks import Ranks
 
 PROBE = "probe"
@@ -36,19 +36,19 @@ class Probe:
     """One copy after the other.
 
     Args:
-        anchors: where the copy is kept.
+        frozen: where the copy is kept.
         config: how often, and which versions are published.
         ranks: who measure together; None: this process alone.
     """
 
-    def __init__(self, anchors: Anchors, config: TrainerConfig, ranks: Ranks | None = None) -> None:
-        self._anchors, self._config, self._ranks = anchors, config, ranks or Ranks()
+    def __init__(self, frozen: FrozenPolicies, config: TrainerConfig, ranks: Ranks | None = None) -> None:
+        self._frozen, self._config, self._ranks = frozen, config, ranks or Ranks()
         self._version: int | None = None
         self._next = 0
         self.renew(0)
 
     def state(self) -> dict[str, Any]:
-        """All that `restore` needs; the copy itself is with the anchors."""
+        """All that `restore` needs; the copy itself is in `frozen_policies`."""
         return {"version": self._version, "next": self._next}
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -64,7 +64,7 @@ class Probe:
         config = self._config
         due = config.probe_every and self._version is None and version >= self._next
         if due and config.publishes(version) and version < config.updates:
-            self._anchors.take(PROBE, version)
+            self._frozen.take(PROBE, version)
             self._version, self._next = version, version + config.probe_every
 
     def read(self, batch: Batch) -> dict[str, float]:
@@ -78,7 +78,7 @@ class Probe:
             metrics, self._next = {}, 0
         else:
             return {}
-        self._anchors.drop(PROBE)
+        self._frozen.drop(PROBE)
         self._version = None
         return metrics
 
@@ -93,8 +93,8 @@ class Probe:
     def _apart(self, batch: Batch, rows: np.ndarray) -> Tensor:
         """Σ log π − Σ log μ of each row, float64."""
         part = batch.part(rows)
-        difference = self._anchors.log_prob(PROBE, *part).cpu() - batch.log_prob[rows]
-        factors = self._anchors.adapter.factors(part[2])
+        difference = self._frozen.log_prob(PROBE, *part).cpu() - batch.log_prob[rows]
+        factors = self._frozen.adapter.factors(part[2])
         if factors is not None:
             difference = difference.masked_fill(~factors.cpu(), 0.0)
         return difference.double().sum(dim=-1)

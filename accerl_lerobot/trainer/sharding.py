@@ -24,8 +24,7 @@ from torch.utils.checkpoint import checkpoint
 
 from accerl_lerobot.checkpoint.tensors import in_parts
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.base import Evaluation, PolicyAdapter
-from accerl_lerobot.policies.value_head import Value
+from accerl_lerobot.policies.adapter import Evaluation, PolicyAdapter
 from accerl_lerobot.trainer.config import TrainerConfig
 
 
@@ -66,9 +65,8 @@ def _share_out(adapter: PolicyAdapter, blocks: Sequence[nn.Module], config: Trai
 
     if config.cpu_offload and adapter.device.type == "cpu":
         raise InputError("trainer.cpu_offload", True, "the policy is on the CPU already; leave the field out")
-    for kind in (Evaluation, Value):
-        if kind not in torch.utils._pytree.SUPPORTED_NODES:
-            torch.export.register_dataclass(kind)  # so that FSDP finds the tensors of which gradients begin
+    if Evaluation not in torch.utils._pytree.SUPPORTED_NODES:
+        torch.export.register_dataclass(Evaluation)  # so that FSDP finds the tensors of which gradients begin
     options: dict[str, Any] = {
         "mesh": init_device_mesh(adapter.device.type, (dist.get_world_size(),)),
         "reshard_after_forward": config.sharding == "zero3",

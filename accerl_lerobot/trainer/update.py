@@ -7,8 +7,8 @@ With ``advantage=group`` the advantages are those that the rollout workers stamp
 only makes the critic's targets; where ``value_coef`` is 0, not even those, and V is not computed beforehand.
 
 Values stored with the samples are stale by their lag, so they are recomputed; the stored log-probs are not,
-since they are what the ratio divides by. Log-probs under older weights come from `anchors`. Knows no process:
-the Ray worker and the single-process mode both call `Update.step`.
+since they are what the ratio divides by. Log-probs under older weights come from `frozen_policies`. Knows no
+process: the Ray worker and the single-process mode both call `Update.step`.
 
 Shapes: S segments, T decisions of the longest one, N decisions in all.
 """
@@ -32,18 +32,17 @@ from accerl_lerobot.algorithms import (
     check_level,
     compute_loss,
 )
+from accerl_lerobot.algorithms.advantages import decision_mask, gae, moments, normalise
 from accerl_lerobot.algorithms.diagnostics import lag_metrics
-from accerl_lerobot.algorithms.gae import decision_mask, gae
-from accerl_lerobot.algorithms.normalise import moments, normalise
 from accerl_lerobot.algorithms.ratio import present
 from accerl_lerobot.checkpoint.optimizers import optimizer_state, restore_optimizer
 from accerl_lerobot.checkpoint.tensors import whole
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import reach
-from accerl_lerobot.policies.base import PolicyAdapter
-from accerl_lerobot.trainer.anchors import CRITIC, Anchors
+from accerl_lerobot.policies.adapter import PolicyAdapter
 from accerl_lerobot.trainer.batch import Batch, Part, collate, pick, turns
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.frozen_policies import CRITIC, FrozenPolicies
 from accerl_lerobot.trainer.nonfinite import NonFiniteError
 from accerl_lerobot.trainer.probe import Probe
 from accerl_lerobot.trainer.ranks import Ranks
@@ -98,10 +97,10 @@ class Update:
         self.skipped = 0
         self._skipped_in_a_row = 0
         self._moments = torch.zeros(3, dtype=torch.float64)
-        self.anchors = Anchors(adapter)
+        self.frozen = FrozenPolicies(adapter)
         if algorithm.reference_coef:
-            self.anchors.take("reference", self.version)
-        self._probe = Probe(self.anchors, config, self.ranks)
+            self.frozen.take("reference", self.version)
+        self._probe = Probe(self.frozen, config, self.ranks)
         named = adapter.trainable()
         self._policy = [p for k, p in named.items() if not k.startswith(CRITIC)]
         self._value = [p for k, p in named.items() if k.startswith(CRITIC)]
@@ -123,7 +122,7 @@ class Update:
         batch = collate(segments)
         mismatch = self._probe.read(batch)
         if self._is_proximal and self.algorithm.proximal_updates > 1:
-            self.anchors.take("proximal", self.version)
+            self.frozen.take("proximal", self.version)
         lr, value_lr = self._set_rates()
         self.optimizer.zero_grad(set_to_none=True)
         metrics = self._backward(batch)
@@ -161,7 +160,7 @@ class Update:
             "schedule_updates": self._schedule_updates,
             "moments": self._moments.clone(),
             "optimizer": optimizer_state(self.optimizer),
-            "anchors": self.anchors.state(),
+            "frozen_policies": self.frozen.state(),
             "probe": self._probe.state(),
         }
 
@@ -172,7 +171,7 @@ class Update:
         self._schedule_updates = state["schedule_updates"]
         self._moments = state["moments"]
         restore_optimizer(self.optimizer, state["optimizer"])
-        self.anchors.restore(state["anchors"])
+        self.frozen.restore(state["frozen_policies"])
         self._probe.restore(state["probe"])
 
     @property
@@ -224,7 +223,7 @@ class Update:
             if self._is_proximal:
                 proximal = evaluation.log_prob.detach()
             if targets is None:
-                mine = evaluation.value.mean.detach().cpu().float()
+                mine = evaluation.value.detach().cpu().float()
                 values = self.ranks.gather(mine if turn.own else mine[:0], len(batch))
                 targets = self._targets(batch, values, bootstrap)
             device = evaluation.log_prob.device
@@ -234,8 +233,8 @@ class Update:
                 log_prob_old=batch.log_prob[rows].to(device),
                 actions=self.adapter.actions,
                 advantage=targets[0][rows].to(device),
-                value=evaluation.value.mean,
-                value_error=evaluation.value.error(returns),
+                value=evaluation.value,
+                value_error=(evaluation.value - returns).square(),
                 returns=returns,
                 entropy=evaluation.entropy,
                 factors=None if factors is None else factors[rows].to(device),
@@ -271,7 +270,7 @@ class Update:
 
     def _under(self, name: str, part: Part) -> Tensor | None:
         """log-probs (rows, L) under a copy; None if there is none."""
-        return self.anchors.log_prob(name, *part) if name in self.anchors else None
+        return self.frozen.log_prob(name, *part) if name in self.frozen else None
 
     def _ratios_per_decision(self, factors: Tensor) -> float:
         return float(present(factors, self.algorithm.level, self.adapter.actions).sum()) / len(factors)

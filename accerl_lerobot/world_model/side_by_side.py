@@ -14,7 +14,7 @@ import torch
 
 from accerl_lerobot.envs.base import World
 from accerl_lerobot.experience import Observation, Request
-from accerl_lerobot.policies.base import PolicyAdapter
+from accerl_lerobot.policies.adapter import PolicyAdapter
 from accerl_lerobot.seeds import noise_seed
 from accerl_lerobot.world_model.contract import Context
 from accerl_lerobot.world_model.frames import observed, seen

@@ -29,8 +29,7 @@ from accerl_lerobot.checkpoint.safety import (
 )
 from accerl_lerobot.config.imports import DISCOVER, discover
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.files import check_origin, check_processor
-from accerl_lerobot.policies.guard import guarded, input_error
+from accerl_lerobot.policies.guard import check_origin, check_processor, guarded, input_error
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ import pytest
 
 from accerl_lerobot.bench import policy as bench
 from accerl_lerobot.bench.policy import BenchPolicyConfig
+from accerl_lerobot.demos import backbone
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies import backbone
 from accerl_lerobot.policies.config import TuningConfig
 
 

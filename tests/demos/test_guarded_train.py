@@ -16,7 +16,7 @@ from accerl_lerobot.demos import cached_train, guarded_train, sft
 from accerl_lerobot.demos.sft import CODE_REVISION, REFUSED, SFTConfig, run_sft, sft_command
 from accerl_lerobot.errors import InputError
 from tests.policies.checkpoints import write_gaussian_actor
-from tests.policies.test_pi0_fast_loading import remote
+from tests.policies.test_loading import remote
 from tests.policies.tiny_pi import ACTIONS, COMMIT, PALIGEMMA, hub
 
 ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"

@@ -18,9 +18,9 @@ import pytest
 import torch
 
 from accerl_lerobot.demos import cached_train, sft
+from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig, run_sft, sft_command
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.backbone import BackboneConfig
 from tests.policies.tiny import adapter_at
 from tests.rounding import assert_close
 
@@ -309,7 +309,7 @@ def test_a_moved_checkpoint_is_started_from_a_copy(
 ):
     from accerl_lerobot.checkpoint.layout import relocate
     from accerl_lerobot.policies.config import PolicyConfig
-    from accerl_lerobot.policies.loading import save_pretrained
+    from accerl_lerobot.policies.saving import save_pretrained
 
     start = tmp_path / "start"
     save_pretrained(adapter_at(tiny_checkpoint), start, PolicyConfig(path=str(tiny_checkpoint)))

@@ -24,7 +24,8 @@ from accerl_lerobot.engine.config import LaunchConfig, encode
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
-from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, save_pretrained
+from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config
+from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.hub.folders import SUMMARY, write_json
 from tests.hub_server import HubServer, environment

@@ -36,7 +36,7 @@ def moments(
     """Mean and std of one entry's step from timestep t to `following`, −1 for none.
 
     Args:
-        rule: scheduler, eta, prediction, clip.
+        rule: scheduler, prediction, clip.
     """
     alphas = cumulative_alphas(train_steps)
     a, b = alphas[t], alphas[following] if following >= 0 else 1.0
@@ -49,7 +49,6 @@ def moments(
     # The noising from `following` to t scales by √(a/b) and adds variance 1 − a/b.
     variance = (1 - a / b) * (1 - b) / (1 - a)
     if rule["scheduler"] == "DDIM":
-        variance *= rule["eta"] ** 2
         return math.sqrt(b) * clean + math.sqrt(max(0.0, 1 - b - variance)) * noise, math.sqrt(variance)
     # Product of two Gaussians in x_following: N(√b·x̂, 1 − b) and the likelihood of x given it.
     if b == 1.0:
@@ -65,7 +64,7 @@ def log_prob(
     path: np.ndarray,
     timesteps: list[int],
     train_steps: int,
-    executed: int,
+    executed: slice,
     std_min: float,
     rule: dict,
 ) -> np.ndarray:
@@ -77,7 +76,7 @@ def log_prob(
         following = counted[i + 1] if i + 1 < len(counted) else -1
         output = network(path[i], t)
         for row in range(horizon):
-            if following < 0 and row >= executed:
+            if following < 0 and not executed.start <= row < executed.stop:
                 continue
             for dim in range(dims):
                 mean, std = moments(

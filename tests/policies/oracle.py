@@ -12,14 +12,15 @@ from collections.abc import Callable
 
 import numpy as np
 
+from accerl_lerobot.policies.config import FlowSamplerConfig
 from accerl_lerobot.policies.flow import FlowShape
-from accerl_lerobot.policies.samplers import FlowSamplerConfig
 
 SlowVelocity = Callable[[np.ndarray, float, int], np.ndarray]
 """(x (K, D), t, which sample of the batch) → v (K, D)."""
 
 
 def std(k: int, n: int, config: FlowSamplerConfig) -> float:
+    """Std of step k; a learned one is passed to `log_prob` instead."""
     if config.noise == "euler":
         return config.noise_level / (math.sqrt(n) if config.stochastic == "all" else 1.0)
     t, remaining = (n - k) / n, max(k, 1) / n
@@ -27,7 +28,7 @@ def std(k: int, n: int, config: FlowSamplerConfig) -> float:
 
 
 def mean(x: float, v: float, k: int, n: int, config: FlowSamplerConfig) -> float:
-    if config.noise == "euler":
+    if config.noise != "flow_sde":
         return x - v / n
     t = (n - k) / n
     return x - v / n - std(k, n, config) ** 2 / (2 * t) * (x + (1 - t) * v)
@@ -37,11 +38,11 @@ def density(x: float, centre: float, scale: float) -> float:
     return -0.5 * ((x - centre) / scale) ** 2 - math.log(scale * math.sqrt(2 * math.pi))
 
 
-def counts(k: int, row: int, dim: int, shape: FlowShape, config: FlowSamplerConfig) -> bool:
+def counts(k: int, row: int, dim: int, shape: FlowShape) -> bool:
     """True if entry (row, dim) of step k's outcome belongs to the density."""
     if k == shape.num_steps - 1:
         return row < shape.executed and dim < shape.action_dim
-    return dim < shape.action_dim or config.padded == "joint"
+    return True
 
 
 def drawn(config: FlowSamplerConfig, n: int, index: int) -> list[int]:
@@ -72,8 +73,6 @@ def paths(
                     if k in drawn(config, n, index[b]):
                         noise = std(k, n, config) * eps[b, k, i, j]
                         following[i, j] = mean(x[i, j], v[i, j], k, n, config) + noise
-                    if j >= shape.action_dim and config.padded == "analytic" and config.stochastic != "last":
-                        following[i, j] = (n - k - 1) / n * x0[b, i, j]
             x = result[b, k + 1] = following
     return result
 
@@ -84,10 +83,15 @@ def log_prob(
     index: np.ndarray,
     shape: FlowShape,
     config: FlowSamplerConfig,
+    stds: np.ndarray | None = None,
 ) -> np.ndarray:
-    """(B, K) from whole paths (B, N + 1, K, D); under ``last`` only their two ends are read."""
+    """(B,) from whole paths (B, N + 1, K, D), of which under ``last`` only the two ends are read.
+
+    Args:
+        stds: (B, N, D), where they are learned.
+    """
     n = shape.num_steps
-    result = np.zeros((len(path), shape.chunk_size))
+    result = np.zeros(len(path))
     for b in range(len(path)):
         for k in drawn(config, n, int(index[b])):
             start = path[b, k].astype(np.float64)
@@ -98,7 +102,8 @@ def log_prob(
             v = velocity(start, (n - k) / n, b)
             for i in range(shape.chunk_size):
                 for j in range(shape.padded_dim):
-                    if counts(k, i, j, shape, config):
+                    if counts(k, i, j, shape):
                         centre = mean(start[i, j], v[i, j], k, n, config)
-                        result[b, i] += density(path[b, k + 1, i, j], centre, std(k, n, config))
+                        scale = std(k, n, config) if stds is None else stds[b, k, j]
+                        result[b] += density(path[b, k + 1, i, j], centre, scale)
     return result

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
 import shutil
 import subprocess
 import sys
@@ -17,17 +16,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from accerl_lerobot.checkpoint.layout import BACKBONE, PRETRAINED, save_checkpoint
+from accerl_lerobot.checkpoint.layout import BACKBONE, PRETRAINED
+from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig, run_sft, sft_command
 from accerl_lerobot.engine.preflight import check_sft_policy
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.backbone import BackboneConfig
-from accerl_lerobot.policies.base import stack_observations
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.loading import load_adapter, save_pretrained
-from accerl_lerobot.policies.plugins import PLUGINS, discovery, register_policies
-from tests.policies.tiny import adapter_at, log_ratio, perturb, requests
-from tests.policies.tiny_bins import write_bins
+from accerl_lerobot.policies.registry import PLUGINS, discovery, register_policies
+from accerl_lerobot.policies.saving import save_pretrained
+from tests.policies.checkpoints import write_bins
+from tests.policies.tiny import adapter_at, requests
 from tests.rounding import assert_close
 
 DATASET = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
@@ -165,6 +163,15 @@ def test_bins_by_hand(loaded: tuple[Any, Any, Any]):
     assert torch.equal(policy.encode_actions(policy.decode_tokens(every)), every)
 
 
+def test_the_chunk_is_the_tokens_bin_centres_in_the_environment_s_units(path: Path):
+    adapter = adapter_at(path)
+    decisions = adapter.decide(requests(8), 0)
+    tokens = np.stack([d.latent["tokens"] for d in decisions]).reshape(8, 2, DIMS)
+    assert_close(np.stack([d.chunk for d in decisions]), -1 + 4 * (tokens + 0.5) / BINS)
+    short = adapter_at(path, n_action_steps=1).decide(requests(1), 0)[0]
+    assert short.chunk.shape == (1, DIMS) and short.latent["tokens"].shape == (DIMS,)
+
+
 def test_the_loss_by_hand(loaded: tuple[Any, Any, Any]):
     policy, pre, _ = loaded
     raw = observed(3)
@@ -275,39 +282,6 @@ def test_a_new_policy_has_the_backbone_s_weights_when_asked(path: Path, tmp_path
     save_pretrained(adapter, tmp_path / "saved", PolicyConfig(path=str(where), device="cpu"))
     files = {f.name for f in (tmp_path / "saved" / BACKBONE).iterdir()}
     assert "tokenizer.json" in files and not any(f.endswith(".safetensors") for f in files)
-
-
-def test_a_moved_checkpoint_needs_nothing_from_where_it_was_made(tmp_path: Path):
-    origin = write_bins(tmp_path / "origin" / PRETRAINED)
-    config = PolicyConfig(path=str(origin), device="cpu")
-    adapter = load_adapter(config)
-    perturb(adapter, 0.1)
-
-    def write(directory: Path) -> int:
-        save_pretrained(adapter, directory / PRETRAINED, config)
-        return 12
-
-    final = save_checkpoint(tmp_path / "run" / "checkpoints", write)
-    shutil.rmtree(tmp_path / "origin")
-    asked = requests(3)
-    decisions = adapter.decide(asked, 0)
-    assert pickle.dumps(adapter_at(final / PRETRAINED).decide(asked, 0)) == pickle.dumps(decisions)
-    moved = Path(shutil.move(final, tmp_path / "elsewhere"))
-    assert pickle.dumps(adapter_at(moved / PRETRAINED).decide(asked, 0)) == pickle.dumps(decisions)
-
-
-def test_bf16_moves_log_probs_little(path: Path):
-    asked = requests(32)
-    fp32 = adapter_at(path)
-    perturb(fp32, 0.3)
-    bf16 = adapter_at(path, precision="bf16")
-    bf16.load_trainable(fp32.export_trainable())
-    change = log_ratio(bf16, asked, fp32.decide(asked, 0))
-    assert 0 < change.abs().max() < 0.1
-    batch = bf16.processing.prepare(*stack_observations(asked))
-    with torch.autocast("cpu", torch.bfloat16):
-        encoded = bf16.model.encode(batch)
-    assert encoded.context.logits(torch.zeros(32, 4, dtype=torch.long)).dtype == torch.float32
 
 
 def test_where_lerobot_finds_the_type(path: Path, tmp_path: Path):

@@ -13,9 +13,10 @@ from torch import Tensor
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies import gaussian
+from accerl_lerobot.policies.config import GaussianSamplerConfig
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.gaussian import GaussianContext, GaussianFamily, GaussianModel, log_slope
-from accerl_lerobot.policies.samplers import GaussianSamplerConfig
+from tests.policies.tiny import deviation
 
 SAMPLES = 40_000
 EXACT, WRONG = 4.0, 10.0
@@ -65,12 +66,6 @@ def family(squashed: bool, own_std: bool, sampler: GaussianSamplerConfig | None 
 def payoff(chunk: Tensor) -> Tensor:
     """Depends on every executed entry, and on two of them together."""
     return torch.tanh(2 * chunk[:, 0, 0] + chunk[:, 1, 1]) + 0.5 * chunk[:, 0, 1] ** 2 + 0.6 * chunk[:, 1, 0]
-
-
-def deviation(one: Tensor, other: Tensor) -> float:
-    """Difference of two means in units of its standard error."""
-    error = math.sqrt(one.var().item() / len(one) + other.var().item() / len(other))
-    return abs(one.mean().item() - other.mean().item()) / error
 
 
 @pytest.mark.parametrize("squashed", [False, True])
@@ -150,18 +145,26 @@ def test_entropy_moves_with_the_std():
     assert it.std.out.bias.grad.min() > 0, "a wider std is more entropy"
 
 
-@pytest.mark.parametrize("at_rest", ["stock", "mean"])
+@pytest.mark.parametrize("deterministic", [True, False])
 @pytest.mark.parametrize("own_std", [False, True])
-def test_at_rest(at_rest: str, own_std: bool):
-    it = family(False, own_std, GaussianSamplerConfig(at_rest=at_rest))
+def test_evaluation(deterministic: bool, own_std: bool):
+    it = family(False, own_std, GaussianSamplerConfig(deterministic_eval=deterministic))
     encoded = it.model.under(0.0, 4)
-    resting, moving = it.act(encoded, asked(4, explore=False)), it.act(encoded, asked(4))
-    assert not resting.log_prob.any() and resting.chunk.shape == (4, 2, 2)
-    if own_std and at_rest == "stock":  # a policy that has a std of its own samples in LeRobot too
-        assert torch.equal(resting.chunk, moving.chunk)
+    still, moving = it.act(encoded, asked(4, explore=False)), it.act(encoded, asked(4))
+    assert not still.log_prob.any() and still.chunk.shape == (4, 2, 2)
+    if own_std and not deterministic:  # a policy that has a std of its own samples in LeRobot too
+        assert torch.equal(still.chunk, moving.chunk)
     else:
-        assert torch.equal(resting.chunk, encoded.context.mean[:, :2])
+        assert torch.equal(still.chunk, encoded.context.mean[:, :2])
     assert not torch.equal(moving.chunk, encoded.context.mean[:, :2])
+
+
+def test_the_learned_std_does_not_shape_the_features():
+    it = family(squashed=False, own_std=False)
+    encoded = it.model.under(0.0, 4)
+    encoded.context.rows.requires_grad_()
+    it.score(encoded, it.act(encoded, asked(4)).latent).log_prob.sum().backward()
+    assert encoded.context.rows.grad is None and it.std.out.weight.grad.abs().max() > 0
 
 
 def test_a_constant_std_is_no_parameter():
@@ -178,7 +181,6 @@ def test_a_constant_std_is_no_parameter():
         ({"std_min": 0.0}, "std_min"),
         ({"std_min": 0.2}, "std_min"),
         ({"std_max": 0.2}, "std_max"),
-        ({"at_rest": "greedy"}, "at_rest"),
     ],
 )
 def test_bad_values_name_their_field(values: dict, field: str):

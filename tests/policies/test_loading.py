@@ -1,45 +1,69 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loading refuses what is not the checkpoint; what is saved is LeRobot's, wherever it is moved."""
+"""Loading refuses what is not the checkpoint; what is saved needs nothing from where it was made."""
 
 from __future__ import annotations
 
+import importlib
 import json
 import logging
 import pickle
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from pydoc import locate
+from typing import Any
 
 import draccus
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from accerl_lerobot.checkpoint.layout import BACKBONE, PRETRAINED, save_checkpoint
+from accerl_lerobot.checkpoint.layout import BACKBONE, FAST, PRETRAINED, displaced, relocate, save_checkpoint
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.config import PolicyConfig, ValueHeadConfig
-from accerl_lerobot.policies.loading import (
-    example_observations,
-    load_adapter,
-    load_lerobot_config,
-    no_tf32,
-    resolve_device,
-    save_pretrained,
-)
-from accerl_lerobot.policies.samplers import FlowSamplerConfig, SamplerConfig
+from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig, SamplerConfig, ValueHeadConfig
+from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, no_tf32, resolve_device
+from accerl_lerobot.policies.saving import save_pretrained
 from tests.conftest import write_smolvla
+from tests.policies.checkpoints import edit_config, stock_chunk, write_act, write_bins, write_diffusion
 from tests.policies.tiny import adapter_at, perturb, requests
+from tests.policies.tiny_pi import ACTIONS, COMMIT, KINDS, PALIGEMMA, SKIP, hub, small, write_pi
+
+MODELING = "lerobot.policies.pi0_fast.modeling_pi0_fast"
+Tensors = dict[str, torch.Tensor]
+PROCESSOR = "policy_preprocessor.json"
+WRITERS: dict[str, Callable[[Path], Path]] = {
+    "smolvla": write_smolvla,
+    "smolvla_bins": write_bins,
+    "act": write_act,
+    "diffusion": write_diffusion,
+    "pi0": lambda path: write_pi(path, "pi0"),
+    "pi05": lambda path: write_pi(path, "pi05"),
+    "pi0_fast": lambda path: write_pi(path, "pi0_fast", num_steps=8),
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def sizes() -> Iterator[None]:
+    with small():
+        yield
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    @cache
+    def write(name: str) -> Path:
+        return WRITERS[name](tmp_path_factory.mktemp(name) / PRETRAINED)
+
+    return write
 
 
 @pytest.fixture
-def copied(tiny_checkpoint: Path, tmp_path: Path) -> Path:
-    """A checkpoint to damage."""
-    return Path(shutil.copytree(tiny_checkpoint, tmp_path / "copied"))
-
-
-def edit_config(path: Path, **changes: object) -> None:
-    config = json.loads((path / "config.json").read_text())
-    (path / "config.json").write_text(json.dumps(config | changes))
+def damaged(written: Callable[[str], Path], tmp_path: Path) -> Callable[[str], Path]:
+    """A copy of a checkpoint, to damage."""
+    return lambda name: Path(shutil.copytree(written(name), tmp_path / f"copied-{name}"))
 
 
 def saved(path: Path, directory: Path, **options: object) -> Path:
@@ -48,6 +72,27 @@ def saved(path: Path, directory: Path, **options: object) -> Path:
     perturb(adapter, 0.1)
     save_pretrained(adapter, directory, config)
     return directory
+
+
+def decided(path: Path | str, **options: object) -> bytes:
+    return pickle.dumps(
+        load_adapter(PolicyConfig(path=str(path), device="cpu", **options)).decide(requests(3), 0)
+    )
+
+
+def edit_weights(path: Path, edit: Callable[[Tensors], object]) -> None:
+    tensors = load_file(path / "model.safetensors")
+    changed = edit(tensors)
+    save_file(changed if isinstance(changed, dict) else tensors, path / "model.safetensors")
+
+
+def refused(path: Path, sentence: str, **options: object) -> None:
+    with pytest.raises(InputError, match=f"^{sentence}") as caught:
+        adapter_at(path, **options)
+    assert "\n" not in str(caught.value)
+
+
+# ---- paths, configs, options
 
 
 @pytest.mark.parametrize(
@@ -66,13 +111,6 @@ def test_a_path_to_nothing(path: str | None, sentence: str):
     assert str(caught.value).startswith(sentence) and "\n" not in str(caught.value)
 
 
-def test_the_folder_above_the_checkpoint(copied: Path):
-    (copied / "config.json").unlink()
-    for path in (copied, copied / "model.safetensors"):
-        with pytest.raises(InputError, match="no config.json there; give the folder named pretrained_model"):
-            load_adapter(PolicyConfig(path=str(path)))
-
-
 @pytest.mark.parametrize(
     ("kind", "why"),
     [
@@ -82,111 +120,58 @@ def test_the_folder_above_the_checkpoint(copied: Path):
         ("my_policy", "no likelihood for it here; use one of smolvla, "),
     ],
 )
-def test_a_policy_without_a_likelihood(copied: Path, kind: str, why: str):
-    edit_config(copied, type=kind)
-    with pytest.raises(InputError) as caught:
-        load_adapter(PolicyConfig(path=str(copied)))
-    assert str(caught.value).startswith(f"policy.type='{kind}': {copied} is of this type: {why}")
+def test_a_policy_without_a_likelihood(damaged: Any, kind: str, why: str):
+    path = damaged("act")
+    edit_config(path, type=kind)
+    refused(path, f"policy.type='{kind}': {path} is of this type: {why}")
 
 
-def test_a_config_of_something_else(copied: Path):
-    for text, why in (
-        ('{"type": "smolvla", "no_such_field": 1}', "its config.json is not one of this LeRobot's policies"),
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ('{"type": "act", "no_such_field": 1}', "its config.json is not one of this LeRobot's policies"),
         ("[1, 2]", "config.json: a mapping is wanted, not list"),
         ("not json", "config.json: not good JSON"),
-    ):
-        (copied / "config.json").write_text(text)
-        with pytest.raises(InputError, match=why):
-            load_lerobot_config(PolicyConfig(path=str(copied)))
+        (None, "no config.json there; give the folder named pretrained_model"),
+    ],
+)
+def test_a_config_of_something_else(damaged: Any, text: str | None, why: str):
+    path = damaged("act")
+    (path / "config.json").unlink()
+    if text is not None:
+        (path / "config.json").write_text(text)
+    refused(path, f"policy.path=.*{why}")
 
 
 @pytest.mark.parametrize(
-    ("changes", "field"),
+    ("name", "changes", "options", "sentence"),
     [
-        ({"rtc_config": {"enabled": True}}, "policy.rtc_config.enabled=True"),
-        ({"adapt_to_pi_aloha": True}, "policy.adapt_to_pi_aloha=True"),
+        ("smolvla", {"rtc_config": {"enabled": True}}, {}, "policy.rtc_config.enabled=True: real-time"),
+        ("pi0", {"rtc_config": {"enabled": True}}, {}, "policy.rtc_config.enabled=True: "),
+        ("pi0_fast", {"rtc_config": {"enabled": True}}, {}, "policy.rtc_config.enabled=True: "),
+        ("smolvla", {"adapt_to_pi_aloha": True}, {}, "policy.adapt_to_pi_aloha=True: "),
+        ("smolvla", {"compile_model": True}, {}, "policy.compile_model=True: a compiled sampler rounds"),
+        ("pi05", {"compile_model": True}, {}, "policy.compile_model=True: "),
+        ("pi0_fast", {"compile_model": True}, {}, "policy.compile_model=True: "),
+        ("diffusion", {"compile_model": True}, {}, "policy.compile_model=True: "),
+        ("pi0_fast", {"temperature": 0.7}, {}, "policy.temperature=0.7: LeRobot's sampler has to be greedy"),
+        ("pi0_fast", {"n_action_steps": 3}, {}, "policy.n_action_steps=3: LeRobot decodes so many rows from"),
+        ("pi0_fast", {}, {"n_action_steps": 2}, "policy.n_action_steps=2: LeRobot decodes so many rows"),
+        ("pi0_fast", {}, {"num_steps": 3}, "policy.num_steps=3: a pi0_fast policy does not denoise"),
+        ("smolvla_bins", {}, {"num_steps": 3}, "policy.num_steps=3: a smolvla_bins policy does not denoise"),
+        ("smolvla", {}, {"n_action_steps": 5}, "policy.n_action_steps=5: use 1 to 4, the chunk the policy"),
+        ("act", {}, {"sampler": FlowSamplerConfig()}, "policy.sampler.type='flow': a act policy explores"),
     ],
-)
-def test_samplers_that_have_another_density(copied: Path, changes: dict, field: str):
-    edit_config(copied, **changes)
-    with pytest.raises(InputError, match=f"^{field}: "):
-        load_adapter(PolicyConfig(path=str(copied), device="cpu"))
-
-
-def test_a_compiled_sampler_is_refused(copied: Path, monkeypatch: pytest.MonkeyPatch):
+)  # fmt: skip
+def test_options_under_which_its_density_would_be_another(
+    damaged: Any, monkeypatch: pytest.MonkeyPatch, name: str, changes: dict, options: dict, sentence: str
+):
     monkeypatch.setattr(torch, "compile", lambda function, **options: function)
     precision = torch.get_float32_matmul_precision()
-    edit_config(copied, compile_model=True)
-    with pytest.raises(InputError, match="^policy.compile_model=True: "):
-        load_adapter(PolicyConfig(path=str(copied), device="cpu"))
+    path = damaged(name)
+    edit_config(path, **changes)
+    refused(path, sentence, **options)
     torch.set_float32_matmul_precision(precision)
-
-
-def without_one(tensors: dict[str, torch.Tensor], key: str) -> None:
-    del tensors[key]
-
-
-def with_one_more(tensors: dict[str, torch.Tensor], key: str) -> None:
-    tensors["model.of_another_version"] = torch.zeros(2)
-
-
-def reshaped(tensors: dict[str, torch.Tensor], key: str) -> None:
-    tensors[key] = torch.zeros(3, 3)
-
-
-def with_nan(tensors: dict[str, torch.Tensor], key: str) -> None:
-    tensors[key].view(-1)[0] = float("nan")
-
-
-@pytest.mark.parametrize(
-    ("damage", "detail"),
-    [
-        (without_one, r"1 tensors missing \['model.action_out_proj.weight'\], 0 unexpected"),
-        (with_one_more, r"0 tensors missing \[\], 1 unexpected \['model.of_another_version'\]"),
-        (reshaped, "size mismatch for model.action_out_proj.weight"),
-        (with_nan, "model.safetensors: model.action_out_proj.weight holds NaN or infinity"),
-    ],
-)
-def test_weights_that_are_not_the_policy_s(copied: Path, damage: Callable[..., None], detail: str):
-    tensors = load_file(copied / "model.safetensors")
-    damage(tensors, "model.action_out_proj.weight")
-    save_file(tensors, copied / "model.safetensors")
-    with pytest.raises(InputError, match=f"^policy.path=.*{detail}"):
-        load_adapter(PolicyConfig(path=str(copied), device="cpu"))
-
-
-def with_infinity(tensors: dict[str, torch.Tensor], key: str) -> None:
-    tensors[key].view(-1)[-1] = float("-inf")
-
-
-@pytest.mark.parametrize("damage", [with_nan, with_infinity])
-def test_statistics_are_numbers(copied: Path, damage: Callable[..., None]):
-    (file,) = copied.glob("policy_preprocessor*.safetensors")
-    tensors = load_file(file)
-    damage(tensors, "observation.state.mean")
-    save_file(tensors, file)
-    with pytest.raises(InputError) as caught:
-        load_adapter(PolicyConfig(path=str(copied), device="cpu"))
-    said = f"{file.name}: observation.state.mean holds NaN or infinity; train it again"
-    assert str(caught.value) == f"policy.path='{copied}': {said}"
-
-
-@pytest.mark.parametrize(
-    ("content", "why"),
-    [(None, "is missing; give a folder with the weights"), (b"not tensors", "not safetensors")],
-)
-def test_a_weights_file_that_is_none(copied: Path, content: bytes | None, why: str):
-    (copied / "model.safetensors").unlink()
-    if content is not None:
-        (copied / "model.safetensors").write_bytes(content)
-    with pytest.raises(InputError, match=f"^policy.path=.*model.safetensors: {why}"):
-        load_adapter(PolicyConfig(path=str(copied), device="cpu"))
-
-
-def test_missing_processors(copied: Path):
-    (copied / "policy_preprocessor.json").unlink()
-    with pytest.raises(InputError, match="its LeRobot processors did not load"):
-        load_adapter(PolicyConfig(path=str(copied), device="cpu"))
 
 
 @pytest.mark.parametrize("values", [{"num_steps": 0}, {"n_action_steps": 0}, {"n_action_steps": -1}])
@@ -195,164 +180,14 @@ def test_sizes_below_one_are_refused_when_parsed(values: dict):
         PolicyConfig(**values)
 
 
-def test_more_executed_than_predicted(tiny_checkpoint: Path):
-    with pytest.raises(
-        InputError, match="^policy.n_action_steps=5: use 1 to 4, the chunk the policy predicts"
-    ):
-        load_lerobot_config(PolicyConfig(path=str(tiny_checkpoint), n_action_steps=5))
-
-
 def test_devices(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert resolve_device("auto") == resolve_device("cpu") == torch.device("cpu")
-    for name in ("cuda", "cuda:1"):
-        with pytest.raises(
-            InputError, match=f"^policy.device='{name}': no CUDA device here; use cpu or auto"
-        ):
+    for name, why in (("cuda", "no CUDA"), ("cuda:1", "no CUDA"), ("gpu", "use cpu, cuda or auto")):
+        with pytest.raises(InputError, match=f"^policy.device='{name}': {why}"):
             resolve_device(name)
-    with pytest.raises(InputError, match="^policy.device='gpu': use cpu, cuda or auto"):
-        resolve_device("gpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert resolve_device("auto") == torch.device("cuda")
-
-
-def test_overridden_steps_are_used_and_saved(tiny_checkpoint: Path, tmp_path: Path):
-    path = saved(tiny_checkpoint, tmp_path / "saved", num_steps=2, n_action_steps=3)
-    adapter = adapter_at(path)
-    shape = adapter.family.shape
-    assert (shape.num_steps, shape.executed, shape.chunk_size) == (2, 3, 4)
-    assert adapter.decide(requests(1), 0)[0].chunk.shape == (3, 2)
-
-
-def test_a_moved_checkpoint_needs_nothing_from_where_it_was_made(tmp_path: Path):
-    from lerobot.policies.factory import make_pre_post_processors
-    from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
-
-    origin = write_smolvla(tmp_path / "origin" / PRETRAINED)
-    config = PolicyConfig(path=str(origin), device="cpu")
-    adapter = load_adapter(config)
-    perturb(adapter, 0.1)
-
-    def write(directory: Path) -> int:
-        save_pretrained(adapter, directory / PRETRAINED, config)
-        return 12
-
-    path = save_checkpoint(tmp_path / "run" / "checkpoints", write) / PRETRAINED
-    shutil.rmtree(tmp_path / "origin")
-
-    stock = SmolVLAPolicy.from_pretrained(path)
-    pre, post = make_pre_post_processors(stock.config, pretrained_path=str(path))
-    asked = requests(1, explore=False)
-    observation = asked[0].observation
-    noise, _, _ = adapter.family._noise(asked, adapter.device)
-    batch = pre(
-        {
-            "observation.state": torch.from_numpy(observation["observation.state"]),
-            "observation.images.front": torch.from_numpy(observation["observation.images.front"]).permute(
-                2, 0, 1
-            )
-            / 255.0,
-            "task": observation["task"],
-        }
-    )
-    expected = adapter.decide(asked, 0)[0].chunk
-    assert (post(stock.predict_action_chunk(batch, noise=noise)[0]).numpy() == expected).all()
-
-    moved = shutil.move(tmp_path / "run" / "checkpoints" / "000012", tmp_path / "elsewhere")
-    shutil.rmtree(tmp_path / "run")
-    again = adapter_at(Path(moved) / PRETRAINED)
-    assert pickle.dumps(again.decide(asked, 0)) == pickle.dumps(adapter.decide(asked, 0))
-    second = saved(Path(moved) / PRETRAINED, tmp_path / "second")
-    shutil.rmtree(moved)
-    assert len(adapter_at(second).decide(asked, 0)) == 1, "and so does a checkpoint of the moved one"
-
-
-def test_a_backbone_that_is_gone_is_named(tmp_path: Path):
-    origin = write_smolvla(tmp_path / "origin" / PRETRAINED)
-    shutil.rmtree(tmp_path / "origin" / f"{PRETRAINED}-backbone")
-    with pytest.raises(
-        InputError, match=rf"{PRETRAINED}-backbone, which is gone; put a copy into {BACKBONE}/"
-    ):
-        load_lerobot_config(PolicyConfig(path=str(origin)))
-
-
-def test_the_backbone_s_own_weights_are_not_copied(tiny_checkpoint: Path, tmp_path: Path):
-    config = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
-    adapter = load_adapter(config)
-    backbone = Path(shutil.copytree(adapter.policy.config.vlm_model_name, tmp_path / "backbone"))
-    (backbone / "model.safetensors").write_bytes(b"large")
-    adapter.policy.config.vlm_model_name = str(backbone)
-    save_pretrained(adapter, tmp_path / "saved", config)
-    assert (tmp_path / "saved" / BACKBONE / "tokenizer.json").is_file()
-    assert not (tmp_path / "saved" / BACKBONE / "model.safetensors").exists()
-    config_file = json.loads((tmp_path / "saved" / "config.json").read_text())
-    assert config_file["vlm_model_name"] == str(tmp_path / "saved" / BACKBONE)
-
-
-def test_a_checkpoint_on_the_hub_is_loaded_whole(
-    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    # The layout of the Hub's cache, as after a download: critic and backbone must come along.
-    from huggingface_hub import constants
-
-    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
-    repository = tmp_path / "hub" / "models--me--policy"
-    path = saved(tiny_checkpoint, repository / "snapshots" / "abc")
-    edit_config(path, vlm_model_name="/on/another/machine")
-    (repository / "refs").mkdir()
-    (repository / "refs" / "main").write_text("abc")
-    here, there = adapter_at(path), load_adapter(PolicyConfig(path="me/policy", device="cpu"))
-    asked = requests(2)
-    assert pickle.dumps(there.decide(asked, 0)) == pickle.dumps(here.decide(asked, 0))
-    assert there.decide(asked, 0)[0].value != 0
-    with pytest.raises(InputError, match="not loadable from the Hub"):
-        load_adapter(PolicyConfig(path="me/policy", revision="v9", device="cpu"))
-
-
-def test_tilde_is_the_home_folder(copied: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("HOME", str(copied.parent))
-    assert adapter_at(Path("~/copied")).decide(requests(1), 0)[0].value == 0
-
-
-def test_the_critic_is_saved_and_loaded(
-    tiny_checkpoint: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-):
-    path = saved(tiny_checkpoint, tmp_path / "saved")
-    one, other = adapter_at(path), adapter_at(path, value_head=ValueHeadConfig(detach=False))
-    values = [a.decide(requests(3), 0)[i].value for a in (one, other) for i in range(3)]
-    assert values[:3] == values[3:] and 0 not in values
-    assert caplog.text == "", "detach is a choice of training; the weights fit"
-
-
-@pytest.mark.parametrize("changed", [{"hidden": 16}, {"pooling": "mean"}])
-def test_another_critic_starts_anew_with_a_warning(
-    tiny_checkpoint: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, changed: dict
-):
-    path = saved(tiny_checkpoint, tmp_path / "saved")
-    with caplog.at_level(logging.WARNING):
-        adapter = adapter_at(path, value_head=ValueHeadConfig(**changed))
-    assert adapter.decide(requests(1), 0)[0].value == 0
-    ((name, value),) = changed.items()
-    assert (
-        f"critic is not loaded, a new one starts at V = 0: policy.value_head.{name}={value}, there"
-        in caplog.text
-    )
-
-
-def test_another_sampler_is_pointed_out(
-    tiny_checkpoint: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-):
-    path = saved(tiny_checkpoint, tmp_path / "saved", sampler=FlowSamplerConfig(noise_level=0.4))
-    stored = json.loads((path / "accerl.json").read_text())["sampler"]
-    assert stored == draccus.encode(FlowSamplerConfig(noise_level=0.4), SamplerConfig)
-    assert stored["type"] == "flow" and stored["noise_level"] == 0.4
-    with caplog.at_level(logging.WARNING):
-        adapter_at(path, FlowSamplerConfig(noise_level=0.4))
-        assert caplog.text == ""
-        adapter_at(path, FlowSamplerConfig(noise_level=0.2, stochastic="all"))
-    assert (
-        "policy.sampler.stochastic=all, there last, policy.sampler.noise_level=0.2, there 0.4" in caplog.text
-    )
 
 
 def test_fp32_is_fp32_on_a_gpu_too():
@@ -370,24 +205,438 @@ def test_fp32_is_fp32_on_a_gpu_too():
             backend.allow_tf32 = allowed
 
 
-def test_a_checkpoint_of_lerobot_s_own_trainer_has_neither(
-    tiny_checkpoint: Path, caplog: pytest.LogCaptureFixture
+# ---- weights: each tensor of the policy is the file's
+
+OUT = "model.action_out_proj.weight"
+EXPERT = "model.paligemma_with_expert.gemma_expert."
+PALI = "model.paligemma_with_expert.paligemma."
+EMBEDDING, HEAD = f"{PALI}model.language_model.embed_tokens.weight", f"{PALI}lm_head.weight"
+
+
+def with_nan(tensors: Tensors, key: str) -> None:
+    tensors[key].view(-1)[0] = float("nan")
+
+
+@pytest.mark.parametrize(("name", "key"), [("smolvla", OUT), ("pi0", OUT), ("pi05", OUT), ("pi0_fast", HEAD)])
+@pytest.mark.parametrize(
+    ("damage", "detail"),
+    [
+        (lambda t, key: t.pop(key), r"1 tensors missing \['{key}'\], 0 unexpected \[\]"),
+        (lambda t, key: t.update(x=torch.zeros(2)), r"0 tensors missing \[\], 1 unexpected \['(model.)?x'\]"),
+        (lambda t, key: t.update(x=t.pop(key)), r"1 tensors missing \['{key}'\], 1 unexpected"),
+        (lambda t, key: t.update({key: torch.zeros(3, 3)}), r"size mismatch for {key}, \(3, 3\) in the file"),
+        (with_nan, "model.safetensors: {key} holds NaN or infinity"),
+        (lambda t, key: {"another": torch.zeros(1)}, r"\d+ tensors missing \['.*', '.*', '.*'\], 1 unexp"),
+    ],
+    ids=["missing", "unexpected", "renamed", "shape", "nan", "another"],
+)  # fmt: skip
+def test_weights_that_did_not_load_are_named(
+    damaged: Any, name: str, key: str, damage: Callable[..., object], detail: str
 ):
-    assert adapter_at(tiny_checkpoint).decide(requests(1), 0)[0].value == 0
-    assert caplog.text == ""
+    path = damaged(name)
+    edit_weights(path, lambda tensors: damage(tensors, key))
+    refused(path, f"policy.path=.*: {detail.replace('{key}', key)}")
 
 
-def test_example_observations_carry_the_world_s_names(tiny_checkpoint: Path):
-    config = load_lerobot_config(PolicyConfig(path=str(tiny_checkpoint)))
-    renames = {"observation.images.top": "observation.images.front"}
-    observations, tasks = example_observations(config, renames)
-    assert {k: (v.shape, str(v.dtype)) for k, v in observations.items()} == {
-        "observation.images.top": ((2, 32, 32, 3), "uint8"),
-        "observation.state": ((2, 4), "float32"),
-    }
-    assert len(tasks) == 2 and len(tasks[0]) != len(tasks[1])
-    request = requests(1)[0]
+@pytest.mark.parametrize("name", ["smolvla", "pi0"])  # LeRobot prints it, and returns a random π0
+@pytest.mark.parametrize(("content", "why"), [(None, "is missing"), (b"not tensors", "not safetensors")])
+def test_a_weights_file_that_is_none(damaged: Any, name: str, content: bytes | None, why: str):
+    path = damaged(name)
+    (path / "model.safetensors").unlink()
+    if content is not None:
+        (path / "model.safetensors").write_bytes(content)
+    refused(path, f"policy.path=.*model.safetensors: {why}")
+
+
+def test_weights_of_another_type_are_refused(written: Any, damaged: Any):
+    for one, other in (KINDS, KINDS[::-1]):
+        path = damaged(one)
+        shutil.copy(written(other) / "model.safetensors", path)
+        refused(path, "policy.path=.*the weights did not load: .* tensors missing")
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_output_layers_that_no_action_is_computed_with_may_be_left_out(damaged: Any, name: str):
+    path = damaged(name)
+    expected = decided(path)
+    edit_weights(path, lambda t: [t.pop(k) for k in (HEAD, f"{EXPERT}lm_head.weight")])
+    assert decided(path) == expected
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_openpi_s_names_are_read_as_lerobot_reads_them(damaged: Any, name: str):
+    # Without the leading ``model.``, the input embedding under the name of the output layer.
+    def as_openpi(tensors: Tensors) -> Tensors:
+        tensors[HEAD] = tensors.pop(EMBEDDING)
+        return {k.removeprefix("model."): v for k, v in tensors.items()}
+
+    path = damaged(name)
+    expected = decided(path)
+    edit_weights(path, as_openpi)
+    assert decided(path) == expected
+    edit_weights(path, lambda t: t.pop("action_in_proj.bias"))
+    refused(path, r"policy.path=.*1 tensors missing \['model.action_in_proj.bias'\]")
+
+
+def test_a_shared_embedding_is_read_as_lerobot_reads_it(damaged: Any):
+    path = damaged("pi0_fast")
+    edit_weights(path, lambda t: t.update({EMBEDDING: t[HEAD].clone()}))
+    expected = decided(path)
+    edit_weights(path, lambda t: t.pop(EMBEDDING))
+    assert decided(path) == expected
+
+
+@pytest.mark.parametrize("number", [float("nan"), float("-inf")])
+def test_statistics_are_numbers(damaged: Any, number: float):
+    path = damaged("smolvla")
+    (file,) = path.glob("policy_preprocessor*.safetensors")
+    tensors = load_file(file)
+    tensors["observation.state.mean"].view(-1)[-1] = number
+    save_file(tensors, file)
+    refused(
+        path, f"policy.path='{path}': {file.name}: observation.state.mean holds NaN or infinity; train it"
+    )
+
+
+def test_missing_processors(damaged: Any):
+    path = damaged("act")
+    (path / PROCESSOR).unlink()
+    refused(path, "policy.path=.*its LeRobot processors did not load")
+
+
+@pytest.mark.parametrize("name", ["act", "diffusion"])
+def test_torchvision_s_weights_are_not_asked_for(
+    damaged: Any, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def download(*arguments: object, **options: object) -> None:
+        raise AssertionError("the network")
+
+    monkeypatch.setattr("torchvision.models._api.load_state_dict_from_url", download)
+    path, asked = damaged(name), requests(1, image=16)[0]
+    edit_config(path, pretrained_backbone_weights="ResNet18_Weights.IMAGENET1K_V1")
+    with pytest.raises(AssertionError, match="the network"):
+        stock_chunk(path, asked)
+    stock_chunk(saved(path, tmp_path / "saved"), asked)
+
+
+# ---- LeRobot's internals: what the sampler is compared with at load
+
+
+@pytest.mark.parametrize("name", ["smolvla", *KINDS])
+def test_another_integrator_in_lerobot_fails_at_load(
+    written: Any, name: str, monkeypatch: pytest.MonkeyPatch
+):
+    def midpoint(denoise: Any, noise: torch.Tensor, num_steps: int, **options: Any) -> torch.Tensor:
+        x, dt = noise, -1.0 / num_steps
+        for step in range(num_steps):
+            x = x + dt * denoise(x, torch.full((len(x),), 1.0 + (step + 0.5) * dt))
+        return x
+
+    module = importlib.import_module(f"lerobot.policies.{name}.modeling_{name}")
+    monkeypatch.setattr(module, "euler_integrate", midpoint)
+    refused(written(name), "lerobot=.*does not fit LeRobot .*: it differs from its sampler by")
+
+
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        ("act", "act.modeling_act.ACTPolicy.predict_action_chunk"),
+        ("smolvla", "smolvla.modeling_smolvla.SmolVLAPolicy.predict_action_chunk"),
+        ("diffusion", "diffusion.modeling_diffusion.DiffusionPolicy.predict_action_chunk"),
+        ("pi0_fast", "pi0_fast.modeling_pi0_fast.PI0FastPolicy.predict_action_chunk"),
+        ("pi0_fast", "pi0_fast.modeling_pi0_fast.PI0FastPytorch.sample_actions_fast_kv_cache"),
+    ],
+)
+def test_a_changed_lerobot_fails_at_load(
+    written: Any, name: str, method: str, monkeypatch: pytest.MonkeyPatch
+):
+    """A larger chunk, or other tokens behind the same chunk."""
+    owner = locate(f"lerobot.policies.{method}".rpartition(".")[0])
+    attribute = method.rpartition(".")[2]
+    stock = getattr(owner, attribute)
+    monkeypatch.setattr(owner, attribute, lambda *given, **options: stock(*given, **options) + 1)
+    if attribute.startswith("sample"):
+        zeros = lambda self, tokens, **sizes: torch.zeros(len(tokens), 4, 2)  # noqa: E731
+        monkeypatch.setattr(f"{MODELING}.PI0FastPolicy.detokenize_actions", zeros)
+    refused(written(name), "lerobot=.*does not fit LeRobot .*: it differs from its sampler by")
+
+
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        ("smolvla", "smolvla.modeling_smolvla.VLAFlowMatching.embed_prefix"),
+        ("pi0", "pi0.modeling_pi0.PI0Pytorch.embed_prefix"),
+        ("pi05", "pi05.modeling_pi05.PI05Pytorch.embed_prefix"),
+        ("pi0_fast", "pi0_fast.modeling_pi0_fast.PI0FastPytorch.embed_prefix_fast"),
+        ("diffusion", "diffusion.modeling_diffusion.DiffusionModel._prepare_global_conditioning"),
+    ],
+)
+def test_a_lerobot_without_what_is_driven_fails_at_load(
+    written: Any, name: str, method: str, monkeypatch: pytest.MonkeyPatch
+):
+    path = written(name)
+    monkeypatch.delattr(f"lerobot.policies.{method}")
+    refused(path, rf"lerobot=.*cannot drive it \(AttributeError: .*{method.rpartition('.')[2]}")
+
+
+def test_weights_that_compute_nan_are_refused(written: Any):
+    adapter = adapter_at(written("smolvla"))
+    with torch.no_grad():
+        adapter.policy.model.action_out_proj.bias.fill_(float("nan"))
+    observations, tasks, _ = adapter_at(written("smolvla")).example()
+    with pytest.raises(InputError, match="differs from its sampler by nan"):
+        adapter.self_check(observations, tasks)
+
+
+# ---- files beside the weights
+
+
+@pytest.mark.parametrize("name", ["smolvla", "smolvla_bins"])
+def test_a_moved_checkpoint_needs_nothing_from_where_it_was_made(name: str, tmp_path: Path):
+    origin = WRITERS[name](tmp_path / "origin" / PRETRAINED)
+    config = PolicyConfig(path=str(origin), device="cpu")
+    adapter = load_adapter(config)
+    perturb(adapter, 0.1)
+
+    def write(directory: Path) -> int:
+        save_pretrained(adapter, directory / PRETRAINED, config)
+        return 12
+
+    final = save_checkpoint(tmp_path / "run" / "checkpoints", write)
+    shutil.rmtree(tmp_path / "origin")
+    expected = pickle.dumps(adapter.decide(requests(3), 0))
+    assert decided(final / PRETRAINED) == expected
+    moved = Path(shutil.move(final, tmp_path / "elsewhere")) / PRETRAINED
+    shutil.rmtree(tmp_path / "run")
+    assert decided(moved) == expected
+    second = saved(moved, tmp_path / "second")
+    shutil.rmtree(moved)
+    assert len(adapter_at(second).decide(requests(1), 0)) == 1, "and so does a checkpoint of the moved one"
+
+
+def test_a_backbone_that_is_gone_is_named(tmp_path: Path):
+    origin = write_smolvla(tmp_path / "origin" / PRETRAINED)
+    shutil.rmtree(tmp_path / "origin" / f"{PRETRAINED}-backbone")
+    refused(origin, rf"policy.path=.*{PRETRAINED}-backbone, which is gone; put a copy into {BACKBONE}/")
+
+
+def test_the_backbone_s_own_weights_are_not_copied(written: Any, tmp_path: Path):
+    config = PolicyConfig(path=str(written("smolvla")), device="cpu")
+    adapter = load_adapter(config)
+    backbone = Path(shutil.copytree(adapter.policy.config.vlm_model_name, tmp_path / "backbone"))
+    (backbone / "model.safetensors").write_bytes(b"large")
+    adapter.policy.config.vlm_model_name = str(backbone)
+    save_pretrained(adapter, tmp_path / "saved", config)
+    assert (tmp_path / "saved" / BACKBONE / "tokenizer.json").is_file()
+    assert not (tmp_path / "saved" / BACKBONE / "model.safetensors").exists()
+    config_file = json.loads((tmp_path / "saved" / "config.json").read_text())
+    assert config_file["vlm_model_name"] == str(tmp_path / "saved" / BACKBONE)
+
+
+def test_a_checkpoint_on_the_hub_is_loaded_whole(
+    written: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    # The layout of the Hub's cache, as after a download: critic and backbone must come along.
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
+    repository = tmp_path / "hub" / "models--me--policy"
+    path = saved(written("smolvla"), repository / "snapshots" / "abc")
+    edit_config(path, vlm_model_name="/on/another/machine")
+    (repository / "refs").mkdir()
+    (repository / "refs" / "main").write_text("abc")
+    assert decided("me/policy") == decided(path)
+    with pytest.raises(InputError, match="not loadable from the Hub"):
+        load_adapter(PolicyConfig(path="me/policy", revision="v9", device="cpu"))
+
+
+def test_tilde_is_the_home_folder(written: Any, monkeypatch: pytest.MonkeyPatch):
+    path = written("smolvla")
+    monkeypatch.setenv("HOME", str(path.parent))
+    assert decided(f"~/{path.name}") == decided(path)
+
+
+def test_overridden_steps_are_used_and_saved(written: Any, tmp_path: Path):
+    for name in ("smolvla", "pi0"):
+        path = saved(written(name), tmp_path / name, num_steps=2, n_action_steps=3)
+        shape = adapter_at(path).family.shape
+        assert (shape.num_steps, shape.executed, shape.chunk_size) == (2, 3, 4)
+
+
+def test_names_of_the_environment_s_features_are_mapped(written: Any):
+    path, request = written("smolvla"), requests(1)[0]
+    adapter = adapter_at(path, rename_map={"observation.images.top": "observation.images.front"})
+    assert adapter.example()[0].keys() == {"observation.images.top", "observation.state"}
     renamed = {k.replace("front", "top"): v for k, v in request.observation.items()}
-    adapter = adapter_at(tiny_checkpoint, rename_map=renames)
-    decision = adapter.decide([type(request)(observation=renamed, noise_seed=request.noise_seed)], 0)
-    assert pickle.dumps(decision) == pickle.dumps(adapter_at(tiny_checkpoint).decide([request], 0))
+    decision = adapter.decide([replace(request, observation=renamed)], 0)
+    assert pickle.dumps(decision) == pickle.dumps(adapter_at(path).decide([request], 0))
+
+
+# ---- critic and sampler beside the weights
+
+
+def test_the_critic_is_saved_and_loaded(written: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    assert adapter_at(written("smolvla")).decide(requests(1), 0)[0].value == 0, "LeRobot's own has none"
+    path = saved(written("smolvla"), tmp_path / "saved")
+    one, other = adapter_at(path), adapter_at(path, value_head=ValueHeadConfig(detach=False))
+    values = [a.decide(requests(3), 0)[i].value for a in (one, other) for i in range(3)]
+    assert values[:3] == values[3:] and 0 not in values
+    assert caplog.text == "", "detach is a choice of training; the weights fit"
+    with caplog.at_level(logging.WARNING):
+        adapter = adapter_at(path, value_head=ValueHeadConfig(hidden=16))
+    assert adapter.decide(requests(1), 0)[0].value == 0
+    assert (
+        "critic is not loaded, a new one starts at V = 0: policy.value_head.hidden=16, there 128"
+        in caplog.text
+    )
+
+
+def test_another_sampler_is_pointed_out(written: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    sampler = FlowSamplerConfig(noise_level=0.4)
+    path = saved(written("smolvla"), tmp_path / "saved", sampler=sampler)
+    stored = json.loads((path / "accerl.json").read_text())["sampler"]
+    assert stored == draccus.encode(sampler, SamplerConfig)
+    assert stored["type"] == "flow" and stored["noise_level"] == 0.4
+    with caplog.at_level(logging.WARNING):
+        adapter_at(path, sampler)
+        assert caplog.text == ""
+        adapter_at(path, FlowSamplerConfig(noise_level=0.2, stochastic="all"))
+    assert (
+        "policy.sampler.stochastic=all, there last, policy.sampler.noise_level=0.2, there 0.4" in caplog.text
+    )
+
+
+# ---- tokenisers of π0, π0.5 and π0-FAST
+
+REMOTE_CODE = """
+import json
+from pathlib import Path
+from transformers import PreTrainedTokenizerFast
+Path({marker!r}).touch()
+class UniversalActionProcessor:
+    @classmethod
+    def register_for_auto_class(cls): pass
+    @classmethod
+    def from_pretrained(cls, name, **options):
+        from huggingface_hub import snapshot_download
+        folder = Path(name) if Path(name).is_dir() else Path(snapshot_download(name))
+        made = cls()
+        made.__dict__.update(json.loads((folder / "processor_config.json").read_text()))
+        made.bpe_tokenizer = PreTrainedTokenizerFast.from_pretrained(folder)
+        return made
+"""
+"""Code in a tokeniser's repository, such as the class that LeRobot means to run."""
+
+
+def remote(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Puts code into the Hub repository of FAST's tokeniser; it leaves a mark when it is run."""
+    from transformers import dynamic_module_utils
+
+    snapshot = cache / f"models--{ACTIONS.replace('/', '--')}" / "snapshots" / COMMIT
+    marker = cache / "was-run"
+    (snapshot / "processing_action_tokenizer.py").write_text(REMOTE_CODE.format(marker=str(marker)))
+    monkeypatch.setattr(dynamic_module_utils, "HF_MODULES_CACHE", str(cache / "modules"))
+    return marker
+
+
+def named(path: Path) -> set[str]:
+    """Names of tokenisers in a checkpoint's files."""
+    config = json.loads((path / "config.json").read_text())
+    steps = json.loads((path / PROCESSOR).read_text())["steps"]
+    options = {s.get("registry_name"): s["config"] for s in steps}
+    return {
+        config.get("text_tokenizer_name", PALIGEMMA),
+        config.get("action_tokenizer_name", ACTIONS),
+        options["tokenizer_processor"]["tokenizer_name"],
+        options.get("action_tokenizer_processor", {}).get("action_tokenizer_name", ACTIONS),
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("pi0", f"its LeRobot processors did not load.*into {BACKBONE}/ beside config"),
+        ("pi05", f"its LeRobot processors did not load.*into {BACKBONE}/ beside config"),
+        ("pi0_fast", "its network cannot be built .*Failed to load required tokenizers"),
+    ],
+)
+def test_lerobot_s_checkpoint_needs_the_hub_and_ours_does_not(
+    name: str, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    original = write_pi(tmp_path / "original", name, num_steps=8, whole=False)
+    assert not (original / BACKBONE).exists()
+    refused(original, f"policy.path=.*{sentence}")
+    with hub(tmp_path / "original-hub"):
+        marker = remote(tmp_path / "original-hub", monkeypatch)
+        adapter = adapter_at(original)
+        perturb(adapter, 0.1)
+        assert not marker.exists(), "code from the Hub was run"
+    save_pretrained(adapter, tmp_path / "ours", PolicyConfig(path=str(original), device="cpu"))
+    for folder in (original, tmp_path / "original-hub"):
+        shutil.rmtree(folder)
+    moved = Path(shutil.move(tmp_path / "ours", tmp_path / "moved"))
+    expected = pickle.dumps(adapter.decide(requests(3), 0))
+    assert decided(moved) == expected
+    save_pretrained(adapter_at(moved), tmp_path / "second", PolicyConfig(path=str(moved), device="cpu"))
+    shutil.rmtree(moved)
+    assert decided(tmp_path / "second") == expected
+    assert named(tmp_path / "second") == {PALIGEMMA, ACTIONS}, "others find them where the original's were"
+    assert not displaced(tmp_path / "second")
+
+
+def test_stock_lerobot_runs_the_code_of_fast_s_tokeniser(
+    written: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    from lerobot.policies.factory import get_policy_class
+
+    with hub(tmp_path / "hub"):
+        marker = remote(tmp_path / "hub", monkeypatch)
+        get_policy_class("pi0_fast").from_pretrained(written("pi0_fast"))
+    assert marker.exists(), "or the test above shows nothing"
+
+
+def test_tokenisers_named_by_their_path_move_along(damaged: Any, tmp_path: Path):
+    path, gone = damaged("pi0_fast"), str(tmp_path / "gone")
+    edit_config(path, text_tokenizer_name=gone, action_tokenizer_name=gone)
+    processor = json.loads((path / PROCESSOR).read_text())
+    for step in processor["steps"]:
+        if step.get("registry_name") == "tokenizer_processor":
+            step["config"]["tokenizer_name"] = gone
+    (path / PROCESSOR).write_text(json.dumps(processor))
+    (path / FAST / "processing_action_tokenizer.py").write_text("raise RuntimeError")
+    assert displaced(path)
+    save_pretrained(adapter_at(path), tmp_path / "saved", PolicyConfig(path=str(path), device="cpu"))
+    own = {str(tmp_path / "saved" / BACKBONE), str(tmp_path / "saved" / FAST)}
+    assert own <= named(tmp_path / "saved") <= own | {ACTIONS}
+    assert (tmp_path / "saved" / FAST / "processing_action_tokenizer.py").is_file(), "for those who run it"
+    relocate(path, path)
+    assert not displaced(path)
+    shutil.rmtree(path / BACKBONE)
+    refused(path, f"policy.path=.*its tokeniser was in {path}/.*, which is gone; put a copy into")
+
+
+def test_a_tokeniser_with_too_few_tokens(damaged: Any):
+    path = damaged("pi0_fast")
+    state = json.loads((path / BACKBONE / "tokenizer.json").read_text())
+    del state["model"]["vocab"]["<loc0399>"]
+    (path / BACKBONE / "tokenizer.json").write_text(json.dumps(state))
+    refused(path, "policy.text_tokenizer_name=.*knows only 399 of the 400 tokens")
+
+
+def test_what_lerobot_forgets_of_its_action_tokeniser_is_put_back(written: Any):
+    path = written("pi0_fast")
+    step = adapter_at(path).processing.preprocessor.steps[6]
+    assert (step.fast_skip_tokens, step.paligemma_tokenizer_name) == (SKIP, str((path / BACKBONE).resolve()))
+    stored = json.loads((path / PROCESSOR).read_text())["steps"][6]["config"]
+    assert not {"fast_skip_tokens", "paligemma_tokenizer_name"} & stored.keys()
+
+
+def test_fewer_rows_are_not_the_first_of_a_chunk(written: Any):
+    # Why `n_action_steps` below `chunk_size` is refused: it is the same movement in less time, and larger.
+    policy = adapter_at(written("pi0_fast")).policy
+    chunk = np.linspace(-1, 1, 4)[:, None].repeat(2, 1)
+    tokens = [torch.tensor(policy.action_tokenizer(chunk[None])[0])]
+    whole = policy.decode_actions_with_fast(tokens, time_horizon=4, action_dim=2)[0]
+    half = policy.decode_actions_with_fast(tokens, time_horizon=2, action_dim=2)[0]
+    assert np.abs(whole - chunk).max() < 0.1
+    assert np.abs(half - chunk[:2]).max() > 0.5 and half[1, 0] > 0.5

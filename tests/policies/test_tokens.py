@@ -16,8 +16,8 @@ from torch import Tensor
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies import tokens as tk
+from accerl_lerobot.policies.config import SamplerConfig, TokenSamplerConfig
 from accerl_lerobot.policies.family import Encoded
-from accerl_lerobot.policies.samplers import SamplerConfig, TokenSamplerConfig
 from accerl_lerobot.policies.tokens import TokenContext, TokenFamily, TokenModel
 from tests.rounding import assert_close
 
@@ -188,20 +188,6 @@ def test_scores_are_the_oracle_s_for_all_that_can_be_said(kind: Any, temperature
         assert factors is None
 
 
-@pytest.mark.parametrize("temperature", [1.0, 0.5])
-@pytest.mark.parametrize("kind", MODELS)
-def test_what_acts_is_what_is_scored(kind: Any, temperature: float):
-    model, starts = kind(), observations(40)
-    tokens_family, read = family(model, temperature), encoded(model, starts)
-    action = tokens_family.act(read, requests(40))
-    score = tokens_family.score(read, action.latent)
-    assert action.latent.keys() == {"tokens"}
-    assert action.latent["tokens"].shape == (40, LENGTH) and action.latent["tokens"].dtype == torch.int64
-    assert_close(score.log_prob, action.log_prob)
-    assert action.log_prob.dtype == score.log_prob.dtype == torch.float32
-    assert torch.equal(action.chunk, model.chunk(action.latent["tokens"]))
-
-
 @pytest.mark.parametrize("kind", MODELS)
 def test_without_exploring_the_most_likely_tokens_and_no_log_prob(kind: Any):
     model, starts = kind(), observations(30)
@@ -239,25 +225,6 @@ def test_positions_are_drawn_independently():
     action = family(model).act(encoded(model, observations(1).expand(count, -1)), requests(count))
     correlation = np.corrcoef(action.latent["tokens"].numpy().T)
     assert np.abs(correlation[np.triu_indices(LENGTH, 1)]).max() < 0.08
-
-
-@pytest.mark.parametrize("kind", MODELS)
-def test_a_request_s_tokens_are_its_own(kind: Any):
-    model, starts, asked = kind(), observations(12), requests(12)
-    tokens_family = family(model)
-    together = tokens_family.act(encoded(model, starts), asked)
-    backwards = tokens_family.act(encoded(model, starts.flip(0)), asked[::-1])
-    assert torch.equal(backwards.latent["tokens"].flip(0), together.latent["tokens"])
-    for i in range(12):
-        alone = tokens_family.act(encoded(model, starts[i : i + 1]), [asked[i]])
-        assert torch.equal(alone.latent["tokens"][0], together.latent["tokens"][i])
-        assert_close(alone.log_prob[0], together.log_prob[i])
-    torch.manual_seed(5)
-    assert torch.equal(
-        tokens_family.act(encoded(model, starts), asked).latent["tokens"], together.latent["tokens"]
-    )
-    other = tokens_family.act(encoded(model, starts), requests(12, first=100))
-    assert not torch.equal(other.latent["tokens"], together.latent["tokens"])
 
 
 def test_nothing_after_the_terminator_counts():
@@ -381,10 +348,6 @@ def test_nan_logits_are_visible_in_the_log_prob_and_break_nothing():
     model = Parallel()
     action = family(model).act(encoded(model, torch.full((2, WIDTH), torch.nan)), requests(2))
     assert torch.isnan(action.log_prob).all() and (action.latent["tokens"] < VOCABULARY).all()
-
-
-def test_rows_are_the_actions():
-    assert family(Parallel()).actions == LENGTH and family(Recurrent()).actions is None
 
 
 @pytest.mark.parametrize("temperature", [0.0, -1.0, 10.1, math.nan, math.inf])

@@ -1,36 +1,68 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trained parameters: LeRobot's choice, everything, the expert, or low-rank adapters that are saved
-merged."""
+"""Trained parameters: LeRobot's choice, everything, the expert, or low-rank adapters, saved merged."""
 
 from __future__ import annotations
 
 import pickle
 import threading
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.adapter import LeRobotAdapter
-from accerl_lerobot.policies.base import stack_observations
+from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
-from accerl_lerobot.policies.loading import load_adapter, save_pretrained
+from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.weights.reader import Received, SharedMemoryReader
 from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
-from tests.conftest import write_smolvla
-from tests.policies.tiny import adapter_at, check_ratio_one, perturb, requests, stored
+from tests.policies.cases import CASES
+from tests.policies.tiny import adapter_at, check_ratio_one, log_ratio, perturb, requests, stored
+from tests.policies.tiny_pi import small
 from tests.rounding import assert_close
+
+BACKBONES = {
+    "smolvla": "model.vlm_with_expert.vlm.",
+    "pi0": "model.paligemma_with_expert.paligemma.",
+    "pi05": "model.paligemma_with_expert.paligemma.",
+    "smolvla_bins": "model.vlm.",
+}
+"""Types with an expert apart from a backbone, and the prefix of the latter's parameters."""
+TARGETS = dict.fromkeys(BACKBONES) | {
+    "pi0_fast": r".*language_model.*\.(q|v)_proj",
+    "act": r"model\.(encoder|decoder|vae_encoder)\..*linear\d",
+    "gaussian_actor": r".*state_encoder\.0|actor\.mean_layer",  # an encoder that it holds under three names
+    "diffusion": r"diffusion\.unet\..*cond_encoder\.1",
+}
+"""Type → regular expression of layers for low-rank adapters; None: LeRobot's own choice."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def sizes() -> Iterator[None]:
+    with small():
+        yield
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("smolvla") / "pretrained_model"
-    return write_smolvla(directory, chunk=5, executed=3, padded_dim=4, action_dim=2, num_steps=3)
+def written(tmp_path_factory: pytest.TempPathFactory):  # noqa: ANN201
+    @cache
+    def write(name: str) -> Path:
+        return CASES[name].write(tmp_path_factory.mktemp("policy") / "pretrained_model")
+
+    return write
+
+
+@pytest.fixture
+def path(written) -> Path:  # noqa: ANN001
+    return written("smolvla")
 
 
 def tuned(path: Path, **options: object) -> LeRobotAdapter:
+    torch.manual_seed(0)  # of the adapters
     return adapter_at(path, tuning=TuningConfig(**options))
 
 
@@ -38,103 +70,103 @@ def policy_names(adapter: LeRobotAdapter) -> set[str]:
     return {k.removeprefix("policy.") for k in adapter.trainable() if k.startswith("policy.")}
 
 
-def test_full_expert_and_checkpoint(path: Path):
-    everything = {k for k, _ in adapter_at(path).policy.named_parameters()}
-    frozen_by_lerobot = everything - policy_names(tuned(path))
-    assert frozen_by_lerobot, "LeRobot freezes some of SmolVLA even with train_expert_only=false"
-    assert policy_names(tuned(path, mode="full")) == everything
-    expert = policy_names(tuned(path, mode="expert"))
-    assert expert == {k for k in everything if not k.startswith("model.vlm_with_expert.vlm.")}
-    assert any("lm_expert" in k for k in expert) and "model.action_out_proj.weight" in expert
-
-
-def test_low_rank_adapters_start_as_the_policy_itself(path: Path):
-    plain, adapter, asked = adapter_at(path), tuned(path, mode="lora", rank=2), requests(5)
+@pytest.mark.parametrize("name", TARGETS)
+def test_low_rank_adapters_start_as_the_policy_itself_and_are_saved_merged(
+    written,  # noqa: ANN001
+    name: str,
+    tmp_path: Path,
+):
+    path, asked = written(name), CASES[name].requests(8)
+    tuning = TuningConfig(mode="lora", rank=2, alpha=16, targets=TARGETS[name])
+    torch.manual_seed(0)
+    adapter, plain = adapter_at(path, tuning=tuning), adapter_at(path)
     names = policy_names(adapter)
     assert names and all(".lora_" in k for k in names)
     for one, other in zip(adapter.decide(asked, 0), plain.decide(asked, 0), strict=True):
-        assert np.array_equal(one.chunk, other.chunk)
-    sizes = [sum(a.size for k, a in x.export_trainable().items() if k[0] == "p") for x in (adapter, plain)]
-    assert sizes[0] < 0.2 * sizes[1], "only what is trained is published"
-
-
-def test_they_have_gradients_and_ratio_one(path: Path):
-    adapter, asked = tuned(path, mode="lora", rank=2), requests(12)
-    perturb(adapter, 0.3)
+        assert_close(one.chunk, other.chunk)
+    perturb(adapter, 1.0)
     decisions = adapter.decide(asked, 0)
     check_ratio_one(adapter, asked, decisions)
     latent, _ = stored(decisions)
     adapter.evaluate(*stack_observations(asked), latent).log_prob.sum().backward()
-    silent = [k for k, p in adapter.trainable().items() if k[0] == "p" and not p.grad.abs().max() > 0]
-    assert silent == []
-    still = [k for k, p in adapter.policy.named_parameters() if ".lora_" not in k and p.grad is not None]
-    assert still == []
+    gradients = {k: p.grad for k, p in adapter.policy.named_parameters() if p.grad is not None}
+    assert gradients.keys() == names and all(g.abs().max() > 0 for g in gradients.values())
+    save_pretrained(adapter, tmp_path / "saved", PolicyConfig(path=str(path), device="cpu", tuning=tuning))
+    merged = adapter_at(tmp_path / "saved")
+    assert merged.policy.state_dict().keys() == plain.policy.state_dict().keys()
+    check_ratio_one(merged, asked, decisions)
+    assert log_ratio(plain, asked, decisions).abs().max() > 1e-3, "the adapters must matter"
+    after, before = merged.policy.state_dict(), plain.policy.state_dict()
+    changed = {after[k].data_ptr() for k, v in before.items() if not torch.equal(after[k], v)}
+    assert len(changed) == len(names) / 2
 
 
-def test_they_are_saved_merged_and_stock_lerobot_acts_alike(path: Path, tmp_path: Path):
-    from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
+@pytest.mark.parametrize("name", CASES)
+def test_full_and_expert(written, name: str):  # noqa: ANN001
+    path = written(name)
+    everything = {k for k, _ in adapter_at(path).policy.named_parameters()}
+    idle = tuple(adapter_at(path).model.idle)
+    acting = {k for k in everything if not k.startswith(idle)} if idle else everything
+    assert policy_names(tuned(path, mode="full")) == acting
+    if name not in BACKBONES:
+        with pytest.raises(InputError, match=f"^policy.tuning.mode='expert': {name} has no action expert"):
+            tuned(path, mode="expert")
+        return
+    expert = policy_names(tuned(path, mode="expert"))
+    assert expert == {k for k in acting if not k.startswith(BACKBONES[name])} != set()
 
-    config = PolicyConfig(path=str(path), device="cpu", tuning=TuningConfig(mode="lora", rank=2, alpha=6))
-    adapter, asked = load_adapter(config), requests(5, explore=False)
-    with torch.no_grad():
-        for name, parameter in adapter.trainable().items():
-            if ".lora_B" in name:
-                parameter.normal_(0, 0.3, generator=torch.Generator().manual_seed(len(name)))
-    save_pretrained(adapter, tmp_path / "saved", config)
-    stock, plain = SmolVLAPolicy.from_pretrained(tmp_path / "saved"), SmolVLAPolicy.from_pretrained(path)
-    assert stock.state_dict().keys() == plain.state_dict().keys()
-    changed = {k for k, v in stock.state_dict().items() if not torch.equal(v, plain.state_dict()[k])}
-    assert changed == {f"{n}.weight" for n, m in adapter.policy.named_modules() if hasattr(m, "lora_A")}
-    again = adapter_at(tmp_path / "saved")
-    ours = np.stack([d.chunk for d in adapter.decide(asked, 0)])
-    assert_close(np.stack([d.chunk for d in again.decide(asked, 0)]), ours)
-    before = np.stack([d.chunk for d in adapter_at(path).decide(asked, 0)])
-    assert np.abs(before - ours).max() > 1e-2, "the adapters must matter"
+
+def test_lerobot_freezes_some_of_smolvla_by_itself(path: Path):
+    assert policy_names(tuned(path)) < policy_names(tuned(path, mode="full"))
 
 
 def test_the_merged_weight_by_hand(path: Path, tmp_path: Path):
-    from safetensors.torch import load_file
-
-    config = PolicyConfig(
-        path=str(path),
-        device="cpu",
-        tuning=TuningConfig(mode="lora", rank=2, alpha=6, targets=r"model\.action_out_proj"),
-    )
-    adapter = load_adapter(config)
+    tuning = TuningConfig(mode="lora", rank=2, alpha=6, targets=r"model\.action_out_proj")
+    adapter = adapter_at(path, tuning=tuning)
     layer = adapter.policy.model.action_out_proj
     with torch.no_grad():
         layer.lora_B["default"].weight.normal_()
-    save_pretrained(adapter, tmp_path / "saved", config)
+    save_pretrained(adapter, tmp_path / "saved", PolicyConfig(path=str(path), device="cpu", tuning=tuning))
     product = layer.lora_B["default"].weight @ layer.lora_A["default"].weight
     expected = layer.base_layer.weight + 6 / 2 * product
-    stored_weight = load_file(tmp_path / "saved" / "model.safetensors")["model.action_out_proj.weight"]
-    assert_close(stored_weight, expected)
+    weight = load_file(tmp_path / "saved" / "model.safetensors")["model.action_out_proj.weight"]
+    assert_close(weight, expected)
 
 
-def test_targets_that_match_nothing(path: Path):
-    said = r"^policy\.tuning\.targets='model.nothing': matches none of the policy's \d+ linear layers"
-    with pytest.raises(InputError, match=said):
-        tuned(path, mode="lora", targets="model.nothing")
+@pytest.mark.parametrize(
+    ("name", "targets", "sentence"),
+    [
+        ("smolvla", "model.nothing", r"='model.nothing': matches none of the policy's \d+ linear layers"),
+        ("act", None, "=None: LeRobot names no default for act"),
+        # Attention multiplies by its output layer's weight without calling the layer.
+        ("act", r".*self_attn\.out_proj", ".*matches none of the policy's .* linear layers"),
+    ],
+)
+def test_targets_that_do_not_suit_the_policy(written, name: str, targets: str | None, sentence: str):  # noqa: ANN001
+    with pytest.raises(InputError, match=rf"^policy\.tuning\.targets{sentence}"):
+        tuned(written(name), mode="lora", targets=targets)
 
 
-def test_targets_that_are_no_regular_expression_are_refused_before_anything_is_loaded():
-    with pytest.raises(InputError, match=r"^policy\.tuning\.targets='\(': not a regular expression"):
-        TuningConfig(targets="(")
-
-
-@pytest.mark.parametrize(("name", "value"), [("mode", "qlora"), ("rank", 0), ("alpha", 0)])
-def test_bad_options_name_their_field(name: str, value: object):
-    with pytest.raises(InputError, match=rf"^policy\.tuning\.{name}={value!r}: use"):
+@pytest.mark.parametrize(
+    ("name", "value", "why"),
+    [("mode", "qlora", "use"), ("rank", 0, "use"), ("alpha", 0, "use"), ("targets", "(", "not a regular")],
+)
+def test_bad_options_name_their_field_before_anything_is_loaded(name: str, value: object, why: str):
+    with pytest.raises(InputError) as caught:
         TuningConfig(**{name: value})
+    assert str(caught.value).startswith(f"policy.tuning.{name}={value!r}: {why}")
 
 
 def test_only_what_is_trained_travels_and_is_copied_once(path: Path):
     trainer, reader, asked = tuned(path, mode="lora", rank=2), tuned(path, mode="lora", rank=2), requests(4)
     views, parameters = trainer.view_trainable(), trainer.trainable()
     trained = {f"policy.{k}" for k, p in trainer.policy.named_parameters() if p.requires_grad}
-    assert {k for k in views if k.startswith("policy.")} == trained and len(trained) < 0.5 * sum(
-        1 for _ in trainer.policy.parameters()
-    )
+    assert {k for k in views if k.startswith("policy.")} == trained
+    sizes = [
+        sum(a.size for k, a in x.export_trainable().items() if k[0] == "p")
+        for x in (trainer, adapter_at(path))
+    ]
+    assert sizes[0] < 0.2 * sizes[1]
     assert all(views[k].ctypes.data == p.data_ptr() for k, p in parameters.items()), "their own memory"
     publisher, arrived = SharedMemoryPublisher(1), threading.Event()
 
@@ -152,3 +184,4 @@ def test_only_what_is_trained_travels_and_is_copied_once(path: Path):
     publisher.close()
     assert arrived.is_set()
     assert pickle.dumps(reader.decide(asked, 0)) == pickle.dumps(trainer.decide(asked, 0))
+    assert not np.array_equal(reader.decide(asked, 0)[0].chunk, adapter_at(path).decide(asked, 0)[0].chunk)

@@ -12,9 +12,9 @@ from accerl_lerobot.algorithms import PPOConfig
 from accerl_lerobot.cli.configs import WorldModelEvalRun
 from accerl_lerobot.cli.doctor import pace
 from accerl_lerobot.config.parsing import read_recipe
+from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engine.config import RunConfig, encode, parse
-from accerl_lerobot.policies.backbone import BackboneConfig
 from accerl_lerobot.report.recipe import apart, differences, flat, lag_bound, unreadable
 from tests.report.folders import run_config
 

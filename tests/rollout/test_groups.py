@@ -13,17 +13,17 @@ import pytest
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.rollout.groups import (
     STD_EPSILON,
+    EpisodeOutcome,
     GroupFilter,
     Groups,
-    Outcome,
-    Place,
+    GroupSlot,
     comparable,
     group_advantages,
     open_limit,
 )
 from tests.replay.segments import make_segment
 
-WON, LOST = Outcome(0.9, True), Outcome(-0.3, False)
+WON, LOST = EpisodeOutcome(0.9, True), EpisodeOutcome(-0.3, False)
 
 
 def advantages_by_hand(returns: Sequence[float], form: str) -> list[float]:
@@ -77,12 +77,12 @@ def test_equal_returns_give_zero_and_not_nan():
     ("outcomes", "kept_under"),
     [
         ([WON, LOST], {"outcome", "return", "none"}),
-        ([WON, Outcome(0.8, True)], {"return", "none"}),  # one was faster
-        ([LOST, Outcome(-0.2, False)], {"return", "none"}),
+        ([WON, EpisodeOutcome(0.8, True)], {"return", "none"}),  # one was faster
+        ([LOST, EpisodeOutcome(-0.2, False)], {"return", "none"}),
         ([WON, WON], {"none"}),
         ([LOST, LOST, LOST], {"none"}),
-        ([Outcome(1.0, True), Outcome(1.0, False)], {"none"}),  # every advantage would be 0
-        ([Outcome(1.0, True), Outcome(1.0 + STD_EPSILON / 2, True)], {"none"}),
+        ([EpisodeOutcome(1.0, True), EpisodeOutcome(1.0, False)], {"none"}),  # every advantage would be 0
+        ([EpisodeOutcome(1.0, True), EpisodeOutcome(1.0 + STD_EPSILON / 2, True)], {"none"}),
     ],
 )
 def test_which_groups_are_worth_learning_from(outcomes, kept_under):
@@ -94,7 +94,7 @@ def segments_of(member: int, count: int = 2) -> list[Segment]:
     return [make_segment(f"m{member}.{i}", n=i + 1) for i in range(count)]
 
 
-def play(groups: Groups, outcomes: Sequence[Outcome | None], order: Sequence[int]) -> list[Segment]:
+def play(groups: Groups, outcomes: Sequence[EpisodeOutcome | None], order: Sequence[int]) -> list[Segment]:
     """One group whose members end in `order`; what is released."""
     places = [groups.claim() for _ in outcomes]
     assert all(place is not None for place in places)
@@ -126,7 +126,7 @@ def test_each_decision_of_an_episode_gets_the_same_advantage():
 
 @pytest.mark.parametrize("form", ["grpo", "rloo", "grpo_no_std"])
 def test_the_order_in_which_episodes_end_does_not_matter(form):
-    outcomes = [Outcome(0.5, True), LOST, Outcome(0.7, True), None]
+    outcomes = [EpisodeOutcome(0.5, True), LOST, EpisodeOutcome(0.7, True), None]
     every = []
     for order in itertools.permutations(range(4)):
         released = play(Groups(4, worlds=4, form=form), outcomes, order)
@@ -164,7 +164,11 @@ def test_one_group_is_completed_before_the_next_begins():
     groups = Groups(3, worlds=4)
     assert open_limit(3, 4) == groups.limit == 5
     claimed = [groups.claim() for _ in range(7)]
-    assert claimed == [*(Place(0, i) for i in range(3)), *(Place(1, i) for i in range(3)), Place(2, 0)]
+    assert claimed == [
+        *(GroupSlot(0, i) for i in range(3)),
+        *(GroupSlot(1, i) for i in range(3)),
+        GroupSlot(2, 0),
+    ]
 
 
 def test_at_the_limit_a_world_waits_until_a_group_has_ended():
@@ -175,7 +179,7 @@ def test_at_the_limit_a_world_waits_until_a_group_has_ended():
         groups.end(place, WON)
     assert groups.claim() is None
     groups.end(places[7], LOST)
-    assert groups.claim() == Place(3, 0)
+    assert groups.claim() == GroupSlot(3, 0)
 
 
 def test_abandoned_groups_are_dropped_and_what_follows_of_them_is_ignored():
@@ -191,7 +195,7 @@ def test_abandoned_groups_are_dropped_and_what_follows_of_them_is_ignored():
     assert groups.end(second, LOST) == [] and groups.end(lonely, None) == []
     counted = groups.counters
     assert (counted.entered_decisions, counted.dropped_decisions, counted.dropped) == (5, 5, 2)
-    assert groups.claim() == Place(2, 0), "nobody may join a group that was given up"
+    assert groups.claim() == GroupSlot(2, 0), "nobody may join a group that was given up"
 
 
 @pytest.mark.parametrize(("size", "worlds"), [(2, 8), (4, 8), (8, 4), (3, 5), (16, 1)])
@@ -199,11 +203,11 @@ def test_abandoned_groups_are_dropped_and_what_follows_of_them_is_ignored():
 def test_the_books_balance_whatever_happens(size, worlds, rule):
     rng = np.random.default_rng(0)
     groups = Groups(size, worlds, "rloo", rule)
-    running: dict[int, Place] = {}
-    entered: dict[str, Place] = {}
+    running: dict[int, GroupSlot] = {}
+    entered: dict[str, GroupSlot] = {}
     released: dict[str, Segment] = {}
-    outcomes: dict[Place, Outcome | None] = {}
-    claimed: list[Place] = []
+    outcomes: dict[GroupSlot, EpisodeOutcome | None] = {}
+    claimed: list[GroupSlot] = []
     for event in range(4000):
         world = int(rng.integers(worlds))
         if rng.random() < 0.002:
@@ -222,7 +226,9 @@ def test_the_books_balance_whatever_happens(size, worlds, rule):
         else:
             thrown_away = rng.random() < 0.1
             success = bool(rng.random() < 0.5)
-            outcomes[place] = None if thrown_away else Outcome(float(success - rng.integers(3) / 4), success)
+            outcomes[place] = (
+                None if thrown_away else EpisodeOutcome(float(success - rng.integers(3) / 4), success)
+            )
             for segment in groups.end(running.pop(world), outcomes[place]):
                 assert segment.key not in released
                 released[segment.key] = segment

@@ -7,7 +7,7 @@ import itertools
 
 import pytest
 
-from accerl_lerobot.rollout.groups import Outcome, Place
+from accerl_lerobot.rollout.groups import EpisodeOutcome, GroupSlot
 from accerl_lerobot.rollout.plans import (
     STARTS_PER_INCARNATION,
     EpisodePlans,
@@ -52,15 +52,15 @@ def test_evaluations_go_first_and_nothing_is_explored_before_it_is_time():
     assert [p.index for p in take(plans, 1)] == [0]
     assert plans.next(exploring=False) == evaluate(index=1)
     assert plans.next(exploring=False) is None
-    assert take(plans, 1)[0].place == Place(0, 0)
+    assert take(plans, 1)[0].place == GroupSlot(0, 0)
     plans.queue([evaluate(index=2)])
     following = take(plans, 2)  # the group goes on where it was
-    assert not following[0].explore and following[1].place == Place(0, 1)
+    assert not following[0].explore and following[1].place == GroupSlot(0, 1)
 
 
 def test_a_group_shares_its_start_and_the_next_group_has_another():
     plans = take(make(group_size=4, worlds=8), 12)
-    assert [p.place for p in plans] == [Place(start, member) for start in range(3) for member in range(4)]
+    assert [p.place for p in plans] == [GroupSlot(start, member) for start in range(3) for member in range(4)]
     starts = [{(p.task, p.seed) for p in group} for _, group in itertools.groupby(plans, _start)]
     assert starts == [{(task, train_seed(3, 0, i))} for i, task in enumerate(TASKS)]
 
@@ -77,8 +77,8 @@ def test_a_world_waits_when_too_many_groups_are_unfinished():
     assert len(unfinished) == 4 * plans.groups.limit
     for plan in unfinished[:4]:
         assert plan.place is not None
-        plans.groups.end(plan.place, Outcome(0.0, False))
-    assert take(plans, 1)[0].place == Place(plans.groups.limit, 0)
+        plans.groups.end(plan.place, EpisodeOutcome(0.0, False))
+    assert take(plans, 1)[0].place == GroupSlot(plans.groups.limit, 0)
 
 
 @pytest.mark.parametrize("group_size", [0, 4])

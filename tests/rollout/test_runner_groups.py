@@ -12,7 +12,7 @@ import pytest
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, SimulatedConfig, World, make_world
 from accerl_lerobot.experience import Decision, Observation, Request, Segment
 from accerl_lerobot.replay import decisions_under_way
-from accerl_lerobot.rollout.groups import Place
+from accerl_lerobot.rollout.groups import GroupSlot
 from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig, RolloutRunner
 from tests.rollout.worlds import ScriptedWorld, decide, evaluate
@@ -182,10 +182,10 @@ def test_a_group_starts_alike_and_goes_on_differently(env: EnvConfig):
     assert any(not np.array_equal(starts[0][key], starts[1][key]) for key in starts[0])
 
 
-def noise_by_member(slots: int, order: list[int], groups: int = 2) -> dict[Place, list[int]]:
+def noise_by_member(slots: int, order: list[int], groups: int = 2) -> dict[GroupSlot, list[int]]:
     """Noise seeds of each member's decisions when slots advance in `order`, again and again."""
     fleet = Fleet([ScriptedWorld(6) for _ in range(slots)])
-    found: dict[Place, list[int]] = {}
+    found: dict[GroupSlot, list[int]] = {}
     while len(fleet.results) < 3 * groups + slots:
         fleet.start()
         for slot in order:
@@ -198,7 +198,7 @@ def noise_by_member(slots: int, order: list[int], groups: int = 2) -> dict[Place
 
 def test_noise_depends_on_the_member_and_not_on_who_runs_it():
     alone = noise_by_member(1, [0])
-    assert set(alone) == {Place(start, member) for start in range(2) for member in range(3)}
+    assert set(alone) == {GroupSlot(start, member) for start in range(2) for member in range(3)}
     assert all(len(seeds) == 3 for seeds in alone.values())
     every = [seed for seeds in alone.values() for seed in seeds]
     assert len(set(every)) == len(every), "no two decisions share their noise"

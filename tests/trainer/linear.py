@@ -13,9 +13,8 @@ from torch import Tensor, nn
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import Decision, Origin, Request, Segment
-from accerl_lerobot.policies.base import Evaluation, PolicyAdapter
+from accerl_lerobot.policies.adapter import Evaluation, PolicyAdapter
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.value_head import Value
 
 STATE = "observation.state"
 STD = 0.5
@@ -54,7 +53,7 @@ class LinearAdapter(PolicyAdapter):
         state = torch.from_numpy(observations[STATE])
         z = (latent["x"] - state @ self.weight.T) / STD
         entropy = torch.zeros(len(state))
-        value = Value(mean=self.value_head(state)[:, 0])
+        value = self.value_head(state)[:, 0]
         return Evaluation(log_prob=-0.5 * z * z, entropy=entropy, value=value)
 
     @torch.no_grad()

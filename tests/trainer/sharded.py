@@ -18,8 +18,7 @@ from torch.nn import functional
 from accerl_lerobot.algorithms import AlgorithmConfig, DecoupledConfig, GIPOConfig, PPOConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import Segment
-from accerl_lerobot.policies.base import Evaluation, PolicyAdapter
-from accerl_lerobot.policies.value_head import Value
+from accerl_lerobot.policies.adapter import Evaluation, PolicyAdapter
 from accerl_lerobot.trainer import ranks
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.update import Update
@@ -69,7 +68,7 @@ class LayeredAdapter(LinearAdapter):
     ) -> Evaluation:
         features = self.encode(torch.from_numpy(observations[STATE]))
         z = (latent["x"] - features @ self.weight.T) / STD
-        value = Value(mean=self.value_head(features.detach())[:, 0])
+        value = self.value_head(features.detach())[:, 0]
         return Evaluation(log_prob=-0.5 * z * z, entropy=torch.zeros(len(z)), value=value)
 
     @torch.no_grad()

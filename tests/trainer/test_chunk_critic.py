@@ -16,11 +16,10 @@ from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Origin, Request, Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
-from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.flow import FlowContext, FlowFamily, FlowShape
 from accerl_lerobot.policies.loading import load_adapter
-from accerl_lerobot.policies.samplers import FlowSamplerConfig
 from accerl_lerobot.policies.teacher import TASK_BITS, Ensemble, Teacher, WithTeacher, state_of
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig

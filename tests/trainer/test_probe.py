@@ -120,19 +120,19 @@ def test_only_published_versions_are_probed():
 
 def test_nothing_is_probed_when_it_is_off_nor_after_the_last_update():
     update = make_update(replace(CONFIG, probe_every=0))
-    assert readings(update, 4) == [] and "probe" not in update.anchors
+    assert readings(update, 4) == [] and "probe" not in update.frozen
     update = make_update(replace(CONFIG, updates=3))
-    assert readings(update, 3) == [1] and "probe" not in update.anchors
+    assert readings(update, 3) == [1] and "probe" not in update.frozen
 
 
 def test_the_copy_is_freed_when_it_has_been_read():
     update = make_update()
-    assert "probe" in update.anchors
+    assert "probe" in update.frozen
     update.step(fresh(update))
-    assert "probe" not in update.anchors
+    assert "probe" not in update.frozen
     update.step(fresh(update))
     update.step(fresh(update))
-    assert "probe" in update.anchors
+    assert "probe" in update.frozen
 
 
 def test_a_version_that_never_acted_is_given_up_for_the_newest():

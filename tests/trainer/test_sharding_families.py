@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every LeRobot policy type that has a likelihood, in parts: two ranks with zero3 learn what one learns.
 
-Small, offline, on LeRobot's own classes, see `tests.policies.matrix`. One group of two processes for all, as
+Small, offline, on LeRobot's own classes, see `tests.policies.cases`. One group of two processes for all, as
 each imports LeRobot.
 """
 
@@ -21,11 +21,11 @@ from accerl_lerobot.checkpoint.tensors import whole
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.config import TuningConfig
-from accerl_lerobot.policies.loading import copy_weights
+from accerl_lerobot.policies.saving import copy_weights
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.ranks import Ranks
 from accerl_lerobot.trainer.update import Update
-from tests.policies.matrix import KINDS
+from tests.policies.cases import CASES as POLICIES
 from tests.policies.tiny import adapter_at, as_segment, perturb
 from tests.rounding import assert_close
 from tests.trainer.sharded import joined
@@ -46,7 +46,7 @@ class Case(NamedTuple):
     options: dict[str, Any] = {}
 
 
-CASES = {kind: Case(kind) for kind in KINDS} | {
+CASES = {kind: Case(kind) for kind in POLICIES} | {
     "smolvla, zero2": Case("smolvla", {"ranks": 2, "sharding": "zero2"}),
     "smolvla, lora": Case("smolvla", options={"tuning": TuningConfig(mode="lora", rank=2, alpha=2)}),
     "smolvla_bins, forgetful": Case("smolvla_bins", SHARDED | {"activation_checkpointing": True}),
@@ -57,7 +57,7 @@ CASES = {kind: Case(kind) for kind in KINDS} | {
 def learn(case: Case, folder: Path, config: TrainerConfig, group: Ranks) -> dict[str, Any]:
     """Makes two updates on what `segments` has left there; all that is published and saved afterwards."""
     batch = snapshot.load(folder / case.kind / "segments")
-    with KINDS[case.kind].context():
+    with POLICIES[case.kind].context():
         torch.manual_seed(0)
         adapter = adapter_at(folder / case.kind / "pretrained_model", **case.options)
         perturb(adapter, 0.02)
@@ -78,7 +78,7 @@ def learn(case: Case, folder: Path, config: TrainerConfig, group: Ranks) -> dict
 
 
 def segments(adapter: LeRobotAdapter, kind: str) -> list[Segment]:
-    asked = KINDS[kind].ask(DECISIONS + 1, image=KINDS[kind].image)
+    asked = POLICIES[kind].requests(DECISIONS + 1)
     made = as_segment(asked, adapter, DECISIONS)
     made.reward = np.linspace(-1, 1, DECISIONS, dtype=np.float32)
     return [made]
@@ -97,7 +97,7 @@ def work(rank: int, size: int, place: Any, folder: Path) -> None:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("families")
-    for name, kind in KINDS.items():
+    for name, kind in POLICIES.items():
         with kind.context():
             (directory / name).mkdir()
             adapter = adapter_at(kind.write(directory / name / "pretrained_model"))

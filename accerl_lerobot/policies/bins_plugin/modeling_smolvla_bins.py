@@ -4,8 +4,8 @@
     [images, instruction] [state] [K·A queries]  ──language model──►  K·A hidden states ──head──► bins
 
 Images, instruction and state form the prefix as in smolvla: what is in brackets sees itself and what is to
-the left. Queries are learnt vectors, one per row and action dimension, and see each other in both directions,
-so that the bins, independent given the observations, can still agree on what to do.
+the left. Queries are learned vectors, one per row and action dimension, and see each other both ways, so
+that the bins, independent given the observations, can still agree on what to do.
 
 Unlike smolvla, the language model runs as Transformers runs it: with its own rotary base and without scaling
 of embeddings, as it was trained.
@@ -109,7 +109,7 @@ class SmolVLABinsPolicy(PreTrainedPolicy):
         config.validate_features()
         self.config = config
         self.model = ParallelDecoder(config)
-        config.load_vlm_weights = False  # whoever loads what is saved from here on has them
+        config.load_vlm_weights = False  # what is saved from here on has them
         self.reset()
 
     def reset(self) -> None:

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Advantages: generalised advantage estimation (arXiv 1506.02438) per decision, and their normalisation.
+
+    δ_t = r_t + γ V_{t+1} − V_t
+    Â_t = δ_t + γλ Â_{t+1}
+    R_t = Â_t + V_t
+
+r_t is the reward summed over a whole chunk, so γ and λ are per decision. What follows the last decision of
+a segment: nothing if the episode *terminated* (bootstrap 0); V of the observation after it if time ran out
+(*truncated*) or the segment was cut in mid-episode. Treating a truncation as a termination would teach the
+critic that time limits are deaths.
+
+`values` and `bootstrap_value` must come from the critic of now: those stored with a sample are stale by its
+lag.
+
+*Normalisation* is over the global batch: each trainer rank calls `moments` on its part, sums the three
+numbers with those of the other ranks, and calls `normalise` with the sum. Normalising per rank or per
+micro-batch would compare a decision only with its neighbours.
+
+Shape letters: S segments, T decisions of the longest one.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+STD_EPSILON = 1e-6
+"""Added to the standard deviation: advantages that are all equal become 0, and not noise of unit size."""
+
+
+def decision_mask(lengths: Tensor, t: int) -> Tensor:
+    """bool (S, t), True where a segment of one of the `lengths` (S,) still has a decision."""
+    return torch.arange(t, device=lengths.device) < lengths[:, None]
+
+
+def gae(
+    rewards: Tensor,
+    values: Tensor,
+    bootstrap_value: Tensor,
+    terminated: Tensor,
+    lengths: Tensor,
+    *,
+    gamma: float,
+    lam: float,
+) -> tuple[Tensor, Tensor]:
+    """Advantages and returns of a padded batch of segments, without gradient.
+
+    Args:
+        rewards: (S, T), summed over each chunk. Padding may hold anything, NaN included; so may `values`.
+        values: (S, T), V of the observation before each decision.
+        bootstrap_value: (S,), V of the observation after the last decision; ignored where `terminated`.
+        terminated: bool (S,), the episode is over. False for truncated and for cut segments.
+        lengths: int (S,), 1 to T.
+        gamma: discount per decision.
+        lam: λ per decision.
+
+    Returns:
+        Advantages (S, T), not normalised, and returns (S, T), the targets of the critic; both 0 at padding.
+
+    Raises:
+        ValueError: shapes disagree or a length is outside 1..T.
+    """
+    s, t = rewards.shape
+    shapes = {"values": (values, (s, t)), "bootstrap_value": (bootstrap_value, (s,))}
+    shapes |= {"terminated": (terminated, (s,)), "lengths": (lengths, (s,))}
+    for name, (tensor, shape) in shapes.items():
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} has shape {tuple(tensor.shape)}, not {shape}")
+    if s and not bool(((lengths >= 1) & (lengths <= t)).all()):
+        raise ValueError(f"lengths {lengths.tolist()}: all must be from 1 to {t}")
+
+    padding = ~decision_mask(lengths, t)
+    rewards = rewards.detach().masked_fill(padding, 0.0)
+    values = values.detach().masked_fill(padding, 0.0)
+    after = bootstrap_value.detach().masked_fill(terminated, 0.0)
+    next_values = values.roll(-1, dims=1).scatter(1, lengths[:, None] - 1, after[:, None])
+    delta = (rewards + gamma * next_values - values).masked_fill(padding, 0.0)
+
+    advantages = delta.clone()
+    for i in reversed(range(t - 1)):
+        advantages[:, i] += gamma * lam * advantages[:, i + 1]
+    return advantages, (advantages + values).masked_fill(padding, 0.0)
+
+
+def moments(x: Tensor, mask: Tensor | None = None) -> Tensor:
+    """(sum, sum of squares, count) of the valid entries, float64 (3,); add them to merge batches.
+
+    float64, because the variance is the difference of two nearly equal numbers when the mean is large.
+
+    Args:
+        x: any shape; padding may hold anything, NaN included.
+        mask: bool, same shape, or None.
+    """
+    wide = x.detach().double()
+    if mask is None:
+        count = wide.new_tensor(float(x.numel()))
+    else:
+        wide, count = wide.masked_fill(~mask, 0.0), mask.sum().double()
+    return torch.stack([wide.sum(), wide.square().sum(), count])
+
+
+def normalise(x: Tensor, moments: Tensor, mask: Tensor | None = None) -> Tensor:
+    """(x − mean) / (std + `STD_EPSILON`), same shape and dtype as `x`; 0 at padding.
+
+    Args:
+        x: any shape.
+        moments: (3,), from `moments`, summed over everything that is compared with each other.
+        mask: bool, same shape as `x`, or None.
+    """
+    total, squares, count = moments.unbind()
+    mean = total / count.clamp(min=1.0)
+    std = (squares / count.clamp(min=1.0) - mean.square()).clamp(min=0.0).sqrt()
+    scaled = ((x.detach().double() - mean) / (std + STD_EPSILON)).to(x.dtype)
+    return scaled if mask is None else scaled.masked_fill(~mask, 0.0)

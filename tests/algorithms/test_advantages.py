@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""GAE against a slow oracle and by hand; terminated is not truncated; padding does not matter."""
+
+import numpy as np
+import pytest
+import torch
+
+from accerl_lerobot.algorithms.advantages import decision_mask, gae, moments, normalise
+from tests.algorithms import oracle
+from tests.rounding import assert_close
+
+Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
+
+
+def batch(seed: int = 0, s: int = 6, t: int = 7) -> Batch:
+    generator = torch.Generator().manual_seed(seed)
+    rewards = torch.randn(s, t, generator=generator, dtype=torch.float64)
+    values = torch.randn(s, t, generator=generator, dtype=torch.float64)
+    bootstrap = torch.randn(s, generator=generator, dtype=torch.float64)
+    terminated = torch.arange(s) % 2 == 0
+    lengths = torch.randint(1, t + 1, (s,), generator=generator)
+    lengths[0] = t
+    return rewards, values, bootstrap, terminated, lengths
+
+
+@pytest.mark.parametrize(("gamma", "lam"), [(0.99, 0.95), (1.0, 1.0), (0.9, 0.0), (0.0, 0.5)])
+def test_equals_the_oracle(gamma: float, lam: float) -> None:
+    inputs = batch()
+    rewards, values, bootstrap, terminated, lengths = (x.numpy() for x in inputs)
+    expected = oracle.gae(rewards, values, bootstrap, terminated, lengths, gamma, lam)
+    for got, want in zip(gae(*inputs, gamma=gamma, lam=lam), expected, strict=True):
+        np.testing.assert_allclose(got.numpy(), want, atol=1e-12)
+
+
+def by_hand(terminated: bool) -> tuple[list[float], list[float]]:
+    advantages, returns = gae(
+        torch.tensor([[0.0, 1.0]]),
+        torch.tensor([[0.5, 0.25]]),
+        torch.tensor([2.0]),
+        torch.tensor([terminated]),
+        torch.tensor([2]),
+        gamma=0.5,
+        lam=0.5,
+    )
+    return advantages[0].tolist(), returns[0].tolist()
+
+
+def test_hand_computed_termination() -> None:
+    # δ_1 = 1 + 0 − 0.25 = 0.75; δ_0 = 0 + 0.5·0.25 − 0.5 = −0.375; Â_0 = −0.375 + 0.25·0.75 = −0.1875
+    assert by_hand(terminated=True) == ([-0.1875, 0.75], [0.3125, 1.0])
+
+
+def test_hand_computed_truncation_bootstraps_with_the_critic() -> None:
+    # δ_1 = 1 + 0.5·2 − 0.25 = 1.75; Â_0 = −0.375 + 0.25·1.75 = 0.0625
+    assert by_hand(terminated=False) == ([0.0625, 1.75], [0.5625, 2.0])
+
+
+def test_a_termination_ignores_even_a_nan_bootstrap() -> None:
+    rewards, values, bootstrap, terminated, lengths = batch()
+    bootstrap[terminated] = torch.nan
+    advantages, returns = gae(rewards, values, bootstrap, terminated, lengths, gamma=0.99, lam=0.95)
+    assert advantages.isfinite().all() and returns.isfinite().all()
+
+
+def test_padding_is_never_looked_at() -> None:
+    rewards, values, bootstrap, terminated, lengths = batch()
+    expected = gae(rewards, values, bootstrap, terminated, lengths, gamma=0.99, lam=0.95)
+    padding = ~decision_mask(lengths, 10)
+    tail = torch.zeros(6, 3, dtype=torch.float64)
+    rewards, values = (torch.cat([x, tail], 1).masked_fill(padding, torch.nan) for x in (rewards, values))
+    padded = gae(rewards, values, bootstrap, terminated, lengths, gamma=0.99, lam=0.95)
+    for got, want in zip(padded, expected, strict=True):
+        assert torch.equal(got[:, :7], want)
+        assert (got[padding] == 0).all()
+
+
+def test_lambda_one_without_critic_is_the_discounted_sum() -> None:
+    rewards = torch.tensor([[1.0, 2.0, 4.0]])
+    zero = torch.zeros(1, 3)
+    advantages, _ = gae(
+        rewards, zero, torch.zeros(1), torch.tensor([True]), torch.tensor([3]), gamma=0.5, lam=1.0
+    )
+    assert advantages.tolist() == [[3.0, 4.0, 4.0]]
+
+
+def test_a_perfect_critic_leaves_no_advantage() -> None:
+    values = torch.tensor([[0.25, 0.5, 1.0]])
+    rewards = torch.tensor([[0.0, 0.0, 1.0]])
+    advantages, returns = gae(
+        rewards, values, torch.ones(1), torch.tensor([True]), torch.tensor([3]), gamma=0.5, lam=0.9
+    )
+    assert advantages.abs().max() == 0 and torch.equal(returns, values)
+
+
+def test_no_gradient_leaves() -> None:
+    rewards, values, bootstrap, terminated, lengths = batch()
+    out = gae(rewards, values.requires_grad_(), bootstrap, terminated, lengths, gamma=0.99, lam=0.95)
+    assert not any(x.requires_grad for x in out)
+
+
+def test_wrong_shapes_and_lengths_are_refused() -> None:
+    rewards, values, bootstrap, terminated, lengths = batch()
+    with pytest.raises(ValueError, match="bootstrap_value has shape"):
+        gae(rewards, values, bootstrap[:, None], terminated, lengths, gamma=0.99, lam=0.95)
+    for bad in (0, 8):
+        lengths[2] = bad
+        with pytest.raises(ValueError, match="from 1 to 7"):
+            gae(rewards, values, bootstrap, terminated, lengths, gamma=0.99, lam=0.95)
+
+
+# ---- normalisation
+
+
+def test_parts_of_different_size_equal_the_whole() -> None:
+    x = torch.randn(5, 8, generator=torch.Generator().manual_seed(0)) * 3 + 7
+    mask = torch.rand(5, 8, generator=torch.Generator().manual_seed(1)) < 0.7
+    total = moments(x[:1], mask[:1]) + moments(x[1:], mask[1:])
+    torch.testing.assert_close(total, moments(x, mask))
+    got = torch.cat([normalise(x[:1], total, mask[:1]), normalise(x[1:], total, mask[1:])])
+    valid = x[mask].double()
+    expected = (valid - valid.mean()) / valid.std(correction=0)
+    assert_close(got[mask], expected)
+    assert (got[~mask] == 0).all() and got.dtype == x.dtype
+
+
+def test_normalisation_by_hand() -> None:
+    x = torch.tensor([1.0, 3.0])
+    assert moments(x).tolist() == [4.0, 10.0, 2.0]
+    torch.testing.assert_close(normalise(x, moments(x)), torch.tensor([-1.0, 1.0]))
+
+
+def test_padding_that_is_normalised_may_be_nan() -> None:
+    x, mask = torch.tensor([1.0, torch.nan, 3.0]), torch.tensor([True, False, True])
+    assert normalise(x, moments(x, mask), mask).tolist()[1] == 0.0
+    assert moments(x, mask).tolist() == [4.0, 10.0, 2.0]
+
+
+def test_equal_advantages_and_empty_batches_become_zero() -> None:
+    x = torch.full((64,), 0.1)
+    assert normalise(x, moments(x)).abs().max() == 0
+    nothing = torch.zeros(3, dtype=torch.bool)
+    assert normalise(torch.ones(3), moments(torch.ones(3), nothing), nothing).abs().max() == 0
+
+
+def test_a_large_mean_does_not_eat_the_variance() -> None:
+    x = 1e4 + torch.tensor([-1.0, 1.0] * 50)
+    torch.testing.assert_close(normalise(x, moments(x)).abs(), torch.ones(100), rtol=1e-4, atol=1e-4)

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A random backbone: SmolVLM's own files, small, with a tokeniser that has learned the instructions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from accerl_lerobot.demos.backbone import SPECIAL_TOKENS, BackboneConfig, write_backbone
+from accerl_lerobot.errors import InputError
+
+TEXTS = ["Open the door", "Close the drawer"]
+
+
+def tokenizer_of(directory: Path) -> Any:
+    from transformers import AutoTokenizer
+
+    return AutoTokenizer.from_pretrained(directory)
+
+
+def test_instructions_are_few_tokens_and_others_still_encode(tmp_path: Path):
+    learned = tokenizer_of(write_backbone(tmp_path / "learned", BackboneConfig(), TEXTS))
+    plain = tokenizer_of(write_backbone(tmp_path / "plain", BackboneConfig()))
+    assert [len(plain(text).input_ids) for text in TEXTS] == [13, 16], "a byte each"
+    assert all(len(learned(text).input_ids) <= 5 for text in TEXTS)
+    for text in (*TEXTS, "Öffne die Tür 🚪", "pick\tup\n"):
+        for tokenizer in (learned, plain):
+            assert tokenizer.decode(tokenizer(text).input_ids) == text
+
+
+def test_the_vocabulary_is_bounded_and_ids_are_those_of_the_config(tmp_path: Path):
+    from transformers import AutoConfig
+
+    many = [f"Task number {i} of a benchmark: {i * 7919}" for i in range(200)]
+    directory = write_backbone(tmp_path / "backbone", BackboneConfig(vocabulary=300), many)
+    tokenizer, config = tokenizer_of(directory), AutoConfig.from_pretrained(directory)
+    assert len(tokenizer) == config.text_config.vocab_size <= 300
+    assert config.image_token_id == tokenizer.convert_tokens_to_ids("<image>")
+    assert config.pad_token_id == tokenizer.pad_token_id
+    assert all(len(tokenizer(token).input_ids) == 1 for token in SPECIAL_TOKENS)
+
+
+def test_equal_texts_give_equal_files(tmp_path: Path):
+    one = write_backbone(tmp_path / "one", BackboneConfig(), TEXTS)
+    other = write_backbone(tmp_path / "deep" / "other", BackboneConfig(), [*reversed(TEXTS), TEXTS[0]])
+    for file in one.iterdir():
+        assert file.read_bytes() == (other / file.name).read_bytes(), file.name
+
+
+def test_the_vision_tower_has_the_sizes_asked_for(tmp_path: Path):
+    from transformers import AutoConfig
+
+    sizes = BackboneConfig(hidden=48, layers=3, heads=4, kv_heads=2, vision_hidden=32, patch=8, image=32)
+    config = AutoConfig.from_pretrained(write_backbone(tmp_path / "backbone", sizes))
+    text, vision = config.text_config, config.vision_config
+    assert (text.hidden_size, text.num_hidden_layers, text.head_dim) == (48, 3, 12)
+    assert (vision.hidden_size, vision.patch_size, vision.image_size) == (32, 8, 32)
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({"vocabulary": 263}, "sft.backbone.vocabulary=263: use a whole number from 264"),
+        ({"image": 48}, "sft.backbone.image=48: use a multiple of 32"),
+        ({"heads": 5}, "sft.backbone.heads=5: use a divisor of the width 96"),
+        ({"vision_heads": 3}, "sft.backbone.vision_heads=3: use a divisor of the width 64"),
+        ({"kv_heads": 3}, "sft.backbone.kv_heads=3: use a divisor of the 4 heads"),
+        ({"hidden": 12}, "sft.backbone.hidden=12: use a multiple of 8"),
+        ({"layers": 0}, "sft.backbone.layers=0: use a whole number from 1"),
+    ],
+)
+def test_impossible_sizes_name_their_field(values: dict, sentence: str):
+    with pytest.raises(InputError) as caught:
+        BackboneConfig(**values)
+    assert str(caught.value).startswith(sentence)

@@ -1,0 +1,431 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The contract of every policy type and sampler: what acts and what re-scores are one policy, LeRobot's."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from accerl_lerobot.experience import Request
+from accerl_lerobot.policies.adapter import LeRobotAdapter, Processing, stack_observations
+from accerl_lerobot.policies.config import (
+    FlowSamplerConfig,
+    PolicyConfig,
+    SamplerConfig,
+    TokenSamplerConfig,
+    ValueHeadConfig,
+)
+from accerl_lerobot.policies.family import Encoded
+from accerl_lerobot.policies.registry import POLICIES
+from accerl_lerobot.policies.saving import save_pretrained
+from tests.policies.cases import CASES, VARIANTS, Case
+from tests.policies.checkpoints import write_bins
+from tests.policies.tiny import (
+    adapter_at,
+    check_batches,
+    check_gradient,
+    check_journey,
+    deviation,
+    log_ratio,
+    perturb,
+    requests,
+    stored,
+)
+from tests.policies.tiny_pi import LOWEST, SKIP, VOCABULARY, hub, small, write_pi
+from tests.rounding import assert_close
+
+
+class Policy(NamedTuple):
+    """A case with one of its samplers, on disk and in memory; the adapter is one of its own."""
+
+    case: Case
+    path: Path
+    adapter: LeRobotAdapter
+    asked: list[Request]
+
+
+def label(config: SamplerConfig) -> str:
+    return "-".join(str(v) for v in vars(config).values() if v is not None)
+
+
+def parameters(*, all_samplers: bool = True, cases: dict[str, Case] = CASES | VARIANTS) -> list:
+    return [
+        pytest.param((name, sampler), id=f"{name}-{label(sampler)}")
+        for name, case in cases.items()
+        for sampler in (case.samplers if all_samplers else case.samplers[:1])
+    ]
+
+
+SAMPLERS = pytest.mark.parametrize("policy", parameters(), indirect=True)
+"""Every case with each of its samplers."""
+ONE_SAMPLER = pytest.mark.parametrize("policy", parameters(all_samplers=False), indirect=True)
+TYPES = pytest.mark.parametrize("policy", parameters(all_samplers=False, cases=CASES), indirect=True)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def sizes() -> Iterator[None]:
+    with small():
+        yield
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory):  # noqa: ANN201
+    @cache
+    def write(name: str) -> Path:
+        return (CASES | VARIANTS)[name].write(tmp_path_factory.mktemp("policy") / "pretrained_model")
+
+    return write
+
+
+@pytest.fixture(scope="module")
+def loaded(written):  # noqa: ANN001, ANN201
+    @cache
+    def load(name: str, sampler: SamplerConfig) -> LeRobotAdapter:
+        adapter = adapter_at(written(name), sampler)
+        (CASES | VARIANTS)[name].prepare(adapter)
+        return adapter
+
+    return load
+
+
+@pytest.fixture
+def policy(request: pytest.FixtureRequest, written, loaded) -> Policy:  # noqa: ANN001
+    name, sampler = request.param
+    case = (CASES | VARIANTS)[name]
+    return Policy(case, written(name), copy.deepcopy(loaded(name, sampler)), case.requests(40))
+
+
+def test_every_type_has_a_case():
+    assert set(CASES) == set(POLICIES)
+    for name, case in (CASES | VARIANTS).items():
+        assert case.kind in name
+        assert {sampler.type for sampler in case.samplers} <= set(POLICIES[case.kind][1])
+
+
+@SAMPLERS
+def test_decisions_and_ratio_one_do_not_depend_on_the_batch(policy: Policy):
+    adapter = policy.adapter
+    for one in check_batches(adapter, policy.asked, few=8):
+        assert one.chunk.shape == policy.case.chunk and one.chunk.dtype == np.float32 and one.version == 7
+        assert one.log_prob.dtype == np.float32
+        assert adapter.actions in (None, policy.case.chunk[0], len(one.log_prob))
+
+
+@SAMPLERS
+def test_other_weights_give_the_ratio_of_a_slow_computation(policy: Policy):
+    adapter, asked = policy.adapter, policy.asked[:4]
+    decisions = adapter.decide(asked, 0)
+    latent, old = stored(decisions)
+    perturb(adapter, policy.case.moved, seed=1)
+    expected = np.asarray(policy.case.slow(adapter, asked, latent)) - old.double().sum(1).numpy()
+    change = log_ratio(adapter, asked, decisions).numpy()
+    relative, absolute = policy.case.close
+    assert np.allclose(change, expected, rtol=relative, atol=absolute)
+    assert np.abs(change).max() > 0.05, "the weights must have moved the policy"
+
+
+@SAMPLERS
+def test_no_global_generator_is_read_or_moved(policy: Policy):
+    adapter, asked = policy.adapter, policy.asked[:6]
+    together = pickle.dumps(adapter.decide(asked, 7))
+    torch.manual_seed(1)
+    state = torch.get_rng_state()
+    assert pickle.dumps(adapter.decide(asked, 7)) == together, "no global generator is read"
+    adapter.self_check(*stack_observations(asked))
+    assert torch.equal(torch.get_rng_state(), state), "nor moved"
+
+
+@ONE_SAMPLER
+def test_all_that_is_observed_and_the_seed_matter(policy: Policy):
+    adapter, first = policy.adapter, policy.asked[0]
+    perturb(adapter, 0.1)
+    one = adapter.decide([first], 0)[0]
+    inputs = dict.fromkeys(adapter.policy.config.input_features)
+    changes = {key: np.zeros_like(first.observation[key]) for key in inputs}
+    if hasattr(adapter.policy.config, "tokenizer_max_length"):
+        changes["task"] = "Stay"
+    if first.observation["observation.state"].ndim == 2:  # each of the env steps that it looks back to
+        for key in inputs:
+            changes[f"{key} now"] = first.observation[key].copy()
+            changes[f"{key} now"][-1] = 0
+    for key, value in changes.items():
+        observation = first.observation | {key.removesuffix(" now"): value}
+        other = adapter.decide([replace(first, observation=observation)], 0)[0]
+        moved = np.abs(other.chunk - one.chunk).max() + np.abs(other.log_prob - one.log_prob).max()
+        assert moved > 1e-4, key
+        assert abs(other.value - one.value) > 1e-6, key
+    seeds = adapter.decide([replace(first, noise_seed=seed) for seed in range(20)], 0)
+    assert len({d.chunk.tobytes() for d in seeds}) > 10
+    assert_close([d.value for d in seeds], [one.value] * 20)
+
+
+@SAMPLERS
+def test_ratio_one_after_save_and_load_and_a_segment_s_journey(policy: Policy, tmp_path: Path):
+    adapter, asked = policy.adapter, policy.asked[:7]
+    perturb(adapter, 0.1)
+    check_journey(adapter, asked, policy.path, tmp_path / "saved")
+    untouched = adapter_at(policy.path, adapter.family.sampler)
+    assert log_ratio(untouched, asked[:6], adapter.decide(asked[:6], 0)).abs().max() > 1e-3
+
+
+@SAMPLERS
+def test_gradients_reach_every_trainable_parameter(policy: Policy):
+    adapter, asked = policy.adapter, policy.asked[:8]
+    perturb(adapter, 0.1)  # heads start at zero, where only their output layers have a gradient
+    latent, _ = stored(adapter.decide(asked, 0))
+    evaluation = adapter.evaluate(*stack_observations(asked), latent)
+    (evaluation.log_prob.sum() + evaluation.value.sum()).backward()
+    trainable = adapter.trainable()
+    silent = [k for k, p in trainable.items() if p.grad is None or not p.grad.abs().max() > 0]
+    assert silent == ["value_head.query"] * policy.case.one_token
+    assert all(any(part in k for k in trainable) for part in policy.case.parts)
+
+
+@SAMPLERS
+def test_log_prob_s_gradient_against_finite_differences(policy: Policy):
+    adapter, asked = policy.adapter, policy.asked[:8]
+    decisions = adapter.decide(asked, 0)
+    perturb(adapter, 0.02, seed=1)
+    case = policy.case
+    check_gradient(adapter, asked, decisions, case.parts, step=case.step, slack=case.slack)
+
+
+@SAMPLERS
+def test_not_exploring_is_lerobot_s_own_policy_and_is_not_scored(policy: Policy):
+    adapter, asked = policy.adapter, policy.case.requests(6, explore=False)
+    observations, tasks = stack_observations(asked)
+    assert adapter.self_check(observations, tasks) < 1e-6
+    decisions = adapter.decide(asked, 0)
+    chunks = np.stack([d.chunk for d in decisions])
+    assert not any(d.log_prob.any() for d in decisions)
+    if policy.case.stock is not None:
+        batch = adapter.processing.prepare(observations, tasks)
+        stock = policy.case.stock(adapter, batch, asked, stored(decisions)[0])
+        rows = policy.case.chunk[0]
+        assert np.array_equal(chunks, adapter.processing.unnormalise(stock)[:, :rows].numpy())
+    if adapter.family.frozen or policy.case.kind == "gaussian_actor":  # LeRobot's own policy samples
+        return
+    exploring = np.stack([d.chunk for d in adapter.decide(policy.asked[:6], 0)])
+    assert np.abs(exploring - chunks).max() > 1e-2
+
+
+@ONE_SAMPLER
+def test_values_are_those_of_evaluate_and_carry_no_gradient(policy: Policy):
+    adapter, asked = policy.adapter, policy.asked[:6]
+    perturb(adapter, 0.1)
+    observations, tasks = stack_observations(asked)
+    before = {k: v.copy() for k, v in observations.items()}
+    latent, _ = stored(adapter.decide(asked, 0))
+    values, evaluation = adapter.values(observations, tasks), adapter.evaluate(observations, tasks, latent)
+    assert not values.requires_grad and evaluation.value.requires_grad and evaluation.log_prob.requires_grad
+    assert torch.equal(values, evaluation.value.detach()) and values.shape == evaluation.entropy.shape == (6,)
+    assert values.std() > 0
+    assert all(np.array_equal(observations[k], v) for k, v in before.items()), "arrays are left alone"
+
+
+@ONE_SAMPLER
+def test_published_weights_make_the_same_policy(policy: Policy):
+    trainer, reader, asked = policy.adapter, copy.deepcopy(policy.adapter), policy.asked[:4]
+    perturb(trainer, 0.1)
+    exported = trainer.export_trainable()
+    assert all(a.dtype == np.float32 for a in exported.values())
+    before = pickle.dumps(reader.decide(asked, 0))
+    for array in exported.values():
+        array.setflags(write=False)  # as out of Ray's object store
+    reader.load_trainable(exported)
+    assert pickle.dumps(reader.decide(asked, 0)) == pickle.dumps(trainer.decide(asked, 0)) != before
+    perturb(trainer, 0.1)
+    assert np.array_equal(exported["value_head.out.bias"], reader.export_trainable()["value_head.out.bias"])
+
+
+@ONE_SAMPLER
+def test_training_touches_neither_normalisation_nor_buffers_nor_what_is_frozen(
+    policy: Policy, tmp_path: Path
+):
+    adapter, asked, path = policy.adapter, policy.asked[:4], policy.path
+    state = {k: v.clone() for k, v in adapter.policy.state_dict().items()}
+    trainable = adapter.trainable()
+    latent, _ = stored(adapter.decide(asked, 0))
+    optimizer = torch.optim.AdamW(trainable.values(), lr=1e-2)
+    evaluation = adapter.evaluate(*stack_observations(asked), latent)
+    (evaluation.log_prob.sum() + evaluation.value.sum()).backward()
+    optimizer.step()
+    config = PolicyConfig(path=str(path), device="cpu", sampler=adapter.family.sampler)
+    save_pretrained(adapter, tmp_path / "trained", config)
+    files = [f.name for f in path.glob("policy_*processor*.safetensors")]
+    assert len(files) >= 2 - (policy.case.kind == "pi0_fast")
+    for file in files:
+        assert (tmp_path / "trained" / file).read_bytes() == (path / file).read_bytes()
+    now = adapter.policy.state_dict()
+    moved = {now[k].data_ptr() for k, v in state.items() if not torch.equal(now[k], v)}
+    assert moved == {p.data_ptr() for k, p in trainable.items() if k.startswith("policy.")}
+
+
+@pytest.mark.parametrize("detach", [True, False])
+@pytest.mark.parametrize("name", ["smolvla", "pi0", "pi05"])
+def test_the_value_loss_reaches_the_backbone_only_when_asked(written, name: str, detach: bool):  # noqa: ANN001
+    adapter = adapter_at(written(name), value_head=ValueHeadConfig(detach=detach))
+    perturb(adapter, 0.1)
+    asked = CASES[name].requests(4)
+    latent, _ = stored(adapter.decide(asked, 0))
+    adapter.evaluate(*stack_observations(asked), latent).value.square().sum().backward()
+    reached = {k for k, p in adapter.trainable().items() if p.grad is not None and p.grad.abs().max() > 0}
+    critic = {k for k in adapter.trainable() if k.startswith("value_head.")}
+    assert critic <= reached
+    assert (reached == critic) if detach else any("vision" in k for k in reached)
+
+
+@pytest.mark.parametrize("name", ["smolvla", "pi0", "pi05", "pi0_fast", "smolvla_bins"])
+def test_the_network_runs_in_bfloat16_and_log_probs_and_weights_are_float32(written, name: str):  # noqa: ANN001
+    full, half = adapter_at(written(name)), adapter_at(written(name), precision="bf16")
+    asked = CASES[name].requests(6)
+    perturb(full, 0.1)
+    half.load_trainable(full.export_trainable())
+    latent, old = stored(half.decide(asked, 0))
+    evaluation = half.evaluate(*stack_observations(asked), latent)
+    assert old.dtype == evaluation.log_prob.dtype == evaluation.value.dtype == torch.float32
+    if name == "pi0_fast":  # two passes, two roundings
+        assert (evaluation.log_prob - old).abs().max() < 0.5
+    else:
+        assert torch.equal(evaluation.log_prob, old), "the same batch, the same numbers"
+    assert not torch.equal(old, old.bfloat16().float()), "not rounded"
+    gap = (full.evaluate(*stack_observations(asked), latent).log_prob - old).abs().max()
+    assert 1e-5 < gap < 1, "the network runs in bfloat16"
+    evaluation.log_prob.sum().backward()
+    assert all(p.dtype == torch.float32 for p in half.trainable().values())
+    assert any(p.grad is not None and p.grad.abs().max() > 0 for p in half.trainable().values())
+
+
+@TYPES
+def test_example_is_what_evaluate_takes(policy: Policy):
+    observations, tasks, latent = policy.adapter.example()
+    evaluation = policy.adapter.evaluate(observations, tasks, latent)
+    assert len(evaluation.log_prob) == len(tasks) == 2 and len(tasks[0]) != len(tasks[1])
+
+
+@torch.no_grad()
+def drift_flow(adapter: LeRobotAdapter, encoded: Encoded) -> None:
+    """Padded dims drift as well, and feed back."""
+    adapter.policy.model.action_out_proj.bias += torch.tensor([-0.25, -0.25, 0.4])
+
+
+@torch.no_grad()
+def drift_fast(adapter: LeRobotAdapter, encoded: Encoded) -> None:
+    """Towards tokens whose coefficient is above zero."""
+    last = VOCABULARY - 1 - SKIP + LOWEST
+    head = adapter.policy.model.paligemma_with_expert.paligemma.lm_head.weight
+    head[last - 30 : last] += 0.03 * encoded.features[0, -1]
+
+
+@torch.no_grad()
+def drift_bins(adapter: LeRobotAdapter, encoded: Encoded) -> None:
+    adapter.policy.model.head.bias += torch.linspace(-0.4, 0.4, 32)
+
+
+SMALL_PI = {"chunk": 2, "executed": 1, "padded_dim": 3, "num_steps": 2, "prompt": 28}
+WEIGHTED = {
+    "pi0": (lambda path: write_pi(path, "pi0", **SMALL_PI), FlowSamplerConfig(noise_level=0.5), drift_flow),
+    "pi05": (
+        lambda path: write_pi(path, "pi05", **SMALL_PI),
+        FlowSamplerConfig(stochastic="all", noise="flow_sde", noise_level=0.8),
+        drift_flow,
+    ),
+    "pi0_fast": (
+        lambda path: write_pi(path, "pi0_fast", chunk=2, executed=2, num_steps=4, prompt=28),
+        TokenSamplerConfig(temperature=0.6),
+        drift_fast,
+    ),
+    "smolvla_bins": (lambda path: write_bins(path, chunk=2, executed=2), TokenSamplerConfig(), drift_bins),
+}
+
+
+@pytest.mark.parametrize("name", WEIGHTED)
+def test_weighted_samples_of_mu_are_samples_of_pi(name: str, tmp_path: Path):
+    """E_μ[ρ f(a)] = E_π[f(a)]; of each family on a network small enough to sample often in its own tests."""
+    write, sampler, drift = WEIGHTED[name]
+    adapter, count = adapter_at(write(tmp_path / "pretrained_model"), sampler), 4000
+    prepared = adapter.processing.prepare(*stack_observations(requests(1)))
+    batch = {k: v.expand(count, *v.shape[1:]) if isinstance(v, Tensor) else v for k, v in prepared.items()}
+
+    @torch.no_grad()
+    def act(seed: int) -> tuple[Tensor, dict[str, Tensor], Tensor]:
+        asked = [Request(observation={}, noise_seed=seed + i) for i in range(count)]
+        action = adapter.family.act(adapter.model.encode(batch), asked)
+        executed = adapter.processing.unnormalise(action.chunk)
+        first, last, other = executed[:, 0, 0], executed[:, -1, 0], executed[:, -1, 1]
+        payoff = torch.tanh(first + last + 0.5) * (1 + torch.tanh(other) ** 2) + torch.tanh(other)
+        if name == "pi0_fast":  # of the first dimension, whose tokens come first
+            payoff = torch.tanh(first + last) * (1 + torch.tanh(executed[:, 0, 1]) ** 2)
+        return payoff, action.latent, action.log_prob.sum(1)
+
+    old, latent, behaviour = act(0)
+    perturb(adapter, 0.03)
+    drift(adapter, adapter.model.encode(prepared))
+    with torch.no_grad():
+        score = adapter.family.score(adapter.model.encode(batch), latent)
+    ratio = (score.log_prob.sum(1) - behaviour).exp()
+    new, _, _ = act(10_000)
+    assert deviation(old, new) > 6, "the weights must matter, or the test shows nothing"
+    assert deviation(ratio, torch.ones(2)) < 4
+    assert deviation(ratio * old, new) < 4
+
+
+@TYPES
+def test_stock_lerobot_runs_what_is_saved(policy: Policy, tmp_path: Path):
+    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+
+    adapter, saved, asked = policy.adapter, tmp_path / "saved", policy.asked[:3]
+    perturb(adapter, 0.1)
+    save_pretrained(adapter, saved, PolicyConfig(path=str(policy.path), device="cpu"))
+    with hub(tmp_path / "hub"), adapter.model.loading():
+        stock = get_policy_class(policy.case.kind).from_pretrained(saved)
+        pre, post = make_pre_post_processors(stock.config, pretrained_path=str(saved))
+    ours, theirs = adapter.policy.state_dict(), stock.state_dict()
+    assert ours.keys() == theirs.keys() and all(torch.equal(ours[k], theirs[k]) for k in ours)
+    observations = stack_observations(asked)
+    processing = Processing(pre, post, adapter.device)
+    batch, expected = (p.prepare(*observations) for p in (processing, adapter.processing))
+    assert all(torch.equal(batch[k], v) for k, v in expected.items() if isinstance(v, Tensor))
+    if stock.config.n_obs_steps > 1:  # LeRobot keeps the history itself
+        batch = {k: v[:, -1] if k in stock.config.input_features else v for k, v in batch.items()}
+    action = stock.select_action(batch)
+    assert torch.isfinite(action).all()
+    assert torch.equal(post(action), adapter.processing.unnormalise(action))
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if name != "gaussian_actor"])
+def test_lerobot_s_own_training_lowers_its_loss(written, name: str):  # noqa: ANN001
+    """gaussian_actor has no loss on demonstrations: LeRobot trains it by SAC."""
+    adapter, asked = adapter_at(written(name)), CASES[name].requests(24)
+    config, policy = adapter.policy.config, adapter.policy
+    observations, tasks = stack_observations(asked)
+    generator = torch.Generator().manual_seed(0)
+    rows, dims = len(config.action_delta_indices), config.output_features["action"].shape[0]
+    batch: dict[str, Any] = {"task": tasks}
+    for key in config.input_features:
+        value = torch.from_numpy(observations[key])
+        batch[key] = value.movedim(-1, -3) / 255.0 if value.dtype == torch.uint8 else value
+    batch["action"] = 0.3 * torch.randn(len(asked), rows, dims, generator=generator)
+    batch["action_is_pad"] = torch.zeros(len(asked), rows, dtype=torch.bool)
+    batch = adapter.processing.preprocessor(batch)
+    policy.train()
+    optimizer = torch.optim.AdamW([p for p in policy.parameters() if p.requires_grad], lr=1e-3)
+    losses = []
+    for _ in range(21):
+        torch.manual_seed(1)  # the same noise and times each step, so that losses can be compared
+        loss = policy.forward(batch)[0]
+        losses.append(loss.item())
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert losses[-1] < 0.99 * losses[0]

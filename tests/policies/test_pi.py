@@ -1,0 +1,319 @@
+# SPDX-License-Identifier: Apache-2.0
+"""π0, π0.5 and π0-FAST beside the contract: caches, layouts, decoding, precision."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.policies import flow, pi0_fast
+from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
+from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig, TokenSamplerConfig
+from accerl_lerobot.policies.saving import save_pretrained
+from accerl_lerobot.policies.tokens import TokenContext
+from tests.policies.cases import CASES
+from tests.policies.tiny import adapter_at, check_ratio_one, log_ratio, perturb, requests, stored
+from tests.policies.tiny_pi import CHARACTERS, KINDS, LOWEST, SCALE, SKIP, VOCABULARY, small, write_pi
+from tests.rounding import assert_close
+
+LANGUAGE_MODEL = "paligemma.model.language_model"
+LENGTH = 10
+FIRST = VOCABULARY - 1 - SKIP
+"""Token of FAST's token 0; the others lie below it."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def sizes() -> Iterator[None]:
+    with small():
+        yield
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def path(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return CASES[request.param].write(tmp_path_factory.mktemp(request.param) / "pretrained_model")
+
+
+@pytest.fixture
+def adapter(path: Path) -> LeRobotAdapter:
+    return adapter_at(path)
+
+
+def test_the_state_counts_in_full_however_the_critic_weights_its_tokens(tmp_path: Path):
+    adapter = adapter_at(write_pi(tmp_path / "pi0", "pi0"))
+    first = requests(1)[0]
+    arrays, tasks = stack_observations([first])
+    encoded = adapter.encode(arrays, tasks)
+    weights = torch.softmax(torch.randn(encoded.mask.shape).masked_fill(~encoded.mask, -math.inf), -1)
+    pooled = (weights[..., None] * encoded.features).sum(1)
+    assert_close(pooled[0, -4:], first.observation["observation.state"] / 0.5)
+
+
+def test_the_first_decision_of_a_process_is_lerobot_s_too(path: Path):
+    # LeRobot switches PaliGemma to eager attention when it first samples, which is not the default's result.
+    adapter, asked = adapter_at(path), requests(3, explore=False)
+    config = adapter.policy.model.paligemma_with_expert.paligemma.model.language_model.config
+    config._attn_implementation = "sdpa"
+    model = type(adapter.model)(adapter.policy)
+    assert config._attn_implementation == "eager"
+    batch = adapter.processing.prepare(*stack_observations(asked))
+    with torch.no_grad():
+        assert flow.difference(model, batch, model.encode(batch)) == 0.0
+
+
+def test_one_cache_serves_every_step(path: Path, monkeypatch: pytest.MonkeyPatch):
+    adapter = adapter_at(path, FlowSamplerConfig(stochastic="one"))
+    model = adapter.policy.model
+    seen: list[tuple[int, Tensor]] = []
+    denoise = model.denoise_step
+
+    def recording(**given: Any) -> Tensor:
+        cache = given["past_key_values"]
+        seen.append((id(cache), cache.layers[0].keys.clone()))
+        return denoise(**given)
+
+    monkeypatch.setattr(model, "denoise_step", recording)
+    prefixes: list[object] = []
+    embed = model.embed_prefix
+    monkeypatch.setattr(model, "embed_prefix", lambda *rest: prefixes.append(1) or embed(*rest))
+    asked = requests(3)
+    latent, _ = stored(adapter.decide(asked, 0))
+    assert len(seen) == 3 and len(prefixes) == 1
+    assert len({cache for cache, _ in seen}) == 1
+    assert all(torch.equal(keys, seen[0][1]) for _, keys in seen), "what a step adds goes into a copy"
+    seen.clear()
+    adapter.evaluate(*stack_observations(asked), latent).log_prob.sum().backward()
+    assert len(seen) == 1, "one drawn step is one pass of the suffix"
+
+
+def test_what_no_action_depends_on_is_not_trained(adapter: LeRobotAdapter):
+    asked = requests(4, explore=False)
+    before = np.stack([d.chunk for d in adapter.decide(asked, 0)])
+    frozen = {k: p for k, p in adapter.policy.named_parameters() if not p.requires_grad}
+    for parameter in frozen.values():
+        parameter.normal_()
+    assert np.array_equal(np.stack([d.chunk for d in adapter.decide(asked, 0)]), before)
+    assert {k.split("with_expert.")[1] for k in frozen} == {
+        "paligemma.lm_head.weight",
+        "gemma_expert.lm_head.weight",
+        f"{LANGUAGE_MODEL}.norm.weight",
+        f"{LANGUAGE_MODEL}.layers.1.self_attn.q_proj.weight",
+        f"{LANGUAGE_MODEL}.layers.1.self_attn.o_proj.weight",
+        f"{LANGUAGE_MODEL}.layers.1.mlp.gate_proj.weight",
+        f"{LANGUAGE_MODEL}.layers.1.mlp.up_proj.weight",
+        f"{LANGUAGE_MODEL}.layers.1.mlp.down_proj.weight",
+        f"{LANGUAGE_MODEL}.layers.1.post_attention_layernorm.weight",
+    }
+
+
+def test_lerobot_s_own_freezing_is_kept(tmp_path: Path):
+    for kind in KINDS:
+        path = write_pi(tmp_path / kind, kind, train_expert_only=True)
+        assert not any("paligemma." in k for k in adapter_at(path).trainable())
+
+
+def test_a_bfloat16_checkpoint_acts_and_is_saved_in_float32(path: Path, tmp_path: Path):
+    kind = adapter_at(path).policy.config.type
+    origin = write_pi(tmp_path / "origin", kind, dtype="bfloat16", padded_dim=4)
+    adapter, asked = adapter_at(origin), requests(16)
+    assert {p.dtype for p in adapter.policy.parameters()} == {torch.float32}
+    together = adapter.decide(asked, 0)
+    alone = [adapter.decide([request], 0)[0] for request in asked]
+    check_ratio_one(adapter, asked, alone)
+    perturb(adapter, 0.1)
+    save_pretrained(adapter, tmp_path / "saved", PolicyConfig(path=str(origin), device="cpu"))
+    again = adapter_at(tmp_path / "saved")
+    assert again.policy.config.dtype == "float32"
+    expected = adapter.decide(asked, 0)
+    assert np.array_equal(again.decide(asked, 0)[0].chunk, expected[0].chunk), "not rounded to bfloat16"
+    assert np.abs(expected[0].chunk - together[0].chunk).max() > 1e-3
+
+
+def test_relative_actions_are_added_to_their_own_state(tmp_path: Path):
+    for kind in KINDS:
+        absolute = adapter_at(write_pi(tmp_path / f"{kind}-absolute", kind))
+        relative = adapter_at(write_pi(tmp_path / f"{kind}-relative", kind, use_relative_actions=True))
+        asked = requests(5)
+        states = np.stack([r.observation["observation.state"] for r in asked])
+        chunks = [np.stack([d.chunk for d in a.decide(asked, 0)]) for a in (absolute, relative)]
+        assert_close(chunks[1], chunks[0] + states[:, None, :2])
+        check_ratio_one(relative, asked, relative.decide(asked, 0))
+
+
+def test_a_camera_the_world_does_not_have_is_masked(tmp_path: Path):
+    for kind in KINDS:
+        one = adapter_at(write_pi(tmp_path / f"{kind}-one", kind))
+        two = adapter_at(write_pi(tmp_path / f"{kind}-two", kind, empty_cameras=1))
+        asked = requests(5)
+        chunks = [np.stack([d.chunk for d in a.decide(asked, 0)]) for a in (one, two)]
+        assert_close(chunks[1], chunks[0])
+        values = [a.values(*stack_observations(asked)) for a in (one, two)]
+        assert_close(values[1], values[0])
+
+
+# ---- π0-FAST
+
+
+@pytest.fixture(scope="module")
+def loaded(tmp_path_factory: pytest.TempPathFactory) -> LeRobotAdapter:
+    """Ends about every tenth time it could."""
+    adapter = adapter_at(CASES["pi0_fast"].write(tmp_path_factory.mktemp("pi0_fast") / "pretrained_model"))
+    CASES["pi0_fast"].prepare(adapter)
+    return adapter
+
+
+@pytest.fixture
+def fast(loaded: LeRobotAdapter) -> LeRobotAdapter:
+    """One of its own for each test."""
+    return copy.deepcopy(loaded)
+
+
+@pytest.mark.parametrize("sampler", ["sample_actions_fast_kv_cache", "sample_actions_fast"])
+@pytest.mark.parametrize("temperature", [1.0, 0.6])
+def test_lerobot_s_own_sampler_draws_from_the_same_probabilities(
+    fast: LeRobotAdapter, monkeypatch: pytest.MonkeyPatch, temperature: float, sampler: str
+):
+    # It is made to draw our tokens, and the probabilities that it would have drawn from are read off.
+    asked = requests(16)
+    fast.family.sampler = TokenSamplerConfig(temperature=temperature)
+    latent, log_prob = stored(fast.decide(asked, 0))
+    tokens, seen = latent["tokens"], []
+
+    def dictated(probabilities: Tensor, num_samples: int) -> Tensor:
+        position = len(seen)
+        seen.append(probabilities.gather(1, tokens[:, position : position + 1])[:, 0])
+        return tokens[:, position : position + 1]
+
+    monkeypatch.setattr(torch, "multinomial", dictated)
+    policy, batch = fast.policy, fast.processing.prepare(*stack_observations(asked))
+    drawn = getattr(policy.model, sampler)(
+        *policy._preprocess_images(batch),
+        batch["observation.language.tokens"],
+        batch["observation.language.attention_mask"],
+        max_decoding_steps=LENGTH,
+        temperature=temperature,
+    )
+    assert torch.equal(drawn, tokens)
+    counted = log_prob != 0
+    assert_close(torch.stack(seen, 1).log()[counted], log_prob[counted])
+    assert counted.any(0).all() and not counted.all()
+
+
+def test_what_follows_the_terminator_does_not_count(fast: LeRobotAdapter):
+    asked = requests(24)
+    latent, old = stored(fast.decide(asked, 0))
+    tokens, end = latent["tokens"], fast.model.terminator
+    factors = fast.factors(latent)
+    expected = np.array([[end not in row[:i] for i in range(LENGTH)] for row in tokens.tolist()])
+    assert np.array_equal(factors, expected) and not factors.all()
+    assert not old[~factors].any() and (old[factors] < 0).all()
+    garbled = torch.where(factors, tokens, 17)
+    with torch.no_grad():
+        new = fast.evaluate(*stack_observations(asked), {"tokens": garbled}).log_prob
+    assert_close(new, old)
+    assert torch.equal(fast.model.chunk(garbled), fast.model.chunk(tokens))
+
+
+def test_one_reading_of_the_observations_serves_again_and_again(fast: LeRobotAdapter):
+    asked = requests(6)
+    tokens = stored(fast.decide(asked, 0))[0]["tokens"]
+    encoded = fast.encode(*stack_observations(asked))
+    with torch.no_grad():
+        first = encoded.context.logits(tokens)
+        again = fast.family.act(encoded, asked)
+        assert torch.equal(again.latent["tokens"], tokens)
+        assert torch.equal(encoded.context.logits(tokens), first)
+        some = encoded.context.logits(tokens[:, :3])
+    assert some.shape == (6, 3, VOCABULARY)
+    assert_close(some, first[:, :3])
+
+
+def test_the_layout_of_training_is_another_policy_s(fast: LeRobotAdapter, monkeypatch: pytest.MonkeyPatch):
+    """BOS as the first causal token, as LeRobot's loss has it: the self-check refuses to score like that."""
+    asked = requests(4)
+    observations, tasks = stack_observations(asked)
+    encode = fast.model.encode
+
+    def in_training_layout(batch: dict[str, Tensor]) -> Any:
+        policy, encoded = fast.policy, encode(batch)
+        bos = policy._paligemma_tokenizer.bos_token_id
+
+        def logits(tokens: Tensor) -> Tensor:
+            from lerobot.policies.common.vla_utils import prepare_attention_masks_4d
+
+            causal = torch.cat([torch.full_like(tokens[:, :1], bos), tokens[:, :-1]], 1)
+            embedded, pad, att, _, _ = policy.model.embed_prefix_fast(
+                *policy._preprocess_images(batch),
+                batch["observation.language.tokens"],
+                batch["observation.language.attention_mask"],
+                fast_action_tokens=causal,
+                fast_action_masks=torch.ones_like(causal, dtype=torch.bool),
+            )
+            (hidden, _), _ = policy.model.paligemma_with_expert.forward(
+                attention_mask=prepare_attention_masks_4d(att, dtype=embedded.dtype),
+                position_ids=torch.cumsum(pad, 1) - 1,
+                inputs_embeds=[embedded, None],
+                use_cache=False,
+            )
+            return policy.model.paligemma_with_expert.paligemma.lm_head(hidden[:, -tokens.shape[1] :])
+
+        return replace(encoded, context=TokenContext(logits=logits, generate=encoded.context.generate))
+
+    decisions = fast.decide(asked, 0)
+    monkeypatch.setattr(fast.model, "encode", in_training_layout)
+    assert log_ratio(fast, asked, decisions).abs().max() > 1e-3
+    with pytest.raises(InputError, match=r"does not fit LeRobot 0\.6\.1: it differs from its sampler"):
+        fast.self_check(observations, tasks)
+
+
+def test_decoding_is_lerobot_s_and_never_fails(fast: LeRobotAdapter, caplog: pytest.LogCaptureFixture):
+    end, half, zeros = fast.model.terminator, FIRST - CHARACTERS, FIRST - CHARACTERS - 1
+    zero = FIRST + LOWEST
+
+    def padded(*tokens: int) -> list[int]:
+        return [*tokens, *[end] * (LENGTH - len(tokens))]
+
+    rows = {
+        "one coefficient": padded(zero - 8),
+        "a sign": padded(zero + 8),
+        "pairs": padded(zeros, zeros, zeros, zeros),
+        "text between": padded(97, zero - 8, 98),
+        "nothing": padded(),
+        "only text": list(range(97, 97 + LENGTH)),
+        "too long": [zero - 1] * LENGTH,
+        "not FAST's": padded(VOCABULARY - 1),
+        "half a letter": padded(half),
+    }
+    with caplog.at_level(logging.WARNING):
+        pi0_fast._Undecodable.warned = False
+        chunks = fast.model.chunk(torch.tensor(list(rows.values())))
+    assert caplog.messages == ["tokens that FAST cannot decode were drawn; such a chunk is all zeros"]
+    by_name = dict(zip(rows, chunks, strict=True))
+    first = 8 / SCALE / 2  # the constant of an orthonormal transform of four rows
+    assert_close(by_name["one coefficient"], torch.tensor([[first, 0.0]]).expand(4, -1))
+    assert torch.equal(by_name["a sign"], -by_name["one coefficient"])
+    assert torch.equal(by_name["text between"], by_name["one coefficient"])
+    for name in ("pairs", "nothing", "only text", "not FAST's"):
+        assert not by_name[name].any(), name
+    assert by_name["too long"].abs().max() > 0 and torch.isfinite(chunks).all()
+    assert by_name["half a letter"].abs().max() > 1000, "LeRobot takes U+FFFD for a coefficient"
+
+
+def test_the_tokeniser_of_actions_goes_there_and_back(fast: LeRobotAdapter):
+    tokenizer = fast.policy.action_tokenizer
+    chunks = np.random.default_rng(0).uniform(-1, 1, (20, 4, 2))
+    tokens = [torch.tensor(each) for each in tokenizer(torch.from_numpy(chunks))]
+    decoded = fast.policy.decode_actions_with_fast(tokens, 4, 2)
+    # Each coefficient is off by at most half a step, so the chunk's norm is by at most √8 of them.
+    assert np.linalg.norm((decoded - chunks).reshape(20, -1), axis=1).max() <= 0.5 / SCALE * math.sqrt(8)
+    assert np.abs(decoded - chunks).max() > 0
