@@ -31,7 +31,7 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import WEIGHTS
 from accerl_lerobot.config.ranges import Range, Section, Threads
 from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.fault_points import reach
+from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.inference.batcher import Batcher, BatcherStats
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
@@ -257,14 +257,14 @@ class InferenceWorker:
             received.release()
             self._swap_s = time.monotonic() - started
             self._version, self._unserved_since = received.version, received.published_s
-            reach("inference.swapped")
+            fault_point("inference.swapped")
 
     def _serve_batch(self, batch: list[Asked]) -> None:
         batch = [asked for asked in batch if not asked.gone]
         requests = [request for asked in batch for request in asked.message]
         started = time.monotonic()
         self._clock.enter(COMPUTE)
-        broken = reach("inference.batch")
+        broken = fault_point("inference.batch")
         decisions = self._adapter.decide(requests, self._version) if requests else []
         for decision in decisions if broken else ():
             decision.log_prob.fill(np.nan)

@@ -26,7 +26,7 @@ import numpy as np
 
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.experience import Decision, Request, Segment
-from accerl_lerobot.fault_points import reach
+from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig, RolloutRunner
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, open_clock
@@ -198,7 +198,7 @@ class RolloutWorker:
         """Brings segments to replay; those of a whole group may come at once, and its pace is for a few."""
         while self._outbox and len(at_the_door) < QUEUE:
             self._clock.enter(TRANSPORT)
-            if reach("rollout.send"):
+            if fault_point("rollout.send"):
                 self._outbox[0].reward = self._outbox[0].reward * np.float32(np.nan)
             at_the_door.add(door.send(self._outbox[:size]))
             del self._outbox[:size]
@@ -218,9 +218,9 @@ class RolloutWorker:
 
     def _advance(self, slot: int, decision: Decision, due: dict[int, Request], idle: list[int]) -> None:
         self._clock.enter(COMPUTE)
-        reach("rollout.decided")
+        fault_point("rollout.decided")
         with self._in_world():
-            reach("rollout.step")
+            fault_point("rollout.step")
             request = self._runner.advance(slot, decision)
         if request is None:
             idle.append(slot)

@@ -25,7 +25,7 @@ from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import WEIGHTS
 from accerl_lerobot.experience import Segment
-from accerl_lerobot.fault_points import reach
+from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.trainer.config import TrainerConfig
 
@@ -126,7 +126,7 @@ class TrainerRank:
 
     def step(self, segments: Sequence[Segment]) -> None:
         """Its part of an update."""
-        reach("rank.step")
+        fault_point("rank.step")
         self._update.step(segments)
 
     def lend_weights(self) -> None:

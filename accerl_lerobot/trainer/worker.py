@@ -23,7 +23,7 @@ import ray
 from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
-from accerl_lerobot.fault_points import reach
+from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
@@ -146,7 +146,7 @@ class TrainerWorker:
             with self._lock:
                 self._clock.enter(COMPUTE)
                 started = time.monotonic()
-                reach("trainer.update")
+                fault_point("trainer.update")
                 with self._peers.joining("step", batch), keeping(self._directory, self._update, segments):
                     metrics = self._update.step(segments)
                 updated = time.monotonic()
@@ -179,7 +179,7 @@ class TrainerWorker:
             self._hand_over(publisher, *due)
 
     def _hand_over(self, publisher: Publisher | Publishers, version: int, tensors: dict[str, Any]) -> None:
-        reach("trainer.publish")
+        fault_point("trainer.publish")
         publisher.publish(version, tensors)
         self._handed_over = version
 
@@ -207,7 +207,7 @@ class TrainerWorker:
     def write(self, directory: Path) -> None:
         """Writes what is kept: ``pretrained_model`` and its part of ``training_state``."""
         (weights, trained, state), self._kept = self._kept, None
-        reach("trainer.write")
+        fault_point("trainer.write")
         self._update.adapter.save(directory / PRETRAINED, self._policy, weights)
         snapshot.save(directory / TRAINING_STATE / WEIGHTS, trained)
         snapshot.save(directory / TRAINING_STATE / "trainer", state)
