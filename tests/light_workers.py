@@ -21,8 +21,7 @@ from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.rollout.worker import Report, RolloutWorker
-from accerl_lerobot.transport.on_loop import serve_on_loop
-from accerl_lerobot.transport.shared_memory import Address
+from accerl_lerobot.transport.shared_memory import Address, serve_on_loop
 
 
 @pytest.fixture(scope="session")

@@ -32,10 +32,10 @@ SHELLS = CONDUCTOR | {
     "dream_workers.py",
     "peers.py",
     "ray_channel.py",
-    "ray_calls.py",
+    "endpoint.py",
 }
 """Files that may import Ray; all others are testable without it."""
-DISTRIBUTED = {"meeting.py", "ranks.py", "sharding.py", "tensors.py"}
+DISTRIBUTED = {"rendezvous.py", "ranks.py", "sharding.py", "tensors.py"}
 """Files that may know of other processes of a `torch.distributed` group."""
 
 LIGHT = [

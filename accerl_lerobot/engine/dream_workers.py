@@ -32,8 +32,7 @@ from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.metrics import numbered
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
-from accerl_lerobot.transport.endpoint import Endpoint
-from accerl_lerobot.transport.lasting import LastingCaller
+from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
 from accerl_lerobot.world_model.online import Promotion
 from accerl_lerobot.world_model.pool import DREAMS, check_workers
 
@@ -84,7 +83,7 @@ class DreamWorker:
         self._lock = threading.Lock()
         self._dreaming = threading.Lock()
         """Held while dreams change; outside, nothing stands in the outbox."""
-        self._deciding = LastingCaller("inference")
+        self._deciding = ReconnectingClient("inference")
         self._promoted: Promotion | None = None
         self._promising = config.imagination.learns
         self._cursor = 0

@@ -43,7 +43,7 @@ from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.transport.contract import ServiceStoppedError
-from accerl_lerobot.transport.endpoint import Endpoint, listens
+from accerl_lerobot.transport.endpoint import Endpoint, uses_shared_memory
 from accerl_lerobot.world_model.pool import together as dreamt_together
 
 logger = logging.getLogger(__name__)
@@ -78,7 +78,7 @@ class RayEngine(Engine):
         load: Load | None = None,
         own: OwnRay | None = None,
     ) -> None:
-        listens(config.launch.transport)
+        uses_shared_memory(config.launch.transport)
         self._config, self._state, self._load = config, state, load
         self._others: list[Watched] = []
         """All but inference services and rollout workers."""

@@ -31,7 +31,7 @@ from accerl_lerobot.engine.watched import Watched
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.inference.pool import added, dealt, together
 from accerl_lerobot.policies.config import Load
-from accerl_lerobot.transport.endpoint import Endpoint, listens
+from accerl_lerobot.transport.endpoint import Endpoint, uses_shared_memory
 
 logger = logging.getLogger(__name__)
 
@@ -270,7 +270,7 @@ class Services:
         service.deadline = time.monotonic() + max(START_S, launch.stall_s)
         yield worker.actor.ready.remote()
         service.deadline = time.monotonic() + launch.stall_s
-        address = (yield worker.actor.listen.remote()) if listens(launch.transport) else None
+        address = (yield worker.actor.listen.remote()) if uses_shared_memory(launch.transport) else None
         worker.work = worker.actor.serve.remote()
         together, joined = 0, False
         # Until all is as it is now: a trainer may have begun meanwhile, or turns ended.

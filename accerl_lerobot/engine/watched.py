@@ -13,7 +13,7 @@ import ray
 from ray.exceptions import GetTimeoutError, RayError
 
 from accerl_lerobot.engine.contract import WorkerError
-from accerl_lerobot.transport.endpoint import Endpoint, Transport, listens
+from accerl_lerobot.transport.endpoint import Endpoint, Transport, uses_shared_memory
 
 GONE_S = 3.0
 """How long a process may take to go that was told to."""
@@ -68,7 +68,7 @@ class Watched:
 
     def endpoint(self, method: str, transport: Transport, timeout: float) -> Endpoint:
         """Where other workers reach it, by this method."""
-        address = self.call("listen", timeout=timeout) if listens(transport) else None
+        address = self.call("listen", timeout=timeout) if uses_shared_memory(transport) else None
         way = getattr(self.actor, method)
         return Endpoint(name=self.name, method=way, address=address, transport=transport)
 

@@ -35,7 +35,7 @@ from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.inference.batcher import Batcher, BatcherStats
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
-from accerl_lerobot.transport.contract import Asked, Server, stopped
+from accerl_lerobot.transport.contract import PendingRequest, Server, stopped
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
 from accerl_lerobot.weights.channel import monotonic_clock
 from accerl_lerobot.weights.reader import Received, SharedMemoryReader
@@ -89,7 +89,7 @@ class InferenceWorker:
 
         torch.set_num_threads(config.num_threads)
         self._adapter = loader(load)(policy)
-        self._batcher: Batcher[Asked] = Batcher(config.max_batch, config.max_wait_s)
+        self._batcher: Batcher[PendingRequest] = Batcher(config.max_batch, config.max_wait_s)
         self._server = Server(self._take)
         self._version = version
         if state is not None:
@@ -211,7 +211,7 @@ class InferenceWorker:
         return replace(stats, batch_sizes=dict(stats.batch_sizes), waits=Counter(stats.waits))
 
     def _serve(self) -> None:
-        batch: list[Asked] = []
+        batch: list[PendingRequest] = []
         try:
             while not self._over:
                 self._turn = time.monotonic()
@@ -236,7 +236,7 @@ class InferenceWorker:
             self._server.close()
             raise
 
-    def _take(self, asked: Asked) -> None:
+    def _take(self, asked: PendingRequest) -> None:
         try:
             self._batcher.add(asked, asked.sent)
         except (TypeError, ValueError) as error:  # no list of requests, or an empty one
@@ -259,7 +259,7 @@ class InferenceWorker:
             self._version, self._unserved_since = received.version, received.published_s
             fault_point("inference.swapped")
 
-    def _serve_batch(self, batch: list[Asked]) -> None:
+    def _serve_batch(self, batch: list[PendingRequest]) -> None:
         batch = [asked for asked in batch if not asked.gone]
         requests = [request for asked in batch for request in asked.message]
         started = time.monotonic()

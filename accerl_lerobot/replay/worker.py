@@ -31,8 +31,7 @@ from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.replay.turns import Schedule, Turns
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
 from accerl_lerobot.transport.contract import stopped
-from accerl_lerobot.transport.on_loop import serve_on_loop
-from accerl_lerobot.transport.shared_memory import Address
+from accerl_lerobot.transport.shared_memory import Address, serve_on_loop
 
 IN_TRANSIT = 1024
 """Newest real segments that are kept for those who dream, who ask for them several times a second."""

@@ -13,7 +13,7 @@ from typing import Any, get_args
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.transport.endpoint import FIELD, Transport
-from accerl_lerobot.transport.nameless import available
+from accerl_lerobot.transport.memfd import available
 from accerl_lerobot.weights.publisher import FLUSH_S, Publisher
 from accerl_lerobot.weights.ray_channel import RayPublisher, answered
 from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher

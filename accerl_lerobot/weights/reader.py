@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from accerl_lerobot.transport.nameless import new_socket, same_user
+from accerl_lerobot.transport.memfd import new_socket, same_user
 from accerl_lerobot.weights.channel import Tensors
 from accerl_lerobot.weights.shared_memory import (
     APPLIED,

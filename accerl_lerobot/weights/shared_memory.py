@@ -21,7 +21,7 @@ import struct
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from accerl_lerobot.transport.nameless import listening, new_name, same_user
+from accerl_lerobot.transport.memfd import listening, new_name, same_user
 from accerl_lerobot.weights.publisher import Publisher, Shipment
 from accerl_lerobot.weights.slab import Slab, digest
 

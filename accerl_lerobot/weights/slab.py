@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 import xxhash
 
-from accerl_lerobot.transport.nameless import aligned, new_memory
+from accerl_lerobot.transport.memfd import aligned, new_memory
 
 
 class TornSetError(RuntimeError):

@@ -27,13 +27,13 @@ from accerl_lerobot.timeline.read import read_timeline
 from accerl_lerobot.timeline.states import STATES, TIMELINE
 from accerl_lerobot.trainer import worker as trainer
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.transport.contract import Caller
+from accerl_lerobot.transport.contract import Client
 from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.weights import ray_channel
 from tests.local_ray import Handle, Local
 from tests.replay.segments import make_segment
 from tests.trainer.linear import LinearAdapter, make_segments
-from tests.transport.played import PlayedCaller, played
+from tests.transport.played import PlayedClient, played
 
 
 class StoppedError(Exception):
@@ -151,8 +151,8 @@ def test_collecting_is_to_step_worlds_and_wait_for_decisions(collect) -> None:
 class ShutDoor(Endpoint):
     """Lets nobody in, and ends the loop that has waited there three times."""
 
-    def connect(self) -> Caller:
-        class Shut(PlayedCaller):
+    def connect(self) -> Client:
+        class Shut(PlayedClient):
             waits = 0
 
             def done(self, timeout: float) -> list[tuple[int, Any]]:
