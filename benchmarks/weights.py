@@ -158,7 +158,7 @@ def _arms(apart: bool) -> list[str]:
 
 def _block(arm: str, handles: list[Any], tensors: Tensors, copy: Tensors) -> dict[str, float]:
     """Publishes a few times, each after an update, and notes the last."""
-    from accerl_lerobot.weights.choice import make_publisher
+    from accerl_lerobot.weights.factory import make_publisher
     from benchmarks.weights_readers import ask
 
     publisher = make_publisher(handles, ARMS[arm])

@@ -135,7 +135,7 @@ class LightTrainer:
     def run(self, replay: Any, readers: list[Any], *_: str) -> int:
         import ray
 
-        from accerl_lerobot.weights.choice import make_publisher
+        from accerl_lerobot.weights.factory import make_publisher
 
         self._publisher = publisher = make_publisher(readers, "ray")
         publisher.publish(len(self._ledger), {})
@@ -159,12 +159,9 @@ class LightTrainer:
         return self._config.updates
 
     def join(self, reader: Any) -> int:
-        from accerl_lerobot.weights.choice import join
-
         assert self._publishing.wait(60)
-        newest = self._publisher._version
-        assert newest is not None
-        join(self._publisher, reader)
+        newest = len(self._ledger)
+        self._publisher.add(reader)
         return newest
 
     def metrics(self) -> list[dict[str, float]]:

@@ -31,7 +31,7 @@ SHELLS = CONDUCTOR | {
     "worker.py",
     "dream_workers.py",
     "peers.py",
-    "ray_channel.py",
+    "factory.py",
     "endpoint.py",
 }
 """Files that may import Ray; all others are testable without it."""
@@ -49,7 +49,7 @@ LIGHT = [
     "accerl_lerobot.rollout.worker",
     "accerl_lerobot.timeline",
     "accerl_lerobot.trainer.config",
-    "accerl_lerobot.weights.choice",
+    "accerl_lerobot.weights.factory",
 ]
 """Modules of processes that hold no policy: torch and LeRobot would cost each 400 MB and four seconds."""
 

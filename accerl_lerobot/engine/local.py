@@ -33,7 +33,7 @@ from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutRun
 from accerl_lerobot.seeds import global_generators, restore_global_generators
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.nonfinite import keeping
-from accerl_lerobot.weights.held_back import HeldBack
+from accerl_lerobot.weights.publisher import PublishDelay
 
 logger = logging.getLogger(__name__)
 
@@ -73,7 +73,11 @@ class LocalEngine(Engine):
         self._config = config
         self._adapter = loader(load)(config.policy)
         self._update = make_update(self._adapter, config.algorithm, config.trainer)
-        self._held, self._acting, self._acting_version = HeldBack(config.trainer.hold_back), self._adapter, 0
+        self._held, self._acting, self._acting_version = (
+            PublishDelay(config.trainer.hold_back),
+            self._adapter,
+            0,
+        )
         if config.trainer.hold_back:
             self._acting = loader(load)(config.policy)
             self._acting.load_trainable(self._adapter.export_trainable())
@@ -167,7 +171,7 @@ class LocalEngine(Engine):
             "generators": global_generators(),
             "rng": self._rng,
             "acting": (self._acting_version, acting),
-            "held_back": self._held.state(),
+            "held_back": self._delay.state(),
             "outstanding": sorted(self._outstanding),
             "outbox": list(self._outbox),
             "plans": self._plans.state(),
@@ -194,7 +198,7 @@ class LocalEngine(Engine):
         self._acting_version, acting = engine["acting"]
         if acting is not None:
             self._acting.load_trainable(acting)
-        self._held.restore(engine["held_back"])
+        self._delay.restore(engine["held_back"])
         self._outstanding = set(engine["outstanding"])
         self._outbox.extend(engine["outbox"])
         self._plans.restore(engine["plans"])
@@ -283,7 +287,7 @@ class LocalEngine(Engine):
         self._clock.enter(WEIGHT_SYNC)
         last = version == updates or not self._exploring
         weights = self._adapter.export_trainable()
-        for number, tensors in self._held.push(version, weights, last=last):
+        for number, tensors in self._delay.push(version, weights, last=last):
             self._acting.load_trainable(tensors)
             self._acting_version = number
 

@@ -17,8 +17,7 @@ from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.base import stack_observations
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.loading import load_adapter, save_pretrained
-from accerl_lerobot.weights.reader import Received, SharedMemoryReader
-from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
+from accerl_lerobot.weights.shared_memory import Received, SharedMemoryPublisher, SharedMemoryReader
 from tests.conftest import write_smolvla
 from tests.policies.tiny import adapter_at, check_ratio_one, perturb, requests, stored
 from tests.rounding import assert_close
