@@ -30,7 +30,7 @@ from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, SUMM
 from accerl_lerobot.config.ranges import Range, Repeats, Section, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, encode, parse
-from accerl_lerobot.engine.ray_environment import RAY_PROCESSES
+from accerl_lerobot.engine.ray_session import RAY_PROCESSES
 from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate

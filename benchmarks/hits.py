@@ -16,7 +16,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from accerl_lerobot.engine.ray_environment import NEEDED, RAY_PROCESSES
+from accerl_lerobot.engine.ray_session import RAY_PROCESSES, REQUIRED
 from benchmarks.audit import audit_updates
 from benchmarks.fault_injection import FULL, NAN, POINTS, TORN, inject, proof, withdraw
 from benchmarks.study import last_words
@@ -167,7 +167,7 @@ def _recover(victim: Victim, target: str, fault: str, pid: int, count: int) -> N
         RuntimeError: its process has ended, or it has not in time.
     """
     last = max(victim.updates(), default=0)
-    if fault == NAN or target in RAY_PROCESSES.keys() - set(NEEDED):
+    if fault == NAN or target in RAY_PROCESSES.keys() - set(REQUIRED):
         victim.await_update(last + SPARE, START_S)
     elif target in (DRIVER, EVERYTHING):
         try:

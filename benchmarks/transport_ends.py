@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import ray
 
-from accerl_lerobot.engine.cluster import start_ray
+from accerl_lerobot.engine.ray_session import start_ray
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.transport.contract import Client
 from accerl_lerobot.transport.endpoint import Endpoint, uses_shared_memory

@@ -27,7 +27,7 @@ from accerl_lerobot.bench.host import host, ranged, spread
 from accerl_lerobot.bench.tables import as_markdown, as_table, write
 from accerl_lerobot.config.ranges import Range, Repeats, Section, Seed
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine import ray_environment
+from accerl_lerobot.engine import ray_session
 from accerl_lerobot.errors import check_absent, make_folder
 from benchmarks.study import named
 
@@ -82,7 +82,7 @@ def bench_weights(config: BenchWeightsConfig) -> dict[str, Any]:
     root = None if config.output_dir is None else Path(config.output_dir).expanduser()
     if root is not None:
         check_absent(root)
-    ray_environment.prepare()
+    ray_session.prepare()
     from benchmarks.weights_readers import two_nodes
 
     before, console, cells = host(), Console(), []

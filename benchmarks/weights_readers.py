@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import ray
 
-from accerl_lerobot.engine.cluster import start_ray
-from accerl_lerobot.engine.ray_environment import check_private
+from accerl_lerobot.engine.ray_session import check_private, start_ray
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.weights.buffer import Tensors
 from accerl_lerobot.weights.factory import monotonic_clock

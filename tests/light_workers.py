@@ -29,7 +29,7 @@ def light_ray() -> Iterator[None]:
     """Ray for the rest of the test session; engines that find it leave it running."""
     import ray
 
-    from accerl_lerobot.engine.cluster import start_ray
+    from accerl_lerobot.engine.ray_session import start_ray
 
     if not ray.is_initialized():
         start_ray()

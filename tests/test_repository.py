@@ -25,8 +25,8 @@ PACKAGE = ROOT / "accerl_lerobot"
 
 HEADER = "# SPDX-License-Identifier: Apache-2.0\n"
 LONGEST_FILE = 600
-CONDUCTOR = {"launch.py", "cluster.py", "own_ray.py", "seats.py", "services.py", "watched.py"}
-SHELLS = CONDUCTOR | {
+ENGINE = {"launch.py", "placement.py", "ray_session.py", "replicas.py", "supervisor.py"}
+SHELLS = ENGINE | {
     "doctor.py",
     "worker.py",
     "dream_workers.py",

@@ -184,9 +184,9 @@ def hugging_face_datasets() -> Check:
 
 def ray_imports(joins: bool = False) -> Check:
     """Ray, with the environment a run would give it."""
-    from accerl_lerobot.engine import ray_environment
+    from accerl_lerobot.engine import ray_session
 
-    ray_environment.prepare(joins)
+    ray_session.prepare(joins)
     try:
         import ray
     except Exception as error:

@@ -23,7 +23,6 @@ from accerl_lerobot.config.parsing import decode, encode, parse
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Section, Seed, Steps, check
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
-from accerl_lerobot.engine.placement_config import PlacementConfig
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
@@ -39,6 +38,51 @@ from accerl_lerobot.transport.endpoint import Transport
 from accerl_lerobot.world_model.imagination_config import ImaginationConfig
 
 __all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "check_chunk", "decode", "encode", "parse"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoleConfig(Section, section="launch.placement"):
+    """Nodes of a kind of worker, and what each takes there."""
+
+    nodes: str | None = None
+    """A node's number as ``accerl doctor`` prints it, 0 being the one where the run is started; the name of a
+    custom resource, as in ``ray start --resources='{"simulators": 1}'``; or all. None: node 0."""
+    gpus: Annotated[float, Range("[0, 1]")] | None = None
+    """Share of a GPU for each. None: those with a network on the same nodes share what these have."""
+    cpus: NonNegative = 0.0
+    """Cores reserved for each; 0: none."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.nodes is not None and not self.nodes.strip():
+            remedy = "name a node's number or resource, or use all"
+            raise InputError(f"{self.SECTION}.nodes", self.nodes, remedy)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacementConfig(Section, section="launch.placement"):
+    """Nodes of all workers; replay is where the run is started."""
+
+    trainer: RoleConfig = field(default_factory=RoleConfig)
+    """Each of its ranks."""
+    inference: RoleConfig = field(default_factory=RoleConfig)
+    """Each replica."""
+    imagination: RoleConfig = field(default_factory=RoleConfig)
+    """Each worker that imagines, and the one that trains the world model."""
+    rollout: RoleConfig = field(default_factory=RoleConfig)
+    """Each rollout worker."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.rollout.gpus:
+            remedy = "rollout workers have no network; leave the field out"
+            raise InputError("launch.placement.rollout.gpus", self.rollout.gpus, remedy)
+
+    @property
+    def elsewhere(self) -> bool:
+        """True if any worker may be on another node."""
+        roles = (self.trainer, self.inference, self.imagination, self.rollout)
+        return any(role.nodes not in (None, "0") for role in roles)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,13 +30,12 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, saved_version
-from accerl_lerobot.engine.cluster import on, placed
 from accerl_lerobot.engine.config import RunConfig, journal_folder, timeline_folder
 from accerl_lerobot.engine.contract import Engine, Progress, Saved, WorkerError
-from accerl_lerobot.engine.own_ray import OwnRay
-from accerl_lerobot.engine.seats import START_S, Seats
-from accerl_lerobot.engine.services import Services
-from accerl_lerobot.engine.watched import Watched, end
+from accerl_lerobot.engine.placement import actor_options, place_workers
+from accerl_lerobot.engine.ray_session import RaySession
+from accerl_lerobot.engine.replicas import START_S, InferenceReplicas, RolloutWorkers
+from accerl_lerobot.engine.supervisor import ActorHandle, end
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.metrics import numbered
 from accerl_lerobot.policies.config import Load
@@ -76,31 +75,31 @@ class RayEngine(Engine):
         history: int = 1,
         state: Path | None = None,
         load: Load | None = None,
-        own: OwnRay | None = None,
+        own: RaySession | None = None,
     ) -> None:
         uses_shared_memory(config.launch.transport)
         self._config, self._state, self._load = config, state, load
-        self._others: list[Watched] = []
+        self._others: list[ActorHandle] = []
         """All but inference services and rollout workers."""
-        self._seats = Seats(config, tasks, history, state)
+        self._rollouts = RolloutWorkers(config, tasks, history, state)
         self._updates: list[dict[str, float]] = []
         self._replay_metrics: dict[str, float] = {}
         self._inference_metrics: dict[str, float] = {}
         self._of_dreamers: dict[str, dict[str, float]] = {}
         self._of_learner: dict[str, float] = {}
-        self._dreamers: list[Watched] = []
-        self._learner: Watched | None = None
-        self._ranks: list[Watched] = []
+        self._dreamers: list[ActorHandle] = []
+        self._learner: ActorHandle | None = None
+        self._ranks: list[ActorHandle] = []
         """The trainer's, but the first."""
         self._real_ended = False
         self._schedule: Schedule = ASYNCHRONOUS
         self._training = self._done = self._closed = False
         self._version = 0 if state is None else saved_version(state)
-        self._inference = Services(config, self._version, state, load)
+        self._inference = InferenceReplicas(config, self._version, state, load)
         self._last_change = time.monotonic()
         self._last_state: tuple[object, ...] = ()
-        self._ray = OwnRay(config.launch) if own is None else own
-        self._lasting = own is not None
+        self._ray = RaySession(config.launch) if own is None else own
+        self._keeps_ray = own is not None
         try:
             self._ray.start()
             self._start()
@@ -109,7 +108,7 @@ class RayEngine(Engine):
             raise
 
     def plan(self, plans: list[EpisodePlan]) -> None:
-        self._seats.plan(plans)
+        self._rollouts.plan(plans)
         self._last_change = time.monotonic()  # whatever the caller did before took its time
 
     def train(self) -> None:
@@ -130,7 +129,7 @@ class RayEngine(Engine):
         if schedule == self._schedule:
             return
         in_turn = schedule != ASYNCHRONOUS
-        self._seats.in_turn, self._schedule = in_turn, schedule
+        self._rollouts.in_turn, self._schedule = in_turn, schedule
         # The trainer first: who takes turns waits for it to hand over its weights.
         for worker in (self._trainer, self._replay):
             worker.call("follow", schedule, timeout=self._limit)
@@ -153,7 +152,7 @@ class RayEngine(Engine):
             done=self._done,
             updates=updates,
             episodes=episodes,
-            rollout=self._seats.counters(),
+            rollout=self._rollouts.counters(),
             replay=self._replay_metrics,
             inference=self._inference_metrics,
             imagination=dreamt_together(list(self._of_dreamers.values())) | self._of_learner,
@@ -176,7 +175,7 @@ class RayEngine(Engine):
         for imaginer in self._imaginers:
             imaginer.call("save", directory, **alive)
         self._trainer.call("write", directory, **alive)
-        self._seats.save(state)
+        self._rollouts.save(state)
         self._last_change = time.monotonic()
         return Saved(version, told + records)
 
@@ -188,7 +187,7 @@ class RayEngine(Engine):
             if lost := bool(self._ray.lost):
                 self._ray.close()
             end(self._everyone(), told=not lost)
-            if not self._lasting:
+            if not self._keeps_ray:
                 self._ray.close()
         except Exception:
             logger.exception("could not end all workers")
@@ -206,15 +205,15 @@ class RayEngine(Engine):
         return self._config.launch.stall_s
 
     @property
-    def _imaginers(self) -> list[Watched]:
+    def _imaginers(self) -> list[ActorHandle]:
         """In the order in which they are saved: who learns, then who dreams of it."""
         return [*([self._learner] if self._learner is not None else []), *self._dreamers]
 
-    def _everyone(self) -> Iterator[Watched]:
+    def _everyone(self) -> Iterator[ActorHandle]:
         """All workers, those that others depend on first."""
         yield from self._inference.workers()
         yield from self._others
-        yield from self._seats.workers()
+        yield from self._rollouts.workers()
 
     def _start(self) -> None:
         from accerl_lerobot.replay.worker import ReplayWorker
@@ -222,10 +221,10 @@ class RayEngine(Engine):
         from accerl_lerobot.trainer.worker import TrainerWorker
 
         c, timeline = self._config, timeline_folder(self._config)
-        plan, imagination = placed(c), c.imagination
+        plan, imagination = place_workers(c), c.imagination
 
         def make(name: str, kind: type, calls: int, *arguments: Any) -> Any:
-            options = on(plan.places[name]) | {"max_concurrency": calls}
+            options = actor_options(plan.places[name]) | {"max_concurrency": calls}
             return ray.remote(kind).options(**options).remote(*arguments)
 
         # The ranks first: Ray fills the GPU that is fullest, and each of them needs more than half of one.
@@ -248,7 +247,7 @@ class RayEngine(Engine):
             if imagination.learns:
                 learns = make("world learning", WorldLearningWorker, 4, c, self._state, timeline)
                 self._learner = self._other("world learning", learns)
-        self._seats.start(plan)
+        self._rollouts.start(plan)
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
         for worker, reference in ready:
             here = plan.places[worker.name].node.number == 0
@@ -258,15 +257,15 @@ class RayEngine(Engine):
         # Those that get one rollout worker more come first.
         self._dreams_ask = [(deciding[-1 - i % len(deciding)], inserting) for i in range(len(self._dreamers))]
         self._replay.work = self._replay.actor.run.remote()
-        self._seats.set_to_work(deciding, inserting)
+        self._rollouts.run(deciding, inserting)
 
-    def _other(self, name: str, actor: Any) -> Watched:
-        self._others.append(Watched(name, actor))
+    def _other(self, name: str, actor: Any) -> ActorHandle:
+        self._others.append(ActorHandle(name, actor))
         return self._others[-1]
 
     def _move(self, number: int, inference: Endpoint) -> None:
         """Tells those who ask an inference service where it is now."""
-        self._seats.move(number, inference)
+        self._rollouts.move(number, inference)
         services = self._config.inference.workers
         for i, dreamer in enumerate(self._dreamers):
             if services - 1 - i % services == number:
@@ -277,7 +276,7 @@ class RayEngine(Engine):
         self._inference.ask()
         for worker in self._others:
             worker.ask("metrics")
-        self._seats.ask(self._training and not self._done)
+        self._rollouts.ask(self._training and not self._done)
 
     def _await_end(self) -> None:
         """Waits a little, and deals with every worker whose long call has ended."""
@@ -290,7 +289,7 @@ class RayEngine(Engine):
             if reference in ended and worker.work is reference:
                 self._ended(worker)
 
-    def _ended(self, worker: Watched) -> None:
+    def _ended(self, worker: ActorHandle) -> None:
         """Decides what the end of a worker's long call means."""
         reference, worker.work = worker.work, None
         try:
@@ -299,7 +298,7 @@ class RayEngine(Engine):
             innocent = RayError | ServiceStoppedError
             if isinstance(error, RayTaskError) and isinstance(error.cause, innocent):
                 self._blame()
-            if self._inference.restart_worker(worker, error) or self._seats.restart_worker(worker, error):
+            if self._inference.restart_worker(worker, error) or self._rollouts.restart_worker(worker, error):
                 return
             raise WorkerError(f"{worker.name} worker failed for good:\n{error}") from error
         if worker is self._trainer:
@@ -335,13 +334,13 @@ class RayEngine(Engine):
             self._of_dreamers[dreamer.name] = self._hear(dreamer) or self._of_dreamers.get(dreamer.name, {})
         if self._learner is not None:
             self._of_learner = self._hear(self._learner) or self._of_learner
-        episodes = self._seats.listen()
-        if not self._real_ended and self._seats.spent:
+        episodes = self._rollouts.listen()
+        if not self._real_ended and self._rollouts.spent:
             self._real_ended = True
             self._replay.call("end_real", timeout=self._limit)
         return episodes
 
-    def _hear(self, worker: Watched, timeout: float = 0.0) -> Any:
+    def _hear(self, worker: ActorHandle, timeout: float = 0.0) -> Any:
         try:
             return worker.answer(timeout)
         except RayError as error:
@@ -357,7 +356,7 @@ class RayEngine(Engine):
             if worker.silent_s() > self._limit:
                 raise WorkerError(f"{worker.name} worker has not answered for {worker.silent_s():.0f} s")
         self._inference.check_hung()
-        self._seats.check_hung(self._inference.up)
+        self._rollouts.check_hung(self._inference.up)
 
     def _check_moving(self, progress: Progress) -> None:
         """Ends a run in which everybody answers and nothing moves.
@@ -368,10 +367,10 @@ class RayEngine(Engine):
         imagined = tuple(progress.imagination.get(k) for k in ("decisions", "learn_steps", "trial_s"))
         state = (progress.version, progress.rollout.get("decisions"), progress.rollout["restarts"], imagined)
         now = time.monotonic()
-        waiting = self._seats.outstanding or (self._training and not self._done)
+        waiting = self._rollouts.outstanding or (self._training and not self._done)
         # Where one worker is to blame, `_check_hung` comes to it a moment later.
         silent = max(worker.silent_s() for worker in self._everyone())
-        suspect = max(silent, self._seats.stuck_s) > self._limit / 2
+        suspect = max(silent, self._rollouts.stuck_s) > self._limit / 2
         # A service that is to come has a limit of its own.
         if state != self._last_state or not waiting or not all(self._inference.up):
             self._last_state, self._last_change = state, now

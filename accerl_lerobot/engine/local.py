@@ -73,11 +73,8 @@ class LocalEngine(Engine):
         self._config = config
         self._adapter = loader(load)(config.policy)
         self._update = make_update(self._adapter, config.algorithm, config.trainer)
-        self._held, self._acting, self._acting_version = (
-            PublishDelay(config.trainer.hold_back),
-            self._adapter,
-            0,
-        )
+        self._delay = PublishDelay(config.trainer.hold_back)
+        self._acting, self._acting_version = self._adapter, 0
         if config.trainer.hold_back:
             self._acting = loader(load)(config.policy)
             self._acting.load_trainable(self._adapter.export_trainable())

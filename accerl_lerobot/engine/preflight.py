@@ -20,7 +20,7 @@ import draccus
 
 from accerl_lerobot.algorithms import OffPolicyConfig, RatioConfig
 from accerl_lerobot.config.ranges import Range, check
-from accerl_lerobot.engine import ray_environment
+from accerl_lerobot.engine import ray_session
 from accerl_lerobot.envs import EnvConfig, WorldSpec, make_world
 from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.policies.features import (
@@ -437,10 +437,10 @@ def check_placement(config: RunConfig) -> list[str]:
     if config.launch.engine == "local":
         return []
     if config.launch.address is None:
-        from accerl_lerobot.engine.placement import planned, this_machine
+        from accerl_lerobot.engine.placement import plan_workers, this_machine
 
-        return list(planned([this_machine()], config).rows())
-    ray_environment.prepare(joins=True)
-    from accerl_lerobot.engine.cluster import rehearse
+        return list(plan_workers([this_machine()], config).rows())
+    ray_session.prepare(joins=True)
+    from accerl_lerobot.engine.placement import rehearse
 
     return rehearse(config)

@@ -39,7 +39,7 @@ from accerl_lerobot.checkpoint.layout import (
     write_atomically,
 )
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine import ray_environment
+from accerl_lerobot.engine import ray_session
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig, encode, timeline_folder
 from accerl_lerobot.engine.contract import Engine, WorkerError, pause_s
 from accerl_lerobot.engine.loop import Loop, Times
@@ -53,7 +53,7 @@ from accerl_lerobot.replay.journal import EPISODES
 from accerl_lerobot.timeline import RECOVERY, open_clock
 
 if TYPE_CHECKING:
-    from accerl_lerobot.engine.own_ray import OwnRay
+    from accerl_lerobot.engine.ray_session import RaySession
 
 logger = logging.getLogger(__name__)
 
@@ -97,7 +97,7 @@ def make_engine(
     history: int,
     state: Path | None = None,
     load: Load | None = None,
-    own: OwnRay | None = None,
+    own: RaySession | None = None,
 ) -> Engine:
     """The engine that ``launch.engine`` names.
 
@@ -113,7 +113,7 @@ def make_engine(
         from accerl_lerobot.engine.local import LocalEngine
 
         return LocalEngine(config, tasks, history, state, load)
-    ray_environment.prepare(joins=config.launch.address is not None)
+    ray_session.prepare(joins=config.launch.address is not None)
     from accerl_lerobot.engine.launch import RayEngine
 
     return RayEngine(config, tasks, history, state, load, own)
@@ -220,11 +220,11 @@ def train(
                 config = _going_on(config, directory, checkpoint, console)
 
 
-def _own_ray(launch: LaunchConfig) -> OwnRay:
-    ray_environment.prepare(joins=launch.address is not None)
-    from accerl_lerobot.engine.own_ray import OwnRay
+def _own_ray(launch: LaunchConfig) -> RaySession:
+    ray_session.prepare(joins=launch.address is not None)
+    from accerl_lerobot.engine.ray_session import RaySession
 
-    return OwnRay(launch)
+    return RaySession(launch)
 
 
 def _attempt(
@@ -237,7 +237,7 @@ def _attempt(
     times: Times,
     stop: Stopping,
     load: Load | None,
-    own: OwnRay | None,
+    own: RaySession | None,
 ) -> dict[str, Any]:
     """The run, or what is left of it, by one set of workers, which have ended when this returns or raises."""
     history = 1 if load is not None else check_policy(config, own=True)
