@@ -412,7 +412,7 @@ gcs_server = psutil.Process(int(sys.argv[1]))
 ray_session.ray_processes = lambda: {gcs_server: "gcs_server"}
 ray_session.kill_ray = lambda processes: None
 ray_session.GIVE_UP_S = 0.1
-guardian.explain(remedy="to go on: accerl train --resume=true")
+guardian.explain(remedy="to resume: accerl train --resume=true")
 ray_session.RayWatch(300.0)
 os.kill(int(sys.argv[1]), signal.SIGKILL)
 time.sleep(600)
@@ -422,7 +422,7 @@ time.sleep(600)
 def test_a_main_thread_that_hangs_in_ray_does_not_keep_the_process(raylet: psutil.Process):
     command = [sys.executable, "-c", HANGS, str(raylet.pid)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=240)
-    said = f"accerl: Ray's gcs_server (process {raylet.pid}) has died; to go on: accerl train --resume=true"
+    said = f"accerl: Ray's gcs_server (process {raylet.pid}) has died; to resume: accerl train --resume=true"
     assert (done.returncode, done.stderr.splitlines()[-1:]) == (1, [said])
 
 

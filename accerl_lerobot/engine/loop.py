@@ -30,8 +30,7 @@ from accerl_lerobot.checkpoint.layout import (
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Engine, Progress
-from accerl_lerobot.engine.resume import heed_stop
-from accerl_lerobot.engine.stopping import Stopping
+from accerl_lerobot.engine.stopping import Stopping, raise_if_stopped
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.evaluation.pictures import before_after, success_curve
 from accerl_lerobot.evaluation.summary import summarise
@@ -262,7 +261,7 @@ class Loop:
                 if self._is_due(progress.version) or asked:
                     self._save()
                 if asked:
-                    heed_stop(self.stop, self.directory)
+                    raise_if_stopped(self.stop, self.directory)
 
     @property
     def _rl_s(self) -> float:
@@ -340,7 +339,7 @@ class Loop:
 
     def _meanwhile(self, progress: Progress) -> None:
         self._record(progress)
-        heed_stop(self.stop, self.directory)
+        raise_if_stopped(self.stop, self.directory)
 
     def _report(self, group: str, results: list[EpisodeResult], steps: float, version: int) -> dict[str, Any]:
         summary = summarise(results) | {"env_steps": steps, "group": group}

@@ -292,7 +292,7 @@ def check_cluster(launch: LaunchConfig) -> None:
 
 
 def _complaint(process: subprocess.Popen[str]) -> str | None:
-    """What a process has written to stderr before it failed; None: it succeeded."""
+    """The stderr of a process that failed; None: it succeeded."""
     try:
         _, complaint = process.communicate(timeout=ANSWER_S)
     except subprocess.TimeoutExpired:

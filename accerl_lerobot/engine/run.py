@@ -44,8 +44,7 @@ from accerl_lerobot.engine.config import LaunchConfig, RunConfig, encode, timeli
 from accerl_lerobot.engine.contract import Engine, WorkerError, pause_s
 from accerl_lerobot.engine.loop import Loop, Times
 from accerl_lerobot.engine.preflight import check_placement, check_policy, check_start, check_world
-from accerl_lerobot.engine.resume import heed_stop
-from accerl_lerobot.engine.stopping import Stopping
+from accerl_lerobot.engine.stopping import Stopping, raise_if_stopped
 from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, make_folder
 from accerl_lerobot.metrics import METRICS, MetricsLog
 from accerl_lerobot.policies.config import Load
@@ -97,7 +96,7 @@ def make_engine(
     history: int,
     state: Path | None = None,
     load: Load | None = None,
-    own: RaySession | None = None,
+    session: RaySession | None = None,
 ) -> Engine:
     """The engine that ``launch.engine`` names.
 
@@ -107,7 +106,7 @@ def make_engine(
         history: env steps that the policy sees at a time.
         state: the ``training_state`` to go on from; None: begin.
         load: makes the policy's adapter; None: of LeRobot's checkpoint.
-        own: the Ray to use, which outlives the engine; None: one that ends with it.
+        session: the Ray to use, which outlives the engine; None: one that ends with it.
     """
     if config.launch.engine == "local":
         from accerl_lerobot.engine.local import LocalEngine
@@ -116,7 +115,7 @@ def make_engine(
     ray_session.prepare(joins=config.launch.address is not None)
     from accerl_lerobot.engine.launch import RayEngine
 
-    return RayEngine(config, tasks, history, state, load, own)
+    return RayEngine(config, tasks, history, state, load, session)
 
 
 def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfig:
@@ -213,9 +212,9 @@ def train(
                 if not isinstance(loss, WorkerError):
                     raise
                 times.clock.enter(RECOVERY)
-                heed_stop(stop, directory)
+                raise_if_stopped(stop, directory)
                 checkpoint = recovery.next(directory / CHECKPOINTS, console, loss, times.furthest)
-                heed_stop(stop, directory)
+                raise_if_stopped(stop, directory)
                 go_back_to(checkpoint)
                 config = _going_on(config, directory, checkpoint, console)
 
@@ -237,16 +236,16 @@ def _attempt(
     times: Times,
     stop: Stopping,
     load: Load | None,
-    own: RaySession | None,
+    session: RaySession | None,
 ) -> dict[str, Any]:
     """The run, or what is left of it, by one set of workers, which have ended when this returns or raises."""
     history = 1 if load is not None else check_policy(config, own=True)
     state = None if checkpoint is None else checkpoint / TRAINING_STATE
     try:
         with console.stage("starting workers"), stop.at_once():
-            engine = make_engine(config, tasks, history, state, load, own)
+            engine = make_engine(config, tasks, history, state, load, session)
     except KeyboardInterrupt:
-        heed_stop(stop, directory)
+        raise_if_stopped(stop, directory)
         raise
     with contextlib.closing(engine):
         return Loop(config, directory, console, engine, log, tasks, times, stop).run(state)
