@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole picture in one process, without Ray: the same parts, called in turn, deterministic for a seed.
+"""The engine in one process, without Ray: the same parts, called in turn, deterministic for a seed.
 
-    every poll:   all worlds get a decision and step it → segments enter replay, as far as the pace allows
-                  → all dreams get a decision and are dreamt on, if the pace allows it
+    every poll:   all environments get a decision and step it → segments enter replay, as the pace allows
+                  → all imagined rollouts get a decision and a step, if the pace allows it
                   → one update, if the pace allows it
 
 For tests and debugging. Weights reach the acting policy at once, so the lag comes from replay alone, unless
@@ -38,7 +38,7 @@ from accerl_lerobot.weights.publisher import PublishDelay
 logger = logging.getLogger(__name__)
 
 LOCAL, DREAMS = "local", "dreams"
-"""Names of this engine's own state, and of all that imagines."""
+"""Names of this engine's parts of a checkpoint."""
 
 
 class LocalEngine(Engine):
@@ -48,7 +48,7 @@ class LocalEngine(Engine):
         config: the run; its ``policy.path`` must be set.
         tasks: the training tasks.
         history: env steps that an observation holds, the policy's ``n_obs_steps``.
-        state: the ``training_state`` to go on from, as if it had never been left; None: begin.
+        state: the ``training_state`` to resume from, bit for bit; None: begin.
         load: makes the policy's adapter; None: of LeRobot's checkpoint.
 
     Raises:
@@ -185,7 +185,7 @@ class LocalEngine(Engine):
     def _restore(self, directory: Path) -> None:
         if not (directory / f"{LOCAL}.json").is_file():
             raise InputError(
-                "launch.engine", "local", "this run was asynchronous; go on with launch.engine=ray"
+                "launch.engine", "local", "this run was asynchronous; resume it with launch.engine=ray"
             )
         self._adapter.load_trainable(snapshot.load(directory / WEIGHTS))
         self._update.restore(snapshot.load(directory / "trainer"))
@@ -220,13 +220,13 @@ class LocalEngine(Engine):
 
     @property
     def _exploring(self) -> bool:
-        """True if learning goes on."""
+        """True if there are updates left to make."""
         if not self._training or self._update.version >= self._config.trainer.updates:
             return False
         return not self._replay.exhausted(self._config.trainer.batch_decisions)
 
     def _act(self) -> None:
-        """One decision in every world that may go on."""
+        """One decision in every environment that may continue."""
         if not self._exploring:
             self._runner.abandon_groups()
         for slot in range(len(self._runner)):
@@ -249,7 +249,7 @@ class LocalEngine(Engine):
                 self._due[slot] = request
 
     def _dream(self) -> None:
-        """One decision in every dream, if any is wanted."""
+        """One decision in every imagined rollout, if any is wanted."""
         if self._dreams is None or not self._training:
             return
         if self._replay.real_ended:
@@ -264,7 +264,7 @@ class LocalEngine(Engine):
             self._dreams.advance(self._acting.decide(requests, self._acting_version))
 
     def _learn_world(self) -> None:
-        """One gradient step of the world model, or its trial, if either is due."""
+        """One gradient step of the world model, or its held-out evaluation, if either is due."""
         learner, last = self._world_learner, self._replay.real_ended
         if learner is None or self._dreams is None or not self._training:
             return
@@ -276,7 +276,7 @@ class LocalEngine(Engine):
         self._replay.hold(learner.due(last=False) and not last)
 
     def _publish(self) -> None:
-        """Hands weights to the policy that acts, which is the trainer's own unless they are held back."""
+        """Give weights to the acting policy, which is the trainer's own unless they are delayed."""
         version, updates = self._update.version, self._config.trainer.updates
         if self._acting is self._adapter:
             self._acting_version = version
@@ -289,7 +289,7 @@ class LocalEngine(Engine):
             self._acting_version = number
 
     def _store(self) -> None:
-        """Lets in what stands at the door, one segment at a time: a group's come all at once."""
+        """Store waiting segments one at a time, since those of a group come all at once."""
         while self._outbox and self._replay.may_insert(REAL):
             segment = self._outbox.popleft()
             if not self._replay.insert(segment):
