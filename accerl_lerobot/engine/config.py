@@ -290,7 +290,7 @@ def timeline_folder(config: RunConfig) -> Path | None:
 
 
 def check_chunk(policy: dict[str, Any]) -> None:
-    """Refuses sizes in ``sft.policy`` that no LeRobot policy can have.
+    """Refuse sizes in ``sft.policy`` that no LeRobot policy can have.
 
     Args:
         policy: fields of a LeRobot policy config; LeRobot itself checks the others, see `preflight`.

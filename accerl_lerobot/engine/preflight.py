@@ -55,7 +55,7 @@ SLACK_BYTES = 128 * 2**20
 
 
 def check_world(env: EnvConfig) -> WorldSpec:
-    """Builds and resets an environment once, so that what is wrong with it shows before anything long.
+    """Build and resets an environment once, so that what is wrong with it shows before anything long.
 
     Raises:
         InputError: its simulator is not installed or cannot draw here, or it refuses its options.
@@ -69,7 +69,7 @@ def check_world(env: EnvConfig) -> WorldSpec:
 
 
 def check_policy(config: RunConfig, spec: WorldSpec | None = None, *, own: bool = False) -> int:
-    """Refuses a checkpoint that does not fit the environment; returns its ``n_obs_steps``.
+    """Refuse a checkpoint that does not fit the environment; returns its ``n_obs_steps``.
 
     Args:
         config: with ``policy.path``.
@@ -87,7 +87,7 @@ def check_policy(config: RunConfig, spec: WorldSpec | None = None, *, own: bool 
 
 
 def check_start(config: RunConfig) -> int:
-    """Refuses a run that could not begin or whose outcome could not be used; what can be is checked here.
+    """Refuse a run that could not begin or whose outcome could not be used; what can be is checked here.
 
     Returns:
         The policy's ``n_obs_steps``.
@@ -131,7 +131,7 @@ def check_start(config: RunConfig) -> int:
 def check_training_data(
     sft: SFTConfig, dataset: DatasetConfig, policy: Any, spec: WorldSpec | None, rename_map: dict[str, str]
 ) -> Any:
-    """Compares dataset, policy and environment of an SFT.
+    """Compare dataset, policy and environment of an SFT.
 
     Args:
         sft: makes the policy.
@@ -170,7 +170,7 @@ def check_training_data(
 
 
 def _check_new_policy(policy: Any, source: Features, sft: SFTConfig) -> None:
-    """Gives a new policy the features that LeRobot will give it, and has LeRobot check them.
+    """Give a new policy the features that LeRobot will give it, and has LeRobot check them.
 
     SmolVLA and π0 pad states and actions to a size of their own, and LeRobot does not compare it with theirs.
     """
@@ -195,7 +195,7 @@ def _check_new_policy(policy: Any, source: Features, sft: SFTConfig) -> None:
 
 
 def check_wandb(config: WandBConfig) -> None:
-    """Refuses logging to Weights & Biases where nobody is logged in.
+    """Refuse logging to Weights & Biases where nobody is logged in.
 
     Raises:
         InputError: see above; or its package is not installed.
@@ -235,7 +235,7 @@ def disk_bytes(config: RunConfig, spec: WorldSpec, history: int) -> int:
 
 
 def check_disk(folder: str | None, needed: int, field: str = "output_dir") -> None:
-    """Refuses a folder on a disk with too little space for `needed` bytes and small files; blames `field`.
+    """Refuse a folder on a disk with too little space for `needed` bytes and small files; blames `field`.
 
     Raises:
         InputError: see above.
@@ -250,7 +250,7 @@ def check_disk(folder: str | None, needed: int, field: str = "output_dir") -> No
 
 
 def check_machine(config: RunConfig) -> None:
-    """Refuses sizes far beyond this machine's memory.
+    """Refuse sizes far beyond this machine's memory.
 
     Raises:
         InputError: names the field that takes most memory.
@@ -268,7 +268,7 @@ def check_machine(config: RunConfig) -> None:
 
 
 def check_weights_fit(config: RunConfig) -> None:
-    """Refuses a policy whose weights this machine's memory cannot hold.
+    """Refuse a policy whose weights this machine's memory cannot hold.
 
     Raises:
         InputError: see above.
@@ -307,7 +307,7 @@ def policy_gib(config: RunConfig) -> float:
 
 
 def _check_off_policy(config: RunConfig, spec: WorldSpec, policy: Any) -> None:
-    """Refuses policies whose chunks have no gradient, and segments that are not whole episodes."""
+    """Refuse policies whose chunks have no gradient, and segments that are not whole episodes."""
     from accerl_lerobot.policies.loading import sampler_config
 
     sampler = sampler_config(config.policy, policy.type)
@@ -361,7 +361,7 @@ def policy_to_be(config: RunConfig) -> Any:
 
 
 def check_sft_policy(config: SFTConfig) -> Any:
-    """Lets LeRobot build the policy config that the SFT would ask for, and returns it.
+    """Let LeRobot build the policy config that the SFT would ask for, and returns it.
 
     Raises:
         InputError: LeRobot has no such policy, no such field, or refuses a value; or cannot fine-tune it.
@@ -431,7 +431,7 @@ def _as_input_error(error: BaseException, fields: dict[str, Any]) -> InputError:
 
 
 def check_placement(config: RunConfig) -> list[str]:
-    """Plans where the workers will be, so that what does not fit is refused before anything long; as lines.
+    """Plan where the workers will be, so that what does not fit is refused before anything long; as lines.
 
     Raises:
         InputError: they do not fit, or the cluster that is to be joined is not as it has to be.
