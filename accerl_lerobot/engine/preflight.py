@@ -235,11 +235,7 @@ def disk_bytes(config: RunConfig, spec: WorldSpec, history: int) -> int:
 
 
 def check_disk(folder: str | None, needed: int, field: str = "output_dir") -> None:
-    """Refuse a folder on a disk with too little space for `needed` bytes and small files; blames `field`.
-
-    Raises:
-        InputError: see above.
-    """
+    """Refuse a folder on a disk with too little space for `needed` bytes and small files; blames `field`."""
     path = expanded(folder or ".", field).absolute()
     while not path.exists():
         path = path.parent
@@ -268,11 +264,7 @@ def check_machine(config: RunConfig) -> None:
 
 
 def check_weights_fit(config: RunConfig) -> None:
-    """Refuse a policy whose weights this machine's memory cannot hold.
-
-    Raises:
-        InputError: see above.
-    """
+    """Refuse a policy whose weights this machine's memory cannot hold."""
     from accerl_lerobot.cli.doctor import total_memory_gib
 
     need, total = policy_gib(config), total_memory_gib()

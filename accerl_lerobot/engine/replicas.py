@@ -143,11 +143,7 @@ class RolloutWorkers(ReplicaSet[RolloutSlot]):
                 slot.moved = None
 
     def listen(self) -> list[EpisodeResult]:
-        """Pick up reports; returns the episodes in them.
-
-        Raises:
-            WorkerError: see `restart_worker`.
-        """
+        """Pick up reports; returns the episodes in them."""
         episodes: list[EpisodeResult] = []
         for slot, report in self._answers():
             slot.report, slot.spent = report, report.spent
@@ -195,11 +191,7 @@ class RolloutWorkers(ReplicaSet[RolloutSlot]):
         inference.
 
         Args:
-            served: of each inference replica, True if it is up.
-
-        Raises:
-            WorkerError: see `restart_worker`.
-        """
+            served: of each inference replica, True if it is up."""
         there = alive_nodes() if any(slot.unreachable for slot in self._slots) else frozenset()
         for slot in self._slots:
             if slot.unreachable is not None:
@@ -387,11 +379,7 @@ class InferenceReplicas(ReplicaSet[InferenceSlot]):
         return merged | {"restarts": float(self.restarts)}
 
     def check_hung(self) -> None:
-        """Restart replicas that do not answer.
-
-        Raises:
-            WorkerError: see `restart_worker`.
-        """
+        """Restart replicas that do not answer."""
         for slot in self._slots:
             silent = 0.0 if slot.worker is None else slot.worker.silent_s()
             if slot.up and silent > self._config.launch.stall_s:
@@ -401,11 +389,7 @@ class InferenceReplicas(ReplicaSet[InferenceSlot]):
         """Continue restarts without waiting.
 
         Returns:
-            Index and endpoint of each replica that has come up.
-
-        Raises:
-            WorkerError: see `restart_worker`.
-        """
+            Index and endpoint of each replica that has come up."""
         ready = []
         for slot in self._slots:
             if slot.up or (slot.worker is None and time.monotonic() < slot.due):
