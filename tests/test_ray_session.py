@@ -287,21 +287,6 @@ def test_a_ray_that_others_could_talk_to_is_not_started():
     assert done.returncode == 1 and "would be open to others if started now" in done.stderr
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        ["weights", "--sizes_mb=[1]", "--readers=[1]", "--repeats=1", "--tensors=2"],
-        ["transport", '--sizes=["12 KB"]', "--callers=[1]", "--calls=10", "--rounds=1"],
-    ],
-    ids=lambda options: options[0],
-)
-def test_benches_that_start_ray_by_themselves_have_prepared_for_it(options: list[str]):
-    clean = {k: v for k, v in os.environ.items() if not k.startswith("RAY_")}
-    command = [sys.executable, "-m", "benchmarks", *options]
-    done = subprocess.run(command, env=clean, capture_output=True, text=True, timeout=240)
-    assert done.returncode == 0, done.stderr[-2000:]
-
-
 class Stand:
     """Stands in for `ray`, and counts."""
 

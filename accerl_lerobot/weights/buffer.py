@@ -74,13 +74,6 @@ class BufferLayout:
         specs = {name: TensorSpec(dtype, tuple(shape), at) for name, (dtype, shape, at) in rows}
         return cls(specs, max((aligned(s.offset + s.nbytes) for s in specs.values()), default=0), text)
 
-    def fits(self, tensors: Mapping[str, np.ndarray]) -> bool:
-        """True if these tensors have this layout."""
-        return len(self.specs) == len(tensors) and all(
-            name == other and spec.shape == tensor.shape and spec.dtype == tensor.dtype.str
-            for (name, spec), (other, tensor) in zip(self.specs.items(), tensors.items(), strict=True)
-        )
-
     @property
     def end(self) -> int:
         """Bytes of data and layout."""

@@ -55,7 +55,6 @@ class Publisher(ABC):
         """By slot; one that has become too small is replaced in its slot."""
         self._changed = threading.Condition()
         self._version: int | None = None
-        self._layout = BufferLayout.of({})
         self._pending: WeightUpdate | None = None
         """Published, and not taken by the thread yet."""
         self._current: WeightUpdate | None = None
@@ -80,9 +79,7 @@ class Publisher(ABC):
         if self._version is not None and version <= self._version:
             raise ValueError(f"published version {version} after {self._version}: versions must grow")
         now = time.monotonic()
-        if not self._layout.fits(tensors):
-            self._layout = BufferLayout.of(tensors)
-        layout = self._layout
+        layout = BufferLayout.of(tensors)
         buffer = self._free_buffer(layout.end)
         buffer.fill(layout, tensors)
         with self._changed:
