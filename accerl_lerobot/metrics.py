@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from accerl_lerobot.config.ranges import Section
-from accerl_lerobot.fault_points import reach
+from accerl_lerobot.fault_points import fault_point
 
 METRICS = "metrics.jsonl"
 """Name of the file in a run's folder."""
@@ -90,7 +90,7 @@ class MetricsLog:
         """
         finite = plain(values)
         record = {"kind": kind, "wall_s": round(self.wall_s, 3), "update": update, **finite}
-        reach("driver.metrics")
+        fault_point("driver.metrics")
         self._file.write(json.dumps(record) + "\n")
         scalars = {k: float(v) for k, v in finite.items() if isinstance(v, (int, float))}
         summary = self._summary(

@@ -30,7 +30,7 @@ from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, SUMM
 from accerl_lerobot.config.ranges import Range, Repeats, Section, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, encode, parse
-from accerl_lerobot.engine.ray_environment import RAY_PROCESSES
+from accerl_lerobot.engine.ray_session import RAY_PROCESSES
 from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate
@@ -76,7 +76,7 @@ class BenchFaultsConfig(Section):
     faults: tuple[str, ...] = FAULTS
     """kill, stop: SIGKILL and SIGSTOP, at a point or at any moment. exception, exit (with code 0), hang (of
     one thread), nan, nans (in as many updates in a row as end the trainer), full (the disk), torn (a file of
-    a checkpoint): at the points of `fault_points` where they can happen."""
+    a checkpoint): at the points of `fault_injection` where they can happen."""
     repeats: Repeats = 5
     """Hits of each cell."""
     stall_s: Annotated[float, Range("[5, inf)")] = 10.0
@@ -184,7 +184,7 @@ class Start:
         Args:
             name: of its folder.
             changes: of its command line.
-            orders: folder of them, see `fault_points`.
+            orders: folder of them, see `fault_injection`.
         """
         chosen = [
             f"--trainer.updates={ENDLESS}",

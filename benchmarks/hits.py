@@ -16,9 +16,9 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from accerl_lerobot.engine.ray_environment import NEEDED, RAY_PROCESSES
-from accerl_lerobot.fault_points import FULL, NAN, POINTS, TORN, order, proof, withdraw
+from accerl_lerobot.engine.ray_session import RAY_PROCESSES, REQUIRED
 from benchmarks.audit import audit_updates
+from benchmarks.fault_injection import FULL, NAN, POINTS, TORN, inject, proof, withdraw
 from benchmarks.study import last_words
 from benchmarks.victims import DRIVER, EVERYTHING, Victim, alive, await_hit, hit
 
@@ -136,7 +136,7 @@ def _befall(
     if place != ANYWHERE:
         times = in_a_row if fault == NANS else 1
         what = NAN if fault == NANS else fault
-        taken = order(orders, name, place, what, at=rng.randint(1, VISITS), times=times)
+        taken = inject(orders, name, place, what, at=rng.randint(1, VISITS), times=times)
         deadline = time.monotonic() + AWAIT_S
         while (said := proof(taken)) is None:
             if time.monotonic() > deadline or (victim.process.poll() is not None and not taken.is_file()):
@@ -167,7 +167,7 @@ def _recover(victim: Victim, target: str, fault: str, pid: int, count: int) -> N
         RuntimeError: its process has ended, or it has not in time.
     """
     last = max(victim.updates(), default=0)
-    if fault == NAN or target in RAY_PROCESSES.keys() - set(NEEDED):
+    if fault == NAN or target in RAY_PROCESSES.keys() - set(REQUIRED):
         victim.await_update(last + SPARE, START_S)
     elif target in (DRIVER, EVERYTHING):
         try:

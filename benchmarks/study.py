@@ -26,7 +26,7 @@ from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, LAST, PRETRAIN
 from accerl_lerobot.config.ranges import Range, Section, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, encode, parse
-from accerl_lerobot.engine.resume import locked
+from accerl_lerobot.engine.stopping import locked
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate, mean_interval

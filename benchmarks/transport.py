@@ -29,7 +29,7 @@ from rich.table import Table
 from accerl_lerobot.bench.host import host, spread
 from accerl_lerobot.config.ranges import Choice, Range, Repeats, Section, Seed
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine import ray_environment
+from accerl_lerobot.engine import ray_session
 from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.experience import Decision, Request
@@ -107,7 +107,7 @@ def bench_transport(config: BenchTransportConfig) -> dict[str, Any]:
     Raises:
         InputError: `output_dir` exists, or this system has no shared memory.
     """
-    ray_environment.prepare()
+    ray_session.prepare()
     from benchmarks.transport_ends import Crowd
 
     folder = None if config.output_dir is None else Path(config.output_dir).expanduser()

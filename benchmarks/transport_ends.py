@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 import ray
 
-from accerl_lerobot.engine.cluster import start_ray
+from accerl_lerobot.engine.ray_session import start_ray
 from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.transport.contract import Caller
-from accerl_lerobot.transport.endpoint import Endpoint, listens
-from accerl_lerobot.transport.nameless import listening, new_name, new_socket
+from accerl_lerobot.transport.contract import Client
+from accerl_lerobot.transport.endpoint import Endpoint, uses_shared_memory
+from accerl_lerobot.transport.memfd import listening, new_name, new_socket
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
 from benchmarks.transport import (
     FLOORS,
@@ -106,7 +106,7 @@ class Calling:
         return timed(call, calls), time.monotonic()
 
 
-def _one(caller: Caller, message: list[Request]) -> Any:
+def _one(caller: Client, message: list[Request]) -> Any:
     caller.send(message)
     replies = caller.done(LONG_S)
     if not replies:
@@ -137,7 +137,7 @@ class Crowd:
         self._started = False
 
     def __enter__(self) -> Crowd:
-        listens("shared_memory")  # refuses where there is none
+        uses_shared_memory("shared_memory")  # refuses where there is none
         self._started = not ray.is_initialized()
         if self._started:
             start_ray()

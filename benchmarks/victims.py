@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from accerl_lerobot.checkpoint.layout import CONFIG
-from accerl_lerobot.engine.ray_environment import RAY_PROCESSES, kind_of
-from accerl_lerobot.fault_points import VARIABLE
+from accerl_lerobot.engine.ray_session import RAY_PROCESSES, process_kind
 from accerl_lerobot.metrics import METRICS
+from benchmarks.fault_injection import environment
 from benchmarks.study import last_words
 
 CLASSES = {
@@ -49,7 +49,7 @@ class Victim:
         arguments: of ``accerl train``, without its folder.
         log: file for what it says.
         module: what runs, `TRAIN` or `LIGHT`.
-        orders: folder of orders, see `fault_points`; None: no point of it looks for any.
+        orders: folder of orders, see `fault_injection`; None: no point of it looks for any.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Victim:
         orders: Path | None = None,
     ) -> None:
         self.folder, self.log, self._module = folder, log, module
-        self._environment = dict(os.environ) if orders is None else os.environ | {VARIABLE: str(orders)}
+        self._environment = dict(os.environ) if orders is None else os.environ | environment(orders)
         self._start([*arguments, f"--output_dir={folder}"])
 
     def go_on(self, *changes: str) -> None:
@@ -81,7 +81,7 @@ class Victim:
         if target in (DRIVER, EVERYTHING):
             return [self.process.pid] if self.process.poll() is None else []
         if target in RAY_PROCESSES:
-            return [p for p in descendants(self.process.pid) if kind_of(_command(p)) == target]
+            return [p for p in descendants(self.process.pid) if process_kind(_command(p)) == target]
         name = f"ray::{CLASSES[target]}"
         found = {pid for pid in descendants(self.process.pid) if title(pid).startswith(name)}
         # What a worker forks has its name, too, until it becomes something else.

@@ -27,7 +27,7 @@ from accerl_lerobot.bench.host import host, ranged, spread
 from accerl_lerobot.bench.tables import as_markdown, as_table, write
 from accerl_lerobot.config.ranges import Range, Repeats, Section, Seed
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine import ray_environment
+from accerl_lerobot.engine import ray_session
 from accerl_lerobot.errors import check_absent, make_folder
 from benchmarks.study import named
 
@@ -82,7 +82,7 @@ def bench_weights(config: BenchWeightsConfig) -> dict[str, Any]:
     root = None if config.output_dir is None else Path(config.output_dir).expanduser()
     if root is not None:
         check_absent(root)
-    ray_environment.prepare()
+    ray_session.prepare()
     from benchmarks.weights_readers import two_nodes
 
     before, console, cells = host(), Console(), []
@@ -158,7 +158,7 @@ def _arms(apart: bool) -> list[str]:
 
 def _block(arm: str, handles: list[Any], tensors: Tensors, copy: Tensors) -> dict[str, float]:
     """Publishes a few times, each after an update, and notes the last."""
-    from accerl_lerobot.weights.choice import make_publisher
+    from accerl_lerobot.weights.factory import make_publisher
     from benchmarks.weights_readers import ask
 
     publisher = make_publisher(handles, ARMS[arm])

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import ray
 
-from accerl_lerobot.engine.cluster import start_ray
-from accerl_lerobot.engine.ray_environment import check_private
+from accerl_lerobot.engine.ray_session import check_private, start_ray
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.weights.channel import Tensors, monotonic_clock
-from accerl_lerobot.weights.reader import Received, SharedMemoryReader
+from accerl_lerobot.weights.buffer import Tensors
+from accerl_lerobot.weights.factory import monotonic_clock
+from accerl_lerobot.weights.shared_memory import Received, SharedMemoryReader
 
 _APART = "apart"
 """Resource of the node that is not this one."""

@@ -12,9 +12,9 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-from accerl_lerobot.engine import ray_environment  # noqa: E402
+from accerl_lerobot.engine import ray_session  # noqa: E402
 
-ray_environment.prepare()
+ray_session.prepare()
 
 
 def write_smolvla(

@@ -21,8 +21,7 @@ from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.rollout.worker import Report, RolloutWorker
-from accerl_lerobot.transport.on_loop import serve_on_loop
-from accerl_lerobot.transport.shared_memory import Address
+from accerl_lerobot.transport.shared_memory import Address, serve_on_loop
 
 
 @pytest.fixture(scope="session")
@@ -30,7 +29,7 @@ def light_ray() -> Iterator[None]:
     """Ray for the rest of the test session; engines that find it leave it running."""
     import ray
 
-    from accerl_lerobot.engine.cluster import start_ray
+    from accerl_lerobot.engine.ray_session import start_ray
 
     if not ray.is_initialized():
         start_ray()
@@ -136,7 +135,7 @@ class LightTrainer:
     def run(self, replay: Any, readers: list[Any], *_: str) -> int:
         import ray
 
-        from accerl_lerobot.weights.choice import make_publisher
+        from accerl_lerobot.weights.factory import make_publisher
 
         self._publisher = publisher = make_publisher(readers, "ray")
         publisher.publish(len(self._ledger), {})
@@ -160,12 +159,9 @@ class LightTrainer:
         return self._config.updates
 
     def join(self, reader: Any) -> int:
-        from accerl_lerobot.weights.choice import join
-
         assert self._publishing.wait(60)
-        newest = self._publisher._version
-        assert newest is not None
-        join(self._publisher, reader)
+        newest = len(self._ledger)
+        self._publisher.add(reader)
         return newest
 
     def metrics(self) -> list[dict[str, float]]:

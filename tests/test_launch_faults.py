@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 import ray
 
-from accerl_lerobot.engine import launch, seats
+from accerl_lerobot.engine import launch, replicas
 from accerl_lerobot.engine.config import LaunchConfig
 from accerl_lerobot.engine.contract import Progress, WorkerError, pause_s
 from accerl_lerobot.engine.launch import RayEngine
@@ -124,8 +124,7 @@ def test_both_transports_play_the_same_episodes(engine):
     for transport in ("ray", "shared_memory"):
         env, launch = replace(SLOW, reward="dense"), LaunchConfig(stall_s=120, transport=transport)
         one = engine(env=env, rollout=TWO, launch=launch)
-        assert one._seats._peers is not None
-        (deciding,), inserting = one._seats._peers
+        (deciding,), inserting = one._rollouts._inference, one._rollouts._replay
         assert [end.address is None for end in (deciding, inserting)] == [transport == "ray"] * 2
         one.plan(evaluation_plans(("match",), 10, "eval"))
         results = sorted(collect(one, "eval", 10), key=lambda result: result.plan.index)
@@ -357,12 +356,11 @@ def test_an_inference_is_replaced_before_there_are_weights_and_after_the_last_on
 
 
 def test_a_worker_that_does_not_find_inference_is_replaced(engine, monkeypatch):
-    monkeypatch.setattr(seats, "AWAY_S", 1.0)
+    monkeypatch.setattr(replicas, "AWAY_S", 1.0)
     one = engine(env=HARD, rollout=TWO, trainer=ENDLESS)
     until_training(one)
-    assert one._seats._peers is not None
-    there = one._seats._peers[0][0]
-    one._seats._seats[1].moved = replace(there, address=Address(this_node(), "accerl-nobody"))
+    (there,) = one._rollouts._inference
+    one._rollouts._slots[1].moved = replace(there, address=Address(this_node(), "accerl-nobody"))
     before = one.pids()["rollout 1"]
     restarts = 0.0
     for progress in polls(one):

@@ -26,7 +26,7 @@ from accerl_lerobot.engine.launch import RayEngine
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.runs import collect, drive, polls, tiny_run
-from tests.test_ray_environment import LOOPBACK, listening
+from tests.test_ray_session import LOOPBACK, listening
 
 UPDATES = 12
 TWO = TrainerConfig(

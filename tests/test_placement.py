@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine.config import LaunchConfig, RunConfig, decode
+from accerl_lerobot.engine import placement
+from accerl_lerobot.engine.config import LaunchConfig, PlacementConfig, RoleConfig, RunConfig, decode
 from accerl_lerobot.engine.contract import WorkerError
-from accerl_lerobot.engine.placement import Node, Plan, planned
-from accerl_lerobot.engine.placement_config import PlacementConfig, RoleConfig
+from accerl_lerobot.engine.placement import Node, Plan, place_workers, plan_workers
 from accerl_lerobot.engine.run import train
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.worker import InferenceConfig
@@ -78,9 +78,9 @@ def rollouts_by_node(plan: Plan) -> dict[int, int]:
     return Counter(p.node.number for name, p in plan.places.items() if name.startswith("rollout"))
 
 
-@pytest.mark.parametrize(("gpus", "share"), [(0, 0.0), (1, 0.5), (2, 1.0), (0.5, 0.25)])
+@pytest.mark.parametrize(("gpus", "share"), [(0, 0.0), (1, 0.5), (2, 1.0)])
 def test_nothing_said_all_is_here_and_shares_what_is_left_of_the_gpus(gpus: float, share: float):
-    assert where(planned(cluster((8, gpus), (64, 8)), run())) == {
+    assert where(plan_workers(cluster((8, gpus), (64, 8)), run())) == {
         "trainer": (0, share),
         "inference": (0, share),
         "replay": (0, 0.0),
@@ -90,25 +90,25 @@ def test_nothing_said_all_is_here_and_shares_what_is_left_of_the_gpus(gpus: floa
 
 
 def test_a_policy_on_the_cpu_leaves_gpus_alone():
-    assert {gpus for _, gpus in where(planned(cluster((8, 4)), run(device="cpu"))).values()} == {0.0}
+    assert {gpus for _, gpus in where(plan_workers(cluster((8, 4)), run(device="cpu"))).values()} == {0.0}
     with pytest.raises(InputError, match=r"inference\.gpus=0\.5: policy\.device=cpu takes none"):
-        planned(cluster((8, 4)), run(device="cpu", inference=at(gpus=0.5)))
+        plan_workers(cluster((8, 4)), run(device="cpu", inference=at(gpus=0.5)))
 
 
 def test_ranks_that_do_not_fit_are_refused_as_on_one_machine():
     with pytest.raises(InputError, match=r"trainer\.ranks=4: .* 4 ranks on 3 GPUs leave 1 without"):
-        planned(cluster((8, 3)), run(ranks=4))
+        plan_workers(cluster((8, 3)), run(ranks=4))
 
 
 def test_the_sum_is_in_the_error():
     config = run(ranks=4, services=2, trainer=at(gpus=1), inference=at(gpus=0.5))
     with pytest.raises(InputError) as caught:
-        planned(cluster((8, 4)), config)
+        plan_workers(cluster((8, 4)), config)
     assert str(caught.value) == (
         "launch.placement.inference.gpus=0.5: 4 trainer × 1 + 2 inference × 0.5 = 5 GPUs, and there are 4 on "
         "node 0 (10.0.0.1); ask for less, or for other nodes"
     )
-    found = where(planned(cluster((8, 5)), config))
+    found = where(plan_workers(cluster((8, 5)), config))
     assert [found[f"inference {i}"] for i in range(2)] == [(0, 0.5)] * 2
 
 
@@ -117,20 +117,13 @@ def test_parts_that_add_up_but_fit_on_no_single_gpu_are_refused():
     with pytest.raises(
         InputError, match=r"1\.8 GPUs, and there are 2 on .*, of which no single one has room"
     ):
-        planned(cluster((8, 2)), config)
-
-
-def test_whole_gpus_of_one_process_are_on_one_node():
-    config = run(trainer=at("all", gpus=2), inference=at(gpus=0))
-    assert where(planned(cluster((8, 1), (8, 2)), config))["trainer"] == (1, 2.0)
-    with pytest.raises(InputError, match=r"trainer × 2 = 2 GPUs, and there are 2 on .*no single one"):
-        planned(cluster((8, 1), (8, 1)), config)
+        plan_workers(cluster((8, 2)), config)
 
 
 def test_each_role_goes_where_it_is_sent_and_shares_what_is_there():
     nodes = cluster((8, 2), (8, 1), (64, 0), (32, 0), n2="sim", n3="sim")
     config = run(ranks=2, services=2, rollouts=6, dreams=2, imagination=at("1"), rollout=at("sim"))
-    plan = planned(nodes, config)
+    plan = plan_workers(nodes, config)
     found = where(plan)
     assert [found[name] for name in ("trainer", "trainer rank 1")] == [(0, 0.6)] * 2
     assert [found[f"inference {i}"] for i in range(2)] == [(0, 0.4)] * 2
@@ -148,16 +141,16 @@ def test_each_role_goes_where_it_is_sent_and_shares_what_is_there():
 
 def test_cores_are_kept_where_they_are_asked_for():
     config = run(rollouts=6, rollout=at("all", cpus=2))
-    assert rollouts_by_node(planned(cluster((4, 0), (8, 0)), config)) == {0: 2, 1: 4}
+    assert rollouts_by_node(plan_workers(cluster((4, 0), (8, 0)), config)) == {0: 2, 1: 4}
     with pytest.raises(InputError, match=r"rollout\.cpus=2: 6 × 2 = 12 CPUs .* there are 4 on node 0 .*7 on"):
-        planned(cluster((4, 0), (7, 0)), config)
+        plan_workers(cluster((4, 0), (7, 0)), config)
 
 
 def test_a_node_that_is_not_there_is_refused_with_those_that_are():
     nodes = cluster((8, 0), (8, 0), n1="sim")
     for name in ("7", "simulators"):
         with pytest.raises(InputError, match=rf"rollout\.nodes='{name}': .*numbers 0 to 1 and resources sim"):
-            planned(nodes, run(rollout=at(name)))
+            plan_workers(nodes, run(rollout=at(name)))
 
 
 def test_what_has_a_network_stays_where_the_files_are():
@@ -166,8 +159,8 @@ def test_what_has_a_network_stays_where_the_files_are():
     with pytest.raises(
         InputError, match=r"inference\.nodes='1': node 1 \(10\.0\.0\.2\) does not see the run's"
     ):
-        planned(nodes, run(inference=at("1")))
-    plan = planned(nodes, run(rollouts=9, inference=at("all"), rollout=at("all")))
+        plan_workers(nodes, run(inference=at("1")))
+    plan = plan_workers(nodes, run(rollouts=9, inference=at("all"), rollout=at("all")))
     assert where(plan)["inference"] == (0, 0.0)
     assert rollouts_by_node(plan) == {1: 9}  # the cores of node 0 have a trainer and a policy already
 
@@ -175,46 +168,44 @@ def test_what_has_a_network_stays_where_the_files_are():
 def test_gpus_of_some_who_share_nodes_and_not_of_others_are_refused():
     config = run(trainer=at(gpus=0.5))
     with pytest.raises(InputError, match=r"trainer\.gpus=0\.5: say the same of inference, on the same nodes"):
-        planned(cluster((8, 1)), config)
-    assert where(planned(cluster((8, 1), (8, 1)), run(trainer=at(gpus=0.5), inference=at("1"))))
+        plan_workers(cluster((8, 1)), config)
+    assert where(plan_workers(cluster((8, 1), (8, 1)), run(trainer=at(gpus=0.5), inference=at("1"))))
 
 
 def test_two_ranks_never_share_a_gpu():
     with pytest.raises(InputError, match=r"trainer\.gpus=0\.5: two ranks could share a GPU"):
-        planned(cluster((8, 2)), run(ranks=2, trainer=at(gpus=0.5), inference=at(gpus=0.5)))
+        plan_workers(cluster((8, 2)), run(ranks=2, trainer=at(gpus=0.5), inference=at(gpus=0.5)))
 
 
 def test_cuda_is_not_looked_for_on_nodes_without():
-    with pytest.raises(InputError, match=r"policy\.device='cuda': there is no GPU left on node 1"):
-        planned(cluster((8, 1), (8, 0)), run(device="cuda", inference=at("1")))
+    with pytest.raises(InputError, match=r"policy\.device='cuda': there is no GPU on node 1"):
+        plan_workers(cluster((8, 1), (8, 0)), run(device="cuda", inference=at("1")))
 
 
 def test_shared_memory_ends_where_the_machine_does():
     nodes, config = cluster((8, 0), (8, 0)), run(transport="shared_memory", rollout=at("all"))
     with pytest.raises(InputError, match=r"launch\.transport='shared_memory': node 1 .* shares no memory"):
-        planned(nodes, config)
-    assert planned([nodes[0], replace(nodes[1], host="host0")], config)  # two nodes of one machine
+        plan_workers(nodes, config)
+    assert plan_workers([nodes[0], replace(nodes[1], host="host0")], config)  # two nodes of one machine
 
 
 def test_a_rollout_worker_whose_node_has_left_goes_to_one_that_is_there():
-    plan = planned(cluster((4, 0), (8, 0), (8, 0)), run(rollouts=5, rollout=at("all", cpus=4)))
+    plan = plan_workers(cluster((4, 0), (8, 0), (8, 0)), run(rollouts=5, rollout=at("all", cpus=4)))
     assert rollouts_by_node(plan) == {0: 1, 1: 2, 2: 2}
     left = frozenset({"key0", "key1"})
     for name in [n for n, place in plan.places.items() if place.node.number == 2]:
-        place = plan.instead(name, left)
-        assert place.cpus == 0.0  # whether there is room for it or not
-        plan = plan.moved(name, place)
+        plan = plan.moved(name, left)
+        assert plan.places[name].cpus == 0.0  # whether there is room for it or not
     assert rollouts_by_node(plan) == {0: 2, 1: 3}
-    assert plan.instead("rollout 1", frozenset({"key0"})).node.number == 0
+    assert plan.moved("rollout 1", frozenset({"key0"})).places["rollout 1"].node.number == 0
     with pytest.raises(WorkerError, match="rollout 1 worker is lost, and no node is left"):
-        plan.instead("rollout 1", frozenset())  # a worker's loss may be noticed before its node's
+        plan.moved("rollout 1", frozenset())  # a worker's loss may be noticed before its node's
 
 
 @pytest.mark.parametrize(
     ("role", "fields", "match"),
     [
-        ("trainer", {"gpus": 1.5}, r"trainer\.gpus=1\.5: use a share in \[0, 1\] or a whole number"),
-        ("inference", {"gpus": -1.0}, r"inference\.gpus=-1\.0: use a number of at least 0"),
+        ("trainer", {"gpus": 1.5}, r"trainer\.gpus=1\.5: use a number from 0 to 1"),
         ("rollout", {"cpus": -1.0}, r"rollout\.cpus=-1\.0: use a number of at least 0"),
         ("rollout", {"gpus": 0.5}, r"rollout\.gpus=0\.5: rollout workers have no network"),
         ("imagination", {"nodes": " "}, r"imagination\.nodes=' ': name a node"),
@@ -244,6 +235,26 @@ def test_a_cluster_that_is_none_is_refused_when_the_recipe_is_read(fields: dict[
         LaunchConfig(**fields)
 
 
+def test_a_node_that_leaves_while_it_is_asked_is_planned_without(monkeypatch: pytest.MonkeyPatch):
+    there = [frozenset({"key0", "key1"})]
+    asked: list[int] = []
+
+    def nodes(config: object) -> list[Node]:
+        asked.append(len(there[0]))
+        if len(asked) == 1:
+            there[0] = frozenset({"key0"})
+            raise WorkerError("node 1 could not report its versions")
+        return cluster((8, 0))
+
+    monkeypatch.setattr(placement, "alive_nodes", lambda: there[0])
+    monkeypatch.setattr(placement, "_nodes", nodes)
+    assert set(where(place_workers(run())).values()) == {(0, 0.0)} and asked == [2, 1]
+    asked.clear()
+    there[0] = frozenset({"key0"})
+    with pytest.raises(WorkerError, match="could not report"):  # it is there, and broken
+        place_workers(run())
+
+
 def test_whatever_is_planned_fits():
     """On 300 random clusters no more is taken than there is, GPU by GPU as Ray fills them."""
     rng, made = random.Random(0), 0
@@ -262,7 +273,7 @@ def test_whatever_is_planned_fits():
             rollout=at(sites[2], cpus=rng.choice([0, 0, 1, 2])),
         )
         try:
-            plan = planned(nodes, config)
+            plan = plan_workers(nodes, config)
         except InputError as error:
             assert "GPU" in str(error) or "CPUs" in str(error), error
             continue

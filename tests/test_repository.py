@@ -25,17 +25,17 @@ PACKAGE = ROOT / "accerl_lerobot"
 
 HEADER = "# SPDX-License-Identifier: Apache-2.0\n"
 LONGEST_FILE = 600
-CONDUCTOR = {"launch.py", "cluster.py", "own_ray.py", "seats.py", "services.py", "watched.py"}
-SHELLS = CONDUCTOR | {
+ENGINE = {"launch.py", "placement.py", "ray_session.py", "replicas.py", "supervisor.py"}
+SHELLS = ENGINE | {
     "doctor.py",
     "worker.py",
     "dream_workers.py",
     "peers.py",
-    "ray_channel.py",
-    "ray_calls.py",
+    "factory.py",
+    "endpoint.py",
 }
 """Files that may import Ray; all others are testable without it."""
-DISTRIBUTED = {"meeting.py", "ranks.py", "sharding.py", "tensors.py"}
+DISTRIBUTED = {"rendezvous.py", "ranks.py", "sharding.py", "tensors.py"}
 """Files that may know of other processes of a `torch.distributed` group."""
 
 LIGHT = [
@@ -49,7 +49,7 @@ LIGHT = [
     "accerl_lerobot.rollout.worker",
     "accerl_lerobot.timeline",
     "accerl_lerobot.trainer.config",
-    "accerl_lerobot.weights.choice",
+    "accerl_lerobot.weights.factory",
 ]
 """Modules of processes that hold no policy: torch and LeRobot would cost each 400 MB and four seconds."""
 

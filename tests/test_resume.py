@@ -107,7 +107,7 @@ def test_a_run_that_was_asked_to_stop_goes_on_as_if_it_had_not(
         stop_at(context, 7, number)
         assert main(["train", str(recipe(tmp_path, tiny_checkpoint)), f"--output_dir={run}"]) == code
     said = " ".join(capsys.readouterr().err.split())
-    assert f"stopped by {signal.Signals(number).name}; to go on: accerl train --resume=true" in said
+    assert f"stopped by {signal.Signals(number).name}; to resume: accerl train --resume=true" in said
     assert not (run / "summary.json").exists()
     assert sorted(p.name for p in (run / "checkpoints").iterdir()) == ["000000", "000005", "000007", "last"]
     assert go_on(run, config="checkpoints/last/config.yaml") == 0
@@ -238,7 +238,7 @@ def test_an_asynchronous_run_that_was_killed_and_stopped_goes_on(tiny_checkpoint
     assert until(12, [*command, str(path), f"--output_dir={run}"], signal.SIGKILL) == -signal.SIGKILL
     newest = max(int(p.name) for p in (run / "checkpoints").glob("0*"))
     assert until(newest + 8, again, signal.SIGTERM) == 143, log.read_text()
-    assert "stopped by SIGTERM; to go on: accerl train --resume=true" in log.read_text()
+    assert "stopped by SIGTERM; to resume: accerl train --resume=true" in log.read_text()
     assert not (run / "summary.json").exists()
     ended = subprocess.run(again, capture_output=True, text=True, timeout=300)
     assert ended.returncode == 0, ended.stderr

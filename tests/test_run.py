@@ -331,7 +331,7 @@ def test_groups_with_nothing_to_compare_are_said_aloud(
     run.train(engine.config, tmp_path, Console())
     said = " ".join(capsys.readouterr().err.split())
     # At 60 and 120; one is kept at 140, from where it is counted again: at 200.
-    assert said.count("50 groups in a row were thrown away, and nothing is learnt from them") == 3
+    assert said.count("50 groups in a row were dropped and nothing is learned from them") == 3
     assert "rollout.group_filter=outcome (success while exploring 100%)" in said
 
 

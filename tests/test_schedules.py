@@ -21,7 +21,7 @@ from accerl_lerobot.engine.contract import Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import evaluation_plans
-from accerl_lerobot.inference.pool import dealt, together
+from accerl_lerobot.inference.pool import dealt, merge_metrics
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Turns
@@ -248,16 +248,16 @@ def test_several_services_share_the_worlds_out(light_ray: None, monkeypatch: pyt
         engine.close()
 
 
-def test_what_services_say_together():
+def test_what_services_say_merge_metrics():
     one = {"batches": 2.0, "batch_size_mean": 3.0, "wait_mean_s": 0.1, "wait_max_s": 0.5, "version": 7.0,
            "busy_share": 0.2, "swap_s": 0.1, "publish_to_served_s": 0.3}  # fmt: skip
     other = one | {"batches": 4.0, "batch_size_mean": 1.0, "wait_mean_s": 0.3, "wait_max_s": 0.4,
                    "version": 6.0, "busy_share": 0.6}  # fmt: skip
-    found = together([one, other])
+    found = merge_metrics([one, other])
     assert found["batches"] == 6.0 and found["batch_size_mean"] == pytest.approx(10 / 6)
     assert found["wait_mean_s"] == pytest.approx((0.1 * 6 + 0.3 * 4) / 10)
     assert (found["wait_max_s"], found["version"], found["busy_share"]) == (0.5, 6.0, pytest.approx(0.4))
-    assert together([one]) == one and together([]) == {}
+    assert merge_metrics([one]) == one and merge_metrics([]) == {}
     assert dealt(5, 2) == [3, 2] and dealt(2, 2) == [1, 1]
 
 

@@ -18,19 +18,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.engine import ray_environment
+from accerl_lerobot.engine import ray_session
 
-ray_environment.prepare()
+ray_session.prepare()
 
 import pytest  # noqa: E402
 import ray  # noqa: E402
 from ray.cluster_utils import Cluster  # noqa: E402
 
-from accerl_lerobot.engine import cluster as joining  # noqa: E402
 from accerl_lerobot.engine import launch  # noqa: E402
-from accerl_lerobot.engine.config import LaunchConfig  # noqa: E402
+from accerl_lerobot.engine import placement as planning  # noqa: E402
+from accerl_lerobot.engine.config import LaunchConfig, PlacementConfig, RoleConfig  # noqa: E402
 from accerl_lerobot.engine.launch import RayEngine  # noqa: E402
-from accerl_lerobot.engine.placement_config import PlacementConfig, RoleConfig  # noqa: E402
 from accerl_lerobot.envs import SimulatedConfig  # noqa: E402
 from accerl_lerobot.errors import InputError  # noqa: E402
 from accerl_lerobot.evaluation.config import evaluation_plans  # noqa: E402
@@ -126,7 +125,7 @@ def what_does_not_fit_is_refused(made: Cluster, second: Any, monkeypatch: pytest
     address = made.address
     text = refused(lambda: engine("127.0.0.1:1", "sim", 1))
     assert text.startswith("launch.address='127.0.0.1:1': nobody listens at 127.0.0.1:1 (")
-    wrong = ray_environment.private_folder() / "wrong"
+    wrong = ray_session.private_folder() / "wrong"
     wrong.write_text("0" * 64)
     with monkeypatch.context() as patch:
         patch.setenv("RAY_AUTH_TOKEN_PATH", str(wrong))
@@ -135,11 +134,11 @@ def what_does_not_fit_is_refused(made: Cluster, second: Any, monkeypatch: pytest
         patch.setenv("RAY_AUTH_TOKEN_PATH", str(wrong.parent / "none"))
         assert "there is no token" in refused(lambda: engine(address, "sim", 1))
     with monkeypatch.context() as patch:  # a cluster that answers strangers as it answers us
-        patch.setattr(joining, "without_token", lambda: dict(os.environ))
+        patch.setattr(ray_session, "without_token", lambda: dict(os.environ))
         assert "it asks for no token" in refused(lambda: engine(address, "sim", 1))
     assert not ray.is_initialized()
     key = next(n["NodeID"] for n in _nodes(address) if "sim" in n["Resources"])
-    teller = joining._teller
+    teller = planning._reporter
 
     def other_teller() -> Any:
         tell = teller()
@@ -153,7 +152,7 @@ def what_does_not_fit_is_refused(made: Cluster, second: Any, monkeypatch: pytest
         return other
 
     with monkeypatch.context() as patch:
-        patch.setattr(joining, "_teller", other_teller)
+        patch.setattr(planning, "_reporter", other_teller)
         text = refused(lambda: engine(address, "sim", 1))
         assert "node 1 (127.0.0.1) has lerobot missing, and this is" in text
 
@@ -210,7 +209,7 @@ def main() -> None:
         lap("start")
         what_does_not_fit_is_refused(made, second, monkeypatch)
         lap("refusals")
-        monkeypatch.setattr(joining, "_check_cluster", lambda *_: None)  # it has been found to be ours
+        monkeypatch.setattr(ray_session, "check_cluster", lambda *_: None)  # it has been found to be ours
         a_run_over_two_nodes_ends_right(made, second)
         lap("run")
         a_node_that_leaves_takes_nothing_along(made, second)

@@ -60,9 +60,9 @@ class Measured:
     def __init__(
         self, config: RunConfig, tasks: tuple[str, ...], history: int = 1, load: Load | None = None
     ) -> None:
-        from accerl_lerobot.engine import ray_environment
+        from accerl_lerobot.engine import ray_session
 
-        ray_environment.prepare()
+        ray_session.prepare()
         from accerl_lerobot.engine.launch import RayEngine
 
         self.engine = RayEngine(config, tasks, history, load=load)

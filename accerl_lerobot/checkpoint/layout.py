@@ -26,7 +26,7 @@ from typing import Any
 
 from accerl_lerobot.checkpoint.safety import Origin, safe_join
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.fault_points import reach
+from accerl_lerobot.fault_points import fault_point
 
 PRETRAINED, TRAINING_STATE, WORLD_MODEL = "pretrained_model", "training_state", "world_model"
 CHECKPOINTS = "checkpoints"
@@ -83,10 +83,10 @@ def save_checkpoint(checkpoints: Path, write: Callable[[Path], int]) -> Path:
     temporary = checkpoints / f"{WRITING}{os.getpid()}"
     try:
         temporary.mkdir()
-        reach("driver.save")
+        fault_point("driver.save")
         version = write(temporary)
         final = checkpoints / f"{version:06d}"
-        reach("driver.files")
+        fault_point("driver.files")
         relocate(temporary / PRETRAINED, final / PRETRAINED)
         (temporary / TRAINING_STATE).mkdir(exist_ok=True)
         step = json.dumps({"step": version}, indent=2)
@@ -96,7 +96,7 @@ def save_checkpoint(checkpoints: Path, write: Callable[[Path], int]) -> Path:
         if final.exists():
             final.rename(checkpoints / f"{REPLACED}{final.name}")
         temporary.rename(final)
-        reach("driver.renamed", final)
+        fault_point("driver.renamed", final)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     _point_at(final)

@@ -184,9 +184,9 @@ def hugging_face_datasets() -> Check:
 
 def ray_imports(joins: bool = False) -> Check:
     """Ray, with the environment a run would give it."""
-    from accerl_lerobot.engine import ray_environment
+    from accerl_lerobot.engine import ray_session
 
-    ray_environment.prepare(joins)
+    ray_session.prepare(joins)
     try:
         import ray
     except Exception as error:
@@ -319,7 +319,7 @@ def memory_estimate_gib(config: RunConfig, history: int = 1) -> float:
 
 def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
     """Field → rough memory of what it sizes."""
-    from accerl_lerobot.engine.staleness import under_way
+    from accerl_lerobot.engine.preflight import under_way
 
     rollout, films, local = config.rollout, config.evaluation, config.launch.engine == "local"
     tasks = len(getattr(config.env, "tasks", ("one",)))
@@ -352,7 +352,7 @@ def observation_bytes(config: RunConfig) -> int:
 
 def pace(config: RunConfig) -> Iterator[Check]:
     """How far apart collecting and learning may run under this recipe, and how much it collects."""
-    from accerl_lerobot.engine.staleness import executed, lag_limits, under_way
+    from accerl_lerobot.engine.preflight import executed, lag_limits, under_way
 
     replay, trainer = config.replay, config.trainer
     in_flight = under_way(config)

@@ -57,16 +57,15 @@ def train(arguments: list[str], load: Load | None = None) -> int:
     from accerl_lerobot.engine import run
     from accerl_lerobot.engine.contract import WorkerError
     from accerl_lerobot.engine.preflight import check_start
-    from accerl_lerobot.engine.resume import begun_run, how_to_go_on, locked
-    from accerl_lerobot.engine.stopping import StoppedError
+    from accerl_lerobot.engine.stopping import StoppedError, locked, resume_command, resumed_run
 
-    begun = begun_run(read_arguments(arguments)[0], config) if config.resume else None
+    begun = resumed_run(read_arguments(arguments)[0], config) if config.resume else None
     if load is None and begun is None:
         check_start(config)  # before there is a folder
     console = Console()
     directory = run.make_output_dir(config) if begun is None else begun.directory
     console.say(f"run {directory}")
-    guardian.explain(remedy=f"to go on: {how_to_go_on(directory)}")
+    guardian.explain(remedy=f"to resume: {resume_command(directory)}")
     try:
         with (
             redirect_stdout(sys.stderr),
@@ -84,13 +83,13 @@ def train(arguments: list[str], load: Load | None = None) -> int:
         return 128 + stopped.number
     except BaseException as error:
         if is_full(error):
-            console.say(f"the disk of {directory} is full; free some space, then {how_to_go_on(directory)}")
+            console.say(f"the disk of {directory} is full; free some space, then {resume_command(directory)}")
             return 1
         if isinstance(error, WorkerError) and "\n" not in str(error):  # without a worker's traceback
-            console.say(f"{error}; to resume: {how_to_go_on(directory)}")
+            console.say(f"{error}; to resume: {resume_command(directory)}")
             return 1
         how = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-        console.say(f"{how}; to resume from the last checkpoint: {how_to_go_on(directory)}")
+        console.say(f"{how}; to resume from the last checkpoint: {resume_command(directory)}")
         raise
     before = summary["success_before"]
     console.say(
@@ -349,7 +348,7 @@ def _write_evaluation(out: Path, summary: dict[str, Any], results: list[EpisodeR
 
 def _discard_unused(directory: Path) -> None:
     """Removes the folder of a run that was refused before it did anything, so that its name is free again."""
-    from accerl_lerobot.engine.resume import LOCK
+    from accerl_lerobot.engine.stopping import LOCK
 
     if {path.name for path in directory.iterdir()} <= {CONFIG, LOCK}:
         shutil.rmtree(directory)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run is one dataclass per room, composed, checked and saved beside the results.
+"""The config of a run: one dataclass per section, each beside the class that it configures.
 
-YAML through ``--config_path``, any field through ``--section.field=value``, as in LeRobot. Nothing is added
-later. Each section stands beside the class it configures; what concerns two sections is checked here.
+Values come from YAML through ``--config_path`` and from ``--section.field=value``, as in LeRobot. Checks that
+concern two sections are here.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from accerl_lerobot.config.parsing import decode, encode, parse
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Section, Seed, Steps, check
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
-from accerl_lerobot.engine.placement_config import PlacementConfig
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
@@ -42,56 +41,92 @@ __all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "check_chunk", "decode"
 
 
 @dataclass(frozen=True, kw_only=True)
+class RoleConfig(Section, section="launch.placement"):
+    """Nodes of a kind of worker, and what each takes there."""
+
+    nodes: str | None = None
+    """A node's number as ``accerl doctor`` prints it, 0 being the one where the run is started; the name of a
+    custom resource, as in ``ray start --resources='{"simulators": 1}'``; or all. None: node 0."""
+    gpus: Annotated[float, Range("[0, 1]")] | None = None
+    """Share of a GPU for each. None: those with a network on the same nodes share what these have."""
+    cpus: NonNegative = 0.0
+    """Cores reserved for each; 0: none."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.nodes is not None and not self.nodes.strip():
+            remedy = "name a node's number or resource, or use all"
+            raise InputError(f"{self.SECTION}.nodes", self.nodes, remedy)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacementConfig(Section, section="launch.placement"):
+    """Nodes of all workers; replay is where the run is started."""
+
+    trainer: RoleConfig = field(default_factory=RoleConfig)
+    """Each of its ranks."""
+    inference: RoleConfig = field(default_factory=RoleConfig)
+    """Each replica."""
+    imagination: RoleConfig = field(default_factory=RoleConfig)
+    """Each worker that imagines, and the one that trains the world model."""
+    rollout: RoleConfig = field(default_factory=RoleConfig)
+    """Each rollout worker."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.rollout.gpus:
+            remedy = "rollout workers have no network; leave the field out"
+            raise InputError("launch.placement.rollout.gpus", self.rollout.gpus, remedy)
+
+    @property
+    def elsewhere(self) -> bool:
+        """True if any worker may be on another node."""
+        roles = (self.trainer, self.inference, self.imagination, self.rollout)
+        return any(role.nodes not in (None, "0") for role in roles)
+
+
+@dataclass(frozen=True, kw_only=True)
 class LaunchConfig(Section, section="launch"):
-    """Where the workers run."""
+    """Processes of a run."""
 
     engine: Literal["ray", "local"] = "ray"
     """ray: asynchronous workers. local: the same parts in one process, deterministic, for tests."""
     address: str | None = None
-    """HOST:PORT of a running Ray cluster that the workers join, or auto: the one that ``ray start`` has
-    started here. It must ask for a token, which is looked for where Ray does: RAY_AUTH_TOKEN,
-    RAY_AUTH_TOKEN_PATH, ``~/.ray/auth_token``. None: a private Ray on this machine."""
+    """HOST:PORT of a running Ray cluster to join, or auto: the one that ``ray start`` has started here. It
+    must ask for a token, which is looked for where Ray does: RAY_AUTH_TOKEN, RAY_AUTH_TOKEN_PATH,
+    ``~/.ray/auth_token``. None: a private Ray on this machine."""
     open_cluster: bool = False
     """Join a cluster that asks for no token: whoever reaches it runs code in your workers."""
     placement: PlacementConfig = field(default_factory=PlacementConfig)
-    """Which workers are on which of its nodes, and what each takes."""
+    """Nodes of the workers, and what each takes there."""
     schedule: Schedule = ASYNCHRONOUS
-    """asynchronous: nobody waits for anybody. synchronous: a batch is collected, by all worlds in lock step,
-    then learned from. overlap: the next one is collected meanwhile. These two are for measuring what the
-    first gains; with several inference services, the worlds of each are in step."""
+    """asynchronous: no worker waits for another. synchronous: a batch is collected, by all environments in
+    lock step, then learned from. overlap: the next one is collected meanwhile. The last two are for measuring
+    what the first gains; with several inference replicas, the environments of each are in step."""
     transport: Transport = "auto"
-    """How rollout workers and dreams reach inference and replay, and weights reach inference. shared_memory:
-    a message is written where the other process reads it. ray: it is copied, to any node. auto: shared memory
-    between processes of one node, if the system has it, and Ray otherwise.
-    """
+    """Transport of requests, segments and weights. shared_memory: between processes of one node. ray: copied,
+    to any node. auto: shared memory on one node, if the system has it, and Ray otherwise."""
     stall_s: Positive = 300.0
-    """How long, in seconds, a worker may owe an answer or a world a step, and a run stand still.
+    """Timeout in seconds for an answer of a worker, a step of an environment, and any progress of the run.
 
-    A rollout worker or an inference service is started again then; with any other, and where nothing moves,
-    all are.
+    A rollout worker or an inference replica is restarted alone then; after any other loss, all workers are.
     """
     max_recoveries: Annotated[int, Range("[0, 1000000]")] = 3
-    """How often in a row, no later update or checkpoint having been reached in between, all workers are
-    started again from the last checkpoint because one of them was lost that is not started again alone; once
-    more ends the run with its error."""
+    """How often in a row, without a later update or checkpoint in between, all workers are restarted from the
+    last checkpoint after the loss of one that is not restarted alone."""
     timeline: bool = True
     """True if every worker records what it does when, for ``accerl timeline``: up to 8 MB each time one is
     started."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.schedule != ASYNCHRONOUS and self.engine == "local":
-            remedy = (
-                "with launch.engine=local all is done in one process, in a schedule of its own; leave it out"
-            )
-            raise InputError("launch.schedule", self.schedule, remedy)
-        self._check_cluster()
-
-    def _check_cluster(self) -> None:
-        if self.engine == "local" and (self.address is not None or self.placement != PlacementConfig()):
-            name, value = ("address", self.address) if self.address is not None else ("placement", "…")
-            remedy = "launch.engine=local is one process, which is here; leave it out"
-            raise InputError(f"launch.{name}", value, remedy)
+        if self.engine == "local":
+            one = "launch.engine=local is one process"
+            for name, default in (("schedule", ASYNCHRONOUS), ("address", None)):
+                if (value := getattr(self, name)) != default:
+                    raise InputError(f"launch.{name}", value, f"{one}; leave it out")
+            if self.placement != PlacementConfig():
+                raise InputError("launch.placement", "…", f"{one}; leave it out")
         if self.address is not None and self.address != "auto":
             host, _, port = self.address.rpartition(":")
             if not host or not port.isdecimal() or not 0 < int(port) < 65536:
@@ -135,14 +170,12 @@ class RunConfig(Section):
     save_every_updates: Steps = 0
     """Checkpoint every so many updates; 0: none by their number."""
     save_every_s: NonNegative = 600.0
-    """Checkpoint at least every so many seconds of training; 0: none by time. There is one at the end in any
-    case, and when the run is asked to stop; before the training there is one if there are any by number or
-    time."""
+    """Checkpoint at least every so many seconds of training; 0: none by time. There is always one at the end,
+    and one when the run is asked to stop; there is one before training if there are any by number or time."""
     save_keep: Annotated[int, Range("[1, 1000000]")] = 2
-    """Checkpoints that keep what it takes to go on from them, the newest ones; the others keep
-    their policies."""
+    """Newest checkpoints that can be resumed from; the others keep their policies only."""
     resume: bool = False
-    """Go on with the run whose config is ``--config_path``: ``RUN/config.yaml``, or that of one of its
+    """Resume the run whose config is ``--config_path``: ``RUN/config.yaml``, or that of one of its
     checkpoints, ``RUN/checkpoints/last/config.yaml``."""
 
     @property
@@ -181,18 +214,18 @@ class RunConfig(Section):
                 f"use more than trainer.hold_back, {self.trainer.hold_back}, or all is thrown away as too old"
             )
             raise InputError("replay.max_lag", self.replay.max_lag, remedy)
-        if self.inference.workers > 1 and self.launch.engine == "local":
-            remedy = "launch.engine=local is one process; use launch.engine=ray, or 1"
-            raise InputError("inference.workers", self.inference.workers, remedy)
-        if self.imagination.workers > 1 and self.launch.engine == "local":
-            remedy = "launch.engine=local is one process; use launch.engine=ray, or 1"
-            raise InputError("imagination.workers", self.imagination.workers, remedy)
+        for name, count in (
+            ("inference.workers", self.inference.workers),
+            ("imagination.workers", self.imagination.workers),
+            ("trainer.ranks", self.trainer.ranks),
+        ):
+            if count > 1 and self.launch.engine == "local":
+                raise InputError(
+                    name, count, "launch.engine=local is one process; use launch.engine=ray, or 1"
+                )
         if self.inference.workers > self.rollout.workers:
             remedy = f"use at most rollout.workers, {self.rollout.workers}, or some have nobody to answer"
             raise InputError("inference.workers", self.inference.workers, remedy)
-        if self.trainer.ranks > 1 and self.launch.engine == "local":
-            remedy = "launch.engine=local is one process; use launch.engine=ray, or 1"
-            raise InputError("trainer.ranks", self.trainer.ranks, remedy)
         if self.trainer.cpu_offload and self.policy.device == "cpu":
             remedy = "policy.device=cpu has everything there already; leave the field out"
             raise InputError("trainer.cpu_offload", True, remedy)
@@ -257,7 +290,7 @@ def timeline_folder(config: RunConfig) -> Path | None:
 
 
 def check_chunk(policy: dict[str, Any]) -> None:
-    """Refuses sizes in ``sft.policy`` that no LeRobot policy can have.
+    """Refuse sizes in ``sft.policy`` that no LeRobot policy can have.
 
     Args:
         policy: fields of a LeRobot policy config; LeRobot itself checks the others, see `preflight`.

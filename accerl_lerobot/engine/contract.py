@@ -12,11 +12,10 @@ from typing import NamedTuple
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 
 LONGEST_PAUSE_S = 8.0
-"""Before what was lost is started again; a pause is twice as long as the one before."""
 
 
 def pause_s(restarts: int) -> float:
-    """Seconds before what was lost is started again where that has been done so often in a row already."""
+    """Seconds to wait before another restart; twice as long each time, up to `LONGEST_PAUSE_S`."""
     return min(2.0 ** (restarts - 1), LONGEST_PAUSE_S) if restarts else 0.0
 
 
@@ -31,7 +30,7 @@ class Progress:
     updates: list[dict[str, float]] = field(default_factory=list)
     """Metrics of each update."""
     episodes: list[EpisodeResult] = field(default_factory=list)
-    """Finished episodes, exploring and planned ones."""
+    """Finished episodes, both exploring and planned."""
     rollout: dict[str, float] = field(default_factory=dict)
     """Counters over all rollout workers since the run began."""
     replay: dict[str, float] = field(default_factory=dict)
@@ -41,7 +40,7 @@ class Progress:
 
 
 class WorkerError(RuntimeError):
-    """A worker is lost for good, and the engine with it; another one may go on from what was saved."""
+    """A worker is lost for good, and the engine with it; another engine can resume from a checkpoint."""
 
 
 class Saved(NamedTuple):
@@ -50,11 +49,11 @@ class Saved(NamedTuple):
     version: int
     """Version of the policy: updates behind it."""
     updates: list[dict[str, float]]
-    """Metrics of those updates among them that `Engine.poll` has not reported, and will not any more."""
+    """Metrics of updates that `Engine.poll` has not reported and will not report."""
 
 
 class Engine(ABC):
-    """Worlds, policy and trainer, ready to go; or to go on, from what `save` has written.
+    """Environments, policy and trainer, fresh or restored from what `save` has written.
 
     Example:
         >>> engine.plan(evaluation_plans(tasks, 100, "before"))   # runs at once, nothing else does
@@ -65,7 +64,7 @@ class Engine(ABC):
 
     @abstractmethod
     def plan(self, plans: list[EpisodePlan]) -> None:
-        """Queues episodes that are run before any exploring one; each has one result, which `poll` reports.
+        """Queue episodes that are run before any exploring one; `poll` reports one result for each.
 
         Raises:
             ValueError: an episode of the same group and index has been planned and not been reported yet.
@@ -73,11 +72,11 @@ class Engine(ABC):
 
     @abstractmethod
     def train(self) -> None:
-        """Starts exploring and learning; both end by themselves after the configured updates."""
+        """Start exploring and learning; both end by themselves after the configured updates."""
 
     @abstractmethod
     def poll(self) -> Progress:
-        """Does or awaits a little work and reports it.
+        """Do or await a little work and report it.
 
         Raises:
             WorkerError: a worker failed for good; carries its own traceback.
@@ -85,15 +84,15 @@ class Engine(ABC):
 
     @abstractmethod
     def save(self, directory: Path) -> Saved:
-        """Writes a checkpoint's ``pretrained_model`` and ``training_state``, see `checkpoint`.
+        """Write a checkpoint's ``pretrained_model`` and ``training_state``, see `checkpoint`.
 
-        All of it is as it was after one and the same update: no segment that was learnt from later counts as
-        learnt from, and no planned episode is reported twice.
+        All parts are of the same update: no segment counts as learned from that was used later, and no
+        planned episode is reported twice.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Ends all workers; does not raise, so that it cannot hide why it is called. Safe to call twice."""
+        """End all workers. Does not raise, so that it hides no other error. Safe to call twice."""
 
 
 def episode_key(plan: EpisodePlan) -> tuple[str, int]:
@@ -102,7 +101,7 @@ def episode_key(plan: EpisodePlan) -> tuple[str, int]:
 
 
 def check_new(plans: Sequence[EpisodePlan], outstanding: Container[tuple[str, int]]) -> None:
-    """For engines: refuses what `Engine.plan` refuses.
+    """Check the argument of `Engine.plan`.
 
     Raises:
         ValueError: see there.

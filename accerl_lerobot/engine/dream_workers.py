@@ -29,11 +29,10 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, WORLD_MODEL
 from accerl_lerobot.engine.dreaming import make_imagination, make_learner
 from accerl_lerobot.experience import Segment
-from accerl_lerobot.fault_points import reach
+from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.metrics import numbered
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
-from accerl_lerobot.transport.endpoint import Endpoint
-from accerl_lerobot.transport.lasting import LastingCaller
+from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
 from accerl_lerobot.world_model.online import Promotion
 from accerl_lerobot.world_model.pool import DREAMS, check_workers
 
@@ -84,7 +83,7 @@ class DreamWorker:
         self._lock = threading.Lock()
         self._dreaming = threading.Lock()
         """Held while dreams change; outside, nothing stands in the outbox."""
-        self._deciding = LastingCaller("inference")
+        self._deciding = ReconnectingClient("inference")
         self._promoted: Promotion | None = None
         self._promising = config.imagination.learns
         self._cursor = 0
@@ -173,7 +172,7 @@ class DreamWorker:
             self._clock.enter(CHECKPOINT)
             with self._dreaming:
                 self._clock.enter(COMPUTE)
-                reach("dream.step")
+                fault_point("dream.step")
                 self._dreams.advance([decision for answer in answers for decision in answer])
                 self._clock.enter(TRANSPORT)
                 if self._outbox:
@@ -261,7 +260,7 @@ class WorldLearningWorker:
                 self._clock.enter(CHECKPOINT)
                 with self._learning:
                     self._clock.enter(COMPUTE)
-                    reach("learning.step")
+                    fault_point("learning.step")
                     learner.step()
             elif learner.due(last):
                 self._clock.enter(COMPUTE)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places the workers, connects them and watches them.
+"""The asynchronous engine: places the workers, connects them and watches them.
 
     rollout ×W ──requests──► inference ──decisions──► rollout   micro-asynchrony: others step meanwhile
         │                        ▲
@@ -7,15 +7,14 @@
                           │      │
                           └──► trainer                          macro-asynchrony: no barrier, a measured lag
 
-    dreams ──requests──► inference ──decisions──► dreams ──segments──► replay        where any are imagined
+    imagination ──requests──► inference ──decisions──► imagination ──segments──► replay
        ▲                                                                 │
        └────── world models that have passed ◄── world learning ◄──real──┘
 
-The trainer is the clock: when it has made its updates the run is over. Another worker that ends is an event:
-a rollout worker is started again, a few times (with it go its unfinished segments and groups, nothing else),
-and so is an inference service (with it goes nothing); any other ends this engine with its own traceback, and
-`run` makes another one that goes on from the last checkpoint. The same goes for one that hangs: nothing here
-waits for an answer without a limit. Workers get handles and never hold the conductor.
+The trainer is the clock: when it has made its updates the run is over. A rollout worker or inference replica
+that ends is restarted alone, see `replicas`; the end of any other worker ends this engine with its traceback,
+and `run` makes another one from the last checkpoint. The same goes for a worker that hangs: every wait here
+has a timeout. Workers get handles of each other and never hold the engine.
 """
 
 from __future__ import annotations
@@ -30,20 +29,19 @@ import ray
 from ray.exceptions import RayError, RayTaskError
 
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, saved_version
-from accerl_lerobot.engine.cluster import on, placed
 from accerl_lerobot.engine.config import RunConfig, journal_folder, timeline_folder
 from accerl_lerobot.engine.contract import Engine, Progress, Saved, WorkerError
-from accerl_lerobot.engine.own_ray import OwnRay
-from accerl_lerobot.engine.seats import START_S, Seats
-from accerl_lerobot.engine.services import Services
-from accerl_lerobot.engine.watched import Watched, end
+from accerl_lerobot.engine.placement import actor_options, place_workers
+from accerl_lerobot.engine.ray_session import RaySession
+from accerl_lerobot.engine.replicas import START_S, InferenceReplicas, RolloutWorkers
+from accerl_lerobot.engine.supervisor import ActorHandle, end
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.metrics import numbered
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.transport.contract import ServiceStoppedError
-from accerl_lerobot.transport.endpoint import Endpoint, listens
+from accerl_lerobot.transport.endpoint import Endpoint, uses_shared_memory
 from accerl_lerobot.world_model.pool import together as dreamt_together
 
 logger = logging.getLogger(__name__)
@@ -60,9 +58,9 @@ class RayEngine(Engine):
         config: the run; its ``policy.path`` must be set.
         tasks: the training tasks.
         history: env steps that an observation holds, the policy's ``n_obs_steps``.
-        state: the ``training_state`` to go on from, but for episodes under way, which are lost; None: begin.
+        state: the ``training_state`` to resume from, without the episodes under way; None: begin.
         load: makes the policy's adapter, in the processes that have one; None: of LeRobot's checkpoint.
-        own: the Ray to use, which outlives this engine; None: one that ends with it.
+        session: the Ray to use, which outlives this engine; None: one that ends with it.
 
     Raises:
         InputError: the state is of a run in one process, or this system has no shared memory.
@@ -76,31 +74,27 @@ class RayEngine(Engine):
         history: int = 1,
         state: Path | None = None,
         load: Load | None = None,
-        own: OwnRay | None = None,
+        session: RaySession | None = None,
     ) -> None:
-        listens(config.launch.transport)
+        uses_shared_memory(config.launch.transport)
         self._config, self._state, self._load = config, state, load
-        self._others: list[Watched] = []
-        """All but inference services and rollout workers."""
-        self._seats = Seats(config, tasks, history, state)
-        self._updates: list[dict[str, float]] = []
-        self._replay_metrics: dict[str, float] = {}
-        self._inference_metrics: dict[str, float] = {}
-        self._of_dreamers: dict[str, dict[str, float]] = {}
-        self._of_learner: dict[str, float] = {}
-        self._dreamers: list[Watched] = []
-        self._learner: Watched | None = None
-        self._ranks: list[Watched] = []
-        """The trainer's, but the first."""
-        self._real_ended = False
-        self._schedule: Schedule = ASYNCHRONOUS
-        self._training = self._done = self._closed = False
+        self._limit = config.launch.stall_s
         self._version = 0 if state is None else saved_version(state)
-        self._inference = Services(config, self._version, state, load)
+        self._rollouts = RolloutWorkers(config, tasks, history, state)
+        self._inference = InferenceReplicas(config, self._version, state, load)
+        self._others: list[ActorHandle] = []
+        """All other workers."""
+        self._imaginers: list[ActorHandle] = []
+        self._learner: ActorHandle | None = None
+        self._updates: list[dict[str, float]] = []
+        self._metrics: dict[str, dict[str, float]] = {}
+        """Last metrics by worker; of inference as of one."""
+        self._schedule: Schedule = ASYNCHRONOUS
+        self._training = self._real_ended = self._done = self._closed = False
         self._last_change = time.monotonic()
         self._last_state: tuple[object, ...] = ()
-        self._ray = OwnRay(config.launch) if own is None else own
-        self._lasting = own is not None
+        self._ray = RaySession(config.launch) if session is None else session
+        self._keeps_ray = session is not None
         try:
             self._ray.start()
             self._start()
@@ -109,8 +103,8 @@ class RayEngine(Engine):
             raise
 
     def plan(self, plans: list[EpisodePlan]) -> None:
-        self._seats.plan(plans)
-        self._last_change = time.monotonic()  # whatever the caller did before took its time
+        self._rollouts.plan(plans)
+        self._last_change = time.monotonic()  # time before this call is the caller's
 
     def train(self) -> None:
         self._training, self._last_change = True, time.monotonic()
@@ -119,19 +113,19 @@ class RayEngine(Engine):
         self._trainer.work = self._trainer.actor.run.remote(
             self._replay.actor, readers, self._config.launch.transport
         )
-        dreaming = [dreamer.actor for dreamer in self._dreamers]
-        for dreamer, (deciding, inserting) in zip(self._dreamers, self._dreams_ask, strict=True):
-            dreamer.work = dreamer.actor.run.remote(deciding, inserting, self._replay.actor)
+        for imaginer, inference in zip(self._imaginers, self._imaginers_ask, strict=True):
+            imaginer.work = imaginer.actor.run.remote(inference, self._inserting, self._replay.actor)
         if self._learner is not None:
-            self._learner.work = self._learner.actor.run.remote(dreaming, self._replay.actor)
+            actors = [imaginer.actor for imaginer in self._imaginers]
+            self._learner.work = self._learner.actor.run.remote(actors, self._replay.actor)
 
     def follow(self, schedule: Schedule) -> None:
-        """From now on, collecting and learning take turns like this, see `replay.turns`."""
+        """Change the schedule of collecting and learning, see `replay.turns`."""
         if schedule == self._schedule:
             return
         in_turn = schedule != ASYNCHRONOUS
-        self._seats.in_turn, self._schedule = in_turn, schedule
-        # The trainer first: who takes turns waits for it to hand over its weights.
+        self._rollouts.in_turn, self._schedule = in_turn, schedule
+        # The trainer first: replay's turns wait for it to hand over its weights.
         for worker in (self._trainer, self._replay):
             worker.call("follow", schedule, timeout=self._limit)
         self._inference.lock_step(in_turn)
@@ -141,22 +135,24 @@ class RayEngine(Engine):
             raise WorkerError(lost)
         self._ask()
         self._await_end()
-        for number, endpoint in self._inference.advance():
-            self._move(number, endpoint)
+        for index, endpoint in self._inference.advance():
+            self._move(index, endpoint)
         episodes = self._listen()
         self._check_hung()
         updates, self._updates = self._updates, []
         if updates:
             self._version = int(updates[-1]["update"])
+        imagined = [self._metrics[w.name] for w in self._imaginers if w.name in self._metrics]
+        learned = {} if self._learner is None else self._metrics.get(self._learner.name, {})
         progress = Progress(
             version=self._version,
             done=self._done,
             updates=updates,
             episodes=episodes,
-            rollout=self._seats.counters(),
-            replay=self._replay_metrics,
-            inference=self._inference_metrics,
-            imagination=dreamt_together(list(self._of_dreamers.values())) | self._of_learner,
+            rollout=self._rollouts.counters(),
+            replay=self._metrics.get("replay", {}),
+            inference=self._metrics.get("inference", {}),
+            imagination=dreamt_together(imagined) | learned,
         )
         self._check_moving(progress)
         return progress
@@ -164,19 +160,18 @@ class RayEngine(Engine):
     def save(self, directory: Path) -> Saved:
         directory = directory.absolute()
         state = directory / TRAINING_STATE
-        # What the trainer has told already is heard first: all other records up to its version come with it.
+        # Records that the trainer has sent come first: `hold` returns the rest, up to its version.
         told = self._updates + (self._hear(self._trainer, self._limit) or [])
         self._updates = []
-        limit = max(START_S, self._limit)  # files may be large
-        alive = {"timeout": limit, "silence": self._limit}
+        timeouts = {"timeout": max(START_S, self._limit), "silence": self._limit}  # files may be large
         version, records = self._trainer.call("hold", timeout=self._limit)  # it waits for an update at most
-        # At once, so that little comes in that was decided by weights of later updates. Those who dream may
+        # At once, so that little comes in that was decided by weights of later updates. The imaginers may
         # know of more than replay then; they are told anew of what comes after.
-        self._replay.call("save", state, version, **alive)
-        for imaginer in self._imaginers:
-            imaginer.call("save", directory, **alive)
-        self._trainer.call("write", directory, **alive)
-        self._seats.save(state)
+        self._replay.call("save", state, version, **timeouts)
+        for worker in self._with_learner():
+            worker.call("save", directory, **timeouts)
+        self._trainer.call("write", directory, **timeouts)
+        self._rollouts.save(state)
         self._last_change = time.monotonic()
         return Saved(version, told + records)
 
@@ -188,7 +183,7 @@ class RayEngine(Engine):
             if lost := bool(self._ray.lost):
                 self._ray.close()
             end(self._everyone(), told=not lost)
-            if not self._lasting:
+            if not self._keeps_ray:
                 self._ray.close()
         except Exception:
             logger.exception("could not end all workers")
@@ -198,23 +193,18 @@ class RayEngine(Engine):
         return {w.name: int(w.call("ready", timeout=self._limit)) for w in self._everyone()}
 
     def batching(self) -> BatcherStats:
-        """Batches of the inference services so far."""
+        """Batches of the inference replicas so far."""
         return self._inference.batching()
 
-    @property
-    def _limit(self) -> float:
-        return self._config.launch.stall_s
+    def _with_learner(self) -> list[ActorHandle]:
+        """Workers that imagine, in the order in which they are saved."""
+        return [*([] if self._learner is None else [self._learner]), *self._imaginers]
 
-    @property
-    def _imaginers(self) -> list[Watched]:
-        """In the order in which they are saved: who learns, then who dreams of it."""
-        return [*([self._learner] if self._learner is not None else []), *self._dreamers]
-
-    def _everyone(self) -> Iterator[Watched]:
+    def _everyone(self) -> Iterator[ActorHandle]:
         """All workers, those that others depend on first."""
         yield from self._inference.workers()
         yield from self._others
-        yield from self._seats.workers()
+        yield from self._rollouts.workers()
 
     def _start(self) -> None:
         from accerl_lerobot.replay.worker import ReplayWorker
@@ -222,65 +212,66 @@ class RayEngine(Engine):
         from accerl_lerobot.trainer.worker import TrainerWorker
 
         c, timeline = self._config, timeline_folder(self._config)
-        plan, imagination = placed(c), c.imagination
+        plan, imagination = place_workers(c), c.imagination
 
-        def make(name: str, kind: type, calls: int, *arguments: Any) -> Any:
-            options = on(plan.places[name]) | {"max_concurrency": calls}
+        def make(name: str, kind: type, concurrency: int, *arguments: Any) -> Any:
+            options = actor_options(plan.places[name]) | {"max_concurrency": concurrency}
             return ray.remote(kind).options(**options).remote(*arguments)
 
         # The ranks first: Ray fills the GPU that is fullest, and each of them needs more than half of one.
         learner = (c.policy, c.algorithm, c.trainer, c.seed, self._state, self._load)
-        peers = [f"trainer rank {rank}" for rank in range(1, c.trainer.ranks)]
-        ranks = [make(name, TrainerRank, 1, i, *learner) for i, name in enumerate(peers, start=1)]
+        names = [f"trainer rank {rank}" for rank in range(1, c.trainer.ranks)]
+        ranks = [make(name, TrainerRank, 1, rank, *learner) for rank, name in enumerate(names, start=1)]
         trainer = make("trainer", TrainerWorker, 4, *learner, timeline, ranks, journal_folder(c))
         self._inference.start(plan)
         imagined, counted = imagination.replay if imagination.share else None, c.rollout.episodes > 0
         stores = (c.replay, c.seed, imagined, counted, self._state, journal_folder(c), timeline)
-        self._replay = self._other("replay", make("replay", ReplayWorker, 1000, *stores, imagination.workers))
-        self._ranks = [self._other(*rank) for rank in zip(peers, ranks, strict=True)]
-        self._trainer = self._other("trainer", trainer)
+        self._replay = self._add("replay", make("replay", ReplayWorker, 1000, *stores, imagination.workers))
+        for name, rank in zip(names, ranks, strict=True):
+            self._add(name, rank)
+        self._trainer = self._add("trainer", trainer)
         if imagination.share:
             from accerl_lerobot.engine.dream_workers import DreamWorker, WorldLearningWorker
 
-            for i, n in enumerate(numbered("dream", imagination.workers)):
-                dreams = make(n, DreamWorker, 4, c, self._state, timeline, i)
-                self._dreamers.append(self._other(n, dreams))
+            for i, name in enumerate(numbered("dream", imagination.workers)):
+                imaginer = make(name, DreamWorker, 4, c, self._state, timeline, i)
+                self._imaginers.append(self._add(name, imaginer))
             if imagination.learns:
                 learns = make("world learning", WorldLearningWorker, 4, c, self._state, timeline)
-                self._learner = self._other("world learning", learns)
-        self._seats.start(plan)
+                self._learner = self._add("world learning", learns)
+        self._rollouts.start(plan)
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
         for worker, reference in ready:
             here = plan.places[worker.name].node.number == 0
             worker.await_start(reference, max(START_S, self._limit), here)
-        way = c.launch.transport, self._limit
-        deciding, inserting = self._inference.open(), self._replay.endpoint("insert", *way)
-        # Those that get one rollout worker more come first.
-        self._dreams_ask = [(deciding[-1 - i % len(deciding)], inserting) for i in range(len(self._dreamers))]
+        deciding = self._inference.open()
+        self._inserting = self._replay.endpoint("insert", c.launch.transport, self._limit)
+        # From the last replica on: the first ones may have one rollout worker more.
+        self._imaginers_ask = [deciding[-1 - i % len(deciding)] for i in range(len(self._imaginers))]
         self._replay.work = self._replay.actor.run.remote()
-        self._seats.set_to_work(deciding, inserting)
+        self._rollouts.run(deciding, self._inserting)
 
-    def _other(self, name: str, actor: Any) -> Watched:
-        self._others.append(Watched(name, actor))
+    def _add(self, name: str, actor: Any) -> ActorHandle:
+        self._others.append(ActorHandle(name, actor))
         return self._others[-1]
 
-    def _move(self, number: int, inference: Endpoint) -> None:
-        """Tells those who ask an inference service where it is now."""
-        self._seats.move(number, inference)
-        services = self._config.inference.workers
-        for i, dreamer in enumerate(self._dreamers):
-            if services - 1 - i % services == number:
-                self._dreams_ask[i] = inference, self._dreams_ask[i][1]
-                dreamer.call("move", inference, timeout=self._limit)
+    def _move(self, index: int, inference: Endpoint) -> None:
+        """Tell the clients of an inference replica its new endpoint."""
+        self._rollouts.move(index, inference)
+        replicas = self._config.inference.workers
+        for i, imaginer in enumerate(self._imaginers):
+            if replicas - 1 - i % replicas == index:
+                self._imaginers_ask[i] = inference
+                imaginer.call("move", inference, timeout=self._limit)
 
     def _ask(self) -> None:
         self._inference.ask()
         for worker in self._others:
             worker.ask("metrics")
-        self._seats.ask(self._training and not self._done)
+        self._rollouts.ask(self._training and not self._done)
 
     def _await_end(self) -> None:
-        """Waits a little, and deals with every worker whose long call has ended."""
+        """Wait a little, and handle every worker whose long call has ended."""
         works = {worker.work: worker for worker in self._everyone() if worker.work is not None}
         awaited = [*works, *self._inference.awaited()]
         if not ray.wait(awaited, num_returns=1, timeout=POLL_S)[0]:
@@ -290,65 +281,62 @@ class RayEngine(Engine):
             if reference in ended and worker.work is reference:
                 self._ended(worker)
 
-    def _ended(self, worker: Watched) -> None:
-        """Decides what the end of a worker's long call means."""
+    def _ended(self, worker: ActorHandle) -> None:
+        """Handle the end of a worker's long call: restart it, finish, or raise."""
         reference, worker.work = worker.work, None
         try:
             result = ray.get(reference)
         except RayError as error:
-            innocent = RayError | ServiceStoppedError
-            if isinstance(error, RayTaskError) and isinstance(error.cause, innocent):
+            if isinstance(error, RayTaskError) and isinstance(error.cause, RayError | ServiceStoppedError):
                 self._blame()
-            if self._inference.restart_worker(worker, error) or self._seats.restart_worker(worker, error):
+            if self._inference.restart_worker(worker, error) or self._rollouts.restart_worker(worker, error):
                 return
             raise WorkerError(f"{worker.name} worker failed for good:\n{error}") from error
         if worker is self._trainer:
             self._finish(int(result))
-        elif not (self._done and worker in (self._replay, *self._imaginers)):
+        elif not (self._done and worker in (self._replay, *self._with_learner())):
             raise WorkerError(f"{worker.name} worker ended without being asked to")
 
     def _blame(self) -> None:
-        """A worker failed because of another one: ends the run with that one's failure, if it is found."""
+        """A worker failed because of another one: raise that one's failure, if it comes."""
         works = {w.work: w for w in self._others if w is not self._trainer and w.work is not None}
         if works:
             for reference in ray.wait(list(works), num_returns=1, timeout=BLAME_S)[0]:
                 self._ended(works[reference])
 
     def _finish(self, version: int) -> None:
-        """The trainer has made its updates; its records and those of replay are completed."""
+        """The trainer has made its updates: complete its records and those of replay."""
         self._done, self._version = True, version
         self.follow(ASYNCHRONOUS)
         self._updates += self._hear(self._trainer, self._limit) or []
         self._updates += self._trainer.call("metrics", timeout=self._limit)
         self._replay.call("close", timeout=self._limit)
         self._hear(self._replay, self._limit)
-        self._replay_metrics = self._replay.call("metrics", timeout=self._limit)
+        self._metrics["replay"] = self._replay.call("metrics", timeout=self._limit)
 
     def _listen(self) -> list[EpisodeResult]:
-        """Picks up the answers that have come; returns the episodes among them."""
-        self._updates += self._hear(self._trainer) or []
-        self._replay_metrics = self._hear(self._replay) or self._replay_metrics
-        self._inference_metrics = self._inference.listen()
-        for rank in self._ranks:
-            self._hear(rank)
-        for dreamer in self._dreamers:
-            self._of_dreamers[dreamer.name] = self._hear(dreamer) or self._of_dreamers.get(dreamer.name, {})
-        if self._learner is not None:
-            self._of_learner = self._hear(self._learner) or self._of_learner
-        episodes = self._seats.listen()
-        if not self._real_ended and self._seats.spent:
+        """Pick up the answers that have come; the episodes among them."""
+        for worker in self._others:
+            answer = self._hear(worker)
+            if worker is self._trainer:
+                self._updates += answer or []
+            elif answer:
+                self._metrics[worker.name] = answer
+        self._metrics["inference"] = self._inference.listen()
+        episodes = self._rollouts.listen()
+        if not self._real_ended and self._rollouts.spent:
             self._real_ended = True
             self._replay.call("end_real", timeout=self._limit)
         return episodes
 
-    def _hear(self, worker: Watched, timeout: float = 0.0) -> Any:
+    def _hear(self, worker: ActorHandle, timeout: float = 0.0) -> Any:
         try:
             return worker.answer(timeout)
         except RayError as error:
             raise WorkerError(f"{worker.name} worker failed for good:\n{error}") from error
 
     def _check_hung(self) -> None:
-        """Starts a rollout worker or inference service again that does not answer, or does not get on.
+        """Restart a rollout worker or inference replica that hangs.
 
         Raises:
             WorkerError: another worker does not answer.
@@ -357,10 +345,10 @@ class RayEngine(Engine):
             if worker.silent_s() > self._limit:
                 raise WorkerError(f"{worker.name} worker has not answered for {worker.silent_s():.0f} s")
         self._inference.check_hung()
-        self._seats.check_hung(self._inference.up)
+        self._rollouts.check_hung(self._inference.up)
 
     def _check_moving(self, progress: Progress) -> None:
-        """Ends a run in which everybody answers and nothing moves.
+        """End a run in which every worker answers and nothing moves.
 
         Raises:
             WorkerError: neither decisions nor updates for `LaunchConfig.stall_s`.
@@ -368,11 +356,11 @@ class RayEngine(Engine):
         imagined = tuple(progress.imagination.get(k) for k in ("decisions", "learn_steps", "trial_s"))
         state = (progress.version, progress.rollout.get("decisions"), progress.rollout["restarts"], imagined)
         now = time.monotonic()
-        waiting = self._seats.outstanding or (self._training and not self._done)
-        # Where one worker is to blame, `_check_hung` comes to it a moment later.
+        waiting = self._rollouts.outstanding or (self._training and not self._done)
+        # Where one worker is to blame, `_check_hung` finds it a moment later.
         silent = max(worker.silent_s() for worker in self._everyone())
-        suspect = max(silent, self._seats.stuck_s) > self._limit / 2
-        # A service that is to come has a limit of its own.
+        suspect = max(silent, self._rollouts.stuck_s) > self._limit / 2
+        # The restart of a replica has a timeout of its own.
         if state != self._last_state or not waiting or not all(self._inference.up):
             self._last_state, self._last_change = state, now
         elif now - self._last_change > self._limit and not suspect:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole picture in one process, without Ray: the same parts, called in turn, deterministic for a seed.
+"""The engine in one process, without Ray: the same parts, called in turn, deterministic for a seed.
 
-    every poll:   all worlds get a decision and step it → segments enter replay, as far as the pace allows
-                  → all dreams get a decision and are dreamt on, if the pace allows it
+    every poll:   all environments get a decision and step it → segments enter replay, as the pace allows
+                  → all imagined rollouts get a decision and a step, if the pace allows it
                   → one update, if the pace allows it
 
 For tests and debugging. Weights reach the acting policy at once, so the lag comes from replay alone, unless
@@ -33,12 +33,12 @@ from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutRun
 from accerl_lerobot.seeds import global_generators, restore_global_generators
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.nonfinite import keeping
-from accerl_lerobot.weights.held_back import HeldBack
+from accerl_lerobot.weights.publisher import PublishDelay
 
 logger = logging.getLogger(__name__)
 
 LOCAL, DREAMS = "local", "dreams"
-"""Names of this engine's own state, and of all that imagines."""
+"""Names of this engine's parts of a checkpoint."""
 
 
 class LocalEngine(Engine):
@@ -48,7 +48,7 @@ class LocalEngine(Engine):
         config: the run; its ``policy.path`` must be set.
         tasks: the training tasks.
         history: env steps that an observation holds, the policy's ``n_obs_steps``.
-        state: the ``training_state`` to go on from, as if it had never been left; None: begin.
+        state: the ``training_state`` to resume from, bit for bit; None: begin.
         load: makes the policy's adapter; None: of LeRobot's checkpoint.
 
     Raises:
@@ -73,7 +73,8 @@ class LocalEngine(Engine):
         self._config = config
         self._adapter = loader(load)(config.policy)
         self._update = make_update(self._adapter, config.algorithm, config.trainer)
-        self._held, self._acting, self._acting_version = HeldBack(config.trainer.hold_back), self._adapter, 0
+        self._delay = PublishDelay(config.trainer.hold_back)
+        self._acting, self._acting_version = self._adapter, 0
         if config.trainer.hold_back:
             self._acting = loader(load)(config.policy)
             self._acting.load_trainable(self._adapter.export_trainable())
@@ -167,7 +168,7 @@ class LocalEngine(Engine):
             "generators": global_generators(),
             "rng": self._rng,
             "acting": (self._acting_version, acting),
-            "held_back": self._held.state(),
+            "held_back": self._delay.state(),
             "outstanding": sorted(self._outstanding),
             "outbox": list(self._outbox),
             "plans": self._plans.state(),
@@ -184,7 +185,7 @@ class LocalEngine(Engine):
     def _restore(self, directory: Path) -> None:
         if not (directory / f"{LOCAL}.json").is_file():
             raise InputError(
-                "launch.engine", "local", "this run was asynchronous; go on with launch.engine=ray"
+                "launch.engine", "local", "this run was asynchronous; resume it with launch.engine=ray"
             )
         self._adapter.load_trainable(snapshot.load(directory / WEIGHTS))
         self._update.restore(snapshot.load(directory / "trainer"))
@@ -194,7 +195,7 @@ class LocalEngine(Engine):
         self._acting_version, acting = engine["acting"]
         if acting is not None:
             self._acting.load_trainable(acting)
-        self._held.restore(engine["held_back"])
+        self._delay.restore(engine["held_back"])
         self._outstanding = set(engine["outstanding"])
         self._outbox.extend(engine["outbox"])
         self._plans.restore(engine["plans"])
@@ -219,13 +220,13 @@ class LocalEngine(Engine):
 
     @property
     def _exploring(self) -> bool:
-        """True if learning goes on."""
+        """True if there are updates left to make."""
         if not self._training or self._update.version >= self._config.trainer.updates:
             return False
         return not self._replay.exhausted(self._config.trainer.batch_decisions)
 
     def _act(self) -> None:
-        """One decision in every world that may go on."""
+        """One decision in every environment that may continue."""
         if not self._exploring:
             self._runner.abandon_groups()
         for slot in range(len(self._runner)):
@@ -248,7 +249,7 @@ class LocalEngine(Engine):
                 self._due[slot] = request
 
     def _dream(self) -> None:
-        """One decision in every dream, if any is wanted."""
+        """One decision in every imagined rollout, if any is wanted."""
         if self._dreams is None or not self._training:
             return
         if self._replay.real_ended:
@@ -263,7 +264,7 @@ class LocalEngine(Engine):
             self._dreams.advance(self._acting.decide(requests, self._acting_version))
 
     def _learn_world(self) -> None:
-        """One gradient step of the world model, or its trial, if either is due."""
+        """One gradient step of the world model, or its held-out evaluation, if either is due."""
         learner, last = self._world_learner, self._replay.real_ended
         if learner is None or self._dreams is None or not self._training:
             return
@@ -275,7 +276,7 @@ class LocalEngine(Engine):
         self._replay.hold(learner.due(last=False) and not last)
 
     def _publish(self) -> None:
-        """Hands weights to the policy that acts, which is the trainer's own unless they are held back."""
+        """Give weights to the acting policy, which is the trainer's own unless they are delayed."""
         version, updates = self._update.version, self._config.trainer.updates
         if self._acting is self._adapter:
             self._acting_version = version
@@ -283,12 +284,12 @@ class LocalEngine(Engine):
         self._clock.enter(WEIGHT_SYNC)
         last = version == updates or not self._exploring
         weights = self._adapter.export_trainable()
-        for number, tensors in self._held.push(version, weights, last=last):
+        for number, tensors in self._delay.push(version, weights, last=last):
             self._acting.load_trainable(tensors)
             self._acting_version = number
 
     def _store(self) -> None:
-        """Lets in what stands at the door, one segment at a time: a group's come all at once."""
+        """Store waiting segments one at a time, since those of a group come all at once."""
         while self._outbox and self._replay.may_insert(REAL):
             segment = self._outbox.popleft()
             if not self._replay.insert(segment):

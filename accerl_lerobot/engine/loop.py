@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The run once its engine stands: evaluation, training, checkpoints, and what is written of them."""
+"""The run once its engine has started: evaluation, training, checkpoints, and their records."""
 
 from __future__ import annotations
 
@@ -30,8 +30,7 @@ from accerl_lerobot.checkpoint.layout import (
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Engine, Progress
-from accerl_lerobot.engine.resume import heed_stop
-from accerl_lerobot.engine.stopping import Stopping
+from accerl_lerobot.engine.stopping import Stopping, raise_if_stopped
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.evaluation.pictures import before_after, success_curve
 from accerl_lerobot.evaluation.summary import summarise
@@ -41,10 +40,10 @@ from accerl_lerobot.timeline import CHECKPOINT, EVALUATION, TIMELINE, TRAINING, 
 from accerl_lerobot.timeline.watch import Watch
 
 FILMED = ".before"
-"""Name of the filmed episodes of the evaluation before, kept until the video is made."""
+"""Name of the filmed episodes of the first evaluation, kept until the video is made."""
 FRUITLESS_GROUPS = 50
-"""So many groups thrown away in a row are said aloud: no update is made of them."""
-DREAMT = 10
+"""Groups dropped in a row after which a message is printed: no update is made of them."""
+RECORD_EVERY = 10
 """Updates between two records of the workers' counters when no episode ends."""
 RECENT = 100
 """Exploring episodes over which the training success of the curve is averaged."""
@@ -61,7 +60,7 @@ def run_plans(
     console: Console,
     on_progress: Callable[[Progress], object] = lambda progress: None,
 ) -> list[EpisodeResult]:
-    """Waits for `count` planned episodes of `group`; `on_progress` sees what else happens meanwhile."""
+    """Wait for `count` planned episodes of `group`; `on_progress` gets everything that is polled."""
     results: list[EpisodeResult] = []
     with console.stage(f"evaluation ({group})", total=count) as stage:
         while len(results) < count:
@@ -74,18 +73,18 @@ def run_plans(
 
 @dataclass(kw_only=True)
 class Times:
-    """Where a run's seconds go, those before it was left included."""
+    """Seconds of a run, those before it was resumed included."""
 
     started: float
     """When this process began, by the monotonic clock."""
     warm_s: float
     """Warm start."""
     rl_s: float = 0.0
-    """Training, in processes before this one."""
+    """Training, in earlier processes."""
     before_s: float | None = 0.0
-    """All, in processes before this one; None: the checkpoint will tell."""
+    """All, in earlier processes; None: the checkpoint has it."""
     furthest: int = 0
-    """The latest update that has been made in this process, whether or not it was lost since."""
+    """Latest update made in this process, lost or not."""
     clock: Clock = field(default_factory=NoClock)
     """The driver's row of the timeline."""
 
@@ -96,17 +95,12 @@ class Times:
 
 
 class Loop:
-    """The run once its engine stands: evaluates, trains, saves, and writes what came of it.
+    """Evaluates, trains, saves checkpoints, and writes the results.
 
     Args:
-        config: the run.
-        directory: its folder.
         console: progress for people.
-        engine: does the work.
         log: of all numbers.
-        tasks: the training tasks.
-        times: so far.
-        stop: says when to save and end.
+        stop: tells when to save and end.
     """
 
     def __init__(
@@ -135,7 +129,7 @@ class Loop:
         self.during: dict[str, list[EpisodeResult]] = {}
         self.base: dict[str, float] = {}
         self.groups = (0.0, 0.0)
-        """Kept so far, and thrown away when that was last said or one was kept."""
+        """Groups kept, and groups dropped at the last message or kept group."""
         self.steps = math.inf
         """Env steps of the training, once it has ended."""
         self.evaluated = self.saved = 0
@@ -146,10 +140,10 @@ class Loop:
         self._watch = Watch(directory / TIMELINE)
 
     def run(self, state: Path | None) -> dict[str, Any]:
-        """Does it, or does what is left of it; returns the summary.
+        """Do the run, or the rest of it; returns the summary.
 
         Args:
-            state: the ``training_state`` to go on from; None: begin.
+            state: the ``training_state`` to resume from; None: begin.
 
         Raises:
             StoppedError: it was asked to stop.
@@ -180,11 +174,11 @@ class Loop:
         write_atomically(self.directory / SUMMARY, json.dumps(summary, indent=2) + "\n")
         for left in self.directory.glob(f"{FILMED}.*"):
             left.unlink()
-        let_go(self.directory / CHECKPOINTS, self.config.save_keep)  # nobody begins again any more
+        let_go(self.directory / CHECKPOINTS, self.config.save_keep)  # it has ended
         return dict(summary)
 
     def _state(self) -> dict[str, Any]:
-        """All that `_restore` needs; see `snapshot`."""
+        """Everything that `_restore` needs; see `snapshot`."""
         spent = {"rl_s": self._rl_s, "wall_s": self.times.wall_s, "warm_s": self.times.warm_s}
         return {name: getattr(self, name) for name in _STATE} | {"log": self.log.state(), "times": spent}
 
@@ -243,7 +237,7 @@ class Loop:
         config = self.config
         self.engine.train()
         self.times.clock.enter(TRAINING)
-        self._watch.news()  # what was before is not of the first record
+        self._watch.news()  # the first record begins here
         self._training_since = self._saved_at = time.monotonic()
         with self.console.stage(f"RL ({config.algorithm.type})", total=config.trainer.updates) as stage:
             while True:
@@ -253,7 +247,7 @@ class Loop:
                 if progress.done:
                     self.times.rl_s, self._training_since = self._rl_s, None
                     return progress
-                self._heed_groups(progress.rollout)
+                self._warn_of_groups(progress.rollout)
                 every = config.evaluation.every_updates
                 if every and progress.version // every > self.evaluated:
                     self.evaluated = progress.version // every
@@ -262,7 +256,7 @@ class Loop:
                 if self._is_due(progress.version) or asked:
                     self._save()
                 if asked:
-                    heed_stop(self.stop, self.directory)
+                    raise_if_stopped(self.stop, self.directory)
 
     @property
     def _rl_s(self) -> float:
@@ -271,7 +265,7 @@ class Loop:
         return self.times.rl_s + (0.0 if since is None else time.monotonic() - since)
 
     def _is_due(self, version: int) -> bool:
-        """True if it is time for a checkpoint."""
+        """True if a checkpoint is due."""
         updates, seconds = self.config.save_every_updates, self.config.save_every_s
         if updates and version // updates > self.saved:
             return True
@@ -295,8 +289,8 @@ class Loop:
         # The first episodes to end are the short ones, which are successes.
         if explored and len(self.recent) >= RECENT // 4:
             self.curve.append((self._steps(progress), share))
-        # Once all real episodes have been played, dreams and the learning from them go on.
-        if explored or any(metrics["update"] % DREAMT == 0 for metrics in progress.updates):
+        # Imagination and learning go on once all real episodes have been played.
+        if explored or any(metrics["update"] % RECORD_EVERY == 0 for metrics in progress.updates):
             values = progress.rollout | {"success_exploring": share}
             for part in ("replay", "inference", "imagination"):
                 values |= {f"{part}_{k}": v for k, v in getattr(progress, part).items()}
@@ -308,8 +302,8 @@ class Loop:
                 if len(results) == self.config.evaluation.episodes_during:
                     self._report(episode.plan.group, results, self._steps(progress), progress.version)
 
-    def _heed_groups(self, counters: dict[str, float]) -> None:
-        """Says so when groups of equal starts have nothing to compare, or the run would seem to hang."""
+    def _warn_of_groups(self, counters: dict[str, float]) -> None:
+        """Print a message when groups have nothing to compare, as the run would seem to hang."""
         kept, dropped = counters.get("groups_kept", 0.0), counters.get("groups_dropped", 0.0)
         if kept > self.groups[0]:
             self.groups = (kept, dropped)
@@ -317,8 +311,8 @@ class Loop:
             self.groups = (kept, dropped)
             success = f"{np.mean(self.recent):.0%}" if self.recent else "unknown"
             self.console.say(
-                f"{FRUITLESS_GROUPS} groups in a row were thrown away, and nothing is learnt from them: they "
-                f"had nothing to compare under rollout.group_filter={self.config.rollout.group_filter} "
+                f"{FRUITLESS_GROUPS} groups in a row were dropped and nothing is learned from them: they had "
+                f"nothing to compare under rollout.group_filter={self.config.rollout.group_filter} "
                 f"(success while exploring {success}); stop the run, or choose tasks that succeed sometimes"
             )
 
@@ -340,7 +334,7 @@ class Loop:
 
     def _meanwhile(self, progress: Progress) -> None:
         self._record(progress)
-        heed_stop(self.stop, self.directory)
+        raise_if_stopped(self.stop, self.directory)
 
     def _report(self, group: str, results: list[EpisodeResult], steps: float, version: int) -> dict[str, Any]:
         summary = summarise(results) | {"env_steps": steps, "group": group}
@@ -354,7 +348,7 @@ class Loop:
         return summary
 
     def _save(self) -> None:
-        """Writes a checkpoint of now."""
+        """Write a checkpoint."""
 
         def write(folder: Path) -> int:
             saved = self.engine.save(folder)

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import difflib
 import logging
 import math
@@ -20,7 +21,7 @@ import draccus
 
 from accerl_lerobot.algorithms import OffPolicyConfig, RatioConfig
 from accerl_lerobot.config.ranges import Range, check
-from accerl_lerobot.engine import ray_environment
+from accerl_lerobot.engine import ray_session
 from accerl_lerobot.envs import EnvConfig, WorldSpec, make_world
 from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.policies.features import (
@@ -34,6 +35,7 @@ from accerl_lerobot.policies.features import (
     policy_features,
     resizes,
 )
+from accerl_lerobot.replay.pacing import decisions_under_way, lag_bound
 
 LARGEST_FIELD = 10**6
 """Largest number in a policy config; LeRobot has no size or number of steps beyond."""
@@ -53,7 +55,7 @@ SLACK_BYTES = 128 * 2**20
 
 
 def check_world(env: EnvConfig) -> WorldSpec:
-    """Builds and resets an environment once, so that what is wrong with it shows before anything long.
+    """Build and resets an environment once, so that what is wrong with it shows before anything long.
 
     Raises:
         InputError: its simulator is not installed or cannot draw here, or it refuses its options.
@@ -67,7 +69,7 @@ def check_world(env: EnvConfig) -> WorldSpec:
 
 
 def check_policy(config: RunConfig, spec: WorldSpec | None = None, *, own: bool = False) -> int:
-    """Refuses a checkpoint that does not fit the environment; returns its ``n_obs_steps``.
+    """Refuse a checkpoint that does not fit the environment; returns its ``n_obs_steps``.
 
     Args:
         config: with ``policy.path``.
@@ -85,7 +87,7 @@ def check_policy(config: RunConfig, spec: WorldSpec | None = None, *, own: bool 
 
 
 def check_start(config: RunConfig) -> int:
-    """Refuses a run that could not begin or whose outcome could not be used; what can be is checked here.
+    """Refuse a run that could not begin or whose outcome could not be used; what can be is checked here.
 
     Returns:
         The policy's ``n_obs_steps``.
@@ -129,7 +131,7 @@ def check_start(config: RunConfig) -> int:
 def check_training_data(
     sft: SFTConfig, dataset: DatasetConfig, policy: Any, spec: WorldSpec | None, rename_map: dict[str, str]
 ) -> Any:
-    """Compares dataset, policy and environment of an SFT.
+    """Compare dataset, policy and environment of an SFT.
 
     Args:
         sft: makes the policy.
@@ -168,7 +170,7 @@ def check_training_data(
 
 
 def _check_new_policy(policy: Any, source: Features, sft: SFTConfig) -> None:
-    """Gives a new policy the features that LeRobot will give it, and has LeRobot check them.
+    """Give a new policy the features that LeRobot will give it, and has LeRobot check them.
 
     SmolVLA and π0 pad states and actions to a size of their own, and LeRobot does not compare it with theirs.
     """
@@ -193,7 +195,7 @@ def _check_new_policy(policy: Any, source: Features, sft: SFTConfig) -> None:
 
 
 def check_wandb(config: WandBConfig) -> None:
-    """Refuses logging to Weights & Biases where nobody is logged in.
+    """Refuse logging to Weights & Biases where nobody is logged in.
 
     Raises:
         InputError: see above; or its package is not installed.
@@ -233,11 +235,7 @@ def disk_bytes(config: RunConfig, spec: WorldSpec, history: int) -> int:
 
 
 def check_disk(folder: str | None, needed: int, field: str = "output_dir") -> None:
-    """Refuses a folder on a disk with too little space for `needed` bytes and small files; blames `field`.
-
-    Raises:
-        InputError: see above.
-    """
+    """Refuse a folder on a disk with too little space for `needed` bytes and small files; blames `field`."""
     path = expanded(folder or ".", field).absolute()
     while not path.exists():
         path = path.parent
@@ -248,7 +246,7 @@ def check_disk(folder: str | None, needed: int, field: str = "output_dir") -> No
 
 
 def check_machine(config: RunConfig) -> None:
-    """Refuses sizes far beyond this machine's memory.
+    """Refuse sizes far beyond this machine's memory.
 
     Raises:
         InputError: names the field that takes most memory.
@@ -266,11 +264,7 @@ def check_machine(config: RunConfig) -> None:
 
 
 def check_weights_fit(config: RunConfig) -> None:
-    """Refuses a policy whose weights this machine's memory cannot hold.
-
-    Raises:
-        InputError: see above.
-    """
+    """Refuse a policy whose weights this machine's memory cannot hold."""
     from accerl_lerobot.cli.doctor import total_memory_gib
 
     need, total = policy_gib(config), total_memory_gib()
@@ -305,7 +299,7 @@ def policy_gib(config: RunConfig) -> float:
 
 
 def _check_off_policy(config: RunConfig, spec: WorldSpec, policy: Any) -> None:
-    """Refuses policies that cannot imitate a chunk, and segments that are not whole episodes."""
+    """Refuse policies that cannot imitate a chunk, and segments that are not whole episodes."""
     from accerl_lerobot.policies.registry import sampler_config
 
     sampler = sampler_config(config.policy, policy.type)
@@ -354,7 +348,7 @@ def policy_to_be(config: RunConfig) -> Any:
 
 
 def check_sft_policy(config: SFTConfig) -> Any:
-    """Lets LeRobot build the policy config that the SFT would ask for, and returns it.
+    """Let LeRobot build the policy config that the SFT would ask for, and returns it.
 
     Raises:
         InputError: LeRobot has no such policy, no such field, or refuses a value; or cannot fine-tune it.
@@ -424,7 +418,7 @@ def _as_input_error(error: BaseException, fields: dict[str, Any]) -> InputError:
 
 
 def check_placement(config: RunConfig) -> list[str]:
-    """Plans where the workers will be, so that what does not fit is refused before anything long; as lines.
+    """Plan where the workers will be, so that what does not fit is refused before anything long; as lines.
 
     Raises:
         InputError: they do not fit, or the cluster that is to be joined is not as it has to be.
@@ -432,10 +426,46 @@ def check_placement(config: RunConfig) -> list[str]:
     if config.launch.engine == "local":
         return []
     if config.launch.address is None:
-        from accerl_lerobot.engine.placement import planned, this_machine
+        from accerl_lerobot.engine.placement import plan_workers, this_machine
 
-        return list(planned([this_machine()], config).rows())
-    ray_environment.prepare(joins=True)
-    from accerl_lerobot.engine.cluster import rehearse
+        return list(plan_workers([this_machine()], config).rows())
+    ray_session.prepare(joins=True)
+    from accerl_lerobot.engine.placement import rehearse
 
     return rehearse(config)
+
+
+def lag_limits(config: RunConfig) -> tuple[int, int]:
+    """The largest lag under this recipe, and what its pace alone would allow; in updates."""
+    trainer = config.trainer
+    ahead = 1 if config.launch.engine == "ray" else 0  # of publications under way, and of batches drawn early
+    bound, of_pace = (
+        lag_bound(
+            replay,
+            batch_decisions=trainer.batch_decisions,
+            in_flight=under_way(config),
+            publish_every=trainer.publish_every,
+            pickup=ahead + trainer.hold_back,
+            prefetch=ahead,
+        )
+        for replay in (config.replay, dataclasses.replace(config.replay, max_lag=10**9))
+    )
+    return bound, of_pace
+
+
+def under_way(config: RunConfig) -> int:
+    """Decisions on their way to replay; an unknown chunk counts as one action, the worst case."""
+    rollout = config.rollout
+    return decisions_under_way(
+        workers=rollout.workers,
+        worlds=rollout.worlds,
+        segment_length=rollout.segment_length,
+        group_size=rollout.group_size,
+        episode_decisions=math.ceil(config.env.max_steps / (executed(config) or 1)),
+    )
+
+
+def executed(config: RunConfig) -> int:
+    """Actions of a chunk that are executed; 0 if only the checkpoint says."""
+    of_sft = config.sft.steps and config.sft.policy.get("n_action_steps")
+    return int(config.policy.n_action_steps or of_sft or 0)

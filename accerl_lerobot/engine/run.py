@@ -3,10 +3,10 @@
 
 outputs/<run>/
   config.yaml            the resolved config; `accerl train --config_path=…/config.yaml` repeats the run,
-                         and goes on with it with `--resume=true`
+                         and resumes it with `--resume=true`
   demos/                 a LeRobotDataset, if this run recorded one
   sft/                   LeRobot's own training output, sft.log beside it
-  checkpoints/NNNNNN/    LeRobot's layout, and all that is needed to go on; `last` is the newest
+  checkpoints/NNNNNN/    LeRobot's layout, and everything needed to resume; `last` is the newest
   metrics.jsonl          and tensorboard/
   timeline/              what every worker did when, see `accerl timeline`
   success_curve.png, summary.json, and before_after.mp4 unless evaluation.before=false
@@ -22,7 +22,7 @@ import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
@@ -40,13 +40,12 @@ from accerl_lerobot.checkpoint.layout import (
     write_atomically,
 )
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine import ray_environment
-from accerl_lerobot.engine.config import LaunchConfig, RunConfig, encode, timeline_folder
+from accerl_lerobot.engine import ray_session
+from accerl_lerobot.engine.config import RunConfig, encode, timeline_folder
 from accerl_lerobot.engine.contract import Engine, WorkerError, pause_s
 from accerl_lerobot.engine.loop import Loop, Times
 from accerl_lerobot.engine.preflight import check_placement, check_policy, check_start, check_world
-from accerl_lerobot.engine.resume import heed_stop
-from accerl_lerobot.engine.stopping import Stopping
+from accerl_lerobot.engine.stopping import Stopping, raise_if_stopped
 from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, make_folder
 from accerl_lerobot.metrics import METRICS, MetricsLog
 from accerl_lerobot.policies.config import Load, loader
@@ -54,30 +53,18 @@ from accerl_lerobot.replay.journal import EPISODES
 from accerl_lerobot.timeline import RECOVERY, open_clock
 
 if TYPE_CHECKING:
-    from accerl_lerobot.engine.own_ray import OwnRay
+    from accerl_lerobot.engine.ray_session import RaySession
 
 logger = logging.getLogger(__name__)
 
 BASE = "base"
-"""Folder of a run: the policy that it began from, where that had to be computed back."""
+"""Folder of the policy that a run began from, where that had to be reconstructed."""
 WARM_START = "warm_start.json"
-"""File that says which policy a run's own demonstrations and SFT have led to."""
+"""File with the path of the policy that came of a run's own demonstrations and SFT."""
 
 
-class Placed(Protocol):
-    """A config that says where its results go."""
-
-    @property
-    def output_dir(self) -> str | None:
-        """The folder, which must not exist; None: one named after date, time and job."""
-
-    @property
-    def job_name(self) -> str:
-        """Name of the run's folder."""
-
-
-def make_output_dir(config: Placed) -> Path:
-    """Creates the folder of a run.
+def make_output_dir(config: Any) -> Path:
+    """Create the folder of a run: ``output_dir``, or one named after date, time and ``job_name``.
 
     Raises:
         InputError: it exists, or cannot be created.
@@ -98,18 +85,9 @@ def make_engine(
     history: int,
     state: Path | None = None,
     load: Load | None = None,
-    own: OwnRay | None = None,
+    session: RaySession | None = None,
 ) -> Engine:
-    """The engine that ``launch.engine`` names.
-
-    Args:
-        config: the run.
-        tasks: the training tasks.
-        history: env steps that the policy sees at a time.
-        state: the ``training_state`` to go on from; None: begin.
-        load: makes the policy's adapter; None: of LeRobot's checkpoint.
-        own: the Ray to use, which outlives the engine; None: one that ends with it.
-    """
+    """The engine that ``launch.engine`` names; see `RayEngine` for the arguments."""
     if isinstance(config.algorithm, ChunkCriticConfig):
         from accerl_lerobot.policies.teacher import WithTeacher
 
@@ -119,14 +97,14 @@ def make_engine(
         from accerl_lerobot.engine.local import LocalEngine
 
         return LocalEngine(config, tasks, history, state, load)
-    ray_environment.prepare(joins=config.launch.address is not None)
+    ray_session.prepare(joins=config.launch.address is not None)
     from accerl_lerobot.engine.launch import RayEngine
 
-    return RayEngine(config, tasks, history, state, load, own)
+    return RayEngine(config, tasks, history, state, load, session)
 
 
 def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfig:
-    """Records demonstrations and runs SFT where the config asks for it; sets ``policy.path``."""
+    """Record demonstrations and run SFT where the config asks for it; set ``policy.path``."""
     from accerl_lerobot.demos.record import record_demos
     from accerl_lerobot.demos.sft import run_sft
     from accerl_lerobot.demos.windows import open_metadata, task_texts
@@ -165,18 +143,18 @@ def train(
     wanted: str | None = None,
     load: Load | None = None,
 ) -> dict[str, Any]:
-    """Runs everything and returns the summary, which is also in ``summary.json``.
+    """Run everything and return the summary, which is also in ``summary.json``.
 
     Args:
         config: the run.
         directory: its folder; empty, if it is a new one.
         console: progress for people.
-        wanted: the checkpoint to go on from, where the run has been begun before; see
+        wanted: the checkpoint to resume from, where the run has been begun before; see
             `checkpoint.newest_whole`.
         load: makes the policy's adapter, and may be given a path of its own; None: of LeRobot's checkpoint.
 
     Raises:
-        InputError: the settings do not fit each other, or no checkpoint can be gone on from.
+        InputError: the settings do not fit each other, or no checkpoint can be resumed from.
         StoppedError: it was asked to stop, and has been saved.
     """
     started = time.monotonic()
@@ -188,14 +166,14 @@ def train(
     tasks = check_world(config.env).tasks
     check_placement(replace(config, output_dir=str(directory)))
     if checkpoint is None:
-        _check_imagination(config, going_on=False)
+        _check_imagination(config, resuming=False)
         config = _warm_started(config, directory, console)
     else:
         go_back_to(checkpoint)
-        config = _going_on(config, directory, checkpoint, console)
+        config = _resumed(config, directory, checkpoint, console)
         if load is None:
             check_start(config)
-        _check_imagination(config, going_on=True)
+        _check_imagination(config, resuming=True)
         console.say(f"going on from {checkpoint}")
     before_s = 0.0 if checkpoint is None else None
     config = replace(config, output_dir=str(directory))
@@ -204,62 +182,39 @@ def train(
         stop = stack.enter_context(Stopping())
         times.clock = stack.enter_context(contextlib.closing(open_clock(timeline_folder(config), "driver")))
         log = stack.enter_context(contextlib.closing(MetricsLog(directory, config.wandb, encode(config))))
-        own = (
-            None
-            if config.launch.engine == "local"
-            else stack.enter_context(contextlib.closing(_own_ray(config.launch)))
-        )
+        session = None
+        if config.launch.engine != "local":
+            ray_session.prepare(joins=config.launch.address is not None)
+            session = stack.enter_context(contextlib.closing(ray_session.RaySession(config.launch)))
         recovery = Recovery(config.launch.max_recoveries)
         while True:
+            # A run, or what is left of it, by one set of workers.
+            history = 1 if load is not None else check_policy(config, own=True)
+            state = None if checkpoint is None else checkpoint / TRAINING_STATE
             try:
-                return _attempt(config, directory, checkpoint, console, log, tasks, times, stop, load, own)
+                try:
+                    with console.stage("starting workers"), stop.at_once():
+                        engine = make_engine(config, tasks, history, state, load, session)
+                except KeyboardInterrupt:
+                    raise_if_stopped(stop, directory)
+                    raise
+                with contextlib.closing(engine):
+                    return Loop(config, directory, console, engine, log, tasks, times, stop).run(state)
             except Exception as error:
-                lost = "" if own is None else own.lost  # whatever error that has led to
+                lost = "" if session is None else session.lost  # whatever error that has led to
                 loss = WorkerError(lost) if lost else error
                 if not isinstance(loss, WorkerError):
                     raise
                 times.clock.enter(RECOVERY)
-                heed_stop(stop, directory)
+                raise_if_stopped(stop, directory)
                 checkpoint = recovery.next(directory / CHECKPOINTS, console, loss, times.furthest)
-                heed_stop(stop, directory)
+                raise_if_stopped(stop, directory)
                 go_back_to(checkpoint)
-                config = _going_on(config, directory, checkpoint, console)
-
-
-def _own_ray(launch: LaunchConfig) -> OwnRay:
-    ray_environment.prepare(joins=launch.address is not None)
-    from accerl_lerobot.engine.own_ray import OwnRay
-
-    return OwnRay(launch)
-
-
-def _attempt(
-    config: RunConfig,
-    directory: Path,
-    checkpoint: Path | None,
-    console: Console,
-    log: MetricsLog,
-    tasks: tuple[str, ...],
-    times: Times,
-    stop: Stopping,
-    load: Load | None,
-    own: OwnRay | None,
-) -> dict[str, Any]:
-    """The run, or what is left of it, by one set of workers, which have ended when this returns or raises."""
-    history = 1 if load is not None else check_policy(config, own=True)
-    state = None if checkpoint is None else checkpoint / TRAINING_STATE
-    try:
-        with console.stage("starting workers"), stop.at_once():
-            engine = make_engine(config, tasks, history, state, load, own)
-    except KeyboardInterrupt:
-        heed_stop(stop, directory)
-        raise
-    with contextlib.closing(engine):
-        return Loop(config, directory, console, engine, log, tasks, times, stop).run(state)
+                config = _resumed(config, directory, checkpoint, console)
 
 
 class Recovery:
-    """Goes on after the loss of a worker, from the last checkpoint, unless it happens again and again.
+    """Chooses the checkpoint to resume from after the loss of a worker, unless that happens again and again.
 
     Args:
         most: times in a row.
@@ -269,17 +224,14 @@ class Recovery:
         self._most, self._times, self._begun, self._furthest = most, 0, "", -1
 
     def next(self, checkpoints: Path, console: Console, error: WorkerError, furthest: int) -> Path:
-        """The checkpoint to go on from; where that is done again waits a little, longer each time.
+        """The checkpoint to resume from; waits longer each time without progress in between.
 
         Args:
-            checkpoints: of the run.
-            console: is told.
-            error: what was lost.
             furthest: the latest update so far. A run that gets further each time is not stuck, though it may
                 be hit again before its next checkpoint.
 
         Raises:
-            WorkerError: the one given: there is no checkpoint, or it has been tried often enough.
+            WorkerError: `error`: there is no checkpoint, or it has been tried often enough.
         """
         try:
             path, passed = newest_whole(checkpoints)
@@ -301,9 +253,9 @@ class Recovery:
 
 
 def _checkpoint(directory: Path, wanted: str, console: Console) -> Path | None:
-    """The one to go on from; None if the run had not come so far."""
+    """The checkpoint to resume from; None if there is none yet."""
     if not begun(directory / CHECKPOINTS):
-        console.say("there is no checkpoint yet: what is left of the run is begun from its warm start on")
+        console.say("there is no checkpoint yet: the run begins again after its warm start")
         for name in (METRICS, EPISODES):
             (directory / name).unlink(missing_ok=True)
         shutil.rmtree(directory / "tensorboard", ignore_errors=True)
@@ -315,7 +267,7 @@ def _checkpoint(directory: Path, wanted: str, console: Console) -> Path | None:
 
 
 def _warm_started(config: RunConfig, directory: Path, console: Console) -> RunConfig:
-    """Runs the warm start, unless it has been; what was left of one that was stopped is made anew."""
+    """Run the warm start, unless that has been done; one that was stopped begins again."""
     note = directory / WARM_START
     if config.policy.path is not None:
         return config
@@ -330,8 +282,8 @@ def _warm_started(config: RunConfig, directory: Path, console: Console) -> RunCo
     return _improving(config, path)
 
 
-def _going_on(config: RunConfig, directory: Path, checkpoint: Path, console: Console) -> RunConfig:
-    """The run from its checkpoint on, which holds all that it takes, whatever has become of its start."""
+def _resumed(config: RunConfig, directory: Path, checkpoint: Path, console: Console) -> RunConfig:
+    """The run from its checkpoint on, which holds everything, whatever has become of its start."""
     if config.policy.tuning.mode != "lora":
         return _improving(config, checkpoint / PRETRAINED)
     # A checkpoint has low-rank adapters merged; apart from what they adapt they are in the training state.
@@ -347,7 +299,7 @@ def _going_on(config: RunConfig, directory: Path, checkpoint: Path, console: Con
 
 
 def _start(config: RunConfig, directory: Path) -> str | None:
-    """The policy that a run began from, in a folder or on the Hub; None if it is not here any more."""
+    """The policy that a run began from, a folder or Hub id; None if it is not here any more."""
     path, note = config.policy.path, directory / WARM_START
     if path is None:
         made = directory / json.loads(note.read_text())["policy"] if note.is_file() else None
@@ -356,14 +308,14 @@ def _start(config: RunConfig, directory: Path) -> str | None:
     return path if on_the_hub or Path(path).expanduser().is_dir() else None
 
 
-def _check_imagination(config: RunConfig, going_on: bool) -> None:
+def _check_imagination(config: RunConfig, resuming: bool) -> None:
     if config.imagination.share:
         from accerl_lerobot.engine.dreaming import check_imagination
 
         path = config.imagination.path
-        if going_on and path is not None and not Path(path).expanduser().is_dir():
+        if resuming and path is not None and not Path(path).expanduser().is_dir():
             remedy = (
-                "no such folder; what a run begins to dream with is not in its checkpoints: put a copy there"
+                "no such folder; the first world model of a run is not in its checkpoints: put a copy there"
             )
             raise InputError("imagination.path", path, remedy)
         check_imagination(config)

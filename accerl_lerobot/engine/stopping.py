@@ -1,24 +1,41 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Being asked to stop: SIGTERM, as schedulers send it, or Ctrl-C."""
+"""Stopping a run by SIGTERM, as schedulers send it, or Ctrl-C; and resuming it."""
 
 from __future__ import annotations
 
+import fcntl
 import os
+import shlex
 import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from accerl_lerobot.errors import InputError, make_folder
+
+if TYPE_CHECKING:
+    from accerl_lerobot.engine.config import RunConfig
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
+LOCK = ".lock"
+CHANGEABLE = (
+    "resume", "output_dir", "evaluation", "launch", "wandb", "save_every_updates", "save_every_s",
+    "save_keep", "trainer.updates", "trainer.num_threads", "trainer.ranks", "trainer.sharding",
+    "trainer.cpu_offload", "trainer.activation_checkpointing", "trainer.rank_timeout_s",
+    "rollout.max_restarts", "inference", "imagination.record",
+    "imagination.discover_packages_path",
+)  # fmt: skip
+"""Fields and sections that may change when a run is resumed: what is learned, and from what, stays."""
 _pipe: tuple[int, int] | None = None
-"""Where signals are noted by C code, also while the main thread hangs and Python handles none."""
+"""Where C code notes signals, also while the main thread hangs and Python handles none."""
 _arrived = False
 
 
 def arrived() -> bool:
-    """True if one of these signals has come since a context of this module was entered."""
+    """True if one of `SIGNALS` has come since a context of this module was entered."""
     global _arrived
     with suppress(OSError):  # none has come
         numbers = b"" if _pipe is None else os.read(_pipe[0], 64)
@@ -27,7 +44,7 @@ def arrived() -> bool:
 
 
 def _listen() -> None:
-    """Has signals noted from now on."""
+    """Have signals noted from now on."""
     global _pipe, _arrived
     if _pipe is None:
         _pipe = os.pipe()
@@ -39,11 +56,11 @@ def _listen() -> None:
 
 
 class StoppedError(Exception):
-    """A run was asked to stop, and what it takes to go on is on disk.
+    """A run was asked to stop, and can be resumed.
 
     Args:
         number: of the signal.
-        words: for people: what was saved and how to go on.
+        words: for people: how to resume.
     """
 
     def __init__(self, number: int, words: str) -> None:
@@ -57,7 +74,7 @@ class TerminatedError(KeyboardInterrupt):
 
 @contextmanager
 def interrupted() -> Iterator[None]:
-    """Handles SIGTERM like Ctrl-C: what has been started is ended on the way out.
+    """Handle SIGTERM like Ctrl-C: what has been started is ended on the way out.
 
     Raises:
         TerminatedError: it came.
@@ -80,7 +97,7 @@ def interrupted() -> Iterator[None]:
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Handles these signals when the context is left, for the start of a library with handlers of its own.
+    """Handle signals when the context is left, for the start of a library with handlers of its own.
 
     Ray's handler in Python exits; its handler in C++ prints a trace and sets an alarm that aborts after 3 s,
     which can be cancelled only if its C++ code releases the interpreter's lock by then.
@@ -107,7 +124,7 @@ def deferred() -> Iterator[None]:
 
 
 def _cancel_alarms(left: threading.Event) -> None:
-    """Cancels the alarm that follows a signal, until and when the context is left."""
+    """Cancel the alarm that follows a signal, until and when the context is left."""
     while not left.wait(1.0):
         if arrived():
             signal.alarm(0)
@@ -116,7 +133,7 @@ def _cancel_alarms(left: threading.Event) -> None:
 
 
 class Stopping:
-    """Notes the first such signal; a second one interrupts at once.
+    """Notes the first signal; a second one interrupts at once.
 
     Example:
         >>> with Stopping() as stop:
@@ -142,7 +159,7 @@ class Stopping:
 
     @contextmanager
     def at_once(self) -> Iterator[None]:
-        """Has the first signal interrupt what is inside, where there is nothing new to be saved."""
+        """Have the first signal interrupt this context, in which there is nothing new to be saved."""
         self._waits = False
         try:
             if self.asked is not None:
@@ -155,3 +172,106 @@ class Stopping:
         again, self.asked = self.asked is not None, self.asked or number
         if again or not self._waits:
             raise KeyboardInterrupt
+
+
+def raise_if_stopped(stop: Stopping, directory: Path) -> None:
+    """End a run that was asked to stop.
+
+    Raises:
+        StoppedError: it was.
+    """
+    if stop.asked is not None:
+        words = f"stopped by {signal.Signals(stop.asked).name}; to resume: {resume_command(directory)}"
+        raise StoppedError(stop.asked, words)
+
+
+def resume_command(directory: Path) -> str:
+    """The command that resumes a run."""
+    from accerl_lerobot.checkpoint.layout import CONFIG
+
+    return f"accerl train --resume=true --config_path={shlex.quote(str(directory / CONFIG))}"
+
+
+class ResumedRun(NamedTuple):
+    """A run that was begun before."""
+
+    directory: Path
+    checkpoint: str
+    """Name of the checkpoint to resume from: ``last``, or a number."""
+
+
+def resumed_run(path: Path | None, config: RunConfig) -> ResumedRun:
+    """The run that a config file belongs to.
+
+    Args:
+        path: ``--config_path``: ``RUN/config.yaml`` or ``RUN/checkpoints/NNNNNN/config.yaml``.
+        config: the run as it is to be resumed.
+
+    Raises:
+        InputError: the file is of no run, a setting differs that must not, or there is nothing left to do.
+    """
+    from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, LAST, SUMMARY
+    from accerl_lerobot.checkpoint.safety import Origin, check_folder, check_number, read_json
+    from accerl_lerobot.config.parsing import CONSENT, decode, encode, read_recipe
+
+    how = "name RUN/config.yaml or RUN/checkpoints/last/config.yaml"
+    if path is None:
+        raise InputError("resume", True, f"add --config_path: {how}")
+    folders = path.absolute().parents
+    directory, checkpoint = folders[0], LAST
+    if len(folders) > 2 and folders[1].name == CHECKPOINTS:
+        directory, checkpoint = folders[2], folders[0].name
+    if not (directory / CONFIG).is_file() or not (directory / LOCK).is_file():
+        raise InputError("config_path", str(path), f"no run has been begun there; {how}")
+    origin = Origin("config_path", str(path))
+    check_folder(directory, origin)
+    before = decode(type(config), read_recipe(directory / CONFIG))
+    for name, (was, now) in _differences(encode(before), encode(config), "").items():
+        if not was and name.rpartition(".")[2] in CONSENT:
+            continue  # a pull has dropped it, and the command line allows it anew
+        if not any(name == free or name.startswith(f"{free}.") for free in CHANGEABLE):
+            remedy = f"the run was begun with {was!r}; leave it so, or begin a new run with --policy.path"
+            raise InputError(name, now, remedy)
+    summary, checkpoints = directory / SUMMARY, directory / CHECKPOINTS
+    newest = (checkpoints / checkpoint).resolve() == (checkpoints / LAST).resolve()
+    # From an earlier checkpoint there are updates left to make.
+    if newest and summary.is_file():
+        made: Any = read_json(summary, origin).get("updates")
+        check_number(made, 0, 1e9, f"{SUMMARY}: updates", origin)
+        if made >= config.trainer.updates:
+            remedy = f"the run {directory} has made them, and has ended; ask for more"
+            raise InputError("trainer.updates", config.trainer.updates, remedy)
+    return ResumedRun(directory, checkpoint)
+
+
+def _differences(before: Any, now: Any, name: str) -> dict[str, tuple[Any, Any]]:
+    """Dotted field → old and new value, where they differ."""
+    if not (isinstance(before, dict) and isinstance(now, dict)):
+        return {} if before == now else {name: (before, now)}
+    differences: dict[str, tuple[Any, Any]] = {}
+    for key in before.keys() | now.keys():
+        differences |= _differences(before.get(key), now.get(key), f"{name}.{key}" if name else str(key))
+    return differences
+
+
+@contextmanager
+def locked(directory: Path, field: str, in_use: str) -> Iterator[int]:
+    """Keep other processes out of a folder, which is made if need be.
+
+    Args:
+        field: that the folder was given by.
+        in_use: remedy of the error if another process has locked it.
+
+    Returns:
+        A file descriptor to hand to child processes that are to keep it locked.
+
+    Raises:
+        InputError: it is in use.
+    """
+    make_folder(directory, field, again=True)
+    with (directory / LOCK).open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InputError(field, str(directory), in_use) from error
+        yield file.fileno()

@@ -28,7 +28,7 @@ from accerl_lerobot.checkpoint.layout import CONFIG as RECIPE
 from accerl_lerobot.checkpoint.layout import MANIFEST as OF_CHECKPOINT
 from accerl_lerobot.checkpoint.safety import JSON_MOST, REVISION, Origin, brief, read_bytes, unsafe_name
 from accerl_lerobot.config.parsing import drop_consents, read_recipe
-from accerl_lerobot.engine.resume import LOCK
+from accerl_lerobot.engine.stopping import LOCK
 from accerl_lerobot.errors import InputError, check_absent, expanded
 from accerl_lerobot.hub.config import REPO_TYPES, PullConfig
 from accerl_lerobot.hub.contents import RECORD

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One device answers many worlds: requests are gathered, decided in one pass, and handed back in order."""
+"""Batched inference: requests of many environments are decided in one forward pass and answered in order."""

@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When to answer: requests wait until a batch is full, or until the oldest of them has waited long enough.
+"""Batching: requests wait until a batch is full, or until the oldest of them has waited long enough.
 
-Time is passed in and never read, so the same code serves a real clock and a test. The clock of a batch
-starts with its *oldest* request: counting from the newest would let a steady trickle postpone the answer
-forever, and a clock that is set only once would serve every later request alone.
+Time is an argument, so tests need no clock. The wait of a batch starts with its *oldest* request: counting
+from the newest would let a steady trickle postpone the answer forever.
 
-In lock step, all worlds are decided for together: requests wait until as many are here as there are worlds,
-however long that takes, and are then served in as many batches as they need.
+In lock step, requests wait until there is one for every environment, however long that takes, and are then
+served in as many batches as they need.
 
-What must hold: first in, first out; a request is neither split nor reordered nor forgotten; a request waits
-for at most `max_wait_s` plus the time the batches before it take.
+Invariants: first in, first out; a request is neither split nor reordered nor forgotten; a request waits for
+at most `max_wait_s` plus the time of the batches before it.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from dataclasses import dataclass, field
 from accerl_lerobot.errors import InputError
 
 GRAIN = 1.1
-"""Ratio of neighbouring waits that are told apart."""
+"""Ratio of neighbouring bins of waits."""
 SHORTEST_S = 1e-6
 
 
@@ -43,7 +42,7 @@ class BatcherStats:
     """k → requests whose wait was about `GRAIN` to the k-th, in seconds."""
 
     def note(self, wait_s: float) -> None:
-        """Counts a request that is taken."""
+        """Count a request that is taken."""
         self.requests += 1
         self.wait_sum_s += wait_s
         self.wait_max_s = max(self.wait_max_s, wait_s)
@@ -117,7 +116,7 @@ class Batcher[R: Sized]:
         return self._observations
 
     def add(self, request: R, now: float) -> None:
-        """Queues a request.
+        """Queue a request.
 
         Args:
             request: with at least one observation.
@@ -149,7 +148,7 @@ class Batcher[R: Sized]:
         return oldest if now else oldest + self.max_wait_s
 
     def take(self, now: float) -> list[R]:
-        """Removes the next batch, due or not: the oldest requests, as many as fit, at least one.
+        """Remove the next batch, due or not: the oldest requests, as many as fit, at least one.
 
         Args:
             now: seconds, for the statistics.

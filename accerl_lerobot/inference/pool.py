@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several inference services beside each other: which caller asks which, and what they say together.
+"""Several inference replicas: which client asks which, and their statistics as of one.
 
-Rollout workers are dealt out in turn, worker i to service i modulo their number, and stay where they are:
-each service serves whole workers, so that what they ask is batched together.
+Rollout worker i asks replica i modulo their number, so the requests of a worker are batched together.
 """
 
 from __future__ import annotations
@@ -15,14 +14,14 @@ from accerl_lerobot.inference.batcher import BatcherStats
 LARGEST = ("wait_max_s", "swap_s", "publish_to_served_s")
 
 
-def dealt(workers: int, services: int) -> list[int]:
-    """Rollout workers of each service."""
-    return [len(range(index, workers, services)) for index in range(services)]
+def dealt(workers: int, replicas: int) -> list[int]:
+    """Rollout workers of each replica."""
+    return [len(range(index, workers, replicas)) for index in range(replicas)]
 
 
-def together(metrics: Sequence[dict[str, float]]) -> dict[str, float]:
-    """Reports of services, as one: sums of batches, means over batches and requests, the oldest version;
-    nothing of none."""
+def merge_metrics(metrics: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Metrics as of one replica: sums of batches, means over batches and requests, the oldest version; {} for
+    none."""
     if len(metrics) < 2:
         return dict(*metrics)
     batches = sum(m["batches"] for m in metrics)
@@ -39,8 +38,8 @@ def together(metrics: Sequence[dict[str, float]]) -> dict[str, float]:
     return found | {name: max(m[name] for m in metrics) for name in LARGEST}
 
 
-def added(stats: Sequence[BatcherStats]) -> BatcherStats:
-    """Batches of several services, as one."""
+def merge_stats(stats: Sequence[BatcherStats]) -> BatcherStats:
+    """Batches as of one replica."""
     sizes: Counter[int] = sum((Counter(s.batch_sizes) for s in stats), Counter())
     return BatcherStats(
         batches=sum(s.batches for s in stats),

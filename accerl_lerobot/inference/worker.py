@@ -1,18 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The inference process: one device answers many worlds.
+"""The inference process: one device answers many environments.
 
     consumes    requests from rollout workers; published weights
     produces    decisions, each stamped with the version of the weights that made it
     waits for   a full batch, or for the oldest request to have waited `max_wait_s`
     weights     are swapped between batches: no batch ever sees two versions
+    ends        with the process; an exception fails all requests, and the engine restarts the process
+    restarted   it has no state but weights, which the trainer gives it
 
-    ends        with the process; an exception fails every caller that waits or comes later
-    restarted   it has no state but weights, which the trainer gives it: `launch` starts another in its place
-
-One thread does all of it: it waits for callers and for the batcher's clock at once, runs the forward pass and
-replies; what is sent meanwhile lies in shared memory. Ray's calls come in on the event loop beside it, which
-only hands them over.
-"""
+One thread waits for clients and for the batcher's clock at once, runs the forward pass and replies. Ray's
+calls come in on the event loop beside it, which only hands them over."""
 
 from __future__ import annotations
 
@@ -31,43 +28,43 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import WEIGHTS
 from accerl_lerobot.config.ranges import Range, Section, Threads
 from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.fault_points import reach
+from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.inference.batcher import Batcher, BatcherStats
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
-from accerl_lerobot.transport.contract import Asked, Server, stopped
+from accerl_lerobot.transport.contract import PendingRequest, Server, stopped
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
-from accerl_lerobot.weights.channel import monotonic_clock
-from accerl_lerobot.weights.reader import Received, SharedMemoryReader
+from accerl_lerobot.weights.factory import monotonic_clock
+from accerl_lerobot.weights.shared_memory import Received, SharedMemoryReader
 
 LOOK_S = 1.0
-"""How long the thread that serves waits at most before it looks whether it is still wanted."""
+"""Longest wait of the serving thread before it checks whether it should end."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class InferenceConfig(Section, section="inference"):
-    """How decisions are batched."""
+    """Batching of decisions."""
 
     workers: Annotated[int, Range("[1, 1000]")] = 1
-    """Inference processes, each with a copy of the policy; rollout workers are dealt out over them."""
+    """Inference replicas, each with a copy of the policy; rollout worker i asks replica i modulo their
+    number."""
     max_batch: Annotated[int, Range("[1, 65536]")] = 16
-    """Observations per forward pass at most."""
+    """Largest number of observations per forward pass."""
     max_wait_s: Annotated[float, Range("[0, 10)")] = 0.002
     """How long the oldest request waits for others, seconds."""
     num_threads: Threads = 1
     """CPU threads of the forward pass."""
     max_restarts: Annotated[int, Range("[0, 1000000]")] = 3
-    """How often in a row each of them is started again alone after it died or hung, half a minute of service
-    making up for what was before; after that all workers are, from the last checkpoint."""
+    """How often in a row each replica is restarted alone after it died or hung; 30 s of service reset the
+    count. After that all workers are restarted, from the last checkpoint."""
 
 
 class InferenceWorker:
     """Becomes an asynchronous Ray actor in `launch`.
 
     Args:
-        policy: which checkpoint to load; every inference worker and the trainer load the same one.
-        config: batching.
-        version: of the weights it begins with.
+        policy: the checkpoint, the same for every replica and the trainer.
+        version: of the first weights.
         state: the ``training_state`` that holds these; None: they are the checkpoint's.
         load: makes the adapter; None: of LeRobot's checkpoint.
         timeline: folder of the timeline; None: none is kept.
@@ -89,56 +86,56 @@ class InferenceWorker:
 
         torch.set_num_threads(config.num_threads)
         self._adapter = loader(load)(policy)
-        self._batcher: Batcher[Asked] = Batcher(config.max_batch, config.max_wait_s)
+        self._batcher: Batcher[PendingRequest] = Batcher(config.max_batch, config.max_wait_s)
         self._server = Server(self._take)
         self._version = version
         if state is not None:
             self._adapter.load_trainable(snapshot.load(state / WEIGHTS))
         self._received = -1
-        # Shared by two threads: appending and popping are atomic, and only the newest of each is kept.
+        # Shared by two threads: appending and popping are atomic, and only the newest item is kept.
         self._published: deque[Received] = deque(maxlen=1)
-        self._together: deque[int] = deque(maxlen=1)
+        self._lock_step: deque[int] = deque(maxlen=1)
         self._reader: SharedMemoryReader | None = None
         self._broken: BaseException | None = None
         self._swap_s = self._publish_to_served_s = 0.0
         self._unserved_since: float | None = None
         self._failure: BaseException | None = None
         self._over = False
-        self._turn: float | None = None
-        """When the thread that serves last went round; None while there is none."""
+        self._iteration: float | None = None
+        """Start of the serving thread's last iteration; None while there is none."""
         self._busy_s = self._busy_told_s = 0.0
         self._since = time.monotonic()
         self._clock.enter(WAIT_IN)
 
     async def ready(self) -> int:
-        """Answers once the policy is loaded; returns this process's id."""
+        """Return this process's id once the policy is loaded."""
         return os.getpid()
 
     async def listen(self) -> Address:
-        """Offers shared memory to its callers and says where; before `serve`."""
+        """Offer shared memory to clients; its address. Called before `serve`."""
         self._server = server = SharedMemoryServer(self._take, copy=False)
         return server.address
 
     async def decide(self, requests: list[Request]) -> list[Decision]:
-        """Answers a caller's requests, in order, as part of some batch.
+        """Answer a client's requests, in order, as part of some batch.
 
         Raises:
             ServiceStoppedError: `serve` has failed, before or after this call began.
         """
         answer = self._server.call(requests)
-        if self._failure is not None:  # looked at after the call: `serve` hands over once more when it fails
+        if self._failure is not None:  # after the call, as `serve` hands over once more when it fails
             raise stopped(self._failure)
         decisions: list[Decision] = await asyncio.wrap_future(answer)
         return decisions
 
     async def receive_weights(self, version: int, tensors: dict[str, np.ndarray], published_s: float) -> int:
-        """Takes a published set; it serves from the next batch on. What is not newer is ignored."""
+        """Use a published set from the next batch on, if it is newer."""
         published_s = monotonic_clock(published_s)
         self._offer(Received(version=version, tensors=tensors, published_s=published_s))
         return version
 
     async def open_weights(self, address: str) -> bool:
-        """Receives weights through shared memory from now on; False if that is not to be had from here."""
+        """Receive weights through shared memory; False if that cannot be reached from here."""
         try:
             self._reader = SharedMemoryReader(address, deliver=self._offer, failed=self._break)
         except OSError:
@@ -159,11 +156,11 @@ class InferenceWorker:
 
     async def lock_step(self, observations: int) -> None:
         """See `Batcher.lock_step`."""
-        self._together.append(observations)
+        self._lock_step.append(observations)
         self._server.wake()
 
     async def serve(self) -> None:
-        """Serves until the process ends, or an exception ends it."""
+        """Serve until the process ends, or raise the serving thread's exception."""
         loop = asyncio.get_running_loop()
         ended: asyncio.Future[None] = loop.create_future()
 
@@ -181,16 +178,16 @@ class InferenceWorker:
         try:
             await ended
         finally:
-            self._over, self._turn = True, None
+            self._over, self._iteration = True, None
             self._server.wake()
 
     async def metrics(self) -> dict[str, float]:
-        """Batching statistics, the version served, the busy share since the last call, and of the last
-        swap of weights how long it took and how long after their publication they served first.
+        """Batching statistics, the version served, the busy share since the last call, the seconds of the
+        last swap of weights, and those from their publication to their first batch.
 
-        Answers while the thread that serves goes round, and is as silent as that one otherwise.
+        Does not answer while the serving thread hangs.
         """
-        while self._turn is not None and time.monotonic() - self._turn > 2 * LOOK_S:
+        while self._iteration is not None and time.monotonic() - self._iteration > 2 * LOOK_S:
             await asyncio.sleep(0.1)
         self._clock.beat()
         now, busy_s = time.monotonic(), self._busy_s
@@ -211,21 +208,21 @@ class InferenceWorker:
         return replace(stats, batch_sizes=dict(stats.batch_sizes), waits=Counter(stats.waits))
 
     def _serve(self) -> None:
-        batch: list[Asked] = []
+        batch: list[PendingRequest] = []
         try:
             while not self._over:
-                self._turn = time.monotonic()
+                self._iteration = time.monotonic()
                 self._clock.enter(WAIT_IN)
-                self._server.poll(self._patience())
-                if self._together:
-                    self._batcher.lock_step(self._together.popleft())
+                self._server.poll(self._wait_s())
+                if self._lock_step:
+                    self._batcher.lock_step(self._lock_step.popleft())
                 self._swap()
                 if self._batcher.due(time.monotonic()):
                     batch = self._batcher.take(time.monotonic())
                     self._serve_batch(batch)
                     batch = []
         except BaseException as error:
-            self._failure, self._turn = error, None
+            self._failure, self._iteration = error, None
             if self._reader is not None:
                 self._reader.close()
             self._server.poll(0.0)
@@ -236,14 +233,14 @@ class InferenceWorker:
             self._server.close()
             raise
 
-    def _take(self, asked: Asked) -> None:
+    def _take(self, asked: PendingRequest) -> None:
         try:
             self._batcher.add(asked, asked.sent)
         except (TypeError, ValueError) as error:  # no list of requests, or an empty one
             asked.fail(error)
 
-    def _patience(self) -> float:
-        """How long nothing is to be done unless something comes, in seconds."""
+    def _wait_s(self) -> float:
+        """Seconds to wait for something to come."""
         deadline = self._batcher.next_deadline()
         return LOOK_S if deadline is None else max(0.0, deadline - time.monotonic())
 
@@ -257,14 +254,14 @@ class InferenceWorker:
             received.release()
             self._swap_s = time.monotonic() - started
             self._version, self._unserved_since = received.version, received.published_s
-            reach("inference.swapped")
+            fault_point("inference.swapped")
 
-    def _serve_batch(self, batch: list[Asked]) -> None:
+    def _serve_batch(self, batch: list[PendingRequest]) -> None:
         batch = [asked for asked in batch if not asked.gone]
         requests = [request for asked in batch for request in asked.message]
         started = time.monotonic()
         self._clock.enter(COMPUTE)
-        broken = reach("inference.batch")
+        broken = fault_point("inference.batch")
         decisions = self._adapter.decide(requests, self._version) if requests else []
         for decision in decisions if broken else ():
             decision.log_prob.fill(np.nan)

@@ -20,7 +20,7 @@ import numpy as np
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Origin, Segment
-from accerl_lerobot.fault_points import reach
+from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.metrics import cut_back
 
 EPISODES = "episodes.jsonl"
@@ -80,7 +80,7 @@ class Journal:
             "action_dim": size,
             "actions": base64.b64encode(actions.astype("<f4").tobytes()).decode(),
         }
-        reach("replay.journal")
+        fault_point("replay.journal")
         self._file.write((json.dumps(line) + "\n").encode())
         self._file.flush()
 

@@ -24,15 +24,14 @@ import numpy as np
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import REAL, Segment
-from accerl_lerobot.fault_points import reach
+from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.replay.journal import EPISODES, Journal
 from accerl_lerobot.replay.mixed import MixedReplay
 from accerl_lerobot.replay.pacing import ReplayConfig
 from accerl_lerobot.replay.turns import Schedule, Turns
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
 from accerl_lerobot.transport.contract import stopped
-from accerl_lerobot.transport.on_loop import serve_on_loop
-from accerl_lerobot.transport.shared_memory import Address
+from accerl_lerobot.transport.shared_memory import Address, serve_on_loop
 
 IN_TRANSIT = 1024
 """Newest real segments that are kept for those who dream, who ask for them several times a second."""
@@ -167,7 +166,7 @@ class ReplayWorker:
                     return []
                 self._clock.enter(COMPUTE)
                 with self._failing():
-                    reach("replay.sample")
+                    fault_point("replay.sample")
                     segments = self._replay.sample(num_decisions, trainer_version, self._rng)
                 self._clock.enter(WAIT_IN)
                 self._changed.notify_all()
@@ -217,7 +216,7 @@ class ReplayWorker:
     async def save(self, directory: Path, version: int) -> None:
         """Writes its part of ``training_state``, as it was when the trainer had made `version` updates."""
         self._clock.enter(CHECKPOINT)
-        reach("replay.save")
+        fault_point("replay.save")
         state = {
             "replay": self._replay.state(version),
             "rng": copy.deepcopy(self._rng),
@@ -227,7 +226,7 @@ class ReplayWorker:
         await asyncio.to_thread(snapshot.save, directory / "replay", state)
 
     def _insert(self, segment: Segment) -> None:
-        reach("replay.insert")
+        fault_point("replay.insert")
         if self._replay.insert(segment) and segment.source == REAL:
             self._real.append(segment)
             self._real_count += 1

@@ -7,7 +7,7 @@ import shlex
 from pathlib import Path
 
 from accerl_lerobot.checkpoint.layout import CONFIG
-from accerl_lerobot.engine.resume import how_to_go_on
+from accerl_lerobot.engine.stopping import resume_command
 from accerl_lerobot.report.read import Run
 
 PLUGIN = "accerl_lerobot.envs.lerobot_plugin"
@@ -18,7 +18,7 @@ def commands(run: Run) -> list[tuple[str, str]]:
     recipe = _quoted(run.path / CONFIG)
     found = []
     if run.verb == "train" and run.result is None:
-        found.append(("Go on with it, if it has stopped", how_to_go_on(run.path)))
+        found.append(("Go on with it, if it has stopped", resume_command(run.path)))
     found.append(
         (
             "Run it again; choose a folder that does not exist yet",

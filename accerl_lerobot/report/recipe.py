@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from accerl_lerobot.config.parsing import TYPE, choices_of, decode, encode, section_of
-from accerl_lerobot.engine.staleness import lag_limits
+from accerl_lerobot.engine.preflight import lag_limits
 from accerl_lerobot.errors import InputError
 
 Flat = dict[str, Any]

@@ -26,13 +26,12 @@ import numpy as np
 
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.experience import Decision, Request, Segment
-from accerl_lerobot.fault_points import reach
+from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig, RolloutRunner
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, open_clock
-from accerl_lerobot.transport.contract import Caller
-from accerl_lerobot.transport.endpoint import Endpoint
-from accerl_lerobot.transport.lasting import LastingCaller
+from accerl_lerobot.transport.contract import Client
+from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
 
 PARTS = 2
 """A worker's worlds are asked for in so many parts: one is stepped while the other's decisions are made."""
@@ -112,7 +111,7 @@ class RolloutWorker:
         self._entered: float | None = None
         self._moved: float | None = None
         self._outbox: list[Segment] = []
-        self._deciding = LastingCaller("inference")
+        self._deciding = ReconnectingClient("inference")
         worlds = [make_world(env, history) for _ in range(config.worlds)]
         name = f"rollout{index}.{incarnation}"
         self._runner = RolloutRunner(
@@ -194,11 +193,11 @@ class RolloutWorker:
                 for slot, decision in zip(under_way.pop(ticket), decisions, strict=True):
                     self._advance(slot, decision, due, idle)
 
-    def _bring(self, door: Caller, at_the_door: set[int], size: int) -> None:
+    def _bring(self, door: Client, at_the_door: set[int], size: int) -> None:
         """Brings segments to replay; those of a whole group may come at once, and its pace is for a few."""
         while self._outbox and len(at_the_door) < QUEUE:
             self._clock.enter(TRANSPORT)
-            if reach("rollout.send"):
+            if fault_point("rollout.send"):
                 self._outbox[0].reward = self._outbox[0].reward * np.float32(np.nan)
             at_the_door.add(door.send(self._outbox[:size]))
             del self._outbox[:size]
@@ -218,9 +217,9 @@ class RolloutWorker:
 
     def _advance(self, slot: int, decision: Decision, due: dict[int, Request], idle: list[int]) -> None:
         self._clock.enter(COMPUTE)
-        reach("rollout.decided")
+        fault_point("rollout.decided")
         with self._in_world():
-            reach("rollout.step")
+            fault_point("rollout.step")
             request = self._runner.advance(slot, decision)
         if request is None:
             idle.append(slot)

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.fault_points import reach
+from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.timeline.states import RECOVERY, STATES, role_of
 
 FORMAT = 1
@@ -90,7 +90,7 @@ class Parts:
             state: that it has entered.
             totals: nanoseconds in each state up to then.
         """
-        reach(self._point)
+        fault_point(self._point)
         if sys.byteorder == "big":
             entries.byteswap()
         self._file.write(entries.tobytes())

@@ -25,15 +25,15 @@ from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import WEIGHTS
 from accerl_lerobot.experience import Segment
-from accerl_lerobot.fault_points import reach
+from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.trainer.config import TrainerConfig
 
 if TYPE_CHECKING:
     from accerl_lerobot.trainer.off_policy import OffPolicyUpdate
     from accerl_lerobot.trainer.ranks import Ranks
+    from accerl_lerobot.trainer.rendezvous import Rendezvous
     from accerl_lerobot.trainer.update import Update
-    from accerl_lerobot.transport.meeting import Meeting
 
 LOAD_S = 600.0
 """How long a rank may take to load its policy."""
@@ -110,15 +110,15 @@ class TrainerRank:
         """Nothing: the first rank reports for all. Answering shows that it is not stuck."""
         return {}
 
-    def join(self, meeting: Meeting) -> None:
+    def join(self, rendezvous: Rendezvous) -> None:
         """Meets the others."""
         from accerl_lerobot.trainer import ranks
-        from accerl_lerobot.transport.meeting import LOOPBACK, only_at, visit
+        from accerl_lerobot.trainer.rendezvous import LOOPBACK, join, use_only
 
         config = self._config
-        here = meeting.address == LOOPBACK
-        only_at(LOOPBACK if here else ray.util.get_node_ip_address())
-        store = visit(meeting, config.ranks, config.rank_timeout_s)
+        here = rendezvous.address == LOOPBACK
+        use_only(LOOPBACK if here else ray.util.get_node_ip_address())
+        store = join(rendezvous, config.ranks, config.rank_timeout_s)
         group = ranks.Group(
             store, self._rank, config.ranks, self._learner.adapter.device, config.rank_timeout_s
         )
@@ -126,7 +126,7 @@ class TrainerRank:
 
     def step(self, segments: Sequence[Segment]) -> None:
         """Its part of an update."""
-        reach("rank.step")
+        fault_point("rank.step")
         self._update.step(segments)
 
     def lend_weights(self) -> None:
@@ -158,7 +158,7 @@ class Peers:
     def begin(self, learner: Learner) -> Update | OffPolicyUpdate:
         """Meets them, once they have loaded their policies."""
         from accerl_lerobot.trainer import ranks
-        from accerl_lerobot.transport.meeting import LOOPBACK, host, only_at
+        from accerl_lerobot.trainer.rendezvous import LOOPBACK, create, use_only
 
         if not self._actors:
             return learner.begin(ranks.Ranks())
@@ -167,10 +167,10 @@ class Peers:
         address = LOOPBACK
         if set(nodes) != {str(ray.get_runtime_context().get_node_id())}:
             address = ray.util.get_node_ip_address()
-        only_at(address)
+        use_only(address)
         size, timeout_s = self._config.ranks, self._config.rank_timeout_s
-        store, meeting = host(address, size, timeout_s)
-        with self.joining("join", meeting):
+        store, rendezvous = create(address, size, timeout_s)
+        with self.joining("join", rendezvous):
             return learner.begin(ranks.Group(store, 0, size, learner.adapter.device, timeout_s))
 
     @contextmanager

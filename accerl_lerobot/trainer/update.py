@@ -38,7 +38,7 @@ from accerl_lerobot.algorithms.ratio import present
 from accerl_lerobot.checkpoint.optimizers import optimizer_state, restore_optimizer
 from accerl_lerobot.checkpoint.tensors import whole
 from accerl_lerobot.experience import Segment
-from accerl_lerobot.fault_points import reach
+from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.adapter import PolicyAdapter
 from accerl_lerobot.trainer.batch import Batch, Part, collate, pick, turns
 from accerl_lerobot.trainer.config import TrainerConfig
@@ -126,7 +126,7 @@ class Update:
         lr, value_lr = self._set_rates()
         self.optimizer.zero_grad(set_to_none=True)
         metrics = self._backward(batch)
-        reach("trainer.backward")
+        fault_point("trainer.backward")
         if self.version < self._policy_start:
             for parameter in self._policy:  # its moments in the optimiser begin with its learning rate
                 parameter.grad = None
@@ -246,7 +246,7 @@ class Update:
             share = len(rows) / len(batch) if turn.own else 0.0
             synchronise(self.adapter, number == len(parts))
             loss = output.loss * share * self.ranks.size  # a gradient is the mean over ranks
-            (loss * math.nan if reach("trainer.loss") else loss).backward()
+            (loss * math.nan if fault_point("trainer.loss") else loss).backward()
             _add(means, {k: float(v) if turn.own else 0.0 for k, v in output.means.items()}, share)
             rows_of_samples = output.samples.rows()
             samples.append(rows_of_samples if turn.own else rows_of_samples[:0])

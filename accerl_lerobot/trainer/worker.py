@@ -23,16 +23,15 @@ import ray
 from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
-from accerl_lerobot.fault_points import reach
+from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.nonfinite import keeping
 from accerl_lerobot.trainer.peers import Learner, Peers
-from accerl_lerobot.weights.choice import CONNECT_S, Publishers, join, make_publisher
-from accerl_lerobot.weights.held_back import HeldBack
-from accerl_lerobot.weights.publisher import Publisher
+from accerl_lerobot.weights.factory import CONNECT_S, WeightPublisher, make_publisher
+from accerl_lerobot.weights.publisher import PublishDelay
 
 
 class TrainerWorker:
@@ -69,7 +68,7 @@ class TrainerWorker:
         self._lock = threading.Lock()
         self._kept: Any = None
         self._in_turn = False
-        self._publisher: Publisher | Publishers | None = None
+        self._publisher: WeightPublisher | None = None
         self._publishing = threading.Event()
         """Set once the first weights have been published."""
         self._handed_over = -1
@@ -123,12 +122,12 @@ class TrainerWorker:
             raise TimeoutError(f"the trainer has published no weights for {2 * CONNECT_S:g} s")
         assert self._publisher is not None
         newest = self._handed_over
-        join(self._publisher, reader)
+        self._publisher.add(reader)
         return newest
 
-    def _train(self, replay: Any, publisher: Publisher | Publishers) -> None:
+    def _train(self, replay: Any, publisher: WeightPublisher) -> None:
         """Makes the updates."""
-        held = HeldBack(self._config.hold_back)
+        held = PublishDelay(self._config.hold_back)
         n, config = self._config.batch_decisions, self._config
         upcoming = replay.sample.remote(n, self._update.version)
         asked = time.monotonic()
@@ -146,7 +145,7 @@ class TrainerWorker:
             with self._lock:
                 self._clock.enter(COMPUTE)
                 started = time.monotonic()
-                reach("trainer.update")
+                fault_point("trainer.update")
                 with self._peers.joining("step", batch), keeping(self._directory, self._update, segments):
                     metrics = self._update.step(segments)
                 updated = time.monotonic()
@@ -170,7 +169,7 @@ class TrainerWorker:
                 # It has ended early, and what is evaluated is to be what is saved.
                 self._publish(publisher, held, last=True)
 
-    def _publish(self, publisher: Publisher | Publishers, held: HeldBack, last: bool) -> None:
+    def _publish(self, publisher: WeightPublisher, held: PublishDelay, last: bool) -> None:
         """Hands the weights of now over, or those that are old enough."""
         if not held.updates:
             self._hand_over(publisher, self._update.version, self._view())
@@ -178,8 +177,8 @@ class TrainerWorker:
         for due in held.push(self._update.version, self._export(), last=last):
             self._hand_over(publisher, *due)
 
-    def _hand_over(self, publisher: Publisher | Publishers, version: int, tensors: dict[str, Any]) -> None:
-        reach("trainer.publish")
+    def _hand_over(self, publisher: WeightPublisher, version: int, tensors: dict[str, Any]) -> None:
+        fault_point("trainer.publish")
         publisher.publish(version, tensors)
         self._handed_over = version
 
@@ -207,7 +206,7 @@ class TrainerWorker:
     def write(self, directory: Path) -> None:
         """Writes what is kept: ``pretrained_model`` and its part of ``training_state``."""
         (weights, trained, state), self._kept = self._kept, None
-        reach("trainer.write")
+        fault_point("trainer.write")
         self._update.adapter.save(directory / PRETRAINED, self._policy, weights)
         snapshot.save(directory / TRAINING_STATE / WEIGHTS, trained)
         snapshot.save(directory / TRAINING_STATE / "trainer", state)

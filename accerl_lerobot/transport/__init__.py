@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From worker to worker of one node: a message there, its answer back, whatever carries them."""
+"""Messages between workers: shared memory on a node, Ray between nodes."""

@@ -1,70 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages as bytes: a skeleton that says how they are put together, their arrays, their other values.
+"""Messages as bytes: a JSON header that holds everything but the arrays, then the arrays.
 
-    0    two sizes, of the skeleton and of the values
-    8    the skeleton: JSON, the same for all messages of equal structure
+    0    size of the header
+    4    the header: values as they are, ``[code, …]`` for everything that JSON does not know
          each array, at a multiple of 64 bytes
-         the values: a JSON list of all numbers, texts and None, in the order of the skeleton
 
-A skeleton names kinds of things (see `snapshot.kind`), fields, keys, dtypes and shapes, so all offsets follow
-from it and none is read. Taking one apart is paid for once: messages between workers have few structures, and
-those are remembered. Nothing that is read is ever executed; what does not fit is a `DamagedMessageError`.
+Offsets follow from the dtypes and shapes in the header, so none is read. Nothing that is read is executed;
+whatever does not fit raises `DamagedMessageError`.
 """
 
 from __future__ import annotations
 
+import functools
 import json
-import math
 import re
 import struct
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from accerl_lerobot.checkpoint.snapshot import field_names, kind_named
-from accerl_lerobot.transport.nameless import aligned
+from accerl_lerobot.transport.memfd import ALIGNMENT, aligned
 
-SIZES = struct.Struct("<II")
-REMEMBERED = 1024
-"""Structures that are remembered; a process that has met more begins anew."""
+SIZE = struct.Struct("<I")
 NUMBERS = "biuf"
-"""Dtypes that travel, see `numpy.dtype.kind`: none of them holds Python objects."""
+"""Dtypes that can be sent, see `numpy.dtype.kind`: none of them holds Python objects."""
 
-VALUE, ARRAY, SCALAR, LIST, TUPLE, DICT, KIND = range(7)
-"""The first entry of each node of a skeleton; a value is no more than that."""
+ARRAY, SCALAR, LIST, TUPLE, KIND = range(5)
+"""The first entry of every JSON list in a header. A dict is a JSON object."""
 _VALUES = frozenset((bool, int, float, str, type(None)))
-_from_json = json.JSONDecoder().raw_decode
 _to_json = json.JSONEncoder(separators=(",", ":"), check_circular=False).encode
-
-Shaped = tuple[tuple[int, ...], np.dtype[Any]]
-Next = Callable[[], Any]
-Build = Callable[[Next, Next], Any]
-"""From the next value and the next array to a part of a message."""
 
 
 class DamagedMessageError(ValueError):
     """Bytes that no `Encoded.write` has written."""
-
-
-class Layout(NamedTuple):
-    """Common layout of all messages of one structure, as their writer sees it."""
-
-    skeleton: bytes
-    offsets: list[int]
-    """Offsets of the arrays."""
-    end: int
-    """Where the values begin."""
-
-
-class Plan(NamedTuple):
-    """The same as who reads them sees it."""
-
-    arrays: list[tuple[tuple[int, ...], np.dtype[Any], int]]
-    """Shape, dtype and offset of each."""
-    end: int
-    values: int
-    build: Build
 
 
 class Encoded(NamedTuple):
@@ -78,210 +47,142 @@ class Encoded(NamedTuple):
         [Request(observation={'task': 'push'}, noise_seed=7, explore=True)]
     """
 
-    layout: Layout
-    values: bytes
+    header: bytes
     arrays: list[np.ndarray]
-
-    @property
-    def size(self) -> int:
-        """Bytes that it takes."""
-        return self.layout.end + len(self.values)
+    offsets: list[int]
+    size: int
 
     def write(self, buffer: Any, start: int) -> None:
-        """Copies it into a writable buffer from `start` on, a multiple of `nameless.ALIGNMENT`."""
-        skeleton, offsets, end = self.layout
-        head = start + SIZES.size
-        SIZES.pack_into(buffer, start, len(skeleton), len(self.values))
-        buffer[head : head + len(skeleton)] = skeleton
-        for array, offset in zip(self.arrays, offsets, strict=True):
+        """Copy it into a writable buffer from `start` on, a multiple of `memfd.ALIGNMENT`."""
+        SIZE.pack_into(buffer, start, len(self.header))
+        head = start + SIZE.size
+        buffer[head : head + len(self.header)] = self.header
+        for array, offset in zip(self.arrays, self.offsets, strict=True):
             np.ndarray(array.shape, array.dtype, buffer, start + offset)[...] = array
-        buffer[start + end : start + end + len(self.values)] = self.values
 
 
 def encode(message: Any) -> Encoded:
-    """Takes a message apart: lists, tuples, dicts with texts as keys, known kinds, arrays, plain values.
+    """Encode lists, tuples, dicts with str keys, registered kinds, arrays and plain values.
 
     Raises:
-        TypeError: it holds something else.
+        TypeError: the message holds something else.
     """
-    structure: list[Any] = []
-    values: list[Any] = []
     arrays: list[np.ndarray] = []
     try:
-        _take_apart(message, structure, values, arrays)
+        header = _to_json(_node(message, arrays)).encode()
     except RecursionError:
         raise TypeError("what holds itself cannot be sent") from None
-    key = tuple(structure)
-    layout = _layouts.get(key)
-    if layout is None:
-        layout = _remember(_layouts, key, _lay_out(message, arrays))
-    return Encoded(layout, _to_json(values).encode(), arrays)
+    offsets, end = [], SIZE.size + len(header)
+    for array in arrays:
+        offsets.append(aligned(end))
+        end = offsets[-1] + array.nbytes
+    return Encoded(header, arrays, offsets, end)
 
 
 def decode(buffer: Any, start: int, size: int, *, copy: bool = True) -> Any:
-    """The message that was written.
+    """Decode the message that takes `size` bytes from `start` on.
 
     Args:
-        buffer: that holds it, among other things.
-        start: where it begins.
-        size: bytes that it takes.
         copy: False: its arrays are views of the buffer.
 
     Raises:
         DamagedMessageError: this is no message, or not all of one.
     """
     try:
-        if not 0 <= start <= start + size <= len(buffer):
+        if not 0 <= start <= start + SIZE.size <= start + size <= len(buffer):
             raise ValueError(f"{size} bytes from {start} on are not in a buffer of {len(buffer)}")
-        if size < SIZES.size:
-            raise ValueError("not even its sizes")
-        head, count = start + SIZES.size, SIZES.unpack_from(buffer, start)
-        if SIZES.size + count[0] > size:
-            raise ValueError(f"a skeleton of {count[0]} bytes in {size}")
-        skeleton = bytes(buffer[head : head + count[0]])
-        plan = _plans.get(skeleton)
-        if plan is None:
-            plan = _remember(_plans, skeleton, _plan(skeleton))
-        if plan.end + count[1] != size:
-            raise ValueError(f"{size} bytes where its skeleton and values take {plan.end + count[1]}")
-        text = str(buffer[start + plan.end : start + size], "utf-8")
-        values, end = _from_json(text)
-        fits = type(values) is list and len(values) == plan.values and end == len(text)
-        if not (fits and _VALUES.issuperset(map(type, values))):
-            raise ValueError(f"not the {plan.values} values of its skeleton")
-        arrays: list[Any] = [
-            np.ndarray(shape, dtype, buffer, start + offset) for shape, dtype, offset in plan.arrays
-        ]
-        if copy:
-            arrays = [array.copy() for array in arrays]
-        return plan.build(iter(values).__next__, iter(arrays).__next__)
+        head = start + SIZE.size
+        (length,) = SIZE.unpack_from(buffer, start)
+        if SIZE.size + length > size:
+            raise ValueError(f"a header of {length} bytes in {size}")
+        reader = _Reader(buffer, start, SIZE.size + length, copy)
+        message = reader.read(json.loads(bytes(buffer[head : head + length])))
+        if reader.end != size:
+            raise ValueError(f"{size} bytes where its header and arrays take {reader.end}")
+        return message
     except (ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError) as error:
         raise DamagedMessageError(f"a message that cannot be read: {error}") from error
 
 
-_layouts: dict[tuple[Any, ...], Layout] = {}
-_plans: dict[bytes, Plan] = {}
-_fields: dict[type[Any], tuple[str, ...]] = {}
-
-
-def _remember[K, V](memory: dict[K, V], key: K, value: V) -> V:
-    if len(memory) >= REMEMBERED:
-        memory.clear()
-    memory[key] = value
-    return value
-
-
-def _take_apart(part: Any, structure: list[Any], values: list[Any], arrays: list[np.ndarray]) -> None:
-    """Appends a part's leaves, and to `structure` what tells it from parts put together otherwise."""
-    cls = type(part)
+def _node(part: Any, arrays: list[np.ndarray]) -> Any:
+    """The header's entry for a part; appends the arrays in it."""
+    cls: Any = type(part)
     if cls in _VALUES:
-        structure.append(VALUE)
-        values.append(part)
-    elif cls is np.ndarray:
-        structure += (ARRAY, part.dtype, part.shape)
-        arrays.append(part)
-    elif cls is dict:
-        structure += (DICT, tuple(part))
-        for inner in part.values():
-            _take_apart(inner, structure, values, arrays)
-    elif cls is list or cls is tuple:
-        structure += (LIST if cls is list else TUPLE, len(part))
-        for inner in part:
-            _take_apart(inner, structure, values, arrays)
-    elif isinstance(part, np.generic):
-        structure += (SCALAR, part.dtype)
-        arrays.append(np.asarray(part))
-    else:
-        structure += (KIND, cls)
-        for name in _fields.get(cls) or _fields_of(cls):
-            _take_apart(getattr(part, name), structure, values, arrays)
-
-
-def _fields_of(cls: type[Any]) -> tuple[str, ...]:
-    if kind_named(cls.__name__) is not cls:
-        raise TypeError(f"a {cls.__name__} cannot be sent")
-    return _remember(_fields, cls, field_names(cls))
-
-
-def _lay_out(message: Any, arrays: list[np.ndarray]) -> Layout:
-    skeleton = _to_json(_skeleton(message)).encode()
-    kinds = [(array.shape, array.dtype) for array in arrays]
-    return Layout(skeleton, *_places(len(skeleton), kinds))
-
-
-def _places(skeleton: int, arrays: list[Shaped]) -> tuple[list[int], int]:
-    """The arrays' offsets behind a skeleton of so many bytes, and where they end."""
-    offsets, end = [], SIZES.size + skeleton
-    for shape, dtype in arrays:
-        offsets.append(aligned(end))
-        end = offsets[-1] + math.prod(shape) * dtype.itemsize
-    return offsets, end
-
-
-def _skeleton(part: Any) -> Any:
-    """A part without its leaves, as JSON has it."""
-    cls = type(part)
-    if cls in _VALUES:
-        return VALUE
-    if isinstance(part, np.generic | np.ndarray):
+        return part
+    if cls is np.ndarray or isinstance(part, np.generic):
         if part.dtype.kind not in NUMBERS:
             raise TypeError(f"an array of {part.dtype} cannot be sent")
-        return [SCALAR, part.dtype.str] if cls is not np.ndarray else [ARRAY, part.dtype.str, part.shape]
+        arrays.append(np.asarray(part))
+        return [ARRAY, part.dtype.str, *part.shape] if cls is np.ndarray else [SCALAR, part.dtype.str]
     if cls is dict:
         if not all(type(key) is str for key in part):
             raise TypeError("a dict whose keys are not texts cannot be sent")
-        return [DICT, list(part), [_skeleton(inner) for inner in part.values()]]
+        return {key: _node(inner, arrays) for key, inner in part.items()}
     if cls is list or cls is tuple:
-        return [LIST if cls is list else TUPLE, [_skeleton(inner) for inner in part]]
-    return [KIND, cls.__name__, [_skeleton(getattr(part, name)) for name in _fields_of(cls)]]
+        return [LIST if cls is list else TUPLE, *[_node(inner, arrays) for inner in part]]
+    names = _fields(cls)
+    return [KIND, cls.__name__, *[_node(getattr(part, name), arrays) for name in names]]
 
 
-def _plan(skeleton: bytes) -> Plan:
-    arrays: list[Shaped] = []
-    values: list[None] = []
-    build = _builder(json.loads(skeleton), arrays, values)
-    offsets, end = _places(len(skeleton), arrays)
-    placed = [(shape, dtype, offset) for (shape, dtype), offset in zip(arrays, offsets, strict=True)]
-    return Plan(placed, end, len(values), build)
+class _Reader:
+    """Builds a message from its header; takes arrays one after the other.
+
+    Args:
+        end: where the header ends, counted from `start`.
+    """
+
+    def __init__(self, buffer: Any, start: int, end: int, copy: bool) -> None:
+        self._buffer, self._start, self._copy = buffer, start, copy
+        self.end = end
+
+    def read(self, node: Any) -> Any:
+        """Build the part that a header's entry stands for."""
+        if type(node) is dict:
+            return {key: self.read(inner) for key, inner in node.items()}
+        if type(node) is not list:
+            return node
+        code = node[0]
+        if code == ARRAY:
+            return self._array(node)
+        if code == LIST:
+            return [self.read(inner) for inner in node[1:]]
+        if code == KIND:
+            cls, names = _kind(node[1])
+            parts = [self.read(inner) for inner in node[2:]]
+            return cls(**dict(zip(names, parts, strict=True)))
+        if code == TUPLE:
+            return tuple([self.read(inner) for inner in node[1:]])
+        if code == SCALAR and len(node) == 2:
+            return self._array(node)[()]
+        raise ValueError(f"an entry {str(node)[:80]}")
+
+    def _array(self, node: list[Any]) -> Any:
+        dtype, shape, offset = _dtype(node[1]), node[2:], -(-self.end // ALIGNMENT) * ALIGNMENT
+        # NumPy refuses lengths that are no numbers or below 0, and arrays beyond the buffer.
+        array: np.ndarray = np.ndarray(shape, dtype, self._buffer, self._start + offset)
+        self.end = offset + array.nbytes
+        return array.copy() if self._copy else array
 
 
-def _builder(node: Any, arrays: list[Any], values: list[None]) -> Build:
-    """How to put a part together; counts its leaves."""
-    if node == VALUE and type(node) is int:
-        values.append(None)
-        return lambda value, array: value()
-    what, *rest = node
-    if what in (ARRAY, SCALAR):
-        return _leaf(what, rest, arrays)
-    parts = [_builder(inner, arrays, values) for inner in rest[-1]]
-    if what == LIST:
-        return lambda value, array: [part(value, array) for part in parts]
-    if what == TUPLE:
-        return lambda value, array: tuple([part(value, array) for part in parts])
-    names, cls = (rest[0], None) if what == DICT else _named(what, rest[0])
-    if len(names) != len(parts) or not all(type(name) is str for name in names):
-        raise ValueError(f"{len(parts)} parts for {names!r}")
-    pairs = list(zip(names, parts, strict=True))
-    if cls is None:
-        return lambda value, array: {name: part(value, array) for name, part in pairs}
-    return lambda value, array: cls(**{name: part(value, array) for name, part in pairs})
+@functools.lru_cache(maxsize=256)
+def _fields(cls: Any) -> tuple[str, ...]:
+    registered = kind_named(cls.__name__)
+    if registered is None or registered is not cls:
+        raise TypeError(f"a {cls.__name__} cannot be sent")
+    return field_names(registered)
 
 
-def _leaf(what: int, rest: list[Any], arrays: list[Any]) -> Build:
-    name, shape = rest[0], tuple(rest[1]) if what == ARRAY else ()
-    # NumPy takes many texts for a dtype, and parses some of them as Python.
-    fits = type(name) is str and re.fullmatch(rf"[<>|][{NUMBERS}]\d{{1,2}}", name)
-    if not fits or not all(type(length) is int and length >= 0 for length in shape):
-        raise ValueError(f"an array of {rest!r}")
-    dtype = np.dtype(name)
-    arrays.append((shape, dtype))
-    if what == ARRAY:
-        return lambda value, array: array()
-    return lambda value, array: array()[()]
-
-
-def _named(what: Any, name: Any) -> tuple[tuple[str, ...], type[Any]]:
-    cls = kind_named(name) if what == KIND and type(name) is str else None
+@functools.lru_cache(maxsize=256)
+def _kind(name: str) -> tuple[type[Any], tuple[str, ...]]:
+    cls = kind_named(name)
     if cls is None:
         raise ValueError(f"no kind of thing is called {name!r}")
-    return field_names(cls), cls
+    return cls, field_names(cls)
+
+
+@functools.lru_cache(maxsize=256)
+def _dtype(name: str) -> np.dtype[Any]:
+    # NumPy takes many texts for a dtype, and parses some of them as Python.
+    if type(name) is not str or not re.fullmatch(rf"[<>|][{NUMBERS}]\d{{1,2}}", name):
+        raise ValueError(f"a dtype {name!r}")
+    return np.dtype(name)

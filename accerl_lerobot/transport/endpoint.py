@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a service is reached, and by which transport."""
+"""Connections to a service: which transport leads there, Ray's, and one that outlives the service."""
 
 from __future__ import annotations
 
+import threading
+import time
+from collections import deque
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.transport.contract import Caller
-from accerl_lerobot.transport.nameless import available
-from accerl_lerobot.transport.shared_memory import Address, SharedMemoryCaller, this_node
+from accerl_lerobot.transport.contract import Client, ServiceStoppedError
+from accerl_lerobot.transport.memfd import available
+from accerl_lerobot.transport.shared_memory import Address, SharedMemoryClient, this_node
 
 Transport = Literal["auto", "ray", "shared_memory"]
 FIELD = "launch.transport"
@@ -21,36 +24,34 @@ class Endpoint:
 
     Example:
         >>> inference = Endpoint(name="inference", method=actor.decide, address=address)
-        >>> caller = inference.connect()  # in the process that calls
+        >>> client = inference.connect()  # in the process that calls
     """
 
     name: str
     """Name of the service, for messages."""
     method: Any
-    """Method of the actor's handle; the way through Ray."""
+    """Method of its Ray actor handle."""
     address: Address | None = None
-    """Address of its shared memory; None: only Ray leads there."""
+    """Address of its shared memory; None: it can only be reached through Ray."""
     transport: Transport = "auto"
 
-    def connect(self) -> Caller:
-        """A connection of this process's own.
+    def connect(self) -> Client:
+        """Open a connection for this process.
 
         Raises:
             InputError: shared memory was asked for, and the service is on another node.
             ServiceStoppedError: the service is gone.
         """
         if self.address is not None and available() and self.address.node == this_node():
-            return SharedMemoryCaller(self.name, self.address)
+            return SharedMemoryClient(self.name, self.address)
         if self.transport == "shared_memory":
             remedy = f"{self.name} is on another node; use auto or ray"
             raise InputError(FIELD, self.transport, remedy)
-        from accerl_lerobot.transport.ray_calls import RayCaller
-
-        return RayCaller(self.name, self.method)
+        return RayClient(self.name, self.method)
 
 
-def listens(transport: Transport) -> bool:
-    """True if services are to offer shared memory to their callers.
+def uses_shared_memory(transport: Transport) -> bool:
+    """True if services are to offer shared memory.
 
     Raises:
         InputError: it was asked for and this system does not have it.
@@ -58,3 +59,164 @@ def listens(transport: Transport) -> bool:
     if transport == "shared_memory" and not available():
         raise InputError(FIELD, transport, "this system has no memfd, epoll and eventfd; use auto or ray")
     return transport != "ray" and available()
+
+
+class RayClient(Client):
+    """Calls an actor's method, by value: from any node to any other.
+
+    Args:
+        name: of the service, for messages.
+        method: of its handle; takes one message and returns the reply.
+    """
+
+    def __init__(self, name: str, method: Any) -> None:
+        super().__init__(name)
+        import ray
+
+        self._ray, self._method = ray, method
+        self._tickets: dict[Any, int] = {}
+        """Reference → ticket."""
+        self._sent = 0
+
+    def send(self, message: Any) -> int:
+        self._sent += 1
+        try:
+            self._tickets[self._method.remote(message)] = self._sent
+        except self._ray.exceptions.RayError as error:
+            raise ServiceStoppedError(f"{self.name}: {error}") from error
+        return self._sent
+
+    def done(self, timeout: float) -> list[tuple[int, Any]]:
+        references = list(self._tickets)
+        if not references:
+            time.sleep(timeout)
+            return []
+        ready, others = self._ray.wait(references, timeout=timeout)
+        if ready and others:
+            ready += self._ray.wait(others, num_returns=len(others), timeout=0)[0]
+        try:
+            return [(self._tickets.pop(reference), self._ray.get(reference)) for reference in ready]
+        except self._ray.exceptions.RayError as error:
+            raise ServiceStoppedError(f"{self.name}: {error}") from error
+
+    def forget(self, ticket: int) -> None:
+        self._tickets = {reference: t for reference, t in self._tickets.items() if t != ticket}
+
+    def close(self) -> None:
+        self._tickets.clear()
+
+
+class ReconnectingClient(Client):
+    """Asks a restarted service again what its predecessor has not answered.
+
+    For services without a state of their own: a request for a decision carries its noise, and the decision
+    the version of its weights. While the service is away no replies come and nothing fails; the engine
+    restarts it and says where it is. Messages must not change until they are answered.
+
+    Example:
+        >>> client = ReconnectingClient("inference")
+        >>> client.move(endpoint)      # on any thread; again whenever the service has been restarted
+        >>> ticket = client.send([request])
+        >>> client.done(timeout=0.5)   # empty while the service is away
+        []
+        >>> client.away_s  # since it was lost
+        0.5
+
+    Args:
+        name: of the service, for messages.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self._next: deque[Endpoint] = deque(maxlen=1)
+        self._moved = threading.Event()
+        self._client: Client | None = None
+        self._messages: dict[int, Any] = {}
+        """Ticket → message that has not been answered."""
+        self._tickets: dict[int, int] = {}
+        """Ticket of the connection → ticket here."""
+        self._sent = 0
+        self._away_since: float | None = None
+        self.why = ""
+        """Reason of the last loss of the connection."""
+
+    def move(self, endpoint: Endpoint) -> None:
+        """Connect there with the next call."""
+        self._next.append(endpoint)
+        self._away_since = None
+        self._moved.set()
+
+    @property
+    def away_s(self) -> float:
+        """Seconds since the service was lost; 0 before the first attempt to connect."""
+        since = self._away_since
+        return 0.0 if since is None else time.monotonic() - since
+
+    def send(self, message: Any) -> int:
+        self._follow()
+        self._sent += 1
+        self._messages[self._sent] = message
+        if self._client is not None:
+            self._pass_on(self._sent)
+        return self._sent
+
+    def done(self, timeout: float) -> list[tuple[int, Any]]:
+        self._follow()
+        if self._client is None:
+            if self._moved.wait(timeout):
+                self._moved.clear()
+            return []
+        try:
+            replies = self._client.done(timeout)
+        except ServiceStoppedError as error:
+            self._lose(error)
+            return []
+        answered = [(self._tickets.pop(ticket), reply) for ticket, reply in replies]
+        for ticket, _ in answered:
+            del self._messages[ticket]
+        return answered
+
+    def forget(self, ticket: int) -> None:
+        self._messages.pop(ticket, None)
+        for theirs in [theirs for theirs, ours in self._tickets.items() if ours == ticket]:
+            del self._tickets[theirs]
+            if self._client is not None:
+                self._client.forget(theirs)
+
+    def close(self) -> None:
+        self._messages.clear()
+        self._drop()
+
+    def _follow(self) -> None:
+        """Connect to where the service is now, if that has changed, and ask again."""
+        if not self._next:
+            return
+        self._drop()
+        try:
+            self._client = self._next.popleft().connect()
+        except ServiceStoppedError as error:
+            self._lose(error)
+            return
+        self._away_since = None  # what was lost meanwhile was the predecessor
+        for ticket in list(self._messages):
+            if self._client is not None:
+                self._pass_on(ticket)
+
+    def _pass_on(self, ticket: int) -> None:
+        assert self._client is not None
+        try:
+            self._tickets[self._client.send(self._messages[ticket])] = ticket
+        except ServiceStoppedError as error:
+            self._lose(error)
+
+    def _lose(self, error: ServiceStoppedError) -> None:
+        self.why = str(error)
+        if self._away_since is None:
+            self._away_since = time.monotonic()
+        self._drop()
+
+    def _drop(self) -> None:
+        client, self._client = self._client, None
+        self._tickets.clear()
+        if client is not None:
+            client.close()

@@ -1,52 +1,55 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages through memory that caller and service share, on one node.
+"""Messages through memory that client and service share, on one node.
 
-    caller      writes the message into a slot of its own ──token──► service   reads it where it lies
+    client      writes the message into a slot of its own ──token──► service   reads it where it lies
                 copies the reply out, and the slot is free ◄──token── service  writes the reply behind it
 
-Tokens go through a Unix socket that keeps their borders (SOCK_SEQPACKET); a slot's file goes with the first
-of them. A message that is too large for its slot, or a reply, has whoever writes it replace the slot by a
-larger one. When a process dies the kernel closes its socket, which the other end sees at once.
-
-Neither slots nor sockets have a name in a file system, see `nameless`: nothing is left by a process that is
-killed, and no folder has to be agreed on.
+Tokens go through a Unix socket (SOCK_SEQPACKET); a slot's file descriptor goes with its first token. A
+message or reply that is too large for its slot replaces the slot by a larger one. When a process dies the
+kernel closes its socket, which the other end sees at once. Nothing has a name in a file system, see `memfd`.
 """
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import select
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from accerl_lerobot.transport.codec import DamagedMessageError, decode, encode
-from accerl_lerobot.transport.contract import Asked, Caller, Server, ServiceStoppedError
-from accerl_lerobot.transport.nameless import aligned, listening, new_name, new_socket, same_user
-from accerl_lerobot.transport.slots import (
+from accerl_lerobot.transport.contract import Client, PendingRequest, Server, ServiceStoppedError
+from accerl_lerobot.transport.memfd import (
     ANSWER,
     ASK,
     FAIL,
     LEAST,
     SLOTS,
+    DamagedTokenError,
     Slot,
     Token,
-    new_file,
-    receive,
-    send,
+    aligned,
+    listening,
+    new_name,
+    new_slot,
+    new_socket,
+    receive_token,
+    same_user,
+    send_token,
 )
 
 logger = logging.getLogger(__name__)
 
 CONNECT_S = 30.0
-"""How long a service may take to be connected to."""
+"""Timeout for connecting to a service."""
 
 
 class Address(NamedTuple):
-    """Where a service is reached by processes of its node."""
+    """Where processes of its node reach a service."""
 
     node: str
     """See `this_node`."""
@@ -54,26 +57,22 @@ class Address(NamedTuple):
 
 
 def this_node() -> str:
-    """The same for two processes that can reach each other's sockets and measure the same time."""
+    """Equal for two processes that can reach each other's sockets and have the same monotonic clock."""
     spaces = (os.stat(f"/proc/self/ns/{kind}").st_ino for kind in ("net", "time"))
     return "-".join([Path("/proc/sys/kernel/random/boot_id").read_text().strip(), *map(str, spaces)])
 
 
-class SharedMemoryCaller(Caller):
-    """See the contract.
-
-    Args:
-        name: of the service, for messages.
-        address: of its `SharedMemoryServer`.
+class SharedMemoryClient(Client):
+    """The caller's end.
 
     Raises:
-        ServiceStoppedError: nobody is there any more, or it is somebody else.
+        ServiceStoppedError: the service is gone, or another user has taken its place.
     """
 
     def __init__(self, name: str, address: Address) -> None:
         super().__init__(name)
         self._socket = _connected(name, address)
-        # Cheaper than a timeout of the socket, which costs a system call whenever it is changed.
+        # Cheaper than a socket timeout, which costs a system call whenever it is changed.
         self._readable = select.poll()
         self._readable.register(self._socket, select.POLLIN)
         self._slots: list[Slot] = []
@@ -90,7 +89,7 @@ class SharedMemoryCaller(Caller):
         index = self._free[-1] if self._free else len(self._slots)
         file = None
         if index == len(self._slots) or self._slots[index].size < encoded.size:
-            file = new_file(encoded.size + LEAST)
+            file = new_slot(encoded.size + LEAST)
             self._slots[index : index + 1] = [Slot(file)]
         if self._free:
             self._free.pop()
@@ -98,7 +97,7 @@ class SharedMemoryCaller(Caller):
         self._sent += 1
         self._under_way[self._sent] = index
         try:
-            send(self._socket, Token(ASK, index, self._sent, 0, encoded.size, time.monotonic()), file)
+            send_token(self._socket, Token(ASK, index, self._sent, 0, encoded.size, time.monotonic()), file)
         except OSError as error:
             raise self._gone(error) from error
         return self._sent
@@ -108,13 +107,13 @@ class SharedMemoryCaller(Caller):
         end = time.monotonic() + timeout
         try:
             while self._readable.poll(0 if replies else max(0.0, 1000 * (end - time.monotonic()))):
-                received = receive(self._socket)
+                received = receive_token(self._socket)
                 if received is None:
                     raise self._gone("its end of the connection is closed")
                 replies += self._read(*received)
                 if not self._under_way:
                     break
-        except (OSError, DamagedMessageError) as error:
+        except (OSError, DamagedTokenError, DamagedMessageError) as error:
             raise self._gone(error) from error
         return replies
 
@@ -127,7 +126,7 @@ class SharedMemoryCaller(Caller):
         self._slots.clear()
 
     def _read(self, token: Token, slot: Slot | None) -> list[tuple[int, object]]:
-        """Copies a reply out, which frees its slot; nothing if nobody waits for it."""
+        """Copy a reply out, which frees its slot; empty if it was forgotten."""
         index = self._under_way.pop(token.ticket, -1)
         if index != token.slot:
             raise self._gone(f"a reply to message {token.ticket}, which was not asked")
@@ -137,11 +136,8 @@ class SharedMemoryCaller(Caller):
         if token.ticket in self._forgotten:
             self._forgotten.discard(token.ticket)
             return []
-        try:
-            reply = decode(self._slots[index].memory, token.start, token.size)
-        except DamagedMessageError as error:
-            raise self._gone(error) from error
-        if token.what == FAIL:
+        reply = decode(self._slots[index].memory, token.start, token.size)
+        if token.purpose == FAIL:
             raise ServiceStoppedError(f"{self.name}: {reply}")
         return [(token.ticket, reply)]
 
@@ -160,7 +156,7 @@ def _connected(name: str, address: Address) -> socket.socket:
             mine = same_user(end)
             break
         except OSError as error:
-            # Many may wait to be let in while the service is at something long.
+            # The backlog may be full while the service is busy.
             if not isinstance(error, BlockingIOError) or time.monotonic() > deadline:
                 end.close()
                 raise ServiceStoppedError(f"{name} cannot be connected to: {error}") from error
@@ -172,51 +168,49 @@ def _connected(name: str, address: Address) -> socket.socket:
 
 
 class SharedMemoryServer(Server):
-    """Listens from the beginning; `poll` connects callers and hands their messages over, oldest first.
+    """The service's end: `poll` accepts clients and hands over their messages, oldest first.
 
     Args:
         take: see `Server`.
-        copy: whether messages own their arrays; otherwise these are views, good until the answer.
+        copy: True: messages own their arrays; False: these are views, valid until the answer.
     """
 
-    def __init__(self, take: Callable[[Asked], None], *, copy: bool) -> None:
+    def __init__(self, take: Callable[[PendingRequest], None], *, copy: bool) -> None:
         super().__init__(take)
         self._copy = copy
         self.address = Address(this_node(), new_name())
         self._listener = listening(self.address.name, SLOTS)
         self._listener.setblocking(False)
-        self._bell = open(os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK), "rb+", buffering=0)  # noqa: SIM115
+        self._event = open(os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK), "rb+", buffering=0)  # noqa: SIM115
         self._epoll = select.epoll()
-        for source in (self._listener, self._bell):
+        for source in (self._listener, self._event):
             self._epoll.register(source, select.EPOLLIN)
         self._connections: dict[int, _Connection] = {}
 
     def fileno(self) -> int:
-        """Readable when `poll` has something to do, for those who wait for other things as well."""
+        """Readable when `poll` has something to do, for an event loop."""
         return self._epoll.fileno()
 
     def wake(self) -> None:
-        self._bell.write((1).to_bytes(8, "little"))
+        self._event.write((1).to_bytes(8, "little"))
 
     def poll(self, timeout: float) -> None:
-        heard: list[Asked] = []
+        received: list[PendingRequest] = []
         events = self._epoll.poll(timeout)
         while events:
             for descriptor, _ in events:
                 connection = self._connections.get(descriptor)
                 if connection is not None:
-                    heard += self._hear(connection)
+                    received += self._receive(connection)
                 elif descriptor == self._listener.fileno():
-                    self._connect()
-                elif descriptor == self._bell.fileno():
-                    self._bell.read(8)
+                    self._accept()
+                elif descriptor == self._event.fileno():
+                    self._event.read(8)
             events = self._epoll.poll(0)
         while self._called:
-            heard.append(self._called.popleft())
-        if len(heard) > 1:
-            heard.sort(key=lambda asked: asked.sent)
-        for asked in heard:
-            self._take(asked)
+            received.append(self._called.popleft())
+        for request in sorted(received, key=lambda request: request.sent):
+            self._take(request)
 
     def close(self) -> None:
         self._epoll.unregister(self._listener)
@@ -224,7 +218,7 @@ class SharedMemoryServer(Server):
         for connection in list(self._connections.values()):
             self._drop(connection)
 
-    def _connect(self) -> None:
+    def _accept(self) -> None:
         try:
             end, _ = self._listener.accept()
         except (BlockingIOError, ConnectionError):
@@ -237,75 +231,73 @@ class SharedMemoryServer(Server):
         self._connections[end.fileno()] = _Connection(end, self._drop)
         self._epoll.register(end, select.EPOLLIN)
 
-    def _hear(self, connection: _Connection) -> list[Asked]:
-        """The caller's next message; nothing if it is gone, which is how they end, or talks nonsense."""
+    def _receive(self, connection: _Connection) -> list[PendingRequest]:
+        """The client's next message; empty if it is gone, or has sent what no client sends."""
         try:
-            received = receive(connection.socket)
+            received = receive_token(connection.socket)
             if received is not None:
                 return connection.take(*received, self._copy)
         except BlockingIOError:
             return []
         except ConnectionError:
             pass
-        except DamagedMessageError as error:
-            logger.warning("a caller was dropped: %s", error)
+        except DamagedTokenError as error:
+            logger.warning("a client was dropped: %s", error)
         self._drop(connection)
         return []
 
     def _drop(self, connection: _Connection) -> None:
-        """Forgets a caller; its slots go with the last view of them."""
+        """Forget a client; its slots go with the last view of them."""
         if self._connections.pop(connection.socket.fileno(), None) is not None:
             self._epoll.unregister(connection.socket)
-        connection.close()
+        connection.closed = True
+        connection.socket.close()
+        connection.slots.clear()
 
 
 class _Connection:
-    """One caller as the service sees it."""
+    """One client as the service sees it."""
 
     def __init__(self, end: socket.socket, drop: Callable[[_Connection], None]) -> None:
         self.socket, self._drop = end, drop
         self.closed = False
-        self._slots: dict[int, Slot] = {}
+        self.slots: dict[int, Slot] = {}
         self._busy: set[int] = set()
 
-    def take(self, token: Token, slot: Slot | None, copy: bool) -> list[Asked]:
-        """A message, once; nothing if it was answered here because it cannot be read."""
+    def take(self, token: Token, slot: Slot | None, copy: bool) -> list[PendingRequest]:
+        """The message of a token; empty if it was answered here because it cannot be read."""
         if slot is not None and token.slot < SLOTS and token.slot not in self._busy:
-            self._slots[token.slot] = slot
-        known = token.what == ASK and token.slot in self._slots and token.slot not in self._busy
-        if not known or token.start + token.size > self._slots[token.slot].size:
-            raise DamagedMessageError(f"a token that makes no sense: {token}")
+            self.slots[token.slot] = slot
+        known = token.purpose == ASK and token.slot in self.slots and token.slot not in self._busy
+        if not known or token.start + token.size > self.slots[token.slot].size:
+            raise DamagedTokenError(f"a token that makes no sense: {token}")
         self._busy.add(token.slot)
-        asked = _AskedThere(self, token)
+        request = _RemoteRequest(self, token)
         try:
-            asked.message = decode(self._slots[token.slot].memory, token.start, token.size, copy=copy)
+            request.message = decode(self.slots[token.slot].memory, token.start, token.size, copy=copy)
         except DamagedMessageError as error:
-            asked.fail(error)
+            request.fail(error)
             return []
-        return [asked]
+        return [request]
 
-    def reply(self, what: int, asked: Token, reply: object) -> None:
-        """Writes it behind the message, whose arrays it may consist of, or into a larger slot."""
+    def reply(self, purpose: int, asked: Token, reply: object) -> None:
+        """Write it behind the message, whose arrays it may consist of, or into a larger slot."""
         encoded = encode(reply)
         start, file = aligned(asked.start + asked.size), None
-        if start + encoded.size > self._slots[asked.slot].size:
-            file = new_file(start + encoded.size)
-            self._slots[asked.slot], start = Slot(file), 0
-        encoded.write(self._slots[asked.slot].memory, start)
+        if start + encoded.size > self.slots[asked.slot].size:
+            file = new_slot(start + encoded.size)
+            self.slots[asked.slot], start = Slot(file), 0
+        encoded.write(self.slots[asked.slot].memory, start)
         self._busy.discard(asked.slot)
+        token = Token(purpose, asked.slot, asked.ticket, start, encoded.size, asked.sent)
         try:
-            send(self.socket, Token(what, asked.slot, asked.ticket, start, encoded.size, asked.sent), file)
+            send_token(self.socket, token, file)
         except OSError:  # it has died, or does not read although it may have few messages under way
             self._drop(self)
 
-    def close(self) -> None:
-        self.closed = True
-        self.socket.close()
-        self._slots.clear()
 
-
-class _AskedThere(Asked):
-    """By another process."""
+class _RemoteRequest(PendingRequest):
+    """A message from another process."""
 
     def __init__(self, connection: _Connection, token: Token) -> None:
         self._connection, self._token = connection, token
@@ -322,3 +314,26 @@ class _AskedThere(Asked):
     def fail(self, error: BaseException) -> None:
         if not self.gone:
             self._connection.reply(FAIL, self._token, f"the service has stopped: {error!r}")
+
+
+def serve_on_loop(answer: Callable[[Any], Awaitable[Any]]) -> SharedMemoryServer:
+    """Have a coroutine function answer messages, each in a task of the running event loop.
+
+    Messages own their arrays.
+    """
+    tasks: set[asyncio.Task[None]] = set()
+
+    async def handle(request: PendingRequest) -> None:
+        try:
+            request.answer(await answer(request.message))
+        except Exception as error:
+            request.fail(error)
+
+    def take(request: PendingRequest) -> None:
+        task = asyncio.ensure_future(handle(request))
+        tasks.add(task)  # the loop itself refers to tasks weakly
+        task.add_done_callback(tasks.discard)
+
+    server = SharedMemoryServer(take, copy=True)
+    asyncio.get_running_loop().add_reader(server.fileno(), server.poll, 0.0)
+    return server

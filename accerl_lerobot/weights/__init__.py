@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From trainer to inference: `publish(version, tensors)` on one side, `newest(than)` on the other."""
+"""Weights from the trainer to inference: shared memory on a machine, Ray's object store between machines."""

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The trainer's end of a transport: one copy in the trainer's thread, everything else in another one.
+"""The trainer's end of a weight channel: one copy in the trainer's thread, everything else in another one.
 
-    publish    copies the tensors into a slab that nobody uses, and returns; it waits for nobody
-    thread     hashes, sends, hears who has what; takes the newest set and never one before it
+    publish    copies the tensors into a free buffer and returns; it waits for no reader
+    thread     sends the newest set, and hears which reader has applied what
     flush      waits until all readers have the newest set
-    readers    that die are let go of, and others may come at any time: they get the newest set
     failures   of the thread are raised by the next `publish` or `flush`
 
-At most one set per reader is under way, so a slow one skips versions.
+Guarantees: a reader gets all tensors of one version, never a mixture; versions grow; once `publish` has
+returned, the trainer may change its tensors; at most one set per reader is under way, so a slow reader skips
+versions. Readers that die are dropped, and new ones get the newest set.
 """
 
 from __future__ import annotations
@@ -15,113 +16,99 @@ from __future__ import annotations
 import threading
 import time
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from accerl_lerobot.weights.channel import check_grows
-from accerl_lerobot.weights.slab import Layout, Slab
+from accerl_lerobot.weights.buffer import BufferLayout, Tensors, WeightBuffer
 
 FLUSH_S = 300.0
-"""How long all readers together may take for the last set: a forward pass and a copy of the weights."""
+"""Timeout for all readers together: a forward pass and a copy of the weights."""
 _CLOSE_S = 10.0
 
 
 @dataclass(eq=False)
-class Shipment:
-    """A set on its way."""
+class WeightUpdate:
+    """A published set."""
 
     version: int
-    layout: Layout
-    slab: Slab
+    layout: BufferLayout
+    buffer: WeightBuffer
     published_s: float
-    """When `publish` was called, on the clock `time.monotonic`, which all processes of a machine share."""
+    """When `publish` was called, on `time.monotonic`, which all processes of a machine share."""
     digest: bytes = b""
-    """Digest of the whole set; the thread adds it."""
+    """See `buffer.digest`; added by the thread."""
 
 
 class Publisher(ABC):
-    """Base of all publishers.
+    """Base of both publishers.
 
     Args:
-        slabs: how many there may be; enough of them that one is always free, see `_held`.
-        make: makes one of at least so many bytes.
+        make: makes a buffer of at least so many bytes.
     """
 
-    def __init__(self, slabs: int, make: Callable[[int], Slab]) -> None:
-        self._limit, self._make = slabs, make
-        self._slabs: list[Slab] = []
+    def __init__(self, make: Callable[[int], WeightBuffer]) -> None:
+        self._make = make
+        self._buffers: list[WeightBuffer] = []
         """By slot; one that has become too small is replaced in its slot."""
         self._changed = threading.Condition()
         self._version: int | None = None
-        self._layout = Layout.of({})
-        self._writing: Slab | None = None
-        self._pending: Shipment | None = None
-        self._current: Shipment | None = None
+        self._pending: WeightUpdate | None = None
+        """Published, and not taken by the thread yet."""
+        self._current: WeightUpdate | None = None
+        """The set that the thread sends."""
         self._failure: BaseException | None = None
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="publisher", daemon=True)
 
     def publish(self, version: int, tensors: Mapping[str, np.ndarray]) -> None:
-        """Makes a set the newest one; returns once it is copied.
+        """Copy a set and make it the newest one.
 
         Args:
             version: updates behind these weights, larger than that of any set published before.
-            tensors: may change as soon as this has returned.
 
         Raises:
             ValueError: `version` does not grow; nothing is changed then.
-            BaseException: what has ended the thread.
+            BaseException: the failure of the thread.
         """
         self._check()
-        check_grows(version, self._version)
+        if version < 0:
+            raise ValueError(f"published version {version}: versions count updates from 0")
+        if self._version is not None and version <= self._version:
+            raise ValueError(f"published version {version} after {self._version}: versions must grow")
         now = time.monotonic()
-        if not self._layout.fits(tensors):
-            self._layout = Layout.of(tensors)
-        layout = self._layout
-        self._writing = self._free(layout.end)
-        self._writing.fill(layout, tensors)
+        layout = BufferLayout.of(tensors)
+        buffer = self._free_buffer(layout.end)
+        buffer.fill(layout, tensors)
         with self._changed:
-            self._pending = Shipment(version, layout, self._writing, now)
-            self._version, self._writing = version, None
+            self._pending, self._version = WeightUpdate(version, layout, buffer, now), version
             self._wake()
 
     def flush(self, timeout_s: float = FLUSH_S) -> None:
-        """Waits until every reader has the newest set.
+        """Wait until every reader has the newest set.
 
         Raises:
-            TimeoutError: names those that do not, after `timeout_s` seconds.
-            BaseException: what has ended the thread.
+            TimeoutError: names the readers that do not.
+            BaseException: the failure of the thread.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._failure is not None or not self._owed(), timeout_s)
-            owed = self._owed()
+            self._changed.wait_for(lambda: self._failure is not None or not self._missing(), timeout_s)
+            missing = self._missing()
         self._check()
-        if owed:
-            raise TimeoutError(f"weights of version {self._version}, after {timeout_s:g} s: {owed}")
-
-    def add(self, reader: Any) -> None:
-        """Has another one receive what is published, from the newest set on; not where they come alone.
-
-        Args:
-            reader: actor handle.
-
-        Raises:
-            BaseException: what has ended the thread.
-        """
-        raise NotImplementedError(f"readers connect to a {type(self).__name__}")
+        if missing:
+            raise TimeoutError(f"weights of version {self._version}, after {timeout_s:g} s: {missing}")
 
     def close(self) -> None:
-        """Ends the thread and lets all memory go; readers keep what they have."""
+        """End the thread and release all memory; readers keep what they have."""
         with self._changed:
             self._closing = True
             self._wake()
         if self._thread.ident is not None:
             self._thread.join(_CLOSE_S)
-        for slab in self._slabs:
-            slab.close()
+        for buffer in self._buffers:
+            buffer.close()
 
     @abstractmethod
     def _serve(self) -> None:
@@ -129,14 +116,14 @@ class Publisher(ABC):
 
     @abstractmethod
     def _wake(self) -> None:
-        """Tells the thread that there is something to do; called with the lock held."""
+        """Tell the thread that there is something to do; called with the lock held."""
 
     @abstractmethod
-    def _owed(self) -> str:
-        """Which readers do not have the newest set, in words; empty if all have it. Called with the lock."""
+    def _missing(self) -> str:
+        """Readers without the newest set, in words; empty if all have it. Called with the lock held."""
 
-    def _held(self) -> list[Slab]:
-        """Slabs that readers or the thread still need, besides the current one. Called with the lock."""
+    def _held(self) -> list[WeightBuffer]:
+        """Buffers that readers still read, besides the current one. Called with the lock held."""
         return []
 
     def _run(self) -> None:
@@ -153,46 +140,62 @@ class Publisher(ABC):
         if self._closing:
             raise RuntimeError("these weights have no readers any more: the publisher is closed")
 
-    def _take(self) -> Shipment | None:
-        """The thread takes the newest set, if it has not begun with it yet."""
+    def _take(self) -> WeightUpdate | None:
+        """Take the newest set, if there is a new one; on the thread."""
         with self._changed:
             taken, self._pending = self._pending, None
             if taken is not None:
                 self._current = taken
             return taken
 
-    def _spare(self) -> None:
-        """Makes a slab for the next publication ahead of it, so that the trainer need not wait for memory."""
-        with self._changed:
-            free = self._unused()
-            if free or self._current is None or len(self._slabs) >= self._limit:
-                return
-            size = self._current.layout.end
-        made = self._make(size)
-        with self._changed:
-            self._slabs.append(made)
-
-    def _free(self, size: int) -> Slab:
-        """A slab to write to. What nobody has begun to send is overwritten: something newer comes."""
+    def _free_buffer(self, size: int) -> WeightBuffer:
+        """A buffer to write to. A set that has not been taken yet is overwritten, since a newer one comes."""
         with self._changed:
             self._pending = None
-            free = self._unused()
-            large = [slab for slab in free if len(slab) >= size]
-            if large:
-                return large[0]
-            assert free or len(self._slabs) < self._limit, "a slab is always free"
-            self._writing = free[0] if free else None
+            used = {id(buffer) for buffer in self._held()}
+            if self._current is not None:
+                used.add(id(self._current.buffer))
+            free = [buffer for buffer in self._buffers if id(buffer) not in used]
+        if large := [buffer for buffer in free if len(buffer) >= size]:
+            return large[0]
         made = self._make(size)
         with self._changed:
             if free:
-                self._slabs[self._slabs.index(free[0])] = made
+                self._buffers[self._buffers.index(free[0])] = made
                 free[0].close()
             else:
-                self._slabs.append(made)
+                self._buffers.append(made)
         return made
 
-    def _unused(self) -> list[Slab]:
-        """Slabs that hold nothing anybody needs; called with the lock."""
-        shipments = [s.slab for s in (self._pending, self._current) if s is not None]
-        used = {id(slab) for slab in (*shipments, self._writing, *self._held())}
-        return [slab for slab in self._slabs if id(slab) not in used]
+
+class PublishDelay:
+    """Publishes weights some updates after they were made, for studies of what lag does to an algorithm.
+
+    Args:
+        updates: age of weights when they are published; 0: at once. As many copies are kept.
+    """
+
+    def __init__(self, updates: int) -> None:
+        self.updates = updates
+        self._waiting: deque[tuple[int, Tensors]] = deque()
+
+    def push(self, version: int, tensors: Tensors, *, last: bool = False) -> list[tuple[int, Tensors]]:
+        """Take the newest weights and return those that are due, oldest first; version 0 always is.
+
+        Args:
+            tensors: must not change afterwards.
+            last: no update follows, so return the newest.
+        """
+        self._waiting.append((version, tensors))
+        due = []
+        while self._waiting and (last or self._waiting[0][0] <= max(0, version - self.updates)):
+            due.append(self._waiting.popleft())
+        return due[-1:] if last else due
+
+    def state(self) -> list[tuple[int, Tensors]]:
+        """Everything that `restore` needs; see `snapshot`."""
+        return list(self._waiting)
+
+    def restore(self, state: list[tuple[int, Tensors]]) -> None:
+        """Resume from `state`."""
+        self._waiting.extend(state)

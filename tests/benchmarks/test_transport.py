@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.transport.nameless import available
+from accerl_lerobot.transport.memfd import available
 from benchmarks.transport import (
     ARMS,
     FLOORS,

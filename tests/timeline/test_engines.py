@@ -61,7 +61,7 @@ def test_the_asynchronous_engine(light: None, tmp_path: Path) -> None:
         collect(engine, "before", 4)
         engine.train()
         drive(engine)
-        ray.kill(next(iter(engine._seats.workers())).actor)
+        ray.kill(next(iter(engine._rollouts.workers())).actor)
         engine.plan(evaluation_plans(("match",), 8, "after"))
         collect(engine, "after", 8)
         asked = time.monotonic_ns()

@@ -27,13 +27,13 @@ from accerl_lerobot.timeline.read import read_timeline
 from accerl_lerobot.timeline.states import STATES, TIMELINE
 from accerl_lerobot.trainer import worker as trainer
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.transport.contract import Caller
+from accerl_lerobot.transport.contract import Client
 from accerl_lerobot.transport.endpoint import Endpoint
-from accerl_lerobot.weights import ray_channel
+from accerl_lerobot.weights import factory
 from tests.local_ray import Handle, Local
 from tests.replay.segments import make_segment
 from tests.trainer.linear import LinearAdapter, make_segments
-from tests.transport.played import PlayedCaller, played
+from tests.transport.played import PlayedClient, played
 
 
 class StoppedError(Exception):
@@ -48,7 +48,7 @@ def states(run: Path) -> list[str]:
 
 def test_the_trainer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trainer, "ray", Local)
-    monkeypatch.setattr(ray_channel, "ray", Local)
+    monkeypatch.setattr(factory, "ray", Local)
     monkeypatch.setattr(loading, "load_adapter", lambda policy: LinearAdapter())
     config = TrainerConfig(updates=2, batch_decisions=7, warmup_updates=0, value_warmup_updates=0)
     worker = trainer.TrainerWorker(
@@ -151,8 +151,8 @@ def test_collecting_is_to_step_worlds_and_wait_for_decisions(collect) -> None:
 class ShutDoor(Endpoint):
     """Lets nobody in, and ends the loop that has waited there three times."""
 
-    def connect(self) -> Caller:
-        class Shut(PlayedCaller):
+    def connect(self) -> Client:
+        class Shut(PlayedClient):
             waits = 0
 
             def done(self, timeout: float) -> list[tuple[int, Any]]:

@@ -21,8 +21,8 @@ from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import Evaluation, PolicyAdapter
 from accerl_lerobot.trainer import ranks
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.rendezvous import LOOPBACK, Rendezvous, create, join, use_only
 from accerl_lerobot.trainer.update import Update
-from accerl_lerobot.transport.meeting import LOOPBACK, Meeting, host, only_at, visit
 from tests.trainer.linear import STATE, STD, LinearAdapter, make_segments
 
 TIMEOUT_S = 60.0
@@ -184,11 +184,11 @@ def joined(rank: int, size: int, place: Any) -> ranks.Group:
         size: how many there are.
         place: a queue that tells where they meet.
     """
-    only_at(LOOPBACK)
+    use_only(LOOPBACK)
     if rank == 0:
-        store, meeting = host(LOOPBACK, size, TIMEOUT_S)
+        store, rendezvous = create(LOOPBACK, size, TIMEOUT_S)
         for _ in range(size - 1):
-            place.put(tuple(meeting))
+            place.put(tuple(rendezvous))
     else:
-        store = visit(Meeting(*place.get()), size, TIMEOUT_S)
+        store = join(Rendezvous(*place.get()), size, TIMEOUT_S)
     return ranks.Group(store, rank, size, torch.device("cpu"), TIMEOUT_S)

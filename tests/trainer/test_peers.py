@@ -119,16 +119,16 @@ def test_a_lone_rank_waits_for_nobody():
 
 
 def test_ranks_talk_over_the_interface_that_has_the_address(monkeypatch: pytest.MonkeyPatch):
-    from accerl_lerobot.transport import meeting
+    from accerl_lerobot.trainer import rendezvous
 
     for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"):
         monkeypatch.setenv(name, "")
     at = SimpleNamespace
     faces = {"lo": [at(address="127.0.0.1")], "a": [at(address="fe80::1"), at(address="10.0.0.2")], "b": []}
-    monkeypatch.setattr(meeting.psutil, "net_if_addrs", lambda: faces)
-    meeting.only_at("127.0.0.1")
+    monkeypatch.setattr(rendezvous.psutil, "net_if_addrs", lambda: faces)
+    rendezvous.use_only("127.0.0.1")
     assert (os.environ["GLOO_SOCKET_IFNAME"], os.environ["NCCL_SOCKET_IFNAME"]) == ("lo", "")
-    meeting.only_at("10.0.0.2")
+    rendezvous.use_only("10.0.0.2")
     assert (os.environ["GLOO_SOCKET_IFNAME"], os.environ["NCCL_SOCKET_IFNAME"]) == ("a", "a")
     with pytest.raises(RuntimeError, match=r"no interface of this machine has the address 10\.0\.0\.3"):
-        meeting.only_at("10.0.0.3")
+        rendezvous.use_only("10.0.0.3")

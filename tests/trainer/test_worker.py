@@ -20,7 +20,7 @@ from accerl_lerobot.trainer import worker as module
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.nonfinite import NonFiniteError
 from accerl_lerobot.trainer.worker import TrainerWorker
-from accerl_lerobot.weights import ray_channel
+from accerl_lerobot.weights import factory
 from tests.local_ray import Handle, Local
 from tests.trainer.linear import LinearAdapter, make_segments
 
@@ -30,7 +30,7 @@ def copied(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: tensor.copy() for name, tensor in tensors.items()}
 
 
-class Prompt(ray_channel.RayPublisher):
+class Prompt(factory.RayPublisher):
     """Skips nothing."""
 
     def publish(self, version: int, tensors: Any) -> None:
@@ -71,7 +71,7 @@ def _without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "ray", Local)
     monkeypatch.setattr(module, "make_publisher", lambda readers, *_, **__: Prompt(readers))
     monkeypatch.setattr(module, "CONNECT_S", 0.05)
-    monkeypatch.setattr(ray_channel, "ray", Local)
+    monkeypatch.setattr(factory, "ray", Local)
     monkeypatch.setattr(loading, "load_adapter", lambda policy: LinearAdapter())
 
 

@@ -22,12 +22,11 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.transport.contract import Caller, ServiceStoppedError
-from accerl_lerobot.transport.on_loop import serve_on_loop
-from accerl_lerobot.transport.shared_memory import Address
+from accerl_lerobot.transport.contract import Client, ServiceStoppedError
+from accerl_lerobot.transport.shared_memory import Address, serve_on_loop
 from tests.replay.segments import make_segment
 
-Factory = Callable[[], Caller]
+Factory = Callable[[], Client]
 Check = Callable[[Factory], None]
 LONG_S = 240.0
 """Seconds after which an end counts as hung."""

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import Any
 
-from accerl_lerobot.transport.contract import Caller
+from accerl_lerobot.transport.contract import Client
 from accerl_lerobot.transport.endpoint import Endpoint
 
 
-class PlayedCaller(Caller):
+class PlayedClient(Client):
     """Replies are what a function returns, or what is put into a future that it returns."""
 
     def __init__(self, name: str, answer: Callable[[Any], Any]) -> None:
@@ -45,8 +45,8 @@ class PlayedCaller(Caller):
 class PlayedEndpoint(Endpoint):
     """Leads to a function of the test."""
 
-    def connect(self) -> Caller:
-        return PlayedCaller(self.name, self.method)
+    def connect(self) -> Client:
+        return PlayedClient(self.name, self.method)
 
 
 def played(answer: Callable[[Any], Any]) -> Endpoint:

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.transport import codec
-from accerl_lerobot.transport.codec import SIZES, DamagedMessageError, decode, encode
+from accerl_lerobot.transport.codec import SIZE, DamagedMessageError, decode, encode
 from tests.transport.contract import messages, same
 
 
@@ -25,7 +24,7 @@ def written(message: Any, start: int = 0, room: int = 0) -> bytearray:
 @pytest.mark.parametrize("start", [0, 128])
 @pytest.mark.parametrize("copy", [False, True])
 def test_what_is_written_is_read(start: int, copy: bool):
-    for message in messages() * 2:  # the second time from memory
+    for message in messages():
         buffer = written(message, start, room=100)
         assert same(decode(buffer, start, len(buffer) - start - 100, copy=copy), message)
 
@@ -40,30 +39,7 @@ def test_views_are_of_the_buffer_and_copies_are_not():
 
 def test_arrays_begin_at_lines_of_the_cache():
     message = [np.zeros(3, np.uint8), "text", np.zeros(5, np.float64)]
-    assert all(offset % 64 == 0 for offset in encode(message).layout.offsets)
-
-
-def test_equal_structures_are_remembered_and_different_ones_are_not_mixed_up(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(codec, "_layouts", layouts := {})
-    monkeypatch.setattr(codec, "_plans", plans := {})
-    zeros = np.zeros((2, 3), np.float32)
-    alike = [{"a": zeros, "n": 1}, {"a": zeros + 1, "n": 2.5}]
-    others = [{"n": 1, "a": zeros}, {"a": zeros.T, "n": 1}, {"a": zeros.astype(np.int32), "n": 1}]
-    others += [[zeros, 1], (zeros, 1), {"a": zeros}, {"a": [zeros], "n": 1}, {"a": {"n": zeros}}]
-    for message in [*alike, *others]:
-        buffer = written(message)
-        assert same(decode(buffer, 0, len(buffer)), message)
-    assert len(layouts) == len(plans) == 1 + len(others)
-
-
-def test_what_is_remembered_is_bounded(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(codec, "_layouts", layouts := {})
-    monkeypatch.setattr(codec, "_plans", plans := {})
-    monkeypatch.setattr(codec, "REMEMBERED", 4)
-    for n in range(11):
-        buffer = written(np.zeros(n))
-        assert decode(buffer, 0, len(buffer)).shape == (n,)
-        assert 1 <= len(layouts) <= 4 and 1 <= len(plans) <= 4
+    assert all(offset % 64 == 0 for offset in encode(message).offsets)
 
 
 @dataclass
@@ -95,44 +71,40 @@ def test_what_cannot_be_sent_is_refused(message: Any, said: str):
 
 def test_part_of_a_message_is_refused():
     buffer = written(messages()[1])
-    for size in (0, 7, 8, 100, len(buffer) - 1, len(buffer) + 1, -1):
+    for size in (0, 3, 4, 100, len(buffer) - 1, len(buffer) + 1, -1):
         with pytest.raises(DamagedMessageError):
             decode(buffer, 0, size)
     with pytest.raises(DamagedMessageError):
         decode(buffer, -64, len(buffer))
 
 
-def forged(skeleton: str, values: str = "[]", arrays: int = 0) -> bytes:
-    return SIZES.pack(len(skeleton), len(values)) + skeleton.encode() + bytes(arrays) + values.encode()
+def forged(header: str, arrays: int = 0) -> bytes:
+    return SIZE.pack(len(header)) + header.encode() + bytes(arrays)
 
 
 @pytest.mark.parametrize(
     "message",
     [
-        forged('[1,"<f4",[1000000]]'),
-        forged('[1,"<f4",[-1]]'),
-        forged('[1,"<f4",[4611686018427387904,4]]'),
-        forged('[1,"|O",[1]]', arrays=64),
-        forged('[1,"<U4",[1]]', arrays=64),
-        forged('[1,"<f4",[true]]', arrays=64),
-        forged("[1,{},[1]]", arrays=64),
-        forged('[6,"Popen",[0]]', "[1]"),
-        forged('[6,"Decision",[0]]', "[1]"),
-        forged('[6,["Decision"],[0]]', "[1]"),
-        forged('[5,["a","b"],[0]]', "[1]"),
-        forged("[5,[1],[0]]", "[1]"),
-        forged("[3,[0,0]]", "[1]"),
-        forged("[3,[0]]", "[1,2]"),
-        forged("[3,[0]]", "[[1]]"),
-        forged("[3,[0]]", "[1]x"),
-        forged("[3,[0]]", '{"a":1}'),
-        forged("[9,[0]]", "[1]"),
+        forged('[0,"<f4",1000000]'),
+        forged('[0,"<f4",-1]'),
+        forged('[0,"<f4",4611686018427387904,4]'),
+        forged('[0,"|O",1]', arrays=64),
+        forged('[0,"<U4",1]', arrays=64),
+        forged('[0,"<f4",1.5]', arrays=64),
+        forged('[0,"<f4"]', arrays=3),
+        forged("[0,{},1]", arrays=64),
+        forged('[1,"<f4",1]', arrays=64),
+        forged('[4,"Popen",1]'),
+        forged('[4,"Decision",1]'),
+        forged('[4,["Decision"],1]'),
+        forged("[4]"),
+        forged("[9,1]"),
+        forged('["a",1]'),
         forged("[]"),
-        forged("{}"),
-        forged("3"),
+        forged("3 4"),
+        forged("3", arrays=1),
         forged("[" * 100_000),
-        SIZES.pack(2**32 - 1, 0) + bytes(100),
-        SIZES.pack(0, 2**32 - 1) + bytes(100),
+        SIZE.pack(2**32 - 1) + bytes(100),
         b"\xff" * 64,
     ],
 )
@@ -145,13 +117,11 @@ def test_damaged_messages_are_read_or_refused_and_nothing_else():
     draw, refused = random.Random(0), 0
     for message in messages():
         buffer = written(message)
-        head = SIZES.unpack_from(buffer)[0] + SIZES.size
+        head = SIZE.unpack_from(buffer)[0] + SIZE.size
         for _ in range(2000):
             damaged = bytearray(buffer)
             for _ in range(draw.choice((1, 1, 2, 5))):
-                # The header, and the values behind the arrays: any other byte is as good as another.
-                place = draw.choice((draw.randrange(head), len(buffer) - 1 - draw.randrange(16)))
-                damaged[place] = draw.randrange(256)
+                damaged[draw.randrange(head)] = draw.randrange(256)
             try:
                 decode(damaged, 0, len(damaged))
             except DamagedMessageError:

@@ -18,12 +18,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.transport import nameless, shared_memory, slots
+from accerl_lerobot.transport import memfd, shared_memory
 from accerl_lerobot.transport.codec import encode
-from accerl_lerobot.transport.contract import Asked, Caller, ServiceStoppedError
-from accerl_lerobot.transport.nameless import available
-from accerl_lerobot.transport.shared_memory import SharedMemoryCaller, SharedMemoryServer
-from accerl_lerobot.transport.slots import ASK, LEAST, SLOTS, Token, new_file
+from accerl_lerobot.transport.contract import Client, PendingRequest, ServiceStoppedError
+from accerl_lerobot.transport.memfd import (
+    ANSWER,
+    ASK,
+    FAIL,
+    LEAST,
+    SLOTS,
+    Slot,
+    Token,
+    available,
+    new_slot,
+    receive_token,
+    send_token,
+)
+from accerl_lerobot.transport.shared_memory import SharedMemoryClient, SharedMemoryServer
 
 pytestmark = pytest.mark.skipif(not available(), reason="no memfd, epoll and eventfd here")
 LONG_S = 30.0
@@ -33,15 +44,15 @@ class Stage:
     """A service in the test's own process: what is asked lies in `asked` until the test answers."""
 
     def __init__(self, copy: bool) -> None:
-        self.asked: list[Asked] = []
+        self.asked: list[PendingRequest] = []
         self.server = SharedMemoryServer(self.asked.append, copy=copy)
-        self.callers: list[SharedMemoryCaller] = []
+        self.callers: list[SharedMemoryClient] = []
 
-    def caller(self) -> SharedMemoryCaller:
-        self.callers.append(SharedMemoryCaller("service", self.server.address))
+    def caller(self) -> SharedMemoryClient:
+        self.callers.append(SharedMemoryClient("service", self.server.address))
         return self.callers[-1]
 
-    def await_asked(self, count: int) -> list[Asked]:
+    def await_asked(self, count: int) -> list[PendingRequest]:
         """Polls until so many messages have come; takes them."""
         self.until(lambda: len(self.asked) >= count)
         taken, self.asked[:] = list(self.asked), []
@@ -179,8 +190,8 @@ def test_slots_leave_no_files_open_but_their_own(stage):
 
 ASKING = """
 import sys, time, numpy as np
-from accerl_lerobot.transport.shared_memory import Address, SharedMemoryCaller
-caller = SharedMemoryCaller("service", Address(*sys.argv[1:]))
+from accerl_lerobot.transport.shared_memory import Address, SharedMemoryClient
+caller = SharedMemoryClient("service", Address(*sys.argv[1:]))
 for _ in range(3):
     caller.send(np.zeros(100_000, np.uint8))
 time.sleep(600)
@@ -242,8 +253,8 @@ def test_threads_of_the_same_process_call_and_wake(stage):
 def test_other_users_are_refused_at_both_ends(stage, monkeypatch: pytest.MonkeyPatch):
     one = stage()
     end = one.raw()
-    assert nameless.same_user(end)
-    monkeypatch.setattr(nameless.os, "getuid", lambda: os.geteuid() + 1)
+    assert memfd.same_user(end)
+    monkeypatch.setattr(memfd.os, "getuid", lambda: os.geteuid() + 1)
     with pytest.raises(ServiceStoppedError, match="service: another user's process has taken its place"):
         one.caller()
     one.server.poll(LONG_S)
@@ -275,16 +286,16 @@ def unsealed() -> int:
 NONSENSE: dict[str, Callable[[socket.socket], None]] = {
     "short": lambda end: end.send(b"x"),
     "long": lambda end: end.send(b"x" * 1000),
-    "no slot": lambda end: slots.send(end, asks(0, 0, 100)),
-    "no such slot": lambda end: slots.send(end, asks(SLOTS, 0, 100), new_file(1)),
-    "no question": lambda end: slots.send(end, asks(0, 0, 100)._replace(what=77), new_file(1)),
-    "before the slot": lambda end: slots.send(end, asks(0, 2**63, 100), new_file(1)),
-    "beyond the slot": lambda end: slots.send(end, asks(0, 0, LEAST + 1), new_file(1)),
-    "far beyond": lambda end: slots.send(end, asks(0, 64, 2**63), new_file(1)),
-    "not sealed": lambda end: slots.send(end, asks(0, 0, 100), unsealed()),
-    "too small": lambda end: slots.send(end, asks(0, 0, 100), nameless.new_memory(100)),
-    "no memory": lambda end: slots.send(end, asks(0, 0, 100), os.open("/dev/null", os.O_RDWR)),
-    "a folder": lambda end: slots.send(end, asks(0, 0, 100), os.open("/", os.O_RDONLY)),
+    "no slot": lambda end: send_token(end, asks(0, 0, 100)),
+    "no such slot": lambda end: send_token(end, asks(SLOTS, 0, 100), new_slot(1)),
+    "no question": lambda end: send_token(end, asks(0, 0, 100)._replace(purpose=77), new_slot(1)),
+    "before the slot": lambda end: send_token(end, asks(0, 2**63, 100), new_slot(1)),
+    "beyond the slot": lambda end: send_token(end, asks(0, 0, LEAST + 1), new_slot(1)),
+    "far beyond": lambda end: send_token(end, asks(0, 64, 2**63), new_slot(1)),
+    "not sealed": lambda end: send_token(end, asks(0, 0, 100), unsealed()),
+    "too small": lambda end: send_token(end, asks(0, 0, 100), memfd.new_memory(100)),
+    "no memory": lambda end: send_token(end, asks(0, 0, 100), os.open("/dev/null", os.O_RDWR)),
+    "a folder": lambda end: send_token(end, asks(0, 0, 100), os.open("/", os.O_RDONLY)),
 }
 
 
@@ -308,21 +319,21 @@ def test_who_talks_nonsense_is_dropped_and_nobody_else(stage, nonsense: Callable
 def test_a_message_that_cannot_be_read_is_answered_so(stage, place: tuple[int, int]):
     one = stage()
     end = one.raw()
-    slots.send(end, asks(0, *place), new_file(1))
+    send_token(end, asks(0, *place), new_slot(1))
     one.until(lambda: bool(one.server._connections))
     one.server.poll(0.0)
-    received = slots.receive(end)
-    assert received is not None and received[0].what == slots.FAIL and not one.asked
+    received = receive_token(end)
+    assert received is not None and received[0].purpose == FAIL and not one.asked
 
 
 def test_a_slot_is_asked_once_at_a_time(stage):
     one = stage()
     end, encoded = one.raw(), encode("first")
-    slot = slots.Slot(file := new_file(1))
+    slot = Slot(file := new_slot(1))
     encoded.write(slot.memory, 0)
-    slots.send(end, asks(0, 0, encoded.size), file)
+    send_token(end, asks(0, 0, encoded.size), file)
     (asked,) = one.await_asked(1)
-    slots.send(end, asks(0, 0, encoded.size))
+    send_token(end, asks(0, 0, encoded.size))
     one.until(lambda: asked.gone)
     assert end.recv(1000) == b""
 
@@ -333,14 +344,14 @@ def test_a_caller_does_not_believe_a_strange_reply(stage):
     ticket = caller.send("question")
     one.await_asked(1)
     (connection,) = one.server._connections.values()
-    slots.send(connection.socket, Token(slots.ANSWER, 0, ticket + 5, 0, 10, 0.0))
+    send_token(connection.socket, Token(ANSWER, 0, ticket + 5, 0, 10, 0.0))
     with pytest.raises(ServiceStoppedError, match="a reply to message 6, which was not asked"):
         caller.done(LONG_S)
     other = one.caller()
     ticket = other.send("question")
     one.await_asked(1)
     connection = list(one.server._connections.values())[-1]
-    slots.send(connection.socket, Token(slots.ANSWER, 0, ticket, 0, 2**40, 0.0))
+    send_token(connection.socket, Token(ANSWER, 0, ticket, 0, 2**40, 0.0))
     with pytest.raises(ServiceStoppedError, match="a message that cannot be read"):
         other.done(LONG_S)
 
@@ -348,7 +359,7 @@ def test_a_caller_does_not_believe_a_strange_reply(stage):
 def test_a_service_that_takes_nothing_is_not_waited_for_for_ever(stage, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(shared_memory, "CONNECT_S", 0.05)
     one = stage()
-    caller: Caller = one.caller()
+    caller: Client = one.caller()
     with pytest.raises(TimeoutError, match=r"service: 1 of 1 replies did not come within 0\.05 s"):
         caller.ask(["nobody polls"], 0.05)
     with pytest.raises(ServiceStoppedError, match="service cannot be connected to: .*unavailable"):

@@ -11,11 +11,10 @@ import ray
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.transport import endpoint as module
-from accerl_lerobot.transport.contract import Caller, ServiceStoppedError
-from accerl_lerobot.transport.endpoint import Endpoint, Transport, listens
-from accerl_lerobot.transport.nameless import available
-from accerl_lerobot.transport.ray_calls import RayCaller
-from accerl_lerobot.transport.shared_memory import Address, SharedMemoryCaller
+from accerl_lerobot.transport.contract import Client, ServiceStoppedError
+from accerl_lerobot.transport.endpoint import Endpoint, RayClient, Transport, uses_shared_memory
+from accerl_lerobot.transport.memfd import available
+from accerl_lerobot.transport.shared_memory import Address, SharedMemoryClient
 from tests.light_workers import LightInference, light_ray
 from tests.transport.contract import CHECKS, Check, Service, messages, same
 
@@ -38,10 +37,10 @@ def service(request: pytest.FixtureRequest, light_ray: None) -> Iterator[Endpoin
 
 
 @pytest.fixture
-def connect(service: Endpoint) -> Iterator[Callable[[], Caller]]:
-    made: list[Caller] = []
+def connect(service: Endpoint) -> Iterator[Callable[[], Client]]:
+    made: list[Client] = []
 
-    def make() -> Caller:
+    def make() -> Client:
         made.append(service.connect())
         return made[-1]
 
@@ -51,7 +50,7 @@ def connect(service: Endpoint) -> Iterator[Callable[[], Caller]]:
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
-def test_contract(check: Check, connect: Callable[[], Caller]):
+def test_contract(check: Check, connect: Callable[[], Client]):
     check(connect)
 
 
@@ -60,7 +59,7 @@ def test_both_give_the_same_decisions(light_ray: None):
     actor = ray.remote(LightInference).options(num_cpus=0).remote()
     requests = messages()[1]
     callers = [endpoint_of(actor, "decide", way).connect() for way in ("ray", "shared_memory")]
-    assert [type(caller) for caller in callers] == [RayCaller, SharedMemoryCaller]
+    assert [type(caller) for caller in callers] == [RayClient, SharedMemoryClient]
     through_ray, through_memory = (caller.ask([requests, requests[:1]], 60.0) for caller in callers)
     assert same(through_ray, through_memory) and [len(some) for some in through_ray] == [2, 1]
     ray.kill(actor)
@@ -80,9 +79,9 @@ def end(node: str | None, transport: Transport) -> Endpoint:
 
 
 def test_auto_is_ray_for_another_node_and_where_nobody_listens(nodes: None):
-    assert isinstance(end(ELSEWHERE, "auto").connect(), RayCaller)
-    assert isinstance(end(None, "auto").connect(), RayCaller)
-    assert isinstance(end(None, "ray").connect(), RayCaller)
+    assert isinstance(end(ELSEWHERE, "auto").connect(), RayClient)
+    assert isinstance(end(None, "auto").connect(), RayClient)
+    assert isinstance(end(None, "ray").connect(), RayClient)
 
 
 @NO_MEMORY
@@ -98,11 +97,13 @@ def test_shared_memory_between_nodes_is_refused(nodes: None):
 
 def test_what_the_system_does_not_have_is_refused_when_it_is_asked_for(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(module, "available", lambda: False)
-    assert not listens("auto") and not listens("ray")
+    assert not uses_shared_memory("auto") and not uses_shared_memory("ray")
     with pytest.raises(InputError, match=r"launch.transport='shared_memory': this system has no memfd"):
-        listens("shared_memory")
+        uses_shared_memory("shared_memory")
 
 
 @NO_MEMORY
 def test_where_there_is_shared_memory_it_is_offered_unless_ray_is_asked_for():
-    assert listens("auto") and listens("shared_memory") and not listens("ray")
+    assert (
+        uses_shared_memory("auto") and uses_shared_memory("shared_memory") and not uses_shared_memory("ray")
+    )

@@ -15,11 +15,23 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 import pytest
 
-from accerl_lerobot.weights.channel import Tensors, WeightChannel
+from accerl_lerobot.weights.buffer import Tensors
+
+
+class WeightChannel(Protocol):
+    """A publisher and its readers, as one."""
+
+    def publish(self, version: int, tensors: Tensors) -> None:
+        """Publish a set and wait until it has arrived."""
+
+    def newest(self, than: int) -> tuple[int, Tensors] | None:
+        """The newest set, if it is newer than `than`."""
+
 
 Factory = Callable[[], WeightChannel]
 Check = Callable[[Factory], None]

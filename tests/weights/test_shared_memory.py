@@ -20,10 +20,8 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.weights import shared_memory
-from accerl_lerobot.weights.channel import Tensors, WeightChannel
-from accerl_lerobot.weights.reader import Received, SharedMemoryReader
-from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
-from accerl_lerobot.weights.slab import Layout, Slab, TornSetError, digest
+from accerl_lerobot.weights.buffer import BufferLayout, Tensors, TornSetError, WeightBuffer, digest
+from accerl_lerobot.weights.shared_memory import Received, SharedMemoryPublisher, SharedMemoryReader
 from tests.weights.contract import CHECKS, Check, filled, values_of
 
 OPEN: list[Any] = []
@@ -67,7 +65,7 @@ class Parameters:
         received.release()
 
 
-class Delivered(WeightChannel):
+class Delivered:
     """The publisher with two readers, as one channel: what is published has been applied by both."""
 
     def __init__(self) -> None:
@@ -130,20 +128,13 @@ def test_a_torn_set_is_refused(monkeypatch: pytest.MonkeyPatch):
     publisher.publish(1, filled(1.0, size=1000))
     publisher.flush(60)
 
-    def then_torn(version: int, layout: Layout, data: np.ndarray) -> bytes:
-        found = digest(version, layout, data)
-        data[layout.places["b"].offset] ^= 1
-        return found
+    def then_torn(version: int, layout: BufferLayout, buffer: WeightBuffer) -> bytes:
+        right = digest(version, layout, buffer)
+        if threading.current_thread().name == "publisher":
+            buffer.memory[layout.specs["b"].offset] ^= 1
+        return right
 
-    # What the reader reckons may be of before or after the tear; so it is made to look afterwards.
     monkeypatch.setattr(shared_memory, "digest", then_torn)
-    original = SharedMemoryReader._slab
-
-    def later(self: SharedMemoryReader, *arguments: Any) -> Slab:
-        until(lambda: publisher._current is not None and publisher._current.digest)
-        return original(self, *arguments)
-
-    monkeypatch.setattr(SharedMemoryReader, "_slab", later)
     publisher.publish(2, filled(2.0, size=1000))
     publisher.flush(60)  # nobody is left who would be owed it
     assert isinstance(reader.failure, TornSetError) and "version 2" in str(reader.failure)
@@ -153,17 +144,17 @@ def test_a_torn_set_is_refused(monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.parametrize("what", ["version", "name", "value"])
 def test_the_digest_is_of_everything(what: str):
     tensors = filled(1.0)
-    layout = Layout.of(tensors)
-    slab = Slab(layout.end)
-    slab.fill(layout, tensors)
-    before = digest(3, layout, slab.memory)
+    layout = BufferLayout.of(tensors)
+    buffer = WeightBuffer(layout.end)
+    buffer.fill(layout, tensors)
+    before = digest(3, layout, buffer)
     if what == "version":
-        assert digest(4, layout, slab.memory) != before
+        assert digest(4, layout, buffer) != before
     elif what == "name":
-        assert digest(3, Layout.of({**filled(1.0), "c.weight": tensors["a"].T}), slab.memory) != before
+        assert digest(3, BufferLayout.of({**filled(1.0), "c.weight": tensors["a"].T}), buffer) != before
     else:
-        slab.memory[layout.places["c.weight"].offset + 5] ^= 1
-        assert digest(3, layout, slab.memory) != before
+        buffer.memory[layout.specs["c.weight"].offset + 5] ^= 1
+        assert digest(3, layout, buffer) != before
 
 
 def test_a_slow_reader_keeps_what_it_holds_and_holds_up_nobody():
@@ -183,7 +174,7 @@ def test_a_slow_reader_keeps_what_it_holds_and_holds_up_nobody():
     slow.gate.set()
     publisher.flush(60)
     assert slow.versions == [0, 29] and values_of(slow.tensors) == {29.0}
-    assert len(publisher._slabs) <= 4
+    assert len(publisher._buffers) <= 4
 
 
 def test_flush_names_readers_that_never_came():
@@ -217,8 +208,8 @@ def test_sets_that_grow_find_room():
         found = channel.newest(-1)
         assert found is not None and found[1]["a"].shape == (2, size)
         assert values_of(found[1]) == {float(version)}
-    mapped = channel.readers[0].reader._slabs
-    assert len(mapped) <= len(channel.publisher._slabs) <= 4
+    mapped = channel.readers[0].reader._buffers
+    assert len(mapped) <= len(channel.publisher._buffers) <= 4
 
 
 def test_a_stranger_is_turned_away(monkeypatch: pytest.MonkeyPatch):
@@ -288,7 +279,7 @@ def test_a_reader_that_is_killed_is_let_go_of_and_leaves_nothing():
     finally:
         process.kill()
         process.join(60)
-    for version in range(1, 20):  # to nobody, and no slab is missing
+    for version in range(1, 20):  # to nobody, and no buffer is missing
         publisher.publish(version, filled(float(version), size=10_000))
     reader = Parameters(publisher)
     until(lambda: reader.versions == [19])
@@ -332,13 +323,13 @@ def test_a_trainer_that_is_killed_ends_the_reader_quietly_and_leaves_nothing():
         assert address not in names.read()
 
 
-def test_a_slab_that_is_shared_can_neither_grow_nor_shrink():
-    slab = Slab.shared(10_000)
-    assert slab.fd is not None
+def test_a_buffer_that_is_shared_can_neither_grow_nor_shrink():
+    buffer = WeightBuffer.shared(10_000)
+    assert buffer.fd is not None
     for size in (100, 100_000):
         with pytest.raises(PermissionError):
-            os.ftruncate(slab.fd, size)
-    slab.close()
+            os.ftruncate(buffer.fd, size)
+    buffer.close()
 
 
 def test_closing_lets_go_of_all_descriptors():

@@ -10,8 +10,8 @@ from typing import Any
 import psutil
 import pytest
 
-from accerl_lerobot.engine import watched
-from accerl_lerobot.engine.watched import Watched, end
+from accerl_lerobot.engine import supervisor
+from accerl_lerobot.engine.supervisor import ActorHandle, end
 
 
 class Stand:
@@ -26,10 +26,10 @@ class Stand:
 
 @pytest.mark.parametrize("here", [True, False])
 def test_only_a_process_of_this_node_is_ended_by_its_number(here: bool, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(watched, "ray", Stand())
-    monkeypatch.setattr(watched, "GONE_S", 0.2)
+    monkeypatch.setattr(supervisor, "ray", Stand())
+    monkeypatch.setattr(supervisor, "GONE_S", 0.2)
     with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]) as process:
-        worker = Watched("somebody", None)
+        worker = ActorHandle("somebody", None)
         worker.await_start(process.pid, 1.0, here)
         assert (worker.process == psutil.Process(process.pid)) is here
         end([worker])

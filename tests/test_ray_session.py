@@ -1,27 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ray is a run's own: nobody else can reach it, and nobody who could is let in."""
+"""A private Ray is closed to others, ends with the run, and is watched; a cluster is checked first."""
 
 from __future__ import annotations
 
 import json
 import os
+import signal
+import socket
 import stat
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 
-from accerl_lerobot.engine import ray_environment
+from accerl_lerobot.engine import ray_session
+from accerl_lerobot.engine.config import LaunchConfig
+from accerl_lerobot.engine.contract import WorkerError
+from accerl_lerobot.engine.ray_session import RaySession, RayWatch, process_kind
+from accerl_lerobot.errors import InputError
 from tests.light_workers import light_ray
 
 __all__ = ["light_ray"]
 
 TOKEN, TOKEN_PATH = "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"
 VARIABLES = (
-    *ray_environment.WORKERS,
-    *ray_environment.PRIVATE,
+    *ray_session.WORKERS,
+    *ray_session.PRIVATE,
     "RAY_AUTH_MODE",
     TOKEN,
     TOKEN_PATH,
@@ -36,14 +44,14 @@ def bare(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
         monkeypatch.setenv(name, "")  # so that it is put back afterwards
         monkeypatch.delenv(name)
     monkeypatch.delitem(sys.modules, "ray", raising=False)
-    monkeypatch.setattr(ray_environment, "private_folder", ray_environment.private_folder.__wrapped__)
+    monkeypatch.setattr(ray_session, "private_folder", ray_session.private_folder.__wrapped__)
     yield monkeypatch
 
 
 def test_every_process_makes_its_own_token(bare: pytest.MonkeyPatch):
     tokens = []
     for _ in range(2):
-        ray_environment.prepare()
+        ray_session.prepare()
         assert os.environ["RAY_AUTH_MODE"] == "token" and TOKEN not in os.environ
         tokens.append(Path(os.environ.pop(TOKEN_PATH)).read_text())
         del os.environ["RAY_AUTH_MODE"]
@@ -70,7 +78,7 @@ def test_a_token_was_never_open_to_others(bare: pytest.MonkeyPatch):
     try:
         bare.setattr(os, "mkdir", mkdir)
         bare.setattr(os, "open", open_)
-        ray_environment.write_token()
+        ray_session.write_token()
     finally:
         os.umask(before)
     assert seen == [(True, 0o700), (False, 0o600)]
@@ -79,7 +87,7 @@ def test_a_token_was_never_open_to_others(bare: pytest.MonkeyPatch):
 @pytest.mark.parametrize("end", ["pass", "raise SystemExit(3)", "1 / 0"])
 def test_the_token_goes_with_its_process(end: str):
     code = (
-        "import os\nfrom accerl_lerobot.engine import ray_environment\nray_environment.prepare()\n"
+        "import os\nfrom accerl_lerobot.engine import ray_session\nray_session.prepare()\n"
         "child = os.fork()\nif child == 0: raise SystemExit(0)\nos.waitpid(child, 0)\n"
         f"path = os.environ['RAY_AUTH_TOKEN_PATH']\nassert os.path.isfile(path)\nprint(path)\n{end}"
     )
@@ -92,44 +100,40 @@ def test_the_token_goes_with_its_process(end: str):
 @pytest.mark.parametrize("name", ["RAY_AUTH_MODE", TOKEN, TOKEN_PATH])
 def test_a_configured_token_is_left_alone(bare: pytest.MonkeyPatch, name: str):
     bare.setenv(name, "mine")
-    ray_environment.prepare()
+    ray_session.prepare()
     found = {k: os.environ[k] for k in ("RAY_AUTH_MODE", TOKEN, TOKEN_PATH) if k in os.environ}
     assert found == {name: "mine"}
 
 
 def test_who_joins_a_cluster_has_the_user_s_token_and_nothing_else(bare: pytest.MonkeyPatch, tmp_path: Path):
     bare.setenv("HOME", str(tmp_path))
-    ray_environment.prepare(joins=True)
-    assert not ray_environment.has_token()
-    assert (
-        not {"RAY_AUTH_MODE", TOKEN, TOKEN_PATH, "RAY_TMPDIR", *ray_environment.PRIVATE} & os.environ.keys()
-    )
-    assert ray_environment.passed_on().keys() >= ray_environment.WORKERS.keys()
+    ray_session.prepare(joins=True)
+    assert not ray_session.has_token()
+    assert not {"RAY_AUTH_MODE", TOKEN, TOKEN_PATH, "RAY_TMPDIR", *ray_session.PRIVATE} & os.environ.keys()
+    assert ray_session.forwarded_environment().keys() >= ray_session.WORKERS.keys()
     (tmp_path / ".ray").mkdir()
     (tmp_path / ".ray" / "auth_token").write_text("mine")
-    ray_environment.prepare(joins=True)
-    assert ray_environment.has_token() and os.environ["RAY_AUTH_MODE"] == "token"
+    ray_session.prepare(joins=True)
+    assert ray_session.has_token() and os.environ["RAY_AUTH_MODE"] == "token"
     bare.setenv(TOKEN, "mine")
-    stranger = ray_environment.without_token()
+    stranger = ray_session.without_token()
     assert not {TOKEN, TOKEN_PATH} & stranger.keys() and stranger["RAY_AUTH_MODE"] == "disabled"
     assert not (Path(stranger["HOME"]) / ".ray").exists()
-    assert "mine" not in ray_environment.passed_on().values()
+    assert "mine" not in ray_session.forwarded_environment().values()
 
 
 def test_what_the_user_has_set_is_kept(bare: pytest.MonkeyPatch):
     bare.setenv("OMP_NUM_THREADS", "7")
     bare.setenv("RAY_TMPDIR", "there")
-    ray_environment.prepare()
+    ray_session.prepare()
     assert os.environ["RAY_TMPDIR"] == "there"
     assert os.environ["OMP_NUM_THREADS"] == "7" and os.environ["OMP_WAIT_POLICY"] == "PASSIVE"
 
 
 def test_a_ray_that_is_imported_already_has_read_its_environment(bare: pytest.MonkeyPatch):
     bare.setitem(sys.modules, "ray", sys)
-    ray_environment.prepare()
-    assert (
-        not {TOKEN, TOKEN_PATH} & os.environ.keys() and not set(ray_environment.PRIVATE) & os.environ.keys()
-    )
+    ray_session.prepare()
+    assert not {TOKEN, TOKEN_PATH} & os.environ.keys() and not set(ray_session.PRIVATE) & os.environ.keys()
 
 
 def own_processes() -> set[int]:
@@ -222,8 +226,8 @@ def test_a_client_without_the_token_is_refused(light_ray: None):
 TOKENS = """
 import json, sys
 from pathlib import Path
-from accerl_lerobot.engine import ray_environment
-ray_environment.prepare()
+from accerl_lerobot.engine import ray_session
+ray_session.prepare()
 from accerl_lerobot.engine.launch import RayEngine
 from accerl_lerobot.inference import worker as inference
 from accerl_lerobot.trainer import worker as trainer
@@ -267,14 +271,14 @@ def test_a_client_in_such_a_process_finds_no_token(tmp_path: Path):
         return done.stdout.strip()
 
     assert token({"HF_HOME": str(tmp_path)}) == "hf_storedstoredstored"
-    assert token({"HF_HOME": str(tmp_path)} | ray_environment.TOKENLESS["runtime_env"]["env_vars"]) == "None"
+    assert token({"HF_HOME": str(tmp_path)} | ray_session.NO_HUB_TOKEN["runtime_env"]["env_vars"]) == "None"
 
 
 def test_a_ray_that_others_could_talk_to_is_not_started():
     """Ray first, `prepare` after: too late for what Ray reads when it is imported."""
     program = (
-        "import ray\nfrom accerl_lerobot.engine import ray_environment\nray_environment.prepare()\n"
-        "from accerl_lerobot.engine.cluster import start_ray\nstart_ray()\n"
+        "import ray\nfrom accerl_lerobot.engine import ray_session\nray_session.prepare()\n"
+        "from accerl_lerobot.engine.ray_session import start_ray\nstart_ray()\n"
     )
     clean = {k: v for k, v in os.environ.items() if not k.startswith("RAY_")}
     done = subprocess.run(
@@ -283,16 +287,187 @@ def test_a_ray_that_others_could_talk_to_is_not_started():
     assert done.returncode == 1 and "would be open to others if started now" in done.stderr
 
 
+class Stand:
+    """Stands in for `ray`, and counts."""
+
+    def __init__(self, there: bool = False, failures: int = 0) -> None:
+        self.there, self.failures, self.calls = there, failures, list[str]()
+
+    def is_initialized(self) -> bool:
+        return self.there
+
+    def init(self, launch: LaunchConfig | None = None, **options: object) -> None:
+        self.calls.append("init")
+        if self.failures:
+            self.failures -= 1
+            raise Exception("The current node timed out\nduring startup.")  # a plain one, as Ray's
+        self.there = True
+
+    def shutdown(self) -> None:
+        self.there = False
+        self.calls.append("shutdown")
+
+
+@pytest.fixture
+def hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hide the Ray that other tests use in this process, or it would be ended here."""
+    monkeypatch.setattr(ray_session, "ray_processes", dict)
+
+
 @pytest.mark.parametrize(
-    "options",
-    [
-        ["weights", "--sizes_mb=[1]", "--readers=[1]", "--repeats=1", "--tensors=2"],
-        ["transport", '--sizes=["12 KB"]', "--callers=[1]", "--calls=10", "--rounds=1"],
-    ],
-    ids=lambda options: options[0],
+    ("responds", "calls"),
+    [(True, ["init", "shutdown"]), (False, ["init", "shutdown", "init", "shutdown"])],
 )
-def test_benches_that_start_ray_by_themselves_have_prepared_for_it(options: list[str]):
-    clean = {k: v for k, v in os.environ.items() if not k.startswith("RAY_")}
-    command = [sys.executable, "-m", "benchmarks", *options]
-    done = subprocess.run(command, env=clean, capture_output=True, text=True, timeout=240)
-    assert done.returncode == 0, done.stderr[-2000:]
+def test_it_is_kept_for_those_who_come_later_while_it_responds(
+    hidden: None, responds: bool, calls: list[str], monkeypatch: pytest.MonkeyPatch
+):
+    stand = Stand()
+    monkeypatch.setitem(sys.modules, "ray", stand)
+    monkeypatch.setattr(ray_session, "start_ray", stand.init)
+    monkeypatch.setattr(ray_session, "_responds", lambda: responds)
+    own = RaySession(LaunchConfig())
+    own.start()
+    own.start()
+    own.close()
+    own.close()
+    assert stand.calls == calls and not stand.there
+
+
+def test_one_that_was_there_before_is_left_as_it_is(hidden: None, monkeypatch: pytest.MonkeyPatch):
+    stand = Stand(there=True)
+    monkeypatch.setitem(sys.modules, "ray", stand)
+    monkeypatch.setattr(ray_session, "start_ray", stand.init)
+    monkeypatch.setattr(ray_session, "_responds", lambda: pytest.fail("it is not ours to judge"))
+    own = RaySession(LaunchConfig())
+    own.start()
+    own.close()
+    assert stand.calls == [] and stand.there
+
+
+@pytest.fixture
+def raylet(monkeypatch: pytest.MonkeyPatch) -> Iterator[psutil.Process]:
+    """A process that is taken for Ray's only one."""
+    with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"]) as process:
+        one = psutil.Process(process.pid)  # made once: there is none of a process that has gone
+        monkeypatch.setattr(ray_session, "ray_processes", lambda: {one: "raylet"})
+        yield one
+        process.kill()
+
+
+@pytest.mark.parametrize(("number", "how"), [(signal.SIGKILL, "died"), (signal.SIGSTOP, "been stopped for")])
+def test_a_process_of_ray_that_is_lost_is_named_and_a_new_ray_is_started(
+    number: signal.Signals, how: str, raylet: psutil.Process, monkeypatch: pytest.MonkeyPatch
+):
+    stand = Stand()
+    monkeypatch.setitem(sys.modules, "ray", stand)
+    monkeypatch.setattr(ray_session, "start_ray", stand.init)
+    own = RaySession(LaunchConfig(stall_s=0.1))
+    own.start()
+    assert not own.lost
+    raylet.send_signal(number)
+    while not own.lost:
+        time.sleep(0.01)
+    assert own.lost.startswith(f"Ray's raylet (process {raylet.pid}) has {how}")
+    own.close()
+    assert own.lost and not raylet.is_running()
+    monkeypatch.setattr(ray_session, "ray_processes", dict)
+    own.start()
+    assert not own.lost and stand.calls == ["init", "shutdown", "init"]
+    own.close()
+
+
+def test_who_goes_on_is_not_taken_for_stopped(raylet: psutil.Process):
+    watch = RayWatch(stall_s=3600.0)
+    raylet.suspend()
+    while raylet.status() != psutil.STATUS_STOPPED:
+        time.sleep(0.01)
+    assert not watch.look() and watch._stopped
+    raylet.resume()
+    while watch._stopped:
+        assert not watch.look()
+    watch.close()
+
+
+HANGS = """
+import os, signal, sys, time
+import psutil
+from accerl_lerobot import guardian
+from accerl_lerobot.engine import ray_session
+gcs_server = psutil.Process(int(sys.argv[1]))
+ray_session.ray_processes = lambda: {gcs_server: "gcs_server"}
+ray_session.kill_ray = lambda processes: None
+ray_session.GIVE_UP_S = 0.1
+guardian.explain(remedy="to resume: accerl train --resume=true")
+ray_session.RayWatch(300.0)
+os.kill(int(sys.argv[1]), signal.SIGKILL)
+time.sleep(600)
+"""
+
+
+def test_a_main_thread_that_hangs_in_ray_does_not_keep_the_process(raylet: psutil.Process):
+    command = [sys.executable, "-c", HANGS, str(raylet.pid)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    said = f"accerl: Ray's gcs_server (process {raylet.pid}) has died; to resume: accerl train --resume=true"
+    assert (done.returncode, done.stderr.splitlines()[-1:]) == (1, [said])
+
+
+@pytest.mark.parametrize("failures", [2, ray_session.STARTS])
+def test_a_ray_that_does_not_start_is_started_again_a_few_times(
+    hidden: None, failures: int, monkeypatch: pytest.MonkeyPatch
+):
+    stand = Stand(failures=failures)
+    monkeypatch.setitem(sys.modules, "ray", stand)
+    monkeypatch.setattr(ray_session.time, "sleep", lambda seconds: None)
+    if failures < ray_session.STARTS:
+        ray_session.start_ray()
+        assert stand.there and stand.calls.count("init") == failures + 1
+        return
+    with pytest.raises(WorkerError) as raised:
+        ray_session.start_ray()
+    assert str(raised.value) == (
+        f"Ray did not start in {failures} attempts: The current node timed out during startup."
+    )
+
+
+def test_rays_own_processes_are_told_from_its_workers():
+    assert process_kind(["/x/ray/core/src/ray/raylet/raylet", "--raylet_socket_name=x"]) == "raylet"
+    assert process_kind(["python", "-u", "/x/ray/_private/log_monitor.py"]) == "log monitor"
+    assert process_kind(["ray::DashboardAgent" + " " * 90]) == "dashboard agent"
+    assert process_kind(["python", "/x/ray/_private/workers/default_worker.py", "--raylet=/x"]) is None
+    assert process_kind(["ray::RolloutWorker"]) is None and process_kind([]) is None
+
+
+@pytest.fixture
+def address() -> Iterator[str]:
+    """Where somebody listens."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield f"127.0.0.1:{server.getsockname()[1]}"
+
+
+@pytest.mark.parametrize(
+    ("status", "says"),
+    [
+        ("raise OSError('boom')", "it does not answer as Ray does: OSError: boom"),
+        ("raise OSError('InvalidAuthToken: wrong')", "it does not take the token that is configured here"),
+        ("pass", "it asks for no token, so whoever reaches it runs code"),
+        ("import time; time.sleep(600)", "it does not answer as Ray does: no answer within 1 s"),
+    ],
+)
+def test_what_is_no_cluster_to_join_is_refused(
+    address: str, status: str, says: str, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(ray_session, "STATUS", ("-c", status))
+    monkeypatch.setattr(ray_session, "ANSWER_S", 1.0)
+    with pytest.raises(InputError, match=rf"^launch\.address='{address}': {says}"):
+        ray_session.check_cluster(LaunchConfig(address=address))
+
+
+def test_a_cluster_that_answers_those_with_a_token_only_is_joined(
+    address: str, monkeypatch: pytest.MonkeyPatch
+):
+    asks = "import os; assert os.environ['RAY_AUTH_MODE'] == 'token'"
+    monkeypatch.setattr(ray_session, "STATUS", ("-c", asks))
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")
+    ray_session.check_cluster(LaunchConfig(address=address))
+    monkeypatch.setattr(ray_session, "STATUS", ("-c", "pass"))
+    ray_session.check_cluster(LaunchConfig(address=address, open_cluster=True))

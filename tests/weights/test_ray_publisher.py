@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 import ray
 
-from accerl_lerobot.weights.channel import Tensors, WeightChannel
+from accerl_lerobot.weights.buffer import Tensors
+from accerl_lerobot.weights.factory import RayPublisher
 from accerl_lerobot.weights.publisher import Publisher
-from accerl_lerobot.weights.ray_channel import RayPublisher
 from tests.light_workers import light_ray
 from tests.weights.contract import CHECKS, Check, filled, values_of
 
@@ -83,7 +83,7 @@ def until(holds: Callable[[], bool]) -> None:
         time.sleep(0.005)
 
 
-class Delivered(WeightChannel):
+class Delivered:
     """The publisher with its reader, as one channel: what is published has arrived."""
 
     def __init__(self, reader: Any, publisher: Publisher) -> None:

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 
 from accerl_lerobot.transport.contract import ServiceStoppedError
-from accerl_lerobot.transport.endpoint import Endpoint
-from accerl_lerobot.transport.lasting import LastingCaller
+from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
 from tests.transport.played import played
 
 
@@ -42,8 +41,8 @@ class Nowhere(Endpoint):
         raise ServiceStoppedError("nobody listens there")
 
 
-def connected(service: Service) -> LastingCaller:
-    caller = LastingCaller("inference")
+def connected(service: Service) -> ReconnectingClient:
+    caller = ReconnectingClient("inference")
     caller.move(service.endpoint)
     return caller
 
@@ -68,7 +67,7 @@ def test_what_was_not_answered_is_asked_of_the_next_in_order_and_under_the_same_
 
 
 def test_a_service_that_dies_while_it_is_asked_and_one_that_is_gone_when_it_is_connected_to():
-    caller = LastingCaller("inference")
+    caller = ReconnectingClient("inference")
     ticket = caller.send("early")
     caller.move(Nowhere(name="nowhere", method=None))
     assert caller.done(0.0) == [] and caller.why == "nobody listens there"
@@ -116,7 +115,7 @@ def test_what_is_forgotten_is_not_asked_again():
 
 def test_a_wait_ends_when_the_service_is_there_and_how_long_it_was_away_counts_from_then():
     service = Service("only")
-    caller = LastingCaller("inference")
+    caller = ReconnectingClient("inference")
     ticket = caller.send("question")
     assert caller.done(0.01) == [] and caller.away_s == 0.0, "nobody has said where it is"
     caller.move(Nowhere(name="nowhere", method=None))

@@ -1,0 +1,434 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The Ray of a run: its environment, its start or the cluster that is joined, and a watch over it.
+
+A private Ray can be used by nobody else: it listens on the loopback interface only and asks for a token,
+which is in a folder that only this user can enter, beside Ray's sockets and logs. A run that joins a cluster
+(``launch.address``) uses the user's token and leaves the cluster as it is.
+
+Ray reads its environment when it is imported, so nothing here imports it at the top, and `prepare` is called
+before anything does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+import os
+import secrets
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import psutil
+
+from accerl_lerobot import guardian
+from accerl_lerobot.engine.contract import WorkerError, pause_s
+from accerl_lerobot.engine.stopping import arrived, deferred
+from accerl_lerobot.errors import InputError
+
+if TYPE_CHECKING:
+    from accerl_lerobot.engine.config import LaunchConfig
+
+logger = logging.getLogger(__name__)
+
+FIELD = "launch.address"
+STARTS = 4
+"""Attempts to start a private Ray, which gives up after 30 s; a busy machine may need more."""
+CONNECT_S = 5.0
+"""Timeout for a TCP connection to a cluster."""
+ANSWER_S = 60.0
+"""Timeout for ``ray status``, most of which is importing Ray."""
+RESPONDS_S = 20.0
+"""Timeout for Ray to start a process; after that it counts as broken."""
+LOOK_S = 0.5
+"""Between two looks at Ray's processes."""
+HURRY_S = 2.0
+"""How long one of them may be stopped once the run has been asked to stop."""
+GIVE_UP_S = 30.0
+"""How long the main thread may take to end a lost Ray, before this process is ended."""
+GONE_S = 3.0
+"""How long a killed process may take to be gone."""
+
+WORKERS = {
+    # Several CPU workers share the cores: spinning threads would cost more than they give.
+    "OMP_NUM_THREADS": "1",
+    "OMP_WAIT_POLICY": "PASSIVE",
+    "TOKENIZERS_PARALLELISM": "false",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+}
+FORWARDED = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
+"""Environment variables that workers on other nodes get besides `WORKERS`, where they are set here."""
+PRIVATE = {
+    # Ray 2.60 moves a node at 127.0.0.1 to the machine's address and then listens on every interface, unless
+    # it is told that there is no cluster to be part of. The name is historical: it is read on all systems.
+    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+}
+_AUTH = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
+_NO_TOKEN = {"HF_TOKEN": "", "HUGGING_FACE_HUB_TOKEN": "", "HF_TOKEN_PATH": os.devnull}
+NO_HUB_TOKEN = {"runtime_env": {"env_vars": _NO_TOKEN}}
+"""Options of an actor that runs other people's environments: the Hub's token is not in its environment, and
+its Hub client does not find it. No isolation: the process can still read what this user can."""
+
+RAY_PROCESSES = {
+    "gcs_server": ("/ray/gcs/gcs_server",),
+    "raylet": ("/ray/raylet/raylet",),
+    "dashboard agent": ("/dashboard/agent.py", "ray::DashboardAgent"),
+    "runtime env agent": ("/runtime_env/agent/main.py", "ray::RuntimeEnvAgent"),
+    "log monitor": ("/_private/log_monitor.py",),
+}
+"""Ray's own processes → the beginning of their command lines, without and with a process title."""
+REQUIRED = ("gcs_server", "raylet", "dashboard agent", "runtime env agent")
+"""Processes among these without which Ray does not work: a raylet ends with its agents."""
+STATUS = ("-m", "ray.scripts.scripts", "status")
+"""Arguments of Python that ask a cluster for its status: ``ray status``."""
+UNAUTHORISED = ("Unauthenticated", "UNAUTHENTICATED", "InvalidAuthToken", "AuthenticationError")
+"""One of these is in the answer to a missing or wrong token."""
+
+
+def prepare(joins: bool = False) -> None:
+    """Set the environment variables that Ray and its workers read; what is set already stays.
+
+    Args:
+        joins: True if a cluster is joined, with the user's token.
+    """
+    for key, value in WORKERS.items():
+        os.environ.setdefault(key, value)
+    if joins:
+        if "ray" not in sys.modules and has_token():
+            os.environ.setdefault("RAY_AUTH_MODE", "token")
+        return
+    if not os.environ.get("RAY_TMPDIR"):
+        # Sockets and logs: Ray's own choice is a folder that every user of the machine may write to.
+        os.environ["RAY_TMPDIR"] = str(private_folder())
+    if "ray" in sys.modules:
+        return
+    for key, value in PRIVATE.items():
+        os.environ.setdefault(key, value)
+    if not any(os.environ.get(k) for k in _AUTH):
+        os.environ["RAY_AUTH_MODE"] = "token"
+        os.environ["RAY_AUTH_TOKEN_PATH"] = str(write_token())
+
+
+def check_private() -> None:
+    """Refuse to start a private Ray that others could use.
+
+    Raises:
+        RuntimeError: Ray was imported before `prepare`.
+    """
+    if not all(os.environ.get(key) for key in PRIVATE) or not any(os.environ.get(key) for key in _AUTH):
+        remedy = "start a new process, or call ray_session.prepare() before Ray is imported"
+        raise RuntimeError(f"Ray has been imported, and would be open to others if started now: {remedy}")
+
+
+def has_token() -> bool:
+    """True if there is a token of the user's where Ray looks for one."""
+    if os.environ.get("RAY_AUTH_TOKEN"):
+        return True
+    path = os.environ.get("RAY_AUTH_TOKEN_PATH") or Path.home() / ".ray" / "auth_token"
+    return Path(path).is_file()
+
+
+def without_token() -> dict[str, str]:
+    """This environment as seen by somebody without a token."""
+    home = str(private_folder())  # or Ray would look into this user's
+    kept = {k: v for k, v in os.environ.items() if k not in _AUTH}
+    return kept | {"RAY_AUTH_MODE": "disabled", "HOME": home}
+
+
+def forwarded_environment() -> dict[str, str]:
+    """Environment variables of workers on nodes that were not started from here."""
+    return {name: os.environ[name] for name in (*WORKERS, *FORWARDED) if name in os.environ}
+
+
+def write_token() -> Path:
+    """Write a new token into this process's private folder, never open to others."""
+    path = private_folder() / "token"
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(handle, "w") as file:
+        file.write(secrets.token_hex(32))
+    return path
+
+
+@functools.cache
+def private_folder() -> Path:
+    """A folder of mode 0700, which this process's guardian removes when the process has ended."""
+    temporary = tempfile.gettempdir()
+    # A socket's path has 107 bytes at most, and Ray's part of it takes up to 70.
+    folder = Path(tempfile.mkdtemp(prefix="accerl-", dir=temporary if len(temporary) <= 16 else "/tmp"))
+    guardian.remove(folder)
+    return folder
+
+
+def process_kind(command: Sequence[str]) -> str | None:
+    """The one of `RAY_PROCESSES` that a command line belongs to."""
+    begin = " ".join(command[:3])
+    return next((kind for kind, words in RAY_PROCESSES.items() if any(w in begin for w in words)), None)
+
+
+def ray_processes() -> dict[psutil.Process, str]:
+    """Ray's own processes below this one, and their kind."""
+    processes = {}
+    for process in psutil.Process().children(recursive=True):
+        with contextlib.suppress(psutil.Error):
+            if kind := process_kind(process.cmdline()):
+                processes[process] = kind
+    return processes
+
+
+def kill_ray(known: Iterable[psutil.Process] = ()) -> None:
+    """Kill Ray's own processes below this one and `known` ones, and all that they have started."""
+    everyone: set[psutil.Process] = set()
+    for process in [*ray_processes(), *known]:
+        with contextlib.suppress(psutil.Error):
+            everyone |= {process, *process.children(recursive=True)}
+    for process in everyone:
+        with contextlib.suppress(psutil.Error):
+            process.kill()
+    psutil.wait_procs(everyone, timeout=GONE_S)
+
+
+def start_ray(launch: LaunchConfig | None = None) -> None:
+    """Start a private Ray on this machine, or join the cluster of ``launch.address``.
+
+    Raises:
+        InputError: there is no such cluster, or this run should not join it.
+        WorkerError: a private Ray did not start in `STARTS` attempts.
+    """
+    import ray
+
+    with deferred():
+        if launch is not None and launch.address is not None:
+            _join(launch)
+            return
+        check_private()
+        for attempt in range(1, STARTS + 1):
+            try:
+                ray.init(
+                    address="local",
+                    include_dashboard=False,
+                    _node_ip_address="127.0.0.1",
+                    log_to_driver=False,
+                    configure_logging=False,
+                )
+                return
+            except Exception as error:  # Ray raises a plain one when its start-up fails
+                reason = " ".join(str(error).split())
+                kill_ray()
+                ray.shutdown()
+                if attempt == STARTS or arrived():
+                    raise WorkerError(f"Ray did not start in {attempt} attempts: {reason}") from error
+                logger.warning("Ray did not start and is started again: %s", reason)
+                time.sleep(pause_s(attempt))
+
+
+def _join(launch: LaunchConfig) -> None:
+    import ray
+    from ray.exceptions import AuthenticationError
+
+    if not has_token() and not launch.open_cluster:
+        remedy = (
+            "there is no token; start the cluster with RAY_AUTH_MODE=token and give its token by "
+            "RAY_AUTH_TOKEN_PATH, or add --launch.open_cluster=true to do without"
+        )
+        raise InputError(FIELD, launch.address, remedy)
+    check_cluster(launch)
+    try:
+        ray.init(
+            address=launch.address,
+            log_to_driver=False,
+            configure_logging=False,
+            runtime_env={"env_vars": forwarded_environment()},
+        )
+    except (RuntimeError, ConnectionError, ValueError, AuthenticationError) as error:
+        said = " ".join(str(error.__cause__ or error).split())[:300]
+        remedy = f"this process cannot join it; is one of its nodes on this machine? Ray says: {said}"
+        raise InputError(FIELD, launch.address, remedy) from error
+
+
+def check_cluster(launch: LaunchConfig) -> None:
+    """Ask a cluster for its status with this run's token and without one, in processes of their own.
+
+    Raises:
+        InputError: it is no Ray cluster, of another version, refuses the token, or asks for none.
+    """
+    address = str(launch.address)
+    if address != "auto":
+        host, _, port = address.rpartition(":")
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), CONNECT_S).close()
+        except OSError as error:
+            why = error.strerror or error
+            remedy = f"nobody listens at {address} ({why}); is it what ray start --head printed?"
+            raise InputError(FIELD, address, remedy) from error
+    command = [sys.executable, *STATUS, f"--address={address}"]
+    pipes: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+    with (
+        subprocess.Popen(command, **pipes) as ours,
+        subprocess.Popen(command, env=without_token(), **pipes) as strangers,
+    ):
+        complaint, open_to_all = _complaint(ours), _complaint(strangers) is None
+    if complaint is not None:
+        if any(word in complaint for word in UNAUTHORISED):
+            remedy = "it does not take the token that is configured here; see RAY_AUTH_TOKEN_PATH"
+        elif address == "auto" and "ConnectionError" in complaint:
+            remedy = "no cluster on this machine; give HOST:PORT, or start one with ray start --head"
+        else:
+            last = (complaint.strip().splitlines() or ["no answer"])[-1][:200]
+            remedy = f"it does not answer as Ray does: {last}"
+        raise InputError(FIELD, address, remedy)
+    if open_to_all and not launch.open_cluster:
+        remedy = (
+            "it asks for no token, so whoever reaches it runs code in its workers; start it with "
+            "RAY_AUTH_MODE=token, or add --launch.open_cluster=true"
+        )
+        raise InputError(FIELD, address, remedy)
+
+
+def _complaint(process: subprocess.Popen[str]) -> str | None:
+    """The stderr of a process that failed; None: it succeeded."""
+    try:
+        _, complaint = process.communicate(timeout=ANSWER_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return f"no answer within {ANSWER_S:.0f} s"
+    return complaint if process.returncode else None
+
+
+class RaySession:
+    """Ray until it is closed. One that was there before is used and left running, and so is a cluster.
+
+    Example:
+        >>> session = RaySession(config.launch)
+        >>> session.start()     # for the first workers
+        >>> session.start()     # for their successors: checks whether it still responds
+        >>> session.close()
+    """
+
+    def __init__(self, launch: LaunchConfig) -> None:
+        self._launch, self._started = launch, False
+        self._watch: RayWatch | None = None
+        self._lost = ""
+
+    @property
+    def lost(self) -> str:
+        """The process of Ray that has been lost, and how; empty: none."""
+        return self._lost if self._watch is None else self._watch.look()
+
+    def start(self) -> None:
+        """Start Ray unless it is there, or if it does not respond any more.
+
+        Raises:
+            InputError: there is no such cluster, see `start_ray`.
+            WorkerError: it does not start.
+        """
+        import ray
+
+        if ray.is_initialized():
+            if not self._started or (not self.lost and _responds()):
+                return
+            logger.warning("Ray does not respond any more and is started again")
+            self.close()
+        self._started, self._lost = True, ""
+        start_ray(self._launch)
+        if self._launch.address is None:
+            self._watch = RayWatch(self._launch.stall_s)
+
+    def close(self) -> None:
+        """End Ray, if it was started here. Safe to call twice."""
+        import ray
+
+        self._lost = self.lost
+        if self._started and ray.is_initialized():
+            if self._watch is not None and self._lost:
+                kill_ray(self._watch.processes)
+            ray.shutdown()
+        if self._watch is not None:
+            self._watch.close()
+            self._watch = None
+        self._started = False
+
+
+class RayWatch(threading.Thread):
+    """Watches Ray's own processes below this one.
+
+    Ray takes a minute to notice that its GCS is gone, then ends this process from C++, and a raylet that has
+    been stopped blocks every call for ever. When a process has died, or has been stopped for too long, this
+    thread kills the others, which ends the calls that wait for them. If the main thread does not get on then,
+    it ends this process.
+
+    Args:
+        stall_s: how long one may be stopped; after SIGTERM or Ctrl-C, `HURRY_S` at most.
+    """
+
+    def __init__(self, stall_s: float) -> None:
+        super().__init__(name="ray watch", daemon=True)
+        self.lost = ""
+        """See `RaySession.lost`."""
+        self.processes: dict[psutil.Process, str] = {}
+        """Required processes and their kind."""
+        self._stall_s = stall_s
+        self._stopped: dict[psutil.Process, float] = {}
+        """Since when they have been stopped, on `time.monotonic`."""
+        self._closed, self._lock = threading.Event(), threading.Lock()
+        self.look()
+        self.start()
+
+    def run(self) -> None:
+        """Look until something is lost, then make sure that this process gets on or ends."""
+        while not self.look():
+            if self._closed.wait(LOOK_S):
+                return
+        kill_ray(self.processes)
+        if self._closed.wait(GIVE_UP_S):
+            return
+        guardian.explain(cause=self.lost)
+        os._exit(1)
+
+    def look(self) -> str:
+        """Look at every process once; see `RaySession.lost`."""
+        with self._lock:
+            if len(self.processes) < len(REQUIRED):
+                self.processes |= {p: kind for p, kind in ray_processes().items() if kind in REQUIRED}
+            for process, kind in self.processes.items() if not self.lost else ():
+                if how := self._fate(process):
+                    self.lost = f"Ray's {kind} (process {process.pid}) {how}"
+                    break
+            return self.lost
+
+    def close(self) -> None:
+        """End the watch."""
+        self._closed.set()
+        self.join()
+
+    def _fate(self, process: psutil.Process) -> str:
+        """How a process was lost; empty: it was not."""
+        try:
+            status = process.status()
+        except psutil.NoSuchProcess:
+            status = psutil.STATUS_ZOMBIE
+        if status == psutil.STATUS_ZOMBIE:
+            return "has died"
+        if status not in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP):
+            self._stopped.pop(process, None)
+            return ""
+        stopped_s = time.monotonic() - self._stopped.setdefault(process, time.monotonic())
+        limit = min(HURRY_S, self._stall_s) if arrived() else self._stall_s
+        return f"has been stopped for {stopped_s:.0f} s" if stopped_s > limit else ""
+
+
+def _responds() -> bool:
+    """True if Ray still starts a process."""
+    import ray
+    from ray.exceptions import RayError
+
+    try:
+        return bool(ray.get(ray.remote(lambda: True).options(num_cpus=0).remote(), timeout=RESPONDS_S))
+    except RayError:
+        return False
