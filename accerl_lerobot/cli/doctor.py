@@ -386,8 +386,7 @@ def _resolve(arguments: list[str]) -> tuple[RunConfig | None, int, list[Check]]:
 def pulled(arguments: list[str]) -> Iterator[Check]:
     """The fields that `pull` has dropped from the recipe."""
     from accerl_lerobot.config.parsing import read_arguments
-    from accerl_lerobot.hub.contents import RECORD
-    from accerl_lerobot.hub.kinds import read_json
+    from accerl_lerobot.hub.artifact_types import RECORD, read_json
 
     with contextlib.suppress(InputError):
         recipe = read_arguments(arguments)[0]

@@ -36,7 +36,7 @@ from accerl_lerobot.errors import (
     make_folder,
 )
 from accerl_lerobot.export.episodes import ExportConfig
-from accerl_lerobot.hub.config import PullConfig, PushConfig
+from accerl_lerobot.hub.artifact_types import PullConfig, PushConfig
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.report.config import ReportConfig
 from accerl_lerobot.rollout.runner import EpisodeResult

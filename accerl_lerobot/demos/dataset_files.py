@@ -208,7 +208,7 @@ def checked(origin: Origin, whole: bool = False) -> Iterator[None]:
     from lerobot.datasets.dataset_reader import DatasetReader
     from PIL import Image
 
-    from accerl_lerobot.hub.trouble import guard_client
+    from accerl_lerobot.hub.errors import guard_client
     from datasets import Image as ImageFeature
 
     load_metadata, load_data = LeRobotDatasetMetadata._load_metadata, DatasetReader._load_hf_dataset

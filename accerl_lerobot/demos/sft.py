@@ -245,7 +245,7 @@ def _stored_config(path: str) -> dict[str, Any]:
     """
     from huggingface_hub import hf_hub_download
 
-    from accerl_lerobot.hub.trouble import guard_client
+    from accerl_lerobot.hub.errors import guard_client
 
     guard_client()
     file = Path(path).expanduser() / "config.json"

@@ -33,8 +33,8 @@ from accerl_lerobot.checkpoint.layout import (
     DEMOS,
     PRETRAINED,
     TRAINING_STATE,
-    begun,
     go_back_to,
+    has_checkpoint,
     newest_whole,
     write_atomically,
 )
@@ -165,7 +165,7 @@ def train(
         config: the run.
         directory: its folder; empty, if it is a new one.
         console: progress for people.
-        wanted: the checkpoint to go on from, where the run has been begun before; see
+        wanted: the checkpoint to go on from, where the run has begun before; see
             `checkpoint.newest_whole`.
         load: makes the policy's adapter, and may be given a path of its own; None: of LeRobot's checkpoint.
 
@@ -296,7 +296,7 @@ class Recovery:
 
 def _checkpoint(directory: Path, wanted: str, console: Console) -> Path | None:
     """The one to go on from; None if the run had not come so far."""
-    if not begun(directory / CHECKPOINTS):
+    if not has_checkpoint(directory / CHECKPOINTS):
         console.say("there is no checkpoint yet: what is left of the run is begun from its warm start on")
         for name in (METRICS, EPISODES):
             (directory / name).unlink(missing_ok=True)
