@@ -274,7 +274,7 @@ def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
 def loaders(trial: Trial, at: dict[str, Path], times: int) -> None:
     """All of it, as a run does: in a child process first."""
     from accerl_lerobot.checkpoint import isolation
-    from accerl_lerobot.demos.windows import open_metadata
+    from accerl_lerobot.demos.dataset_files import open_metadata
     from accerl_lerobot.engine.config import DatasetConfig
     from accerl_lerobot.policies.config import PolicyConfig
     from accerl_lerobot.policies.loading import load_adapter, rehearsed_config

@@ -44,9 +44,6 @@ def help_text(command: str, config_class: type[Any], what: str, section: str = "
         config_class: its config.
         what: what it does, one line.
         section: ``--help=SECTION``: all fields of a section, or ``all``.
-
-    Raises:
-        InputError: there is no such section.
     """
     lines = [
         f"usage: {command} {_bare(config_class)} [--section.field=value …]",

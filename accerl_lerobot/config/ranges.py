@@ -135,11 +135,7 @@ def _hints_of(cls: Any) -> dict[str, Any]:
 
 
 def check(hint: Any, value: Any, field: str) -> None:
-    """Refuses a value that does not fit an annotation.
-
-    Raises:
-        InputError: names `field` and what fits.
-    """
+    """Refuses a value that does not fit an annotation."""
     for text in value if isinstance(value, (list, tuple)) else (value,):
         if isinstance(text, str) and (len(text) > LONGEST_TEXT or "\0" in text):
             raise InputError(field, value, f"use at most {LONGEST_TEXT:,} characters, none of them NUL")

@@ -24,14 +24,15 @@ from rich.progress import Progress
 
 from accerl_lerobot.config.ranges import Range, Section, Seed, Share
 from accerl_lerobot.demos.expert import Episode, make_expert, play
-from accerl_lerobot.demos.starts import Start, write_starts
 from accerl_lerobot.demos.writing import (
+    Start,
     appearing,
     check_free,
     check_target,
     in_order,
     new_dataset,
     simulators,
+    write_starts,
 )
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import World, WorldSpec
@@ -95,9 +96,6 @@ def record_demos(env_config: EnvConfig, config: DemosConfig) -> Path:
 
     Returns:
         The dataset's folder; open it with ``LeRobotDataset(config.repo_id, root=...)``.
-
-    Raises:
-        InputError: the folder exists, the environment has no scripted expert, or its expert keeps failing.
     """
     root = check_free(config.root, "demos.")
     env_config = env_config.shortened(config.max_steps)

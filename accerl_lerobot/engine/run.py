@@ -121,9 +121,9 @@ def make_engine(
 
 def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfig:
     """Records demonstrations and runs SFT where the config asks for it; sets ``policy.path``."""
+    from accerl_lerobot.demos.dataset_files import open_metadata, task_texts
     from accerl_lerobot.demos.record import record_demos
     from accerl_lerobot.demos.sft import run_sft
-    from accerl_lerobot.demos.windows import open_metadata, task_texts
     from accerl_lerobot.policies.loading import resolve_device
 
     if not config.sft.steps:
@@ -140,14 +140,12 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
         assert dataset.repo_id is not None
         path = run_sft(
             config.sft,
-            dataset.repo_id,
-            dataset.root,
+            dataset,
             directory / "sft",
             config.seed,
             str(resolve_device(config.policy.device)),
             task_texts(meta),
             on_step=lambda step, loss: stage.update(step, f"loss {loss:.3f}"),
-            revision=dataset.revision,
         )
     return _improving(config, path)
 

@@ -26,14 +26,15 @@ from accerl_lerobot.config.ranges import Choice, Range, Section, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.expert import Episode
 from accerl_lerobot.demos.record import features, frames
-from accerl_lerobot.demos.starts import Start, write_starts
 from accerl_lerobot.demos.writing import (
+    Start,
     appearing,
     check_free,
     check_target,
     in_order,
     new_dataset,
     simulators,
+    write_starts,
 )
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.envs import make_world

@@ -8,7 +8,6 @@ as there are any, sleeps as long as it is told to, and waits for a byte a second
 
 from __future__ import annotations
 
-import json
 import re
 import threading
 import time
@@ -181,20 +180,23 @@ def _check_answer(response: httpx.Response) -> None:
         for name in ("etag", "x-linked-etag"):
             if name in headers and not ETAG.fullmatch(headers[name]):
                 raise _limits.distrust(f"{name} {brief(ValueError(headers[name]))!r} is no hash")
-    if response.is_success and "/api/" in response.url.path and response.read():
+    if response.is_success and "/api/" in response.url.path and response.request.method in ("GET", "POST"):
+        response.read()
         try:
-            json.loads(response.content, object_hook=_check_commits)
-        except InputError:
-            raise
+            content = response.json() if response.content else None
         except (ValueError, RecursionError) as error:
             raise _limits.distrust(f"its answer is not JSON ({brief(error)})") from None
+        for commit in _commits(content):
+            check_commit(commit, _limits.repo_id)
 
 
-def _check_commits(mapping: dict[str, Any]) -> dict[str, Any]:
-    for key in ("sha", "commitOid", "targetCommit"):
-        if mapping.get(key) is not None:
-            check_commit(mapping[key], _limits.repo_id)
-    return mapping
+def _commits(content: Any) -> Iterator[object]:
+    """Commits that an answer names."""
+    if isinstance(content, dict):
+        refs = [content[key] for key in ("branches", "tags") if isinstance(content.get(key), list)]
+        named = [(ref, "targetCommit") for ref in sum(refs, []) if isinstance(ref, dict)]
+        named += [(content, "sha"), (content, "commitOid")]
+        yield from (mapping[key] for mapping, key in named if mapping.get(key) is not None)
 
 
 class _Stream:

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from accerl_lerobot.algorithms import ChunkCriticConfig
-from accerl_lerobot.checkpoint.optimizers import copied, optimizer_state, restore_optimizer
+from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.trainer.config import TrainerConfig

@@ -36,8 +36,7 @@ from accerl_lerobot.algorithms.diagnostics import lag_metrics
 from accerl_lerobot.algorithms.gae import decision_mask, gae
 from accerl_lerobot.algorithms.normalise import moments, normalise
 from accerl_lerobot.algorithms.ratio import present
-from accerl_lerobot.checkpoint.optimizers import optimizer_state, restore_optimizer
-from accerl_lerobot.checkpoint.tensors import whole
+from accerl_lerobot.checkpoint.tensors import optimizer_state, restore_optimizer, whole
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import reach
 from accerl_lerobot.policies.base import PolicyAdapter
