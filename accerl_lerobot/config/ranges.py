@@ -92,6 +92,8 @@ Steps = Annotated[int, Range("[0, 1000000000]")]
 """A number of steps, updates or episodes that may be 0."""
 Device = Annotated[str, Pattern(r"auto|cpu|cuda(:\d{1,2})?", "auto, cpu, cuda or cuda:0")]
 Threads = Annotated[int, Range("[1, 1024]")]
+NewFolder = Annotated[str, Pattern(r"(?s).+", "the name of a folder to create")]
+DatasetName = Annotated[str, Pattern(r"[^/]+/[^/]+", "the form owner/name")]
 Repeats = Annotated[int, Range("[1, 100000]")]
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from accerl_lerobot import guardian
 from accerl_lerobot.checkpoint.safety import Origin, read_json, safe_join
-from accerl_lerobot.errors import InputError, check_absent, expanded
+from accerl_lerobot.errors import check_absent, expanded
 from accerl_lerobot.seeds import EVAL_SEEDS
 
 Start = tuple[str, int]
@@ -24,14 +24,6 @@ Start = tuple[str, int]
 
 STARTS = Path("meta") / "accerl_starts.json"
 """Inside a dataset of ``accerl demos`` or ``accerl export``."""
-
-
-def check_target(root: str, repo_id: str, prefix: str = "") -> None:
-    """Refuses names under which no dataset can be written; `prefix` begins the names of the fields."""
-    if len(parts := repo_id.split("/")) != 2 or not all(parts):
-        raise InputError(f"{prefix}repo_id", repo_id, "use the form owner/name")
-    if not root:
-        raise InputError(f"{prefix}root", root, "name a folder to create")
 
 
 def check_free(root: str, prefix: str = "") -> Path:

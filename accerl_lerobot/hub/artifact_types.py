@@ -6,15 +6,14 @@ Free of the Hub's client, which takes a second to import.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from accerl_lerobot.checkpoint import safety
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, PREPROCESSOR, PRETRAINED, SUMMARY
 from accerl_lerobot.checkpoint.layout import CONFIG as RECIPE
-from accerl_lerobot.config.ranges import Section
+from accerl_lerobot.config.ranges import NewFolder, Pattern, Section
 from accerl_lerobot.errors import InputError
 
 POLICY, WORLD_MODEL, SUCCESS_MODEL = "policy", "world model", "success model"
@@ -38,7 +37,8 @@ NEEDED = {
 """Artifact type → files and folders that it has at least."""
 CODEBASE_VERSION = "v3.0"
 """Version of LeRobotDatasets, and the tag under which LeRobot looks for them on the Hub."""
-REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
+REPO_ID = r"(?=.{3,192}\Z)(?!.*\.\.)[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*"
+RepoId = Annotated[str, Pattern(REPO_ID, "the name of a repository, user/name")]
 RepoType = Literal["model", "dataset"]
 REPO_TYPES: tuple[RepoType, ...] = ("model", "dataset")
 
@@ -47,16 +47,16 @@ REPO_TYPES: tuple[RepoType, ...] = ("model", "dataset")
 class PushConfig(Section):
     """``accerl push``: a policy, world model, success model, dataset or whole run, as one commit."""
 
-    path: str | None = None
+    path: Annotated[str, Pattern(r"(?s).+", "the name of the folder to push")] = ""
     """Folder to push; its type is told by its files."""
-    repo_id: str | None = None
+    repo_id: RepoId = ""
     """``user/name`` on the Hub; created if it does not exist."""
-    revision: str = "main"
+    revision: Annotated[str, Pattern(r".+", "a branch, or leave the field out")] = "main"
     """Existing branch."""
     private: bool = True
     """Keep the repository private. A public repository is written to only when this is false, and a private
     one stays private."""
-    message: str | None = None
+    message: Annotated[str, Pattern(r"(?s).*\S.*", "some text")] | None = None
     """Commit message. None: names the type of the artifact."""
     include: list[str] = field(default_factory=list)
     """Folders of a run that are not pushed otherwise, such as ``[demos, sft, tensorboard]``."""
@@ -64,42 +64,19 @@ class PushConfig(Section):
     """Folder or file that ``accerl eval`` wrote about this policy; its numbers go into the card. None: those
     of the policy's run."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.path is None:
-            raise InputError("path", None, "name the folder to push")
-        _check_repo_id(self.repo_id)
-        if not self.revision:
-            raise InputError("revision", self.revision, "name a branch, or leave the field out")
-        if self.message is not None and not self.message.strip():
-            raise InputError("message", self.message, "say something, or leave the field out")
-
 
 @dataclass(frozen=True, kw_only=True)
 class PullConfig(Section):
     """``accerl pull``: an artifact from the Hub into a new folder, complete and checked or not at all."""
 
-    repo_id: str | None = None
+    repo_id: RepoId = ""
     """``user/name`` on the Hub."""
-    revision: str | None = None
+    revision: Annotated[str, Pattern(r".+", "a commit, tag or branch")] | None = None
     """Commit, tag or branch, which is resolved to a commit and recorded. None: the branch main."""
     repo_type: RepoType | None = None
     """model or dataset. None: whichever of them has this name."""
-    output_dir: str | None = None
+    output_dir: NewFolder = ""
     """Folder to create."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_repo_id(self.repo_id)
-        if self.output_dir is None:
-            raise InputError("output_dir", None, "name the folder to create")
-        if self.revision == "":
-            raise InputError("revision", "", "name a commit, tag or branch, or leave the field out")
-
-
-def _check_repo_id(repo_id: str | None) -> None:
-    if repo_id is None or not REPO_ID.fullmatch(repo_id) or ".." in repo_id or len(repo_id) > 192:
-        raise InputError("repo_id", repo_id, "name a repository as user/name")
 
 
 def repo_type(artifact: str) -> RepoType:

@@ -7,6 +7,7 @@ an evaluation names its policy.
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -206,7 +207,7 @@ def _base_model(recipe: Mapping[str, Any]) -> str | None:
     for name in ((recipe.get("policy") or {}).get("path"), (recipe.get("sft") or {}).get("init_path")):
         if name and (pulled := read_json(Path(name).expanduser() / RECORD)):
             return str(pulled.get("repo_id"))
-        if name and REPO_ID.fullmatch(name) and not Path(name).exists():
+        if name and re.fullmatch(REPO_ID, name) and not Path(name).exists():
             return None if name.startswith(f"{AWAY}/") else str(name)
     return None
 

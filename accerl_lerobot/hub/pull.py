@@ -67,7 +67,7 @@ def pull(config: PullConfig) -> dict[str, Any]:
 
     There is no new folder if it is refused.
     """
-    repo_id, home = str(config.repo_id), expanded(str(config.output_dir), "output_dir").absolute()
+    repo_id, home = config.repo_id, expanded(config.output_dir, "output_dir").absolute()
     check_absent(home)
     with hub_errors(repo_id, config.revision, writing=False) as limits:
         repo_type, commit = _resolve(HfApi(), config)
@@ -105,7 +105,7 @@ def pull(config: PullConfig) -> dict[str, Any]:
 
 def _resolve(api: HfApi, config: PullConfig) -> tuple[str, str]:
     """Repository type, and the commit that the revision resolves to now."""
-    repo_id, commits = str(config.repo_id), {}
+    repo_id, commits = config.repo_id, {}
     missing: Exception | None = None
     for repo_type in REPO_TYPES if config.repo_type is None else (config.repo_type,):
         try:

@@ -82,7 +82,7 @@ def push(config: PushConfig) -> dict[str, Any]:
 
     If it is refused, or fails, the repository is as before.
     """
-    folder, repo_id = Path(str(config.path)).expanduser(), str(config.repo_id)
+    folder, repo_id = Path(config.path).expanduser(), config.repo_id
     artifact = recognise(folder)
     files, own_card = stage(config, folder, artifact)
     if get_token() is None:
@@ -97,7 +97,7 @@ def stage(config: PushConfig, folder: Path, artifact: str) -> tuple[Files, bool]
     files = contents(folder, artifact, config.include)
     for name, path in provenance.files.items():
         files[name] = scrubbed(name, path.read_bytes(), folder) if is_record(name) else path
-    card, repo_id = folder / CARD, str(config.repo_id)
+    card, repo_id = folder / CARD, config.repo_id
     own = card.is_file() and MARK not in card.read_text()
     if own:
         text = card.read_text()
@@ -111,7 +111,7 @@ def stage(config: PushConfig, folder: Path, artifact: str) -> tuple[Files, bool]
 
 def _upload(config: PushConfig, artifact: str, files: Files, own_card: bool) -> dict[str, Any]:
     """Creates the repository if need be, and the commit."""
-    api, repo_id = HfApi(), str(config.repo_id)
+    api, repo_id = HfApi(), config.repo_id
     where: dict[str, Any] = {"repo_id": repo_id, "repo_type": repo_type(artifact)}
     parent = _parent(api, config, artifact)
 
@@ -154,7 +154,7 @@ def _upload(config: PushConfig, artifact: str, files: Files, own_card: bool) -> 
 
 def _parent(api: HfApi, config: PushConfig, artifact: str) -> str:
     """The commit to go on top of; the repository is created if need be."""
-    repo_id, kind = str(config.repo_id), repo_type(artifact)
+    repo_id, kind = config.repo_id, repo_type(artifact)
     try:
         info = api.repo_info(repo_id, repo_type=kind)
     except RepositoryNotFoundError:

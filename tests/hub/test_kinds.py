@@ -81,13 +81,13 @@ def test_what_is_no_name_of_a_repository(name: str | None):
 
 
 def test_other_fields_are_checked():
-    with pytest.raises(InputError, match="name the folder to push"):
+    with pytest.raises(InputError, match="the name of the folder to push"):
         PushConfig(repo_id="a/b")
-    with pytest.raises(InputError, match="name the folder to create"):
+    with pytest.raises(InputError, match="the name of a folder to create"):
         PullConfig(repo_id="a/b")
     with pytest.raises(InputError, match="repo_type='space': use model or dataset"):
         PullConfig(repo_id="a/b", output_dir="x", repo_type="space")
-    with pytest.raises(InputError, match="say something"):
+    with pytest.raises(InputError, match="use some text or null"):
         PushConfig(path="x", repo_id="a/b", message=" ")
 
 
