@@ -246,7 +246,7 @@ def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
 
 
 def dreams(config: RunConfig) -> Iterator[Check]:
-    """What is to be imagined against the environment and the policy."""
+    """Imagination settings against the environment and the policy."""
     imagination, episodes = config.imagination, config.rollout.episodes
     if not imagination.share:
         return

@@ -30,28 +30,30 @@ def test_kinds(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "name", ["model.safetensors", "policy_preprocessor.json", "policy_postprocessor.json"]
+    ("artifact", "missing"),
+    [
+        ("policy", "model.safetensors"),
+        ("policy", "policy_preprocessor.json"),
+        ("policy", "policy_postprocessor.json"),
+        ("run", "summary.json"),
+        ("dataset", "meta/tasks.parquet"),
+    ],
 )
-def test_a_policy_that_is_not_whole(tmp_path: Path, name: str):
-    (write_policy_folder(tmp_path / "policy") / name).unlink()
-    with pytest.raises(InputError, match=f"looks like a policy but lacks {name}"):
-        recognise(tmp_path / "policy")
+def test_an_incomplete_folder_says_what_it_lacks(tmp_path: Path, artifact: str, missing: str):
+    write = {"policy": write_policy_folder, "run": write_run_folder, "dataset": copy_dataset}[artifact]
+    (write(tmp_path / "folder") / missing).unlink()
+    with pytest.raises(InputError, match=f"looks like a {artifact} but lacks {missing}"):
+        recognise(tmp_path / "folder")
 
 
-def test_a_run_that_is_not_over(tmp_path: Path):
-    (write_run_folder(tmp_path / "run") / "summary.json").unlink()
-    with pytest.raises(InputError, match="looks like a run but lacks summary.json"):
-        recognise(tmp_path / "run")
+def copy_dataset(folder: Path) -> Path:
+    return Path(shutil.copytree(TINY, folder))
 
 
-def test_a_dataset_that_is_not_whole_or_old(tmp_path: Path):
-    shutil.copytree(TINY, tmp_path / "dataset")
-    info = tmp_path / "dataset" / "meta" / "info.json"
+def test_an_old_dataset(tmp_path: Path):
+    info = copy_dataset(tmp_path / "dataset") / "meta" / "info.json"
     info.write_text(info.read_text().replace("v3.0", "v2.1"))
     with pytest.raises(InputError, match=r"version v2\.1; convert it to v3\.0"):
-        recognise(tmp_path / "dataset")
-    shutil.rmtree(tmp_path / "dataset" / "meta" / "episodes")
-    with pytest.raises(InputError, match="looks like a dataset but lacks meta/episodes"):
         recognise(tmp_path / "dataset")
 
 
