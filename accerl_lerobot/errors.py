@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one error a user meets: a field, its value and the remedy, on one line."""
+"""The error for bad input: a field, its value and the remedy, on one line; and other errors on one line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathlib import Path
 TOKEN = re.compile(r"\bhf_\w{6,}")
 """A token of the Hub, which somebody may have typed where it does not belong; it is not repeated."""
 LONGEST, LONGEST_REMEDY = 200, 1200
-"""Characters of a value and of a remedy that are shown; a whole room may have been given where a number
+"""Characters of a value and of a remedy that are shown; a whole section may have been given where a number
 belongs, and some remedies repeat a part of it."""
 
 
@@ -47,11 +47,7 @@ class InputError(ValueError):
 
 
 def check_absent(path: Path, field: str = "output_dir") -> None:
-    """Refuses a folder for results that exists, or that cannot be created.
-
-    Raises:
-        InputError: so it is; names `field`.
-    """
+    """Refuses a folder for results that exists, or that cannot be created."""
     expanded(str(path), field)
     if os.path.lexists(path):
         raise InputError(field, str(path), "the folder exists; choose another or remove it")
@@ -72,11 +68,7 @@ def is_full(error: BaseException | None) -> bool:
 
 
 def expanded(path: str, field: str) -> Path:
-    """A path in which ``~`` stands for a home folder.
-
-    Raises:
-        InputError: there is no such user, or no file can have such a name.
-    """
+    """A path in which ``~`` stands for a home folder."""
     try:
         os.fspath(found := Path(path).expanduser()).encode()
         os.lstat(found)
@@ -89,11 +81,7 @@ def expanded(path: str, field: str) -> Path:
 
 
 def make_folder(path: Path, field: str, *, again: bool = False) -> None:
-    """Creates a folder and those above it; it may be there if `again`.
-
-    Raises:
-        InputError: that is not possible; names `field`.
-    """
+    """Creates a folder and those above it; it may be there if `again`."""
     try:
         path.mkdir(parents=True, exist_ok=again)
     except (OSError, ValueError) as error:
@@ -102,11 +90,7 @@ def make_folder(path: Path, field: str, *, again: bool = False) -> None:
 
 
 def output_folder(path: str) -> Path:
-    """The folder ``output_dir`` names, created if it is not there; results of before are kept in it.
-
-    Raises:
-        InputError: it cannot be created.
-    """
+    """The folder ``output_dir`` names, created if it is not there; results of before are kept in it."""
     folder = expanded(path, "output_dir")
     make_folder(folder, "output_dir", again=True)
     return folder

@@ -23,7 +23,7 @@ from accerl_lerobot.checkpoint.layout import DEMOS
 from accerl_lerobot.config.dataset import DatasetConfig
 from accerl_lerobot.config.ranges import Choice, Range, Seed
 from accerl_lerobot.console import Console
-from accerl_lerobot.demos.windows import open_metadata
+from accerl_lerobot.demos.dataset_files import open_metadata
 from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.evaluation.stats import mean_interval
 from benchmarks.study import (

@@ -239,12 +239,20 @@ def _too_long(*_: object) -> None:
 
 def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
     """Checks that are called before anything is loaded."""
+    from accerl_lerobot.checkpoint.isolation import rehearse
     from accerl_lerobot.checkpoint.safety import Origin, read_json, tensor_shapes
     from accerl_lerobot.demos.dataset_files import check_data, check_info, check_metadata, check_stats
     from accerl_lerobot.policies import guard
 
     origin = Origin("path", "hostile")
     policy, dataset = at["policy"], at["dataset"]
+
+    def metadata() -> None:  # in a child process, as `checked` does: Arrow may end it on a damaged footer
+        rehearse(lambda: check_metadata(dataset, origin), dataset, origin, "meta/**/*")
+
+    def data_rows() -> None:
+        rehearse(lambda: check_data(dataset, info, origin), dataset, origin, "data/**/*")
+
     weights = trial.scratch / "few.safetensors"
     weights.write_bytes((policy / "value_head.safetensors").read_bytes())
     trial.files("safetensors", weights, lambda: tensor_shapes(weights, origin), 300 * times)
@@ -262,20 +270,20 @@ def checks(trial: Trial, at: dict[str, Path], times: int) -> None:
     stats = {"action": json.loads((dataset / "meta/stats.json").read_text())["action"]}
     trial.trees("stats.json", stats, lambda t: check_stats(t, info["features"], origin), 100 * times)
     for part in ("meta/info.json", "meta/tasks.parquet", "meta/episodes/chunk-000/file-000.parquet"):
-        trial.files(part, dataset / part, lambda: check_metadata(dataset, origin), 3 * times)
+        trial.files(part, dataset / part, metadata, 3 * times)
     data = dataset / "data/chunk-000/file-000.parquet"
     footer = data.read_bytes()
     for _ in range(times // 4):  # the description of its columns is at its end
         tail = changed_bytes(footer[-9000:][::-1], trial.rng)[::-1]
         data.write_bytes(footer[:-9000] + tail)
-        trial.one("data", lambda: check_data(dataset, info, origin), tail[-400:])
+        trial.one("data", data_rows, tail[-400:])
     data.write_bytes(footer)
 
 
 def loaders(trial: Trial, at: dict[str, Path], times: int) -> None:
     """All of it, as a run does: in a child process first."""
     from accerl_lerobot.checkpoint import isolation
-    from accerl_lerobot.demos.windows import open_metadata
+    from accerl_lerobot.demos.dataset_files import open_metadata
     from accerl_lerobot.engine.config import DatasetConfig
     from accerl_lerobot.policies.config import PolicyConfig
     from accerl_lerobot.policies.loading import load_adapter, rehearsed_config

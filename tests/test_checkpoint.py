@@ -19,12 +19,12 @@ from accerl_lerobot.checkpoint.layout import (
     RUN_STATE,
     TRAINING_STATE,
     WEIGHTS,
-    begun,
     defect,
     displaced,
     go_back_to,
-    let_go,
+    has_checkpoint,
     newest_whole,
+    prune,
     relocate,
     save_checkpoint,
 )
@@ -113,7 +113,7 @@ def test_one_that_was_put_aside_when_the_process_died_is_brought_back(tmp_path: 
     (tmp_path / "000005").rename(tmp_path / ".replaced-000005")
     assert newest_whole(tmp_path)[0].name == "000005"
     (tmp_path / ".replaced-000005").mkdir()  # the new one had been put in its place
-    assert begun(tmp_path) and listing(tmp_path) == ["000005", "last"]
+    assert has_checkpoint(tmp_path) and listing(tmp_path) == ["000005", "last"]
 
 
 def test_going_back_puts_aside_what_came_after(tmp_path: Path):
@@ -126,9 +126,9 @@ def test_going_back_puts_aside_what_came_after(tmp_path: Path):
 
 
 def test_nothing_but_a_half_written_one_is_none(tmp_path: Path):
-    assert not begun(tmp_path / "checkpoints")
+    assert not has_checkpoint(tmp_path / "checkpoints")
     (tmp_path / ".writing-77" / PRETRAINED).mkdir(parents=True)
-    assert not begun(tmp_path) and listing(tmp_path) == []
+    assert not has_checkpoint(tmp_path) and listing(tmp_path) == []
 
 
 def state_writer(version: int) -> Callable[[Path], int]:
@@ -191,7 +191,7 @@ def test_an_older_one_may_be_named(tmp_path: Path):
 def test_only_the_newest_keep_what_it_takes_to_go_on(tmp_path: Path):
     for version in range(1, 6):
         save_checkpoint(tmp_path, state_writer(version))
-        let_go(tmp_path, keep=2)
+        prune(tmp_path, keep=2)
     kept = [path.name for path in sorted(tmp_path.glob("0*")) if (path / TRAINING_STATE).exists()]
     assert kept == ["000004", "000005"]
     assert all((tmp_path / f"00000{v}" / PRETRAINED / "model.safetensors").is_file() for v in range(1, 6))
@@ -204,7 +204,7 @@ def test_of_the_one_that_the_workers_began_from_the_weights_are_spared(tmp_path:
     for version in range(1, 6):
         write = state_writer(version)
         save_checkpoint(tmp_path, lambda folder, write=write: (write(folder), with_weights(folder))[0])
-        let_go(tmp_path, keep=1, needed="000002")
+        prune(tmp_path, keep=1, needed="000002")
     kept = [path.name for path in sorted(tmp_path.glob("0*")) if (path / TRAINING_STATE).exists()]
     assert kept == ["000002", "000005"]
     spared = tmp_path / "000002" / TRAINING_STATE
@@ -213,7 +213,7 @@ def test_of_the_one_that_the_workers_began_from_the_weights_are_spared(tmp_path:
     with pytest.raises(InputError, match="000002: its training state was not kept"):
         newest_whole(tmp_path, "000004")  # and not what is older still
     assert newest_whole(tmp_path)[0].name == "000005"
-    let_go(tmp_path, keep=1)
+    prune(tmp_path, keep=1)
     assert not spared.exists()
 
 
@@ -225,11 +225,11 @@ def test_what_is_let_go_vouches_for_nothing_else(tmp_path: Path):
     for version in (1, 2):
         save_checkpoint(tmp_path, state_writer(version))
     (tmp_path / "000001" / PRETRAINED / "model.safetensors").write_text("WEIGHTS")
-    let_go(tmp_path, keep=1)
+    prune(tmp_path, keep=1)
     assert defect(tmp_path / "000001") == "pretrained_model/model.safetensors is not what was written"
     save_checkpoint(tmp_path, state_writer(3))
     (tmp_path / "000002" / "manifest.json").write_text("{")
-    let_go(tmp_path, keep=1)
+    prune(tmp_path, keep=1)
     assert not (tmp_path / "000002" / TRAINING_STATE).exists() and "is broken" in str(
         defect(tmp_path / "000002")
     )
@@ -243,9 +243,9 @@ def test_one_that_was_being_let_go_when_the_process_died_is_no_obstacle(
     with monkeypatch.context() as context:
         context.setattr(shutil, "rmtree", lambda path: (path / "training_step.json").unlink() or 1 / 0)
         with pytest.raises(ZeroDivisionError):
-            let_go(tmp_path, keep=1)
+            prune(tmp_path, keep=1)
     assert newest_whole(tmp_path)[0].name == "000002" and defect(tmp_path / "000001") is None
-    let_go(tmp_path, keep=1)
+    prune(tmp_path, keep=1)
     assert not (tmp_path / "000001" / TRAINING_STATE).exists()
 
 

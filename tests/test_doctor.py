@@ -30,7 +30,7 @@ QUICKSTART = Path(__file__).parents[1] / "recipes" / "quickstart.yaml"
 @pytest.fixture
 def healthy(monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine on which all is well, whatever this one is like."""
-    fine = [Check(name="python", status=OK, text="3.12")]
+    fine = [Check("python", OK, "3.12")]
     monkeypatch.setattr(doctor, "machine", lambda config, history: fine)
 
 
@@ -72,17 +72,19 @@ class TestRecipe:
         assert out.startswith("FAIL  recipe     env.type='x': use one of lerobot, metaworld, simulated\n")
         assert "ok    python" in out and "1 of 2 checks failed" in out
 
-    def test_what_only_lerobot_knows_is_found_too(self, capsys: pytest.CaptureFixture[str]) -> None:
-        assert cli.main(["doctor", str(QUICKSTART), "--sft.policy.colour=red"]) == 1
-        assert "sft.policy.colour='red': LeRobot's smolvla has no such field" in capsys.readouterr().out
-
-    def test_an_output_folder_that_exists(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        assert cli.main(["doctor", str(QUICKSTART), f"--output_dir={tmp_path}"]) == 1
-        assert "the folder exists" in capsys.readouterr().out
-
-    def test_no_file(self, capsys: pytest.CaptureFixture[str]) -> None:
-        assert cli.main(["doctor", "nowhere.yaml"]) == 1
-        assert "config_path='nowhere.yaml': no such file" in capsys.readouterr().out
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [
+            ([str(QUICKSTART), "--output_dir=/"], "the folder exists"),
+            (["nowhere.yaml"], "config_path='nowhere.yaml': no such file"),
+            ([str(QUICKSTART), "--sft.policy.colour=red"], "LeRobot's smolvla has no such field"),
+        ],
+    )
+    def test_what_only_the_machine_or_lerobot_knows(
+        self, arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert cli.main(["doctor", *arguments]) == 1
+        assert words in capsys.readouterr().out
 
 
 class TestRendering:
@@ -91,21 +93,18 @@ class TestRendering:
     def draw(self, script: str, needed: bool = True) -> Check:
         return doctor.rendering(needed=needed, script=script)
 
-    def test_a_process_that_dies(self) -> None:
-        check = self.draw("import os; os.abort()")
-        assert check.status == FAIL and "ended with code -6" in check.text
-
-    def test_an_error_keeps_its_remedy(self) -> None:
-        check = self.draw(
-            "from accerl_lerobot.errors import *; raise InputError('MUJOCO_GL', '', 'install it')"
-        )
-        assert check.text == "MUJOCO_GL='': install it"
-
-    def test_an_empty_picture(self) -> None:
-        assert "empty picture" in self.draw("print('drawn', False, 3.0)").text
-
-    def test_a_world_that_does_not_draw_is_only_warned_about(self) -> None:
-        assert self.draw("raise SystemExit(1)", needed=False).status == WARN
+    @pytest.mark.parametrize(
+        ("script", "text"),
+        [
+            ("import os; os.abort()", "ended with code -6"),
+            ("from accerl_lerobot.errors import *; raise InputError('GL', '', 'x')", "GL='': x"),
+            ("print('drawn', False, 3.0)", "empty picture"),
+        ],
+    )
+    def test_a_failure_keeps_its_remedy(self, script: str, text: str) -> None:
+        check = self.draw(script)
+        assert check.status == FAIL and text in check.text
+        assert self.draw(script, needed=False).status == WARN
 
     def test_no_library(self, monkeypatch: pytest.MonkeyPatch) -> None:
         for name in ("DISPLAY", "WAYLAND_DISPLAY"):
@@ -141,21 +140,20 @@ class TestPackages:
         monkeypatch.setattr(importlib.metadata, "version", version)
         return doctor.packages()
 
-    def test_all_as_tested(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        check = self.versions(monkeypatch, {"lerobot": "0.6.1", "torch": "2.11.0+cpu", "mujoco": "3.3.2"})
-        assert check.status == OK and check.text.startswith("3 at the tested versions")
-
-    def test_an_extra_may_be_absent(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        check = self.versions(monkeypatch, {"lerobot": "0.6.1", "torch": "2.11.0"})
-        assert check.status == OK and check.text.endswith("without the extras' mujoco")
-
-    def test_another_version(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        check = self.versions(monkeypatch, {"lerobot": "0.6.2", "torch": "2.11.0"})
-        assert check.status == WARN and "lerobot 0.6.2 instead of 0.6.1" in check.text
-
-    def test_something_absent(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        check = self.versions(monkeypatch, {"lerobot": "0.6.1"})
-        assert check.status == FAIL and "not installed: torch" in check.text
+    @pytest.mark.parametrize(
+        ("installed", "status", "text"),
+        [
+            ({"lerobot": "0.6.1", "torch": "2.11.0+cpu", "mujoco": "3.3.2"}, OK, "3 at the tested versions"),
+            ({"lerobot": "0.6.1", "torch": "2.11.0"}, OK, "without the extras' mujoco"),
+            ({"lerobot": "0.6.2", "torch": "2.11.0"}, WARN, "lerobot 0.6.2 instead of 0.6.1"),
+            ({"lerobot": "0.6.1"}, FAIL, "not installed: torch"),
+        ],
+    )
+    def test_against_the_pins(
+        self, installed: dict[str, str], status: str, text: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        check = self.versions(monkeypatch, installed)
+        assert check.status == status and text in check.text
 
 
 class TestHuggingFaceDatasets:
@@ -190,22 +188,21 @@ class TestResources:
         monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(4)), raising=False)
         monkeypatch.setattr(doctor, "_memory_gib", lambda: 16.0)
 
-    def test_fits(self) -> None:
-        found = checks(self.recipe(rollout={"workers": 4}))
-        assert [found[name].status for name in ("cpu", "memory")] == [OK, OK]
-
-    def test_more_workers_than_cores(self) -> None:
-        cpu = checks(self.recipe(rollout={"workers": 5}))["cpu"]
-        assert cpu.status == WARN and "lower rollout.workers" in cpu.text
-
-    def test_more_threads_than_cores(self) -> None:
-        cpu = checks(self.recipe(trainer={"num_threads": 8}))["cpu"]
-        assert cpu.status == WARN and "trainer.num_threads" in cpu.text
-
-    def test_too_little_memory(self) -> None:
-        big = {"image_size": 480}
-        memory = checks(self.recipe(env=big, replay={"capacity": 100_000}))["memory"]
-        assert memory.status == WARN and "GiB needed: lower" in memory.text
+    @pytest.mark.parametrize(
+        ("sections", "name", "words"),
+        [
+            ({"rollout": {"workers": 4}}, "cpu", ""),
+            ({"rollout": {"workers": 4}}, "memory", ""),
+            ({"rollout": {"workers": 5}}, "cpu", "lower rollout.workers"),
+            ({"trainer": {"num_threads": 8}}, "cpu", "trainer.num_threads"),
+            ({"env": {"image_size": 480}, "replay": {"capacity": 100_000}}, "memory", "GiB needed: lower"),
+        ],
+    )
+    def test_against_four_cores_and_sixteen_gib(
+        self, sections: dict[str, dict[str, Any]], name: str, words: str
+    ) -> None:
+        check = checks(self.recipe(**sections))[name]
+        assert check.status == (WARN if words else OK) and words in check.text
 
     def test_the_weights_count_in_every_process(
         self, monkeypatch: pytest.MonkeyPatch, tiny_checkpoint: Path

@@ -18,7 +18,7 @@ from accerl_lerobot import cli
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.console import Console
-from accerl_lerobot.demos.windows import open_metadata
+from accerl_lerobot.demos.dataset_files import open_metadata
 from accerl_lerobot.engine.config import DatasetConfig, RunConfig
 from accerl_lerobot.engine.contract import Progress
 from accerl_lerobot.engine.dream_workers import DreamWorker, WorldLearningWorker

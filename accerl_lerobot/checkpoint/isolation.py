@@ -15,7 +15,6 @@ import contextlib
 import ctypes
 import faulthandler
 import json
-import math
 import os
 import resource
 import select
@@ -27,45 +26,45 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
-from accerl_lerobot.checkpoint.safety import MIB, Origin, brief, safe_join, tensor_shapes
+from accerl_lerobot.checkpoint.safety import MIB, Origin, brief
 from accerl_lerobot.errors import InputError
 
-SLACK = 1536 * MIB
-"""Bytes that a child may take beside its weights."""
-TIMES = 2
-"""Times that its weights may be held as float32: SmolVLA builds layers that it then drops."""
-CPU_S, CPU_S_PER_NUMBER = 15, 1e-7
-"""Seconds of processor time, and those for each number of its weights: a decision computes with all of them.
+SLACK, PER_BYTE = 1536 * MIB, 4
+"""Bytes that a child may take beside the files, and for each of their bytes: weights are held twice as
+float32, because SmolVLA builds layers that it then drops."""
+CPU_S, CPU_S_PER_BYTE = 15, 1e-7
+"""Seconds of processor time, and those for each byte of the files: a decision computes with all weights.
 Processor time, because a busy machine must not refuse a good file."""
 STALLED_S = 60
 """Seconds without any processor time after which a child is given up, whatever it waits for."""
 LONGEST = 1000
-"""Characters of what a child says."""
-NO_MEMORY = ("MemoryError", "can't allocate", "Cannot allocate", "bad_alloc", "Unable to allocate")
-"""Words of errors, of Python, PyTorch, Linux, C++ and NumPy."""
+"""Characters of a child's message."""
+NO_MEMORY = (
+    "MemoryError",
+    "can't allocate",
+    "Cannot allocate",
+    "bad_alloc",
+    "Unable to allocate",
+    "malloc of",
+)
+"""Words of errors, of Python, PyTorch, Linux, C++, NumPy and Arrow."""
 PR_SET_PDEATHSIG = 1
 
 
-def rehearse[T](task: Callable[[], T], folder: Path, origin: Origin) -> T:
-    """Runs `task` in a child process and gives what it returns, which JSON can say.
+def rehearse[T](task: Callable[[], T], folder: Path, origin: Origin, pattern: str = "**/*.safetensors") -> T:
+    """Runs `task` in a child process and returns its result, which JSON can hold.
 
     Where there is no ``/proc``, as on macOS, limits cannot be set, and it runs in this process.
 
     Args:
         task: loads what is in `folder`, on the CPU.
-        folder: its safetensors files set the limits.
+        folder: its files that match `pattern` set the limits.
         origin: what named the folder, for the error.
-
-    Raises:
-        InputError: the one that `task` raised; or it raised something else, took too much memory or time, or
-            ended the process.
     """
     if not sys.platform.startswith("linux"):
         return task()
-    names = (path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*.safetensors")))
-    headers = (tensor_shapes(safe_join(folder, name, origin), origin) for name in names)
-    numbers = sum(math.prod(shape) for header in headers for _, shape in header.values())
-    memory, cpu_s = SLACK + TIMES * 4 * numbers, round(CPU_S + CPU_S_PER_NUMBER * numbers)
+    size = sum(path.stat().st_size for path in folder.glob(pattern) if path.is_file())
+    memory, cpu_s = SLACK + PER_BYTE * size, round(CPU_S + CPU_S_PER_BYTE * size)
     reader, writer = os.pipe()
     parent = os.getpid()
     with warnings.catch_warnings():  # Python's about threads: the child runs none of the others
@@ -77,25 +76,25 @@ def rehearse[T](task: Callable[[], T], folder: Path, origin: Origin) -> T:
     os.close(writer)
     status = None
     try:
-        said, status = _wait(child, reader)
+        message, status = _wait(child, reader)
     finally:
         os.close(reader)
         if status is None:  # it may still run
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
-    result, field, value, why = json.loads(said) if said else (None, None, None, _cause(status, cpu_s))
+    result, field, value, why = json.loads(message) if message else (None, None, None, _cause(status, cpu_s))
     if any(words in why for words in NO_MEMORY):
         field, why = None, f"takes more than {memory // MIB} MiB beside the libraries"
     if field is not None:
         raise InputError(field, value, why)
     if why:
-        remedy = "its weights do not account for that; get it again, or another one"
+        remedy = "the size of its files does not account for that; get it again, or another one"
         raise InputError(origin.field, origin.value, f"loading it, tried in a process apart, {why}; {remedy}")
     return cast(T, result)
 
 
 def _cause(status: int | None, cpu_s: int) -> str:
-    """Why a child said nothing."""
+    """Why a child sent no message."""
     if status is None:
         return f"waits for something since {STALLED_S} s"
     code = os.waitstatus_to_exitcode(status)
@@ -106,20 +105,20 @@ def _cause(status: int | None, cpu_s: int) -> str:
 
 def _run(task: Callable[[], object], writer: int, parent: int, memory: int, cpu_s: int) -> None:
     """Runs in the child, and ends it."""
-    said = b""
+    message = b""
     try:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:
             os._exit(1)
         _confine(memory, cpu_s)
-        said = _report(task())
+        message = _report(task())
     except InputError as error:
         value = None if error.value is None else str(error.value)[:LONGEST]
-        said = _report(None, error.field, value, error.remedy[:LONGEST])
+        message = _report(None, error.field, value, error.remedy[:LONGEST])
     except BaseException as error:  # Rust's panics are no `Exception`
-        said = _report(None, why=f"fails with {type(error).__name__}: {brief(error)}")
+        message = _report(None, why=f"fails with {type(error).__name__}: {brief(error)}")
     with contextlib.suppress(BaseException):
-        os.write(writer, said)
+        os.write(writer, message)
     os._exit(0)
 
 
@@ -150,20 +149,20 @@ def _confine(memory: int, cpu_s: int) -> None:
 
 
 def _wait(child: int, reader: int) -> tuple[bytes, int | None]:
-    """All that it says, and how it ended; None if it stalls."""
-    ticks, since, said = -1, time.monotonic(), b""
+    """The child's message, and how it ended; None if it stalls."""
+    ticks, since, message = -1, time.monotonic(), b""
     while True:
         ready, _, _ = select.select([reader], [], [], 1.0)
         if ready and (part := os.read(reader, select.PIPE_BUF)):
-            said += part
+            message += part
             continue
         if ready:  # it has closed its end
-            return said, os.waitpid(child, 0)[1]
+            return message, os.waitpid(child, 0)[1]
         now = _ticks(child)
         if now != ticks:
             ticks, since = now, time.monotonic()
         elif time.monotonic() - since > STALLED_S:
-            return said, None
+            return message, None
 
 
 def _ticks(child: int) -> int:

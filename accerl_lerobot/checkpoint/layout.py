@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checkpoints in LeRobot's layout, visible only when whole.
+"""Checkpoints in LeRobot's layout, visible only when complete.
 
     checkpoints/NNNNNN/
-      pretrained_model/     what stock LeRobot loads
-      training_state/       what a run needs to go on, see `snapshot`; `training_step.json` is LeRobot's
-      world_model/          what dreams, where it has learnt on
-      config.yaml           the run's
+      pretrained_model/     loaded by stock LeRobot
+      training_state/       needed to resume, see `snapshot`; `training_step.json` is LeRobot's
+      world_model/          the world model, where it is trained in the run
+      config.yaml           the run's config
       manifest.json         size and SHA-256 of all of these
     checkpoints/last        the newest
 
 A checkpoint is written under another name, its manifest last, and renamed, so that a reader never finds half
-of one. Whoever goes on from one looks at every byte first.
+of one. Every byte is checked before a run resumes from it.
 """
 
 from __future__ import annotations
@@ -24,41 +24,37 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from accerl_lerobot.checkpoint.safety import Origin, safe_join
+from accerl_lerobot.checkpoint.safety import MIB, Origin, read_json, safe_join
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.fault_points import fault_point
 
 PRETRAINED, TRAINING_STATE, WORLD_MODEL = "pretrained_model", "training_state", "world_model"
-CHECKPOINTS = "checkpoints"
-"""Folder of a run's."""
-DEMOS = "demos"
-"""Folder of the demonstrations that a run has recorded for itself."""
+CHECKPOINTS, DEMOS = "checkpoints", "demos"
+"""Folders of a run: its checkpoints, and demonstrations that it has recorded."""
 CONFIG, SUMMARY = "config.yaml", "summary.json"
-"""Files of a run: how it is to be, and what came of it once it has ended."""
+"""Files of a run: its config, and its results once it has ended."""
 MANIFEST, LAST = "manifest.json", "last"
 WRITING, REPLACED = ".writing-", ".replaced-"
-"""How the names of checkpoints begin that are being written, and of those that are being replaced."""
+"""Prefixes of checkpoints that are being written, and of those that are being replaced."""
 RUN_STATE, WEIGHTS = "run", "weights"
-"""Names of states in `TRAINING_STATE`: how far the run has come; what is trained, exactly as it is."""
+"""Names of states in `TRAINING_STATE`: the progress of the run, and the exact trained weights."""
 STEP = "training_step.json"
-"""LeRobot's file of how far it has come."""
 FORMAT = 2
 """Format of the manifest and the training state; another one is refused."""
-UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError)
-"""Exceptions of reading a broken manifest."""
+MANIFEST_MOST = 64 * MIB
 AWAY = "LOCAL"
-"""Stands for the folders above a file that was on the pusher's machine."""
+"""Replaces the folders above a file of the machine that pushed it."""
 BACKBONE = "backbone"
 """Folder beside the weights with the vision-language backbone's config and tokenisers."""
 FAST = f"{BACKBONE}/fast"
 """Folder with the tokeniser of actions, where a policy has one."""
 CONFIG_FOLDERS = {"vlm_model_name": BACKBONE, "text_tokenizer_name": BACKBONE, "action_tokenizer_name": FAST}
-"""Field of a LeRobot policy config that names files → where ours have them."""
+"""Field of a LeRobot policy config that names files → our folder for them."""
 STEP_FOLDERS = {
     "tokenizer_processor": ("tokenizer_name", BACKBONE),
     "action_tokenizer_processor": ("action_tokenizer_name", FAST),
 }
-"""LeRobot processor step → its option that names files, and where ours have them."""
+"""LeRobot processor step → its option that names files, and our folder for them."""
 PREPROCESSOR = "policy_preprocessor.json"
 """LeRobot's file of the processor steps before the policy."""
 
@@ -66,17 +62,15 @@ PREPROCESSOR = "policy_preprocessor.json"
 def save_checkpoint(checkpoints: Path, write: Callable[[Path], int]) -> Path:
     """Writes one checkpoint and points ``last`` at it; both survive a loss of power once this returns.
 
+    If `write` raises, older checkpoints and ``last`` are as before.
+
     Args:
         checkpoints: the run's ``checkpoints`` folder.
-        write: creates and fills ``pretrained_model``, and what else there is to be, in the folder it is
-            given, and returns the version of what it wrote, the number of updates behind it.
+        write: creates and fills ``pretrained_model``, and other folders as needed, in the folder it is given,
+            and returns the number of updates behind what it wrote.
 
     Returns:
-        ``checkpoints/NNNNNN``; one of that version that was there before is replaced, since what goes with
-        the same weights need not be the same.
-
-    Raises:
-        Exception: whatever `write` raises; older checkpoints and ``last`` are as before.
+        ``checkpoints/NNNNNN``; an existing one of that version is replaced.
     """
     checkpoints.mkdir(parents=True, exist_ok=True)
     _tidy(checkpoints)
@@ -89,10 +83,10 @@ def save_checkpoint(checkpoints: Path, write: Callable[[Path], int]) -> Path:
         fault_point("driver.files")
         relocate(temporary / PRETRAINED, final / PRETRAINED)
         (temporary / TRAINING_STATE).mkdir(exist_ok=True)
-        step = json.dumps({"step": version}, indent=2)
-        (temporary / TRAINING_STATE / STEP).write_text(step + "\n")
+        (temporary / TRAINING_STATE / STEP).write_text(json.dumps({"step": version}, indent=2) + "\n")
         write_manifest(temporary)
-        _make_durable(temporary)
+        for path in [*sorted(temporary.rglob("*"), reverse=True), temporary]:
+            _sync(path)
         if final.exists():
             final.rename(checkpoints / f"{REPLACED}{final.name}")
         temporary.rename(final)
@@ -105,19 +99,18 @@ def save_checkpoint(checkpoints: Path, write: Callable[[Path], int]) -> Path:
 
 
 def _tidy(checkpoints: Path) -> None:
-    """Removes what a process that was killed has left half written, and brings back what it had put aside."""
-    for left in checkpoints.glob(f"{WRITING}*"):
-        shutil.rmtree(left)
+    """Removes what a killed process has left half written, and restores what it had put aside."""
+    for partial in checkpoints.glob(f"{WRITING}*"):
+        shutil.rmtree(partial)
     for aside in checkpoints.glob(f"{REPLACED}*"):
-        place = checkpoints / aside.name.removeprefix(REPLACED)
-        if place.exists():
+        original = checkpoints / aside.name.removeprefix(REPLACED)
+        if original.exists():
             shutil.rmtree(aside)
         else:
-            aside.rename(place)
+            aside.rename(original)
 
 
 def _point_at(checkpoint: Path) -> None:
-    """Makes it the last one."""
     link = checkpoint.parent / ".last-new"
     link.unlink(missing_ok=True)
     link.symlink_to(checkpoint.name)
@@ -126,7 +119,7 @@ def _point_at(checkpoint: Path) -> None:
 
 
 def go_back_to(checkpoint: Path) -> None:
-    """Makes it the last one: of what came after it the policy is kept, as ``abandoned-NNNNNN``."""
+    """Makes a checkpoint the last one; of later ones the policy is kept, as ``abandoned-NNNNNN``."""
     for later in _numbered(checkpoint.parent):
         if int(later.name) > int(checkpoint.name):
             aside = later.with_name(f"abandoned-{later.name}")
@@ -136,15 +129,15 @@ def go_back_to(checkpoint: Path) -> None:
     _point_at(checkpoint)
 
 
-def begun(checkpoints: Path) -> bool:
-    """True if there is a checkpoint, whole or not."""
+def has_checkpoint(checkpoints: Path) -> bool:
+    """True if there is a checkpoint, broken or not."""
     if checkpoints.is_dir():
         _tidy(checkpoints)
     return bool(_numbered(checkpoints))
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Replaces a file in one stroke: readers find the old one or the new one, even after a loss of power."""
+    """Replaces a file: readers find the old one or the new one, even after a loss of power."""
     new = path.with_name(f".{path.name}.new")
     new.write_text(text)
     _sync(new)
@@ -152,100 +145,107 @@ def write_atomically(path: Path, text: str) -> None:
     _sync(path.parent)
 
 
+def entry(content: Path | bytes) -> dict[str, int | str]:
+    """Size and SHA-256 of a file, or of bytes, as a manifest lists them."""
+    if isinstance(content, bytes):
+        return {"size": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    return {"size": content.stat().st_size, "sha256": digest(content)}
+
+
+def manifest_text(files: dict[str, dict[str, int | str]], **more: Any) -> str:
+    """A manifest of files, by name."""
+    return json.dumps({"format": FORMAT, **more, "files": dict(sorted(files.items()))}, indent=2) + "\n"
+
+
 def write_manifest(directory: Path) -> None:
-    """Writes the size and SHA-256 of every file in a checkpoint, in one stroke."""
-    files = {
-        str(path.relative_to(directory)): {"size": path.stat().st_size, "sha256": digest(path)}
-        for path in sorted(directory.rglob("*"))
-        if path.is_file() and path.relative_to(directory).parts[0] not in (MANIFEST, f".{MANIFEST}.new")
-    }
-    _write_manifest(directory, {"format": FORMAT, "files": files})
+    """Writes the size and SHA-256 of every file in a checkpoint."""
+    files = {path.relative_to(directory): path for path in directory.rglob("*") if path.is_file()}
+    own = (MANIFEST, f".{MANIFEST}.new")
+    entries = {str(name): entry(path) for name, path in files.items() if name.parts[0] not in own}
+    write_atomically(directory / MANIFEST, manifest_text(entries))
 
 
-def defect(directory: Path) -> str | None:
-    """Why a checkpoint is not what was written; None if it is, byte by byte."""
+def read_manifest(directory: Path, name: str = MANIFEST) -> dict[str, Any]:
+    """The content of a manifest, not checked any further."""
+    return read_json(directory / name, Origin("config_path", str(directory)), MANIFEST_MOST)
+
+
+def defect(directory: Path, name: str = MANIFEST, expected_format: int = FORMAT) -> str | None:
+    """The first difference between a folder and its manifest; None if every byte is as it was written."""
+    origin = Origin("config_path", str(directory))
+    if not (directory / name).is_file():
+        return f"it has no {name}"
     try:
-        manifest = _manifest(directory)
-        if manifest["format"] != FORMAT:
-            return f"its format is {manifest['format']}, and this accerl reads {FORMAT}"
-        files = {str(name): (int(v["size"]), str(v["sha256"])) for name, v in manifest["files"].items()}
-    except FileNotFoundError:
-        return f"it has no {MANIFEST}"
-    except UNREADABLE as error:
-        return f"its {MANIFEST} is broken ({' '.join(str(error).split())[:80]})"
-    for name, (size, expected) in files.items():
+        manifest = read_manifest(directory, name)
+        if manifest["format"] != expected_format:
+            return f"its format is {manifest['format']}, and this accerl reads {expected_format}"
+        files = {str(file): (int(v["size"]), str(v["sha256"])) for file, v in manifest["files"].items()}
+    except (InputError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        return f"its {name} is broken ({' '.join(str(error).split())[-80:]})"
+    for file, (size, sha256) in files.items():
         try:
-            path = safe_join(directory, name, Origin("config_path", str(directory)))
+            path = safe_join(directory, file, origin)
         except InputError:
-            return f"its {MANIFEST} names {name!r}, outside of it"
+            return f"its {name} names {file!r}, outside of it"
         if not path.is_file():
-            return f"{name} is missing"
+            return f"{file} is missing"
         if path.stat().st_size != size:
-            return f"{name} has {path.stat().st_size} bytes, not {size}"
-        if digest(path) != expected:
-            return f"{name} is not what was written"
+            return f"{file} has {path.stat().st_size} bytes, not {size}"
+        if digest(path) != sha256:
+            return f"{file} is not what was written"
     return None
 
 
 def newest_whole(checkpoints: Path, wanted: str = LAST) -> tuple[Path, list[str]]:
-    """The checkpoint to go on from.
-
-    Args:
-        checkpoints: the run's folder of them.
-        wanted: which one; where it is broken, or its training state was let go, the newest before it.
+    """The checkpoint to resume from: `wanted`, or the newest good one before it.
 
     Returns:
-        Its folder, and why each that was passed over was.
-
-    Raises:
-        InputError: none is left.
+        Its folder, and why each later one was skipped: it is broken, or has no training state any more.
     """
     _tidy(checkpoints)
     numbers = _numbered(checkpoints)
     if wanted != LAST:
         if checkpoints / wanted not in numbers:
             names = ", ".join(p.name for p in numbers) or "none"
-            raise InputError(
-                "config_path", str(checkpoints / wanted), f"no such checkpoint; there are {names}"
-            )
+            remedy = f"no such checkpoint; there are {names}"
+            raise InputError("config_path", str(checkpoints / wanted), remedy)
         numbers = numbers[: numbers.index(checkpoints / wanted) + 1]
-    passed: list[str] = []
+    skipped: list[str] = []
     for path in reversed(numbers):
         why = defect(path)
-        if why is None and f"{TRAINING_STATE}/{RUN_STATE}.json" not in _manifest(path)["files"]:
+        if why is None and f"{TRAINING_STATE}/{RUN_STATE}.json" not in read_manifest(path)["files"]:
             why = "its training state was not kept, see save_keep"
         if why is None:
-            return path, passed
-        passed.append(f"{path.name}: {why}")
-    said = "; ".join(passed) or "there is none"
-    remedy = (
-        f"no checkpoint here can be gone on from ({said}); begin a new run from a policy, with --policy.path"
-    )
+            return path, skipped
+        skipped.append(f"{path.name}: {why}")
+    reasons = "; ".join(skipped) or "there is none"
+    remedy = f"no checkpoint here can be resumed ({reasons}); start a new run from a policy: --policy.path"
     raise InputError("config_path", str(checkpoints), remedy)
 
 
 def saved_version(state: Path) -> int:
-    """Updates behind what a ``training_state`` holds."""
+    """Number of updates behind a ``training_state``."""
     return int(json.loads((state / STEP).read_text())["step"])
 
 
-def let_go(checkpoints: Path, keep: int, needed: str | None = None) -> None:
+def prune(checkpoints: Path, keep: int, needed: str | None = None) -> None:
     """Removes the training state of all but the newest `keep` checkpoints; their policies stay.
 
     Args:
         checkpoints: their folder.
         keep: how many.
-        needed: name of one more whose weights are spared, although it cannot be gone on from any more: a
-            service that is lost begins again where all workers did.
+        needed: name of one whose weights are kept as well, although it cannot be resumed from any more: an
+            inference replica that is lost starts again where all workers did.
     """
     having = [path for path in _numbered(checkpoints) if (path / TRAINING_STATE).is_dir()]
     for path in having[: max(0, len(having) - keep)]:
-        # First, or one half removed would count as broken. What is left is not read, let alone vouched for.
-        with contextlib.suppress(*UNREADABLE):  # a broken manifest says nothing of it
-            manifest = _manifest(path)
-            left = {k: v for k, v in manifest["files"].items() if Path(k).parts[0] != TRAINING_STATE}
-            if left != manifest["files"]:
-                _write_manifest(path, manifest | {"files": left})
+        # The manifest first: a checkpoint whose files are half removed would count as broken.
+        with contextlib.suppress(InputError, KeyError, AttributeError):
+            manifest = read_manifest(path)
+            kept = {k: v for k, v in manifest["files"].items() if Path(k).parts[0] != TRAINING_STATE}
+            if kept != manifest["files"]:
+                text = json.dumps(manifest | {"files": kept}, indent=2) + "\n"
+                write_atomically(path / MANIFEST, text)
         if path.name != needed:
             shutil.rmtree(path / TRAINING_STATE)
             continue
@@ -255,29 +255,14 @@ def let_go(checkpoints: Path, keep: int, needed: str | None = None) -> None:
 
 
 def _numbered(checkpoints: Path) -> list[Path]:
-    """The oldest first."""
+    """All checkpoints, the oldest first."""
     return sorted((p for p in checkpoints.glob("*") if p.name.isdigit()), key=lambda p: int(p.name))
-
-
-def _manifest(directory: Path) -> Any:
-    return json.loads((directory / MANIFEST).read_text())
-
-
-def _write_manifest(directory: Path, manifest: dict[str, Any]) -> None:
-    write_atomically(directory / MANIFEST, json.dumps(manifest, indent=2) + "\n")
 
 
 def digest(path: Path) -> str:
     """SHA-256 of a file, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _make_durable(directory: Path) -> None:
-    """Has the disk hold all files in a folder, and their names."""
-    for path in sorted(directory.rglob("*"), reverse=True):
-        _sync(path)
-    _sync(directory)
 
 
 def _sync(path: Path) -> None:
@@ -289,17 +274,13 @@ def _sync(path: Path) -> None:
 
 
 def relocate(directory: Path, home: Path) -> None:
-    """Points a checkpoint's config and processors at the files in its own folder.
+    """Points a checkpoint's config and processors at the files in its own folder, which will be `home`.
 
     LeRobot 0.6.1 stores a local backbone by absolute path. Names on the Hub are left as they are.
-
-    Args:
-        directory: where the files are now.
-        home: where they will be.
     """
     if not (directory / BACKBONE).is_dir():
         return
-    config, processor = _named(directory)
+    config, processor = _read_configs(directory)
     for fields, key, folder in _local_names(config, processor):
         fields[key] = str((home / folder).absolute())
     (directory / "config.json").write_text(json.dumps(config, indent=4) + "\n")
@@ -307,20 +288,19 @@ def relocate(directory: Path, home: Path) -> None:
 
 
 def displaced(directory: Path) -> bool:
-    """True if a checkpoint has a backbone folder of its own and its files name one that is not there."""
+    """True if a checkpoint has a backbone folder of its own and its files name one that does not exist."""
     if not (directory / BACKBONE).is_dir():
         return False
-    return any(not Path(fields[key]).is_dir() for fields, key, _ in _local_names(*_named(directory)))
+    return any(not Path(fields[key]).is_dir() for fields, key, _ in _local_names(*_read_configs(directory)))
 
 
-def _named(directory: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+def _read_configs(directory: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     config = json.loads((directory / "config.json").read_text())
     return config, json.loads((directory / PREPROCESSOR).read_text())
 
 
 def _local_names(config: dict[str, Any], processor: dict[str, Any]) -> list[tuple[dict[str, Any], str, str]]:
-    """Where a checkpoint's files name a folder of this machine, or by its bare name one beside them, as they
-    do on the Hub: (mapping, key, our folder for it)."""
+    """Places of `places_of_names` that name a folder of this machine, or by its bare name one beside them."""
     named = [(place, place[0].get(place[1]) or "") for place in places_of_names(config, processor)]
     return [place for place, name in named if Path(name).is_absolute() or name == place[2]]
 
@@ -328,7 +308,7 @@ def _local_names(config: dict[str, Any], processor: dict[str, Any]) -> list[tupl
 def places_of_names(
     config: dict[str, Any], processor: dict[str, Any]
 ) -> list[tuple[dict[str, Any], str, str]]:
-    """Where a policy's files may name a folder: (mapping, key, our folder for it)."""
+    """Places where a policy's files may name a folder: (mapping, key, our folder for it)."""
     places = [(config, key, folder) for key, folder in CONFIG_FOLDERS.items()]
     for step in processor.get("steps", []):
         if (option := STEP_FOLDERS.get(step.get("registry_name"))) is not None:

@@ -2,7 +2,7 @@
 """Validation of files from untrusted sources: names, sizes, JSON and safetensors.
 
 Checkpoints, world models and datasets may be anybody's. Everything here reads little, runs nothing, writes
-nothing, and either returns or raises an `InputError` that names the file. Free of torch and LeRobot.
+nothing, and refuses with an `InputError` that names the file. Free of torch and LeRobot.
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ import math
 import os
 import re
 import stat
-import string
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -30,14 +29,12 @@ READ_MOST = 64 * MIB
 """Bytes that are read of a safetensors file before it is opened again."""
 PART_MOST, PATH_MOST = 255, 1024
 """Bytes of one part of a file's name, and of all of it."""
-TEMPLATE_MOST = 256
 PICKLES = (".bin", ".pt", ".pth", ".pkl", ".pickle", ".ckpt")
 """Endings of files that PyTorch unpickles, which may run whatever their author wished."""
 REVISION = re.compile(r"[0-9a-f]{40}")
 HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}(/[A-Za-z0-9][\w.-]{0,95})?", re.ASCII)
 _DRIVE = re.compile(r"[A-Za-z]:")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
-_WIDTH = re.compile(r"(0?[1-9])?d?")
 
 
 @dataclass(frozen=True)
@@ -61,12 +58,9 @@ class Origin:
 
 
 def safe_join(root: Path, name: object, origin: Origin) -> Path:
-    """`root` / `name`, where `name` was read from a file of somebody's.
+    """`root` / `name` for a name from an untrusted file; one that is not relative or leads out is refused.
 
-    Links may lead about within `root`; in the Hub's cache also to its blobs, which is how that is laid out.
-
-    Raises:
-        InputError: the name is no plain relative one, or leads out of `root`.
+    Links may point within `root`, and in the Hub's cache to its blobs.
     """
     if why := unsafe_name(name):
         raise origin.refuse(str(name)[:PATH_MOST], f"{why}; only files inside the folder are read")
@@ -92,12 +86,7 @@ RUN_FILES = {".yaml", ".json", ".jsonl", ".bin", ".safetensors"}
 
 
 def check_folder(folder: Path, origin: Origin) -> None:
-    """Refuses a run's folder that holds more than files and folders of its own.
-
-    Raises:
-        InputError: a link leads out of it, there is a pipe or a device, reading which may never end, or a
-            folder where a file belongs.
-    """
+    """Refuses a run's folder with a link that leads out, a pipe or device, or a folder instead of a file."""
     for at, folders, files in os.walk(folder):
         for path in (Path(at, name) for name in (*folders, *files)):
             name = path.relative_to(folder).as_posix()
@@ -111,54 +100,15 @@ def check_folder(folder: Path, origin: Origin) -> None:
 
 
 def check_name(name: object, what: str, origin: Origin) -> str:
-    """A name that will become part of a path, such as a camera's.
-
-    Raises:
-        InputError: it is no single plain part.
-    """
+    """A name that will become part of a path, such as a camera's; more than one part is refused."""
     why = unsafe_name(name) or ("it has a slash in it" if "/" in str(name) else "")
     if why:
         raise origin.refuse(what, f"the name {_shown(str(name))!r} cannot be part of a path: {why}")
     return str(name)
 
 
-def check_template(template: object, fields: Mapping[str, type], what: str, origin: Origin) -> None:
-    """A path with places to be filled in by `str.format`, which can reach attributes and pad to gigabytes.
-
-    Args:
-        template: the text.
-        fields: the places there may be, and whether a number (int) or a name (str) goes there.
-        what: where it was found, for the error.
-        origin: likewise.
-
-    Raises:
-        InputError: it has other places, asks them for more than a width of one digit, or is no safe path.
-    """
-    known = ", ".join(f"{{{name}}}" for name in fields)
-    if not isinstance(template, str) or not 0 < len(template) <= TEMPLATE_MOST:
-        raise origin.refuse(what, f"not a text of up to {TEMPLATE_MOST} characters with places for {known}")
-    try:
-        parts = list(string.Formatter().parse(template))
-    except ValueError as error:
-        raise origin.refuse(what, f"{template!r} is no format ({error}); use {known}") from error
-    for _, name, spec, conversion in parts:
-        if name is None:
-            continue
-        if name not in fields or conversion is not None:
-            raise origin.refuse(what, f"{template!r} has a place {{{name}}}; only {known} may be used")
-        if not (_WIDTH.fullmatch(spec or "") if fields[name] is int else not spec):
-            raise origin.refuse(what, f"{template!r} asks for {spec!r}; use a width such as 03d, or none")
-    example = template.format(**{name: 0 if kind is int else "name" for name, kind in fields.items()})
-    if why := unsafe_name(example):
-        raise origin.refuse(what, f"{template!r} is no path inside the folder: {why}")
-
-
 def read_bytes(path: Path, most: int, origin: Origin) -> bytes:
-    """A regular file's content.
-
-    Raises:
-        InputError: it is missing, something else than a file, too large, or unreadable.
-    """
+    """A regular file's content, if it has at most `most` bytes."""
     size = file_size(path, origin)
     if size > most:
         remedy = f"{size} bytes, more than the {most} that such a file may have; it is not what it says"
@@ -171,11 +121,7 @@ def read_bytes(path: Path, most: int, origin: Origin) -> bytes:
 
 
 def file_size(path: Path, origin: Origin) -> int:
-    """Bytes of a regular file.
-
-    Raises:
-        InputError: it is missing or something else: reading a pipe or a device may never end.
-    """
+    """Bytes of a regular file; a pipe or a device is refused, since reading it may never end."""
     try:
         found = path.stat()
     except (OSError, ValueError) as error:
@@ -186,11 +132,7 @@ def file_size(path: Path, origin: Origin) -> int:
 
 
 def read_json(path: Path, origin: Origin, most: int = JSON_MOST) -> dict[str, Any]:
-    """The mapping in a JSON file.
-
-    Raises:
-        InputError: no such file, too large, too deep, or not a mapping in JSON.
-    """
+    """The mapping in a JSON file of at most `most` bytes."""
     raw = read_bytes(path, most, origin)
     try:
         content = json.loads(raw.decode())
@@ -205,11 +147,7 @@ def read_json(path: Path, origin: Origin, most: int = JSON_MOST) -> dict[str, An
 
 @contextlib.contextmanager
 def opened(path: Path, origin: Origin, framework: str = "np") -> Iterator[Any]:
-    """A safetensors file, whose header safetensors itself compares with the file.
-
-    Raises:
-        InputError: it is none.
-    """
+    """A safetensors file, whose header safetensors itself compares with the file."""
     file_size(path, origin)
     try:
         with safe_open(path, framework) as file:
@@ -219,24 +157,17 @@ def opened(path: Path, origin: Origin, framework: str = "np") -> Iterator[Any]:
 
 
 def tensor_shapes(path: Path, origin: Origin) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Dtype and shape by name of what a safetensors file holds; no tensor is read.
-
-    Raises:
-        InputError: see `opened`.
-    """
+    """Dtype and shape by name of what a safetensors file holds; no tensor is read."""
     with opened(path, origin) as file:
         slices = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
         return {name: (one.get_dtype(), tuple(one.get_shape())) for name, one in slices.items()}
 
 
 def read_tensors(path: Path, origin: Origin) -> Iterator[tuple[str, Any]]:
-    """Name and PyTorch tensor, one after the other, of a safetensors file.
+    """Name and PyTorch tensor, one after the other, of a safetensors file; NaN and infinity are refused.
 
     A tensor is a view of the file, so that none is in memory twice. The file is opened again now and then:
     what has been read of it counts as memory of this process until it is closed.
-
-    Raises:
-        InputError: see `opened`; or a tensor holds NaN or infinity.
     """
     shapes, read = tensor_shapes(path, origin), 0
     with contextlib.ExitStack() as stack:
@@ -261,33 +192,13 @@ def _finite(tensor: Any) -> bool:
 
 
 def check_number(value: object, low: float, high: float, what: str, origin: Origin) -> None:
-    """A number within bounds, and no bool.
-
-    Raises:
-        InputError: it is something else.
-    """
+    """Refuses a value that is no number within bounds."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
         raise origin.refuse(what, f"{_shown(repr(value))}; use {low:g} to {high:g}")
 
 
-def check_shape(shape: object, most: int, what: str, origin: Origin) -> None:
-    """Up to five sides of at least 1, `most` numbers in all.
-
-    Raises:
-        InputError: it is something else.
-    """
-    sides = shape if isinstance(shape, (list, tuple)) and len(shape) <= 5 else [None]
-    whole = all(isinstance(side, int) and not isinstance(side, bool) and side > 0 for side in sides)
-    if not whole or math.prod(sides) > most:
-        raise origin.refuse(what, f"shape {_shown(repr(shape))}; use up to 5 sides and {most} numbers")
-
-
 def check_not_pickled(folder: Path, weights: str, origin: Origin) -> None:
-    """Refuses a folder without `weights`, and says so where there are only weights that would be unpickled.
-
-    Raises:
-        InputError: see above.
-    """
+    """Refuses a folder without `weights`, and says so where there are only pickled ones."""
     if (folder / weights).is_file():
         return
     pickled = sorted(path.name for path in folder.iterdir() if path.suffix in PICKLES)
@@ -297,20 +208,18 @@ def check_not_pickled(folder: Path, weights: str, origin: Origin) -> None:
     raise origin.refuse(weights, "is missing; give a folder with the weights as safetensors")
 
 
-def check_remote_code(trust: bool, revision: str | None, room: str, name: str = "code_revision") -> None:
-    """Code from the Hub is run only where it is asked for, and one version of it that is named.
-
-    Raises:
-        InputError: one of the two is missing, or the revision is not a commit.
-    """
+def check_remote_code(trust: bool, revision: str | None, section: str, name: str = "code_revision") -> None:
+    """Refuses code from the Hub unless it is asked for and one commit of it is named."""
     if trust and revision is None:
         remedy = "name the commit whose code you have read, 40 hexadecimal digits: it is run with your rights"
-        raise InputError(f"{room}.{name}", revision, remedy)
+        raise InputError(f"{section}.{name}", revision, remedy)
     if revision is not None and not REVISION.fullmatch(revision):
         remedy = "name a commit, 40 hexadecimal digits: branches and tags can be moved to other code"
-        raise InputError(f"{room}.{name}", revision, remedy)
+        raise InputError(f"{section}.{name}", revision, remedy)
     if revision is not None and not trust:
-        raise InputError(f"{room}.{name}", revision, f"add {room}.trust_remote_code=true, or leave it out")
+        raise InputError(
+            f"{section}.{name}", revision, f"add {section}.trust_remote_code=true, or leave it out"
+        )
 
 
 def brief(error: BaseException) -> str:

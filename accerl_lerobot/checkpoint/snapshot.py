@@ -54,11 +54,7 @@ def save(path: Path, tree: Any) -> None:
 
 
 def load(path: Path) -> Any:
-    """Reads a file of `save`; arrays are writable and owned by the caller.
-
-    Raises:
-        InputError: a file is missing or is not of this format.
-    """
+    """Reads a file of `save`; arrays are writable and owned by the caller."""
     file = path.with_suffix(".json")
     try:
         text, arrays = file.read_text(), load_file(path.with_suffix(".safetensors"))

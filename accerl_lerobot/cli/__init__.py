@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import difflib
-import importlib
 import logging
 import os
 import signal
@@ -18,23 +17,22 @@ from accerl_lerobot.errors import InputError, one_line
 
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR")
 VERBS = {
-    "train": (
-        "verbs:train",
-        "improve a policy by online RL (demonstrations and SFT first, if the recipe says so)",
-    ),
-    "demos": ("verbs:demos", "record scripted-expert demonstrations into a LeRobotDataset"),
-    "sft": ("verbs:sft", "fine-tune on a LeRobotDataset with LeRobot's own trainer"),
-    "eval": ("verbs:evaluate", "success of a checkpoint, with its confidence interval"),
-    "world-model": ("verbs:world_model", "learn to dream a world from LeRobotDatasets, and be tried on them"),
-    "world-model-eval": ("verbs:world_model_eval", "try a world model on episodes of one or several sources"),
-    "push": ("verbs:push", "a policy, world model, dataset or run to the Hub, as one commit"),
-    "pull": ("verbs:pull", "what was pushed into a new folder, pinned and checked"),
-    "report": ("verbs:report", "one HTML page of a run, or of several beside each other, to look at"),
-    "timeline": ("verbs:timeline", "what every worker of a run did when: a picture, a trace and shares"),
-    "export": ("verbs:export", "the episodes of a run as a LeRobotDataset, with a picture at every env step"),
-    "doctor": ("doctor:main", "resolve a recipe and check this machine"),
-    "bench": ("verbs:bench", "measure this machine: accerl bench world, policy, throughput or latency"),
+    "train": "improve a policy by online RL (demonstrations and SFT first, if the recipe says so)",
+    "demos": "record scripted-expert demonstrations into a LeRobotDataset",
+    "sft": "fine-tune on a LeRobotDataset with LeRobot's own trainer",
+    "eval": "measure the success of a checkpoint, with its confidence interval",
+    "world-model": "train a world model on LeRobotDatasets and validate it on held-out episodes",
+    "world-model-eval": "validate a world model on episodes of one or several datasets",
+    "push": "push a policy, world model, dataset or run to the Hub, as one commit",
+    "pull": "pull from the Hub into a new folder, pinned and checked",
+    "report": "write one HTML page about a run, or several side by side",
+    "timeline": "show when every worker of a run did what: a picture, a trace and shares",
+    "export": "write the episodes of a run as a LeRobotDataset, with an image at every env step",
+    "doctor": "resolve a recipe and check this machine",
+    "bench": "measure this machine: accerl bench world, policy, throughput or latency",
 }
+FUNCTIONS = {"eval": "verbs:evaluate", "doctor": "doctor:main"}
+"""Verb → module and function, where that is not the one of the same name in `verbs`."""
 
 
 def usage() -> str:
@@ -45,7 +43,7 @@ def usage() -> str:
         "usage: accerl VERB [recipe.yaml] [--section.field=value …]",
         "",
     ]
-    lines += [f"  {verb:16} {what}" for verb, (_, what) in VERBS.items()]
+    lines += [f"  {verb:16} {what}" for verb, what in VERBS.items()]
     lines += [
         "",
         "examples:",
@@ -66,7 +64,7 @@ def show_help(verb: str, rest: list[str], section: str) -> int:
     names = [name for name in CONFIGS if name.split()[0] == verb]
     named = [name for name in names if len(names) == 1 or name.split()[-1] in rest]
     if named:
-        text = help_text(f"accerl {named[0]}", CONFIGS[named[0]], VERBS[verb][1], section)
+        text = help_text(f"accerl {named[0]}", CONFIGS[named[0]], VERBS[verb], section)
     else:
         lines = [f"  {name.split()[-1]:16} {brief(CONFIGS[name])[:90]}" for name in names]
         usage = [f"usage: accerl {verb} NAME [--field=value …]", "", *lines]
@@ -115,14 +113,14 @@ def exit_code(program: str, work: Callable[[], int]) -> int:
 
 def run(verb: str, rest: list[str]) -> int:
     """Runs a verb, or shows its help."""
+    from accerl_lerobot.config.imports import imported
+
     set_up_logging()
     if (section := help_asked(rest)) is not None:
         return show_help(verb, rest, section)
-    module, _, name = VERBS[verb][0].partition(":")
+    path = FUNCTIONS.get(verb, f"verbs:{verb.replace('-', '_')}")
     with guarded():
-        function: Callable[[list[str]], int] = getattr(
-            importlib.import_module(f"accerl_lerobot.cli.{module}"), name
-        )
+        function: Callable[[list[str]], int] = imported(f"accerl_lerobot.cli.{path}")
         return function(rest)
 
 
@@ -136,11 +134,7 @@ def help_asked(rest: list[str]) -> str | None:
 
 
 def set_up_logging() -> None:
-    """Sets the level that ``ACCERL_LOG`` names.
-
-    Raises:
-        InputError: it names none.
-    """
+    """Sets the level that ``ACCERL_LOG`` names."""
     level = os.environ.get("ACCERL_LOG", "WARNING").upper()
     if level not in LEVELS:
         raise InputError("ACCERL_LOG", level, f"use {', '.join(LEVELS)}")

@@ -58,7 +58,7 @@ class EvalRun(Section):
     """``accerl eval``: a checkpoint on seeds that no run trains on."""
 
     seed: Seed = 0
-    """Chooses the starts: those of a run with this seed, or others, on which nothing was tuned."""
+    """Selects the initial states: those of a run with this seed, or others, on which nothing was tuned."""
     output_dir: str | None = None
     """Folder for ``evaluation.json`` and videos; None prints only."""
     env: EnvConfig = field(default_factory=MetaWorldConfig)
@@ -79,14 +79,14 @@ class WorldModelRun(Section):
     job_name: str = "world_model"
     """Last part of the folder's name."""
     device: Device = "auto"
-    """cpu, cuda, or auto: where both networks learn and are tried."""
+    """cpu, cuda, or auto: where both networks are trained and validated."""
     env: EnvConfig = field(default_factory=MetaWorldConfig)
-    """The world it is to be a model of: its cameras, sizes, rate and tasks."""
+    """Environment to model: its cameras, sizes, rate and tasks."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """Demonstrations, some of which fail."""
     online: DatasetConfig = field(default_factory=DatasetConfig)
-    """Episodes of a policy, as ``accerl export`` writes them, learnt from together with those; without a name
-    there are none. How a policy fails no demonstration shows."""
+    """Episodes of a policy, as ``accerl export`` writes them, to train on as well; none without a name. No
+    demonstration shows how a policy fails."""
     world_model: WorldModelConfig = field(default_factory=TinyConfig)
 
 
@@ -105,14 +105,13 @@ class WorldModelEvalRun(Section):
     job_name: str = "world_model_eval"
     """Last part of the folder's name."""
     device: Device = "auto"
-    """cpu, cuda, or auto: where the world model dreams and successes are told."""
+    """cpu, cuda, or auto: where the world model and the success model run."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    """Episodes it has not learnt from; of the dataset that it has, those that were held out are taken."""
+    """Episodes it was not trained on; of its own dataset, those that were held out."""
     online: DatasetConfig = field(default_factory=DatasetConfig)
-    """Episodes of a policy, as ``accerl export`` writes them, of which the same is true; without a name there
-    are none."""
+    """Likewise, episodes of a policy as ``accerl export`` writes them; none without a name."""
     success: StandInConfig = field(default_factory=StandInConfig)
-    """A reward model that tells successes in place of the one beside the world model."""
+    """Reward model to use instead of the success model beside the world model."""
     trial: TrialConfig = field(default_factory=TrialConfig)
 
     def __post_init__(self) -> None:

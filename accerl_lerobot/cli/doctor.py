@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``accerl doctor``: will this recipe run on this machine? Every answer that is no comes with its remedy.
+"""``accerl doctor``: checks a recipe against this machine; every failure comes with its remedy.
 
-Nothing here is guessed: a frame is really drawn, in a process of its own, because a broken OpenGL can take a
-process down; packages are compared with the pins this version was tested with.
+A frame is really drawn, in a process of its own, because a broken OpenGL can take a process down. Packages
+are compared with the versions that this one was tested with.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.errors import InputError, expanded
 
 if TYPE_CHECKING:
@@ -61,9 +62,9 @@ print("drawn", frame.std() > 1, round(1000 * (time.perf_counter() - started), 1)
 """
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Check:
-    """One answer."""
+    """One result."""
 
     name: str
     status: str
@@ -100,8 +101,8 @@ def main(arguments: list[str]) -> int:
 
 
 def machine(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
-    """Needs of any run, and those of `config` beyond; `history` is the policy's ``n_obs_steps``."""
-    yield python_version()
+    """Checks that any run needs, and those of `config`; `history` is the policy's ``n_obs_steps``."""
+    yield Check("python", OK, f"{platform.python_version()} in {sys.prefix}")
     yield packages()
     yield hugging_face_datasets()
     yield ray_imports(joins=config is not None and config.launch.address is not None)
@@ -110,18 +111,8 @@ def machine(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
     yield from resources(config, history)
 
 
-def python_version() -> Check:
-    """The interpreter."""
-    fine = sys.version_info >= (3, 12)
-    return Check(
-        name="python",
-        status=OK if fine else FAIL,
-        text=f"{platform.python_version()} in {sys.prefix}" + ("" if fine else "; use 3.12 or newer"),
-    )
-
-
 def pins(requirements: list[str]) -> dict[str, tuple[str, bool]]:
-    """Package → (pinned version, whether it belongs to an extra) from requirement strings.
+    """Package → (pinned version, True if it belongs to an extra) from requirement strings.
 
     Example:
         >>> pins(["lerobot[dataset]==0.6.1", 'mujoco==3.3.2; extra == "metaworld"'])
@@ -140,46 +131,38 @@ def packages() -> Check:
     try:
         pinned = pins(importlib.metadata.requires(DISTRIBUTION) or [])
     except importlib.metadata.PackageNotFoundError:
-        return Check(name="packages", status=FAIL, text=f"{DISTRIBUTION} is not installed: run make setup")
+        return Check("packages", FAIL, f"{DISTRIBUTION} is not installed: run make setup")
     differing: list[str] = []
-    absent: list[str] = []
-    extras: list[str] = []
+    absent: dict[bool, list[str]] = {True: [], False: []}
     for name, (version, extra) in pinned.items():
         try:
             installed = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
-            (extras if extra else absent).append(name)
+            absent[extra].append(name)
             continue
         if installed.partition("+")[0] != version:
             differing.append(f"{name} {installed} instead of {version}")
-    if absent:
-        text = f"not installed: {', '.join(absent)}; run make setup"
-        return Check(name="packages", status=FAIL, text=text)
+    if absent[False]:
+        return Check("packages", FAIL, f"not installed: {', '.join(absent[False])}; run make setup")
     if differing:
-        text = f"{', '.join(differing)}: not the tested versions; run make setup"
-        return Check(name="packages", status=WARN, text=text)
-    text = f"{len(pinned) - len(extras)} at the tested versions, lerobot {pinned['lerobot'][0]} among them"
-    if extras:
-        text += f"; without the extras' {', '.join(extras)}"
-    return Check(name="packages", status=OK, text=text)
+        return Check("packages", WARN, f"{', '.join(differing)}: not the tested versions; run make setup")
+    count = len(pinned) - len(absent[True])
+    text = f"{count} at the tested versions, lerobot {pinned['lerobot'][0]} among them"
+    if absent[True]:
+        text += f"; without the extras' {', '.join(absent[True])}"
+    return Check("packages", OK, text)
 
 
 def hugging_face_datasets() -> Check:
     """A folder named ``datasets`` stands in for a package that is absent, and one with a file shadows it."""
     spec = importlib.util.find_spec("datasets")
-    origin = None if spec is None else spec.origin
-    try:
-        version = importlib.metadata.version("datasets")
-    except importlib.metadata.PackageNotFoundError:
-        version = None
-    if version is None or origin is None:
+    if spec is None or spec.origin is None:
         text = "Hugging Face datasets is not installed, or a folder hides it; run make setup"
-        return Check(name="datasets", status=FAIL, text=text)
-    home = Path(str(importlib.metadata.distribution("datasets").locate_file("datasets"))).resolve()
-    if Path(origin).resolve().parent != home:
-        text = f"{origin} shadows Hugging Face datasets: remove or rename it"
-        return Check(name="datasets", status=FAIL, text=text)
-    return Check(name="datasets", status=OK, text=f"Hugging Face datasets {version}")
+        return Check("datasets", FAIL, text)
+    distribution = importlib.metadata.distribution("datasets")
+    if Path(spec.origin).resolve().parent != Path(str(distribution.locate_file("datasets"))).resolve():
+        return Check("datasets", FAIL, f"{spec.origin} shadows Hugging Face datasets: remove or rename it")
+    return Check("datasets", OK, f"Hugging Face datasets {distribution.version}")
 
 
 def ray_imports(joins: bool = False) -> Check:
@@ -190,58 +173,48 @@ def ray_imports(joins: bool = False) -> Check:
     try:
         import ray
     except Exception as error:
-        return Check(name="ray", status=FAIL, text=f"cannot be imported ({_line(error)}); run make setup")
-    return Check(name="ray", status=OK, text=ray.__version__)
+        return Check("ray", FAIL, f"cannot be imported ({brief(error)}); run make setup")
+    return Check("ray", OK, ray.__version__)
 
 
 def cuda(config: RunConfig | None) -> Check:
-    """Checks that torch sees a GPU, and tells if the recipe insists on one."""
+    """GPUs that torch sees, and whether the recipe insists on one."""
     wish = config.policy.device if config is not None else "auto"
     try:
         import torch
     except Exception as error:
-        return Check(name="torch", status=FAIL, text=f"cannot be imported ({_line(error)}); run make setup")
+        return Check("torch", FAIL, f"cannot be imported ({brief(error)}); run make setup")
     if torch.cuda.is_available():
-        number, name = torch.cuda.device_count(), torch.cuda.get_device_name(0)
-        return Check(name="torch", status=OK, text=f"{torch.__version__}, {number} × {name}")
+        gpus = f"{torch.cuda.device_count()} × {torch.cuda.get_device_name(0)}"
+        return Check("torch", OK, f"{torch.__version__}, {gpus}")
     text = f"{torch.__version__}, no CUDA device"
     if wish.startswith("cuda"):
-        text += f": policy.device={wish!r} cannot be had; use auto or cpu"
-        return Check(name="torch", status=FAIL, text=text)
-    return Check(name="torch", status=OK, text=f"{text}; policies run on the CPU")
+        return Check("torch", FAIL, f"{text}: policy.device={wish!r} cannot be had; use auto or cpu")
+    return Check("torch", OK, f"{text}; policies run on the CPU")
 
 
 def rendering(*, needed: bool, script: str = DRAW) -> Check:
-    """Draws a frame in a process of its own.
+    """Draws a frame in a process of its own; if it is not `needed`, a failure is only a warning."""
+    from accerl_lerobot.envs.gl import choose_backend
 
-    Args:
-        needed: whether the recipe's world draws with MuJoCo; otherwise a failure is only a warning.
-        script: what draws it.
-    """
     bad = FAIL if needed else WARN
     if importlib.util.find_spec("mujoco") is None:
         text = "MuJoCo is not installed; install the extra: accerl-lerobot[metaworld]"
-        return Check(name="rendering", status=bad, text=text)
+        return Check("rendering", bad, text)
+    command = [sys.executable, "-c", script]
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", script],
-            capture_output=True,
-            text=True,
-            timeout=RENDER_TIMEOUT_S,
-            check=False,
-        )
+        done = subprocess.run(command, capture_output=True, text=True, timeout=RENDER_TIMEOUT_S, check=False)
     except subprocess.TimeoutExpired:
         text = f"no frame within {RENDER_TIMEOUT_S} s; set MUJOCO_GL to osmesa or egl"
-        return Check(name="rendering", status=bad, text=text)
+        return Check("rendering", bad, text)
     words = done.stdout.split()
     if done.returncode == 0 and words[:2] == ["drawn", "True"]:
-        text = f"MuJoCo draws 64 × 64 pixels in {words[2]} ms ({_backend()})"
-        return Check(name="rendering", status=OK, text=text)
+        backend = os.environ.get("MUJOCO_GL") or choose_backend() or "the display"
+        return Check("rendering", OK, f"MuJoCo draws 64 × 64 pixels in {words[2]} ms ({backend})")
     if done.returncode == 0:
-        text = "MuJoCo draws an empty picture; set MUJOCO_GL to osmesa or egl"
-        return Check(name="rendering", status=bad, text=text)
+        return Check("rendering", bad, "MuJoCo draws an empty picture; set MUJOCO_GL to osmesa or egl")
     last = (done.stderr.strip().splitlines() or [f"ended with code {done.returncode}"])[-1]
-    return Check(name="rendering", status=bad, text=last.removeprefix("accerl_lerobot.errors.InputError: "))
+    return Check("rendering", bad, last.removeprefix("accerl_lerobot.errors.InputError: "))
 
 
 def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
@@ -255,7 +228,7 @@ def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
             status, text = WARN, f"{text}: they will wait for each other; lower rollout.workers"
         elif threads > cores:
             status, text = WARN, f"{text}: lower trainer.num_threads and inference.num_threads to {cores}"
-    yield Check(name="cpu", status=status, text=text)
+    yield Check("cpu", status, text)
     free = _memory_gib()
     if free is not None:
         text, status = f"{free:.1f} GiB free", OK
@@ -265,49 +238,41 @@ def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
             if need > free:
                 remedy = "lower rollout.workers, rollout.worlds or replay.capacity, or use a smaller policy"
                 status, text = WARN, f"{text}: {remedy}"
-        yield Check(name="memory", status=status, text=text)
+        yield Check("memory", status, text)
     disk = shutil.disk_usage(Path.cwd()).free / GIB
     short = disk < DISK_GIB
     text = f"{disk:.0f} GiB free here" + (f"; a run may need {DISK_GIB:.0f}" if short else "")
-    yield Check(name="disk", status=WARN if short else OK, text=text)
+    yield Check("disk", WARN if short else OK, text)
 
 
 def dreams(config: RunConfig) -> Iterator[Check]:
-    """True if what is to be imagined fits the world and the policy."""
-    if not config.imagination.share:
+    """Imagination settings against the environment and the policy."""
+    imagination, episodes = config.imagination, config.rollout.episodes
+    if not imagination.share:
         return
     from accerl_lerobot.engine.dreaming import check_imagination
 
     try:
         check_imagination(config)
     except InputError as error:
-        yield Check(name="dreams", status=FAIL, text=str(error))
-    else:
-        kind, share = config.imagination.model, config.imagination.share
-        yield Check(name="dreams", status=OK, text=f"{share:.0%} of every batch; what dreams: {kind}")
-        yield from _unwatched(config)
-
-
-def _unwatched(config: RunConfig) -> Iterator[Check]:
-    """Says so where the kill switch hardly ever trips: too few real episodes end beside dreams."""
-    imagination, episodes = config.imagination, config.rollout.episodes
+        yield Check("dreams", FAIL, str(error))
+        return
+    yield Check("dreams", OK, f"{imagination.share:.0%} of every batch; what dreams: {imagination.model}")
     beside = imagination.horizon is None and imagination.beginnings > 0
     if beside and 0 < episodes <= imagination.witnesses:
         why = f"that takes more real episodes than imagination.witnesses, {imagination.witnesses}"
         text = f"are hardly ever switched off where they flatter: {why}, and rollout.episodes is {episodes}"
-        yield Check(name="dreams", status=WARN, text=text)
+        yield Check("dreams", WARN, text)
 
 
 def placement(config: RunConfig) -> Iterator[Check]:
-    """Which worker would be where; the cluster is asked if one is to be joined."""
+    """Where each worker would run; the cluster is asked if one is to be joined."""
     from accerl_lerobot.engine.preflight import check_placement
 
     try:
-        rows = check_placement(config)
+        yield from [Check("placement", OK, row) for row in check_placement(config)]
     except InputError as error:
-        yield Check(name="placement", status=FAIL, text=str(error))
-    else:
-        yield from (Check(name="placement", status=OK, text=row) for row in rows)
+        yield Check("placement", FAIL, str(error))
 
 
 def memory_estimate_gib(config: RunConfig, history: int = 1) -> float:
@@ -344,9 +309,7 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
 def observation_bytes(config: RunConfig) -> int:
     """Bytes of one env step's images; what else a decision holds is small beside them."""
     env: Any = config.env
-    side = getattr(
-        env, "image_size", 96
-    )  # LeRobot's own environments differ; PushT's pictures have 96 pixels
+    side = getattr(env, "image_size", 96)  # LeRobot's own environments differ; PushT's have 96 pixels
     return 3 * side * side * len(getattr(env, "cameras", ("one",)))
 
 
@@ -363,12 +326,12 @@ def pace(config: RunConfig) -> Iterator[Check]:
             f"; the pace alone allows {of_pace}, so segments may be thrown away as too old: "
             "lower replay.capacity, replay.ahead or replay.samples_per_insert, or raise replay.max_lag"
         )
-    yield Check(name="lag", status=WARN if of_pace > bound else OK, text=text)
+    yield Check("lag", WARN if of_pace > bound else OK, text)
     collected = math.ceil(trainer.updates * trainer.batch_decisions / replay.samples_per_insert)
     text = f"{trainer.updates:,} updates of {trainer.batch_decisions} on about {collected:,} decisions"
     if actions := executed(config):
         text += f", at most {collected * actions:,} env steps"
-    yield Check(name="work", status=OK, text=text)
+    yield Check("work", OK, text)
 
 
 def _resolve(arguments: list[str]) -> tuple[RunConfig | None, int, list[Check]]:
@@ -379,15 +342,14 @@ def _resolve(arguments: list[str]) -> tuple[RunConfig | None, int, list[Check]]:
         config: RunConfig = parse(RunConfig, arguments)
         history = check_start(config)
     except InputError as error:
-        return None, 1, [Check(name="recipe", status=FAIL, text=str(error))]
-    return config, history, [Check(name="recipe", status=OK, text="resolves")]
+        return None, 1, [Check("recipe", FAIL, str(error))]
+    return config, history, [Check("recipe", OK, "resolves")]
 
 
 def pulled(arguments: list[str]) -> Iterator[Check]:
     """The fields that `pull` has dropped from the recipe."""
     from accerl_lerobot.config.parsing import read_arguments
-    from accerl_lerobot.hub.contents import RECORD
-    from accerl_lerobot.hub.kinds import read_json
+    from accerl_lerobot.hub.artifact_types import RECORD, read_json
 
     with contextlib.suppress(InputError):
         recipe = read_arguments(arguments)[0]
@@ -398,7 +360,7 @@ def pulled(arguments: list[str]) -> Iterator[Check]:
             if isinstance(fields, dict) and fields:
                 names = ", ".join(map(ascii, fields))
                 text = f"without {names}, which let code run: add them if you trust it"
-                yield Check(name="pulled", status=WARN, text=text)
+                yield Check("pulled", WARN, text)
 
 
 def total_memory_gib() -> float | None:
@@ -423,13 +385,3 @@ def _memory_of(entry: str, used: int) -> float | None:
         limit, taken = (int((group / f"memory.{name}").read_text()) for name in ("max", "current"))
         found = min(found, limit - used * taken)
     return found / GIB
-
-
-def _backend() -> str:
-    from accerl_lerobot.envs.gl import choose_backend
-
-    return os.environ.get("MUJOCO_GL") or choose_backend() or "the display"
-
-
-def _line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

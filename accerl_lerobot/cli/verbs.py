@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The verbs of ``accerl``, once their arguments are parsed.
+"""The verbs of ``accerl``.
 
 Results go to the standard output, everything else to the standard error: LeRobot prints while it loads, and
-what a verb hands on should stay readable for programs.
+results should stay readable for programs.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from accerl_lerobot.errors import (
     make_folder,
 )
 from accerl_lerobot.export.episodes import ExportConfig
-from accerl_lerobot.hub.config import PullConfig, PushConfig
+from accerl_lerobot.hub.artifact_types import PullConfig, PushConfig
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.report.config import ReportConfig
 from accerl_lerobot.rollout.runner import EpisodeResult
@@ -70,7 +70,7 @@ def train(arguments: list[str], load: Load | None = None) -> int:
         with (
             redirect_stdout(sys.stderr),
             kept_traceback(directory),
-            locked(directory, "config_path", "another process goes on with it"),
+            locked(directory, "config_path", "another process resumes it"),
         ):
             wanted = None if begun is None else begun.checkpoint
             summary = run.train(config, directory, console, wanted, load)
@@ -120,8 +120,8 @@ def sft(arguments: list[str]) -> int:
         raise InputError("dataset.repo_id", None, NO_DATASET)
     if config.sft.steps == 0:
         raise InputError("sft.steps", 0, "use at least 1")
+    from accerl_lerobot.demos.dataset_files import task_texts
     from accerl_lerobot.demos.sft import run_sft
-    from accerl_lerobot.demos.windows import task_texts
     from accerl_lerobot.engine import run
     from accerl_lerobot.engine.preflight import check_disk, check_training_data, check_world, sft_policy
     from accerl_lerobot.policies.loading import resolve_device
@@ -140,14 +140,12 @@ def sft(arguments: list[str]) -> int:
     ):
         path = run_sft(
             config.sft,
-            config.dataset.repo_id,
-            config.dataset.root,
+            config.dataset,
             directory / "sft",
             config.seed,
             device,
             task_texts(meta),
             on_step=lambda step, loss: stage.update(step, f"loss {loss:.3f}"),
-            revision=config.dataset.revision,
         )
     sys.stdout.write(f"{path}\n")
     return 0
@@ -165,8 +163,8 @@ def evaluate(arguments: list[str]) -> int:
     from accerl_lerobot.evaluation.config import evaluation_plans
     from accerl_lerobot.evaluation.summary import summarise, table
 
-    rooms = ("seed", "env", "policy", "rollout", "inference", "evaluation", "launch")
-    whole = RunConfig(**{name: getattr(config, name) for name in rooms})
+    sections = ("seed", "env", "policy", "rollout", "inference", "evaluation", "launch")
+    whole = RunConfig(**{name: getattr(config, name) for name in sections})
     check_machine(whole)
     film = config.evaluation.videos if out else 0
     console = Console()
@@ -190,7 +188,7 @@ def evaluate(arguments: list[str]) -> int:
 
 
 def world_model(arguments: list[str]) -> int:
-    """``accerl world-model``; 1 if it fails its trial."""
+    """``accerl world-model``; 1 if it fails its validation."""
     config: WorldModelRun = parse(WorldModelRun, arguments, recipe_class=RunConfig)
     if config.dataset.repo_id is None:
         raise InputError("dataset.repo_id", None, NO_DATASET)
@@ -200,7 +198,7 @@ def world_model(arguments: list[str]) -> int:
 
 
 def world_model_eval(arguments: list[str]) -> int:
-    """``accerl world-model-eval``; 1 if it fails its trial."""
+    """``accerl world-model-eval``; 1 if it fails its validation."""
     config: WorldModelEvalRun = parse(WorldModelEvalRun, arguments, recipe_class=RunConfig)
     from accerl_lerobot.world_model.evaluate import evaluate
 
@@ -208,7 +206,7 @@ def world_model_eval(arguments: list[str]) -> int:
 
 
 def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Console], dict[str, Any]]) -> int:
-    """Does the work in a new folder and shows the trial it ends with."""
+    """Does the work in a new folder and shows the validation that it ends with."""
     from accerl_lerobot.engine.run import make_output_dir
     from accerl_lerobot.world_model.by_source import compared
     from accerl_lerobot.world_model.show import gates, sources_table, table

@@ -44,9 +44,6 @@ def help_text(command: str, config_class: type[Any], what: str, section: str = "
         config_class: its config.
         what: what it does, one line.
         section: ``--help=SECTION``: all fields of a section, or ``all``.
-
-    Raises:
-        InputError: there is no such section.
     """
     lines = [
         f"usage: {command} {_bare(config_class)} [--section.field=value …]",
@@ -64,7 +61,8 @@ def help_text(command: str, config_class: type[Any], what: str, section: str = "
     hints = hints_of(config_class)
     for name, section_class in ((name, section_of(hint)) for name, hint in hints.items()):
         if section_class is not None:
-            lines.append(f"  {name:12}{_summary(section_class)}"[:WIDTH])
+            text = " | ".join(choices_of(section_class)) or _summary(section_class)
+            lines.append(f"  {name:12}{text}"[:WIDTH])
     return "\n".join(lines)
 
 
@@ -85,7 +83,7 @@ def _of_section(every: list[str], section: str, config_class: type[Any]) -> list
             chosen.append(line)
     if not chosen:
         names = [name for name, hint in hints_of(config_class).items() if section_of(hint) is not None]
-        raise InputError("--help", section, f"use all or one of {', '.join(names)}")
+        raise InputError("--help", section, f"use all or one of {', '.join(names)}" if names else "use all")
     return chosen
 
 

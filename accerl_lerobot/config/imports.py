@@ -19,19 +19,11 @@ def imported(path: str) -> Any:
     return getattr(importlib.import_module(module), name)
 
 
-def discover(package: str | None, room: str = "") -> None:
-    """Imports a package that registers types; None does nothing.
-
-    Args:
-        package: its name, as Python imports it.
-        room: of the field that named it, for the error.
-
-    Raises:
-        InputError: it cannot be imported.
-    """
+def discover(package: str | None, section: str = "") -> None:
+    """Imports a package that registers types; None does nothing. `section` is that of the field."""
     if package is None:
         return
-    field = f"{room}.{DISCOVER}" if room else DISCOVER
+    field = f"{section}.{DISCOVER}" if section else DISCOVER
     if not all(part.isidentifier() for part in package.split(".")):
         raise InputError(field, package, "use the name of a package as Python imports it, e.g. my_models")
     try:

@@ -95,9 +95,6 @@ def parse(config_class: type[Any], arguments: list[str], *, recipe_class: type[A
             bare ones are the entries of the field that `config_class` names in ``BARE``.
         recipe_class: top-level keys of a *file* that this class has and `config_class` has not are ignored,
             so that one recipe serves several verbs.
-
-    Raises:
-        InputError: a file, key, type or value is wrong, or the file sets a field in `CONSENT`.
     """
     path, given = read_arguments(arguments, getattr(config_class, "BARE", None))
     tree = {} if path is None else read_recipe(path)
@@ -156,11 +153,7 @@ def consents(tree: Any, given: Any = None, *, drop: bool = False) -> dict[str, A
 
 
 def decode(config_class: type[Any], tree: dict[str, Any]) -> Any:
-    """Builds a config from plain values; imports nothing that they name.
-
-    Raises:
-        InputError: a key, type or value is wrong; names the field.
-    """
+    """Builds a config from plain values; imports nothing that they name."""
     return _decoded(config_class, tree, (), config_class)
 
 
@@ -174,9 +167,6 @@ def read_arguments(arguments: list[str], bare: str | None = None) -> tuple[Path 
     """Splits a command line into the recipe's path and a tree of overrides.
 
     Bare arguments are entries of the list that `bare` names; without it, the one there may be is the recipe.
-
-    Raises:
-        InputError: an argument is not of the form ``--section.field=value``, or there are two recipes.
     """
     path: str | None = None
     given: dict[str, Any] = {}
@@ -213,11 +203,7 @@ def read_arguments(arguments: list[str], bare: str | None = None) -> tuple[Path 
 
 
 def read_recipe(path: Path) -> dict[str, Any]:
-    """The tree in a YAML (or JSON) file.
-
-    Raises:
-        InputError: no such file, or it is not a mapping in good YAML.
-    """
+    """The tree in a YAML (or JSON) file."""
     if not path.is_file():
         names = [p.name for p in path.parent.glob("*.y*ml")]
         near = difflib.get_close_matches(path.name, names, n=3)

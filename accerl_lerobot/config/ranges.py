@@ -92,6 +92,8 @@ Steps = Annotated[int, Range("[0, 1000000000]")]
 """A number of steps, updates or episodes that may be 0."""
 Device = Annotated[str, Pattern(r"auto|cpu|cuda(:\d{1,2})?", "auto, cpu, cuda or cuda:0")]
 Threads = Annotated[int, Range("[1, 1024]")]
+NewFolder = Annotated[str, Pattern(r"(?s).+", "the name of a folder to create")]
+DatasetName = Annotated[str, Pattern(r"[^/]+/[^/]+", "the form owner/name")]
 Repeats = Annotated[int, Range("[1, 100000]")]
 
 
@@ -135,11 +137,7 @@ def _hints_of(cls: Any) -> dict[str, Any]:
 
 
 def check(hint: Any, value: Any, field: str) -> None:
-    """Refuses a value that does not fit an annotation.
-
-    Raises:
-        InputError: names `field` and what fits.
-    """
+    """Refuses a value that does not fit an annotation."""
     for text in value if isinstance(value, (list, tuple)) else (value,):
         if isinstance(text, str) and (len(text) > LONGEST_TEXT or "\0" in text):
             raise InputError(field, value, f"use at most {LONGEST_TEXT:,} characters, none of them NUL")

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of a LeRobotDataset's files, before LeRobot believes them.
+"""Opening of LeRobotDatasets, whose files are checked before LeRobot reads them.
 
-LeRobot fills the templates of ``meta/info.json`` in with `str.format` and joins the outcome to the folder.
-Where an image's ``bytes`` are missing, Hugging Face's `datasets` opens what its ``path`` names, a file of
-this machine or an address, and Pillow has Ghostscript draw what is PostScript. Parquet stores a million equal
-rows in a few bytes. While `checked` lasts, LeRobot's own classes look at the files first, wherever they come
-from, the Hub included.
+LeRobot fills the templates of ``meta/info.json`` in with `str.format` and joins the result to the folder.
+Where an image's ``bytes`` are missing, Hugging Face's `datasets` opens the file or address that its ``path``
+names, and Pillow has Ghostscript draw PostScript. In the context of `checked`, LeRobot's own classes have
+files checked first, wherever they come from. A child process does it, within limits of memory and time.
 """
 
 from __future__ import annotations
@@ -13,215 +12,136 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from accerl_lerobot.checkpoint.isolation import rehearse
 from accerl_lerobot.checkpoint.safety import (
     MIB,
     Origin,
     brief,
     check_name,
     check_number,
-    check_shape,
-    check_template,
     file_size,
     read_json,
     safe_join,
+    unsafe_name,
 )
 from accerl_lerobot.errors import InputError
 
 if TYPE_CHECKING:
     import pyarrow.parquet as pq
 
+    from accerl_lerobot.engine.config import DatasetConfig
+
 INFO, STATS, TASKS, EPISODES, DATA = (
     "meta/info.json", "meta/stats.json", "meta/tasks.parquet", "meta/episodes", "data",
 )  # fmt: skip
 STATS_MOST = 32 * MIB
-META_FILE_MOST, FOOTER_MOST = 512 * MIB, 64 * MIB
-FEATURES_MOST, COLUMNS_MOST = 1_000, 20_000
-EPISODES_MOST, FRAMES_MOST, LENGTH_MOST = 10_000_000, 10_000_000_000, 1_000_000
-TEXT_MOST, TEXTS_MOST = 65_536, 64 * MIB
-"""Bytes of one task's text, and of all of them written out."""
-SIDE_MOST, PIXELS_MOST, NUMBERS_MOST = 8192, 64_000_000, 10_000_000
-"""Pixels of an image's side and of all of it; numbers in any other feature of one frame."""
-FPS_MOST = 10_000
-DEPTH_MOST = 8
-"""Lists within lists of a statistic."""
+SIDE_MOST = 8192
+"""Pixels of an image's side."""
+INDEX = r"\{(chunk_index|file_index)(:0?[1-9]?d)?\}"
+PLACES = {"data_path": INDEX, "video_path": rf"{INDEX}|\{{video_key\}}"}
+"""Key of ``info.json`` → the placeholders that its template may have."""
+COUNTS = {
+    "total_episodes": 0, "total_frames": 0, "total_tasks": 0, "chunks_size": 1, "data_files_size_in_mb": 1,
+    "video_files_size_in_mb": 1,
+}  # fmt: skip
+"""Key of ``info.json`` → its smallest value."""
 DTYPES = {
     "image", "video", "string", "bool", "language", "int8", "int16", "int32", "int64", "uint8", "uint16",
     "uint32", "uint64", "float16", "float32", "float64",
 }  # fmt: skip
-IMAGES = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")
-"""First bytes of PNG and JPEG, which LeRobot writes; for one of the others Pillow runs a program."""
-LEARNT = ("action", "observation", "next.reward", "timestamp")
-"""First parts of the names of features in which a non-finite number would be learnt from."""
+LEARNED = ("action", "observation", "next.reward", "timestamp")
+"""Prefixes of features in which a non-finite number would be learned from."""
 PLAIN = {"Value", "Sequence", "List", "LargeList"}
 """Kinds of columns that `datasets` reads without opening other files."""
-DATA_PLACES: dict[str, type] = {"chunk_index": int, "file_index": int}
-VIDEO_PLACES: dict[str, type] = DATA_PLACES | {"video_key": str}
-"""Fields that the templates of ``info.json`` may contain."""
+AGAIN = "get the dataset again"
 
 
-def check_info(info: dict[str, Any], origin: Origin) -> None:
-    """The content of ``meta/info.json``.
+def open_metadata(dataset: DatasetConfig) -> Any:
+    """LeRobot's metadata of a local or Hub dataset; anything wrong with it is one line."""
+    from lerobot.datasets.dataset_metadata import CODEBASE_VERSION, LeRobotDatasetMetadata
+    from lerobot.datasets.utils import CompatibilityError
 
-    Raises:
-        InputError: it would lead LeRobot out of the folder, or into more memory than there is.
-    """
-
-    def at(key: str) -> str:
-        return f"{INFO}: {key}"
-
-    version = info.get("codebase_version")
-    if not isinstance(version, str) or not 0 < len(version) <= 32:
-        raise origin.refuse(at("codebase_version"), "a version such as v3.0 is wanted")
-    check_number(info.get("fps"), 1, FPS_MOST, at("fps"), origin)
-    for key, most in (
-        ("total_episodes", EPISODES_MOST), ("total_frames", FRAMES_MOST), ("total_tasks", EPISODES_MOST),
-    ):  # fmt: skip
-        _check_count(info.get(key, 0), 0, most, at(key), origin)
-    for key in ("chunks_size", "data_files_size_in_mb", "video_files_size_in_mb"):
-        _check_count(info.get(key, 1), 1, 10**9, at(key), origin)
-    if "data_path" in info:
-        check_template(info["data_path"], DATA_PLACES, at("data_path"), origin)
-    if info.get("video_path") is not None:
-        check_template(info["video_path"], VIDEO_PLACES, at("video_path"), origin)
-    features = info.get("features")
-    if not isinstance(features, dict) or not 0 < len(features) <= FEATURES_MOST:
-        raise origin.refuse(at("features"), f"1 to {FEATURES_MOST} named features are wanted")
-    for name, feature in features.items():
-        _check_feature(name, feature, origin)
-    if not isinstance(info.get("splits", {}), dict) or not isinstance(
-        info.get("tools", []), (list, type(None))
-    ):
-        raise origin.refuse(INFO, "splits is a mapping and tools a list; record the dataset again")
+    name, root = dataset.repo_id, dataset.root
+    if name is None:
+        raise InputError(
+            "dataset.repo_id", None, "name a LeRobotDataset; with dataset.root any label will do"
+        )
+    if root is not None and not (Path(root) / INFO).is_file():
+        raise InputError("dataset.root", root, f"no {INFO} there; give the folder of a LeRobotDataset v3")
+    try:
+        with checked(origin_of(dataset), whole=root is not None):
+            return LeRobotDatasetMetadata(name, root=root, revision=dataset.revision)
+    except InputError:
+        raise
+    except (CompatibilityError, NotImplementedError) as error:
+        tool = f"python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id={name}"
+        remedy = (
+            f"its format is not {CODEBASE_VERSION}, which this LeRobot reads; from v2.1 convert with: {tool}"
+        )
+        raise InputError("dataset.repo_id", name, remedy) from error
+    except (OSError, ValueError) as error:
+        remedy = f"not found locally nor on the Hub ({brief(error)})"
+        raise InputError("dataset.repo_id", name, remedy) from error
+    except Exception as error:  # LeRobot may fail over anything in the files
+        raise origin_of(dataset).refuse("meta", f"LeRobot cannot read it ({brief(error)})") from error
 
 
-def check_stats(stats: dict[str, Any], features: dict[str, Any], origin: Origin) -> None:
-    """The content of ``meta/stats.json``: feature → statistic → numbers, as many as the feature has.
-
-    Raises:
-        InputError: it is something else, or a policy would be normalised by a number that is not finite.
-    """
-    for name, statistics in stats.items():
-        if not isinstance(statistics, dict):
-            raise origin.refuse(f"{STATS}: {name}", "a mapping from statistics to numbers is wanted")
-        feature = features.get(name, {"dtype": "image"})
-        for statistic, values in statistics.items():
-            where, again = f"{STATS}: {name}.{statistic}", "compute the statistics again"
-            if (shape := _regular(values)) is None:
-                raise origin.refuse(where, f"numbers in lists of equal lengths are wanted; {again}")
-            if not name.startswith(LEARNT):
-                continue
-            plain = feature["dtype"] not in ("image", "video") and statistic != "count"
-            if plain and shape and list(shape) != list(feature["shape"]):
-                remedy = f"shape {list(shape)}, and the feature has {list(feature['shape'])}; {again}"
-                raise origin.refuse(where, remedy)
-            if not np.isfinite(np.asarray(values, np.float64)).all():
-                raise origin.refuse(where, f"a number that is not finite; {again}")
+def origin_of(dataset: DatasetConfig) -> Origin:
+    """The field that names a dataset's files."""
+    if dataset.root is not None:
+        return Origin("dataset.root", dataset.root)
+    return Origin("dataset.repo_id", dataset.repo_id)
 
 
-def check_metadata(root: Path, origin: Origin, whole: bool = False) -> None:
-    """All of ``meta/``, before LeRobot reads it.
-
-    Args:
-        root: the dataset's folder.
-        origin: who named it.
-        whole: whether a missing file is an error; otherwise nothing is said, and LeRobot fetches it.
-
-    Raises:
-        InputError: a file is not what its name says, or larger than such a file may be.
-    """
-    if not safe_join(root, INFO, origin).exists():
-        return
-    info = read_json(root / INFO, origin)
-    check_info(info, origin)
-    if safe_join(root, STATS, origin).exists():
-        check_stats(read_json(root / STATS, origin, STATS_MOST), info["features"], origin)
-    if safe_join(root, TASKS, origin).exists() or (whole and info.get("total_tasks", 0)):
-        with _parquet(root / TASKS, origin) as tasks:
-            _check_plain(tasks, TASKS, origin)
-            _check_texts(tasks, TASKS, origin)
-            if (count := tasks.metadata.num_rows) != info.get("total_tasks", 0):
-                remedy = f"{count} tasks, and {INFO} says {info.get('total_tasks', 0)}; get the dataset again"
-                raise origin.refuse(TASKS, remedy)
-    rows = 0
-    files = _files(root, EPISODES, origin)
-    for path in files:
-        name = f"{EPISODES}/{path.parent.name}/{path.name}"
-        with _parquet(path, origin) as episodes:
-            _check_plain(episodes, name, origin)
-            rows += _check_episodes(episodes, info, name, origin)
-    if (files or whole) and rows < info.get("total_episodes", 0):
-        remedy = f"{rows} episodes, and {INFO} says {info['total_episodes']}; get the dataset again"
-        raise origin.refuse(EPISODES, remedy)
-
-
-def check_data(root: Path, info: dict[str, Any], origin: Origin, whole: bool = False) -> None:
-    """The parquet files of ``data/`` and the folders of videos, before LeRobot reads them.
-
-    Args:
-        root: the dataset's folder.
-        info: content of its ``meta/info.json``, checked.
-        origin: who named it.
-        whole: whether fewer rows than frames are an error; otherwise LeRobot fetches the others.
-
-    Raises:
-        InputError: there are other rows than frames, a column is not what its feature says, a number cannot
-            be learnt from, or an image is no PNG or JPEG inside its row.
-    """
-    features = {name: feature for name, feature in info["features"].items() if feature["dtype"] != "video"}
-    rows = 0
-    for path in _files(root, DATA, origin):
-        name = f"{DATA}/{path.parent.name}/{path.name}"
-        with _parquet(path, origin) as file:
-            rows += file.metadata.num_rows
-            if rows > info.get("total_frames", 0):
-                remedy = f"more rows than the {info.get('total_frames', 0)} frames that {INFO} says"
-                raise origin.refuse(name, f"{remedy}; get the dataset again")
-            _check_columns(file, features, info, name, origin)
-            for feature in (f for f in features if features[f]["dtype"] == "image"):
-                _check_images(file, feature, list(features[feature]["shape"]), name, origin)
-    if whole and rows < info.get("total_frames", 0):
-        raise origin.refuse(DATA, _fewer(rows, info["total_frames"]))
-    videos = safe_join(root, "videos", origin)
-    for path in videos.rglob("*") if videos.is_dir() else ():
-        safe_join(root, path.relative_to(root).as_posix(), origin)
-
-
-def _fewer(rows: int, frames: int) -> str:
-    return f"{rows} rows, fewer than the {frames} frames that {INFO} says; get the dataset again"
+def task_texts(meta: Any) -> list[str]:
+    """The dataset's instructions."""
+    return [str(text) for text in meta.tasks.index]
 
 
 @contextlib.contextmanager
 def checked(origin: Origin, whole: bool = False) -> Iterator[None]:
-    """While it lasts, LeRobot checks a dataset's files before it reads them, in this process.
+    """In this context LeRobot has a dataset's files checked before it reads them.
 
     Args:
-        origin: who named the dataset.
-        whole: see `check_metadata`.
+        origin: what named the dataset.
+        whole: refuse missing files and rows; otherwise LeRobot fetches them.
     """
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.dataset_reader import DatasetReader
-    from PIL import Image
 
-    from accerl_lerobot.hub.trouble import guard_client
-    from datasets import Image as ImageFeature
+    from accerl_lerobot.hub.errors import guard_client
+    from datasets import Image
 
     load_metadata, load_data = LeRobotDatasetMetadata._load_metadata, DatasetReader._load_hf_dataset
-    index, decode = DatasetReader._build_index_mapping, ImageFeature.decode_example
-    pixels = Image.MAX_IMAGE_PIXELS
+    index, decode = DatasetReader._build_index_mapping, Image.decode_example
 
     def checked_metadata(self: Any) -> None:
-        check_metadata(Path(self.root), origin, whole)
+        root = Path(self.root)
+
+        def check() -> None:
+            check_metadata(root, origin, whole)
+            try:
+                load_metadata(self)
+            except MemoryError:
+                raise
+            except Exception:
+                pass  # the caller meets it as well, and LeRobot fetches what is missing
+
+        rehearse(check, root, origin, "meta/**/*")
         load_metadata(self)
 
     def checked_data(self: Any) -> Any:
         root = Path(self.root)
-        check_data(root, read_json(root / INFO, origin), origin, whole and self.episodes is None)
+        info = read_json(root / INFO, origin)
+        complete = whole and self.episodes is None
+        rehearse(lambda: check_data(root, info, origin, complete), root, origin, "data/**/*")
         return load_data(self)
 
     def checked_index(self: Any) -> None:
@@ -236,25 +156,70 @@ def checked(origin: Origin, whole: bool = False) -> Iterator[None]:
             raise _undecodable(error, DATA, origin) from error
 
     guard_client()
-    ImageFeature.decode_example = checked_decode
+    Image.decode_example = checked_decode
     LeRobotDatasetMetadata._load_metadata = checked_metadata
     DatasetReader._load_hf_dataset = checked_data
     DatasetReader._build_index_mapping = checked_index
-    Image.MAX_IMAGE_PIXELS = PIXELS_MOST // 2  # Pillow refuses what is twice as large
     try:
         yield
     finally:
         LeRobotDatasetMetadata._load_metadata = load_metadata
         DatasetReader._load_hf_dataset = load_data
         DatasetReader._build_index_mapping = index
-        ImageFeature.decode_example = decode
-        Image.MAX_IMAGE_PIXELS = pixels
+        Image.decode_example = decode
 
 
-def _check_count(value: object, low: int, high: int, what: str, origin: Origin) -> None:
-    if not isinstance(value, int):
-        raise origin.refuse(what, f"{str(value)[:40]!r}; use a whole number")
-    check_number(value, low, high, what, origin)
+def check_metadata(root: Path, origin: Origin, whole: bool = False) -> None:
+    """Refuses metadata that are not what their names say; with `whole`, also missing files."""
+    if not safe_join(root, INFO, origin).exists():
+        return
+    info = read_json(root / INFO, origin)
+    check_info(info, origin)
+    if safe_join(root, STATS, origin).exists():
+        check_stats(read_json(root / STATS, origin, STATS_MOST), info["features"], origin)
+    if safe_join(root, TASKS, origin).exists() or (whole and info.get("total_tasks", 0)):
+        with _parquet(root / TASKS, origin) as tasks:
+            _check_plain(tasks, TASKS, origin)
+            if (count := tasks.metadata.num_rows) != info.get("total_tasks", 0):
+                remedy = f"{count} tasks, and {INFO} says {info.get('total_tasks', 0)}; {AGAIN}"
+                raise origin.refuse(TASKS, remedy)
+    rows = 0
+    files = _files(root, EPISODES, origin)
+    for path in files:
+        name = f"{EPISODES}/{path.parent.name}/{path.name}"
+        with _parquet(path, origin) as episodes:
+            _check_plain(episodes, name, origin)
+            _check_episodes(episodes, info.get("total_frames", 0), name, origin)
+            rows += episodes.metadata.num_rows
+    if (files or whole) and rows < info.get("total_episodes", 0):
+        raise origin.refuse(EPISODES, f"{rows} episodes, and {INFO} says {info['total_episodes']}; {AGAIN}")
+
+
+def check_info(info: dict[str, Any], origin: Origin) -> None:
+    """Refuses an ``info.json`` that would lead LeRobot out of the folder, or that it cannot use."""
+    version = info.get("codebase_version")
+    if not isinstance(version, str) or not 0 < len(version) <= 32:
+        raise origin.refuse(f"{INFO}: codebase_version", "a version such as v3.0 is wanted")
+    check_number(info.get("fps"), 1, 10_000, f"{INFO}: fps", origin)
+    for key, least in COUNTS.items():
+        value = info.get(key, least)
+        if type(value) is not int or not least <= value < 2**53:
+            raise origin.refuse(f"{INFO}: {key}", f"{str(value)[:40]!r}; use a whole number from {least}")
+    for key, places in PLACES.items():
+        template = info.get(key)
+        if template is None and (key == "video_path" or key not in info):
+            continue
+        example = re.sub(places, "0", template) if isinstance(template, str) else "{"
+        strange = bool({"{", "}"} & set(example))
+        if why := "use {chunk_index:03d} and the like only" if strange else unsafe_name(example):
+            raise origin.refuse(f"{INFO}: {key}", f"{str(template)[:80]!r}: {why}")
+    features = info.get("features")
+    if not isinstance(features, dict) or not features:
+        raise origin.refuse(f"{INFO}: features", "named features are wanted")
+    for name, feature in features.items():
+        _check_feature(name, feature, origin)
+    if not isinstance(info.get("splits", {}), dict) or not isinstance(info.get("tools"), list | None):
+        raise origin.refuse(INFO, "splits is a mapping and tools a list; record the dataset again")
 
 
 def _check_feature(name: str, feature: Any, origin: Origin) -> None:
@@ -262,154 +227,156 @@ def _check_feature(name: str, feature: Any, origin: Origin) -> None:
     check_name(name, where, origin)
     if not isinstance(feature, dict) or str(feature.get("dtype")) not in DTYPES:
         raise origin.refuse(where, f"a dtype is wanted, one of {', '.join(sorted(DTYPES))}")
-    shape = feature.get("shape")
     for key in ("info", "video_info"):
-        if not isinstance(feature.get(key), (dict, type(None))):
+        if not isinstance(feature.get(key), dict | None):
             raise origin.refuse(where, f"{key} is a mapping; record the dataset again")
-    if feature["dtype"] not in ("image", "video"):
-        check_shape(shape, NUMBERS_MOST, where, origin)
-        return
-    check_shape(shape, PIXELS_MOST * 4, where, origin)
-    if len(shape or ()) != 3 or max(shape or ()) > SIDE_MOST:
-        raise origin.refuse(where, f"shape {shape}; an image has 3 sides of at most {SIDE_MOST}")
+    shape: Any = feature.get("shape")
+    is_image = feature["dtype"] in ("image", "video")
+    good = isinstance(shape, list) and all(type(side) is int and 0 < side < 2**31 for side in shape)
+    if not good or (is_image and (len(shape) != 3 or max(shape) > SIDE_MOST)):
+        wanted = f"an image has 3 sides of at most {SIDE_MOST}" if is_image else "use a list of lengths"
+        raise origin.refuse(where, f"shape {str(shape)[:80]}; {wanted}")
 
 
-def _regular(values: Any, depth: int = 0) -> tuple[int, ...] | None:
-    """The shape of nested lists of numbers; None if they are not regular, or hold something else."""
-    if depth > DEPTH_MOST:
-        return None
-    if isinstance(values, (int, float)):  # true and false are minima of flags
-        return () if isinstance(values, float) or abs(values) < 2**63 else None
-    if not isinstance(values, list) or len(values) > NUMBERS_MOST:
-        return None
-    shapes = {_regular(value, depth + 1) for value in values}
-    if len(shapes) > 1 or None in shapes:
-        return None
-    inner = next(iter(shapes), ())
-    return (len(values), *(inner or ()))
+def check_stats(stats: dict[str, Any], features: dict[str, Any], origin: Origin) -> None:
+    """Refuses a ``stats.json`` (feature → statistic → numbers) that no policy can be normalised by."""
+    for name, statistics in stats.items():
+        if not isinstance(statistics, dict):
+            raise origin.refuse(f"{STATS}: {name}", "a mapping from statistics to numbers is wanted")
+        feature = features.get(name, {"dtype": "image"})
+        for statistic, values in statistics.items():
+            where, again = f"{STATS}: {name}.{statistic}", "compute the statistics again"
+            try:
+                array = np.asarray(values)
+            except ValueError:
+                array = np.asarray(None)
+            if array.dtype.kind not in "biuf":
+                raise origin.refuse(where, f"numbers in lists of equal lengths are wanted; {again}")
+            if not name.startswith(LEARNED):
+                continue
+            plain = feature["dtype"] not in ("image", "video") and statistic != "count"
+            if plain and array.shape and list(array.shape) != list(feature["shape"]):
+                remedy = f"shape {list(array.shape)}, and the feature has {list(feature['shape'])}; {again}"
+                raise origin.refuse(where, remedy)
+            if not np.isfinite(array).all():
+                raise origin.refuse(where, f"a number that is not finite; {again}")
+
+
+def check_data(root: Path, info: dict[str, Any], origin: Origin, whole: bool = False) -> None:
+    """Refuses rows that are not what ``info.json`` says, or that cannot be learned from.
+
+    With `whole`, fewer rows than frames are refused too; otherwise LeRobot fetches the others.
+    """
+    features = {name: feature for name, feature in info["features"].items() if feature["dtype"] != "video"}
+    rows, frames = 0, info.get("total_frames", 0)
+    for path in _files(root, DATA, origin):
+        name = f"{DATA}/{path.parent.name}/{path.name}"
+        with _parquet(path, origin) as file:
+            rows += file.metadata.num_rows
+            if rows > frames:
+                raise origin.refuse(name, f"more rows than the {frames} frames that {INFO} says; {AGAIN}")
+            _check_columns(file, features, info, name, origin)
+            for feature in (f for f in features if features[f]["dtype"] == "image"):
+                _check_images(file, feature, list(features[feature]["shape"]), name, origin)
+    if whole and rows < frames:
+        raise origin.refuse(DATA, _fewer(rows, frames))
+    videos = safe_join(root, "videos", origin)
+    for path in videos.rglob("*") if videos.is_dir() else ():
+        safe_join(root, path.relative_to(root).as_posix(), origin)
+
+
+def _fewer(rows: int, frames: int) -> str:
+    return f"{rows} rows, fewer than the {frames} frames that {INFO} says; {AGAIN}"
 
 
 def _files(root: Path, folder: str, origin: Origin) -> list[Path]:
     """Files that LeRobot would read, none of which leads out of the dataset."""
     if not safe_join(root, folder, origin).is_dir():
         return []
-    found = sorted((root / folder).glob("*/*.parquet"))
-    return [safe_join(root, path.relative_to(root).as_posix(), origin) for path in found]
+    paths = sorted((root / folder).glob("*/*.parquet"))
+    return [safe_join(root, path.relative_to(root).as_posix(), origin) for path in paths]
 
 
 @contextlib.contextmanager
 def _parquet(path: Path, origin: Origin) -> Iterator[pq.ParquetFile]:
-    """Its metadata; whatever Arrow finds wrong with the file is the user's to know."""
+    """An open file; whatever Arrow finds wrong with it becomes one line."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    if file_size(path, origin) > META_FILE_MOST and DATA not in path.parts:
-        raise origin.refuse(path.name, f"more than {META_FILE_MOST} bytes; get the dataset again")
+    file_size(path, origin)
     try:
-        limits = {"thrift_string_size_limit": FOOTER_MOST, "thrift_container_size_limit": 10**6}
-        with pq.ParquetFile(path, **limits) as file:
-            if file.metadata.num_columns > COLUMNS_MOST:
-                raise origin.refuse(path.name, f"more than {COLUMNS_MOST} columns; get the dataset again")
+        with pq.ParquetFile(path) as file:
             yield file
     except InputError:
         raise
-    except (pa.ArrowException, OSError, ValueError, KeyError, TypeError, IndexError, MemoryError) as error:
-        raise origin.refuse(path.name, f"not good parquet ({brief(error)}); get the dataset again") from error
+    except (pa.ArrowException, OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        raise origin.refuse(path.name, f"not good parquet ({brief(error)}); {AGAIN}") from error
+
+
+def _element_type(kind: Any) -> Any:
+    """The type at the bottom of nested lists."""
+    import pyarrow as pa
+
+    kind = getattr(kind, "storage_type", kind)
+    while pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
+        kind = kind.value_type
+    return kind
 
 
 def _check_plain(file: pq.ParquetFile, name: str, origin: Origin) -> None:
-    """Metadata of numbers and texts only, of a size that can be read."""
+    """Refuses metadata that are not numbers and texts: `datasets` would open the files that others name."""
     import pyarrow as pa
 
     stored = (file.schema_arrow.metadata or {}).get(b"huggingface")
+    kinds: set[str] = set()
     try:
-        kinds = set(_kinds(json.loads(stored))) if stored else set()
+        json.loads(stored or b"{}", object_hook=lambda mapping: kinds.add(str(mapping.get("_type", "Value"))))
     except (ValueError, RecursionError) as error:
-        raise origin.refuse(name, "its description of columns is not JSON; get the dataset again") from error
+        raise origin.refuse(name, f"its description of columns is not JSON; {AGAIN}") from error
     if kinds - PLAIN:
-        remedy = (
-            f"columns of kind {', '.join(sorted(kinds - PLAIN))[:80]}, which name other files; numbers and "
-        )
-        raise origin.refuse(name, f"{remedy}texts are wanted")
+        remedy = f"columns of kind {', '.join(sorted(kinds - PLAIN))[:80]}, which name other files"
+        raise origin.refuse(name, f"{remedy}; numbers and texts are wanted")
+    types = pa.types
     for field in file.schema_arrow:
-        kind = field.type
-        while pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
-            if pa.types.is_fixed_size_list(kind) and kind.list_size > NUMBERS_MOST:
-                raise origin.refuse(name, f"lists of {kind.list_size}; use at most {NUMBERS_MOST}")
-            kind = kind.value_type
-        primitive = pa.types.is_primitive(kind) or pa.types.is_null(kind)
-        if not (primitive or pa.types.is_string(kind) or pa.types.is_large_string(kind)):
+        kind = _element_type(field.type)
+        plain = types.is_primitive(kind) or types.is_null(kind)
+        if not (plain or types.is_string(kind) or types.is_large_string(kind)):
             raise origin.refuse(name, f"column {field.name[:60]} of {str(kind)[:60]}; use numbers and texts")
-    # Not how many values a column has: pyarrow 26.0.1 ends the process where that description is damaged.
-    if not 0 <= file.metadata.num_rows <= EPISODES_MOST:
-        raise origin.refuse(name, f"{file.metadata.num_rows} rows; use at most {EPISODES_MOST}")
 
 
-def _kinds(described: Any) -> Iterator[str]:
-    if isinstance(described, dict):
-        if "_type" in described:
-            yield str(described["_type"])
-        described = list(described.values())
-    if isinstance(described, list):
-        for entry in described:
-            yield from _kinds(entry)
-
-
-def _check_texts(file: pq.ParquetFile, name: str, origin: Origin) -> None:
-    """Texts are counted as stored, once each, before they are written out row by row."""
+def _check_episodes(file: pq.ParquetFile, frames: int, name: str, origin: Origin) -> None:
+    """Refuses a table of episodes that does not say where they are."""
     import pyarrow as pa
 
-    columns = [
-        f.name for f in file.schema_arrow if pa.types.is_string(f.type) or pa.types.is_large_string(f.type)
-    ]
-    total = 0
-    for batch in file.iter_batches(batch_size=1024, columns=columns) if columns else ():
-        for column in batch.columns:
-            sizes = [len(text or "") for text in column.to_pylist()]
-            total += sum(sizes)
-            if max(sizes, default=0) > TEXT_MOST or total > TEXTS_MOST:
-                raise origin.refuse(name, f"a text of more than {TEXT_MOST} characters, or too many of them")
-
-
-def _check_episodes(file: pq.ParquetFile, info: dict[str, Any], name: str, origin: Origin) -> int:
-    """Where each episode is; gives how many there are."""
-    frames = info.get("total_frames", 0)
-    bounds = {"episode_index": EPISODES_MOST, "length": LENGTH_MOST}
-    bounds |= dict.fromkeys(("dataset_from_index", "dataset_to_index"), frames)
-    for column in file.schema_arrow.names:
-        if column.endswith(("/chunk_index", "/file_index")):
-            bounds[column] = EPISODES_MOST
-    wanted = ("dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index")
-    if missing := [column for column in wanted if column not in file.schema_arrow.names]:
-        raise origin.refuse(name, f"no column {missing[0]}; get the dataset again")
-    count = 0
-    present = [column for column in bounds if column in file.schema_arrow.names]
-    for batch in file.iter_batches(batch_size=4096, columns=present):
-        rows = batch.to_pydict()
-        for column in present:
-            for value in rows[column]:
-                _check_count(value, 0, bounds[column], f"{name}: {column}", origin)
-        for first, last in zip(rows["dataset_from_index"], rows["dataset_to_index"], strict=True):
-            if not first < last <= first + LENGTH_MOST:
-                remedy = f"an episode from frame {first} to {last}; get the dataset again"
-                raise origin.refuse(name, remedy)
-        count += batch.num_rows
-    return count
+    columns = ["dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index"]
+    columns += [c for c in file.schema_arrow.names if c.endswith(("/chunk_index", "/file_index"))]
+    if missing := [column for column in columns if column not in file.schema_arrow.names]:
+        raise origin.refuse(name, f"no column {missing[0]}; {AGAIN}")
+    table = file.read(columns=list(dict.fromkeys(columns)))
+    for column in table.column_names:
+        values = table.column(column)
+        if not pa.types.is_integer(values.type) or values.null_count or (values.to_numpy() < 0).any():
+            raise origin.refuse(f"{name}: {column}", f"whole numbers from 0 are wanted; {AGAIN}")
+    first, last = (table.column(column).to_numpy() for column in columns[:2])
+    wrong = np.flatnonzero((last <= first) | (last > frames))
+    if len(wrong):
+        span = f"from frame {first[wrong[0]]} to {last[wrong[0]]} of {frames}"
+        raise origin.refuse(name, f"an episode {span}; {AGAIN}")
 
 
 def _check_columns(
     file: pq.ParquetFile, features: dict[str, Any], info: dict[str, Any], name: str, origin: Origin
 ) -> None:
-    """Columns are what features say: all of them, of such numbers, as many in each row."""
+    """Refuses columns other than the features, of other numbers, or of other lengths in a row."""
     columns = set(file.schema_arrow.names)
     if missing := sorted(features.keys() - columns) or sorted(columns - features.keys()):
         which = "is no column" if missing[0] in features else f"is no feature of {INFO}"
-        raise origin.refuse(name, f"{missing[0][:60]} {which}; get the dataset again")
+        raise origin.refuse(name, f"{missing[0][:60]} {which}; {AGAIN}")
     below = {"task_index": info.get("total_tasks", 0), "episode_index": info.get("total_episodes", 0)}
     numbers = [f for f in features if features[f]["dtype"] not in ("image", "string", "language")]
     for feature in numbers:
         dtype = features[feature]["dtype"]
-        if _family(file.schema_arrow.field(feature).type) != _FAMILIES[dtype.rstrip("0123468")]:
+        if _family(file.schema_arrow.field(feature).type) != dtype.rstrip("0123468").removeprefix("u"):
             raise origin.refuse(name, f"{feature[:60]} holds no numbers of type {dtype}; record it again")
     for batch in file.iter_batches(batch_size=1024, columns=numbers):
         for feature, column in zip(batch.schema.names, batch.columns, strict=True):
@@ -418,28 +385,18 @@ def _check_columns(
             if values is None:
                 remedy = f"{feature[:60]} has other numbers than {shape} in a row; record it again"
                 raise origin.refuse(name, remedy)
-            if feature.startswith(LEARNT) and not np.isfinite(values).all():
+            if feature.startswith(LEARNED) and not np.isfinite(values).all():
                 raise origin.refuse(name, f"{feature[:60]} has a number that is not finite; record it again")
-            if feature in below:
-                wrong = values[(values < 0) | (values >= below[feature])]
-                if len(wrong):
-                    remedy = f"{feature}={wrong[0]}, and there are {below[feature]}; get the dataset again"
-                    raise origin.refuse(name, remedy)
-
-
-_FAMILIES = {"bool": "b", "int": "i", "uint": "i", "float": "f"}
-"""dtype of a feature, without its bits, → `_family` of its column."""
+            if feature in below and len(wrong := values[(values < 0) | (values >= below[feature])]):
+                raise origin.refuse(name, f"{feature}={wrong[0]}, and there are {below[feature]}; {AGAIN}")
 
 
 def _family(kind: Any) -> str:
-    """Kind of a column's values, at the bottom of its lists: b, i, f, or nothing of these."""
+    """bool, int or float for a column of such values or lists of them; otherwise empty."""
     import pyarrow as pa
 
-    kind = getattr(kind, "storage_type", kind)
-    while pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
-        kind = kind.value_type
-    tests = {"b": pa.types.is_boolean, "i": pa.types.is_integer, "f": pa.types.is_floating}
-    return next((family for family, test in tests.items() if test(kind)), "")
+    tests = {"bool": pa.types.is_boolean, "int": pa.types.is_integer, "float": pa.types.is_floating}
+    return next((family for family, test in tests.items() if test(_element_type(kind))), "")
 
 
 def _values(column: Any, shape: list[int]) -> np.ndarray | None:
@@ -460,35 +417,34 @@ def _values(column: Any, shape: list[int]) -> np.ndarray | None:
 
 
 def _undecodable(error: Exception, name: str, origin: Origin) -> InputError:
-    return origin.refuse(name, f"an image that cannot be read ({brief(error)}); record it again")
+    return origin.refuse(
+        name, f"an image that is no PNG or JPEG, or broken ({brief(error)}); record it again"
+    )
 
 
 def _check_images(file: pq.ParquetFile, image: str, shape: list[int], name: str, origin: Origin) -> None:
-    """Its bytes are PNG or JPEG, lie in the row, and what it says of a path names no other file."""
+    """Refuses images that are not PNG or JPEG of the right size in their rows, or that name other files."""
     import pyarrow as pa
     from PIL import Image
 
-    kinds = {field.name: field.type for field in file.schema_arrow}
-    kind = kinds.get(image)
-    if kind is None or not pa.types.is_struct(kind) or {f.name for f in kind} != {"bytes", "path"}:
-        raise origin.refuse(name, f"{image[:60]} is no column of images with their bytes; record it again")
+    where = f"{name}: {image[:60]}"
+    kind = file.schema_arrow.field(image).type
+    if not pa.types.is_struct(kind) or {f.name for f in kind} != {"bytes", "path"}:
+        raise origin.refuse(where, "no column of images with their bytes; record it again")
     for batch in file.iter_batches(batch_size=32, columns=[image]):
         column = batch.column(0)
         if column.null_count or column.field("bytes").null_count:
-            raise origin.refuse(name, f"{image[:60]}: an image without its bytes; record it again")
-        for path in column.field("path").to_pylist():
-            if path is not None:
-                check_name(path, f"{name}: {image[:60]}.path", origin)
+            raise origin.refuse(where, "an image without its bytes; record it again")
+        for path in filter(None, column.field("path").to_pylist()):
+            check_name(path, f"{where}.path", origin)
         for cell in column.field("bytes").to_pylist():
-            if not cell.startswith(IMAGES):
-                raise origin.refuse(name, f"{image[:60]}: an image that is no PNG or JPEG; record it again")
             try:
-                with Image.open(io.BytesIO(cell), formats=("PNG", "JPEG")) as opened:  # reads its header
+                with Image.open(io.BytesIO(cell), formats=("PNG", "JPEG")) as opened:  # reads the header
                     size = list(opened.size)
             except Exception as error:  # Pillow's plugins raise what they like
-                raise _undecodable(error, f"{name}: {image[:60]}", origin) from error
+                raise _undecodable(error, where, origin) from error
             if size not in (shape[1::-1], shape[:0:-1]):
                 remedy = (
                     f"an image of {size[0]} x {size[1]} pixels, and its shape is {shape}; record it again"
                 )
-                raise origin.refuse(name, f"{image[:60]}: {remedy}")
+                raise origin.refuse(where, remedy)

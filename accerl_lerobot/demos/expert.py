@@ -55,11 +55,7 @@ class Episode:
 
 
 def make_expert(config: EnvConfig, world: World, task: str) -> Expert:
-    """The scripted expert of `task`, reading the simulator's own state.
-
-    Raises:
-        InputError: there is no scripted expert for this kind of environment.
-    """
+    """The scripted expert of `task`, reading the simulator's own state."""
     if type(config) not in _EXPERTS:
         names = ", ".join(kind.get_choice_name(kind) for kind in _EXPERTS)
         raise InputError("env.type", config.type, f"scripted experts exist for: {names}")
@@ -78,7 +74,7 @@ def play(
         seed: Of the world and of the noise.
         noise: Standard deviation of the Gaussian added to each action.
         push: Largest length of the constant vector that is added to what the expert wants.
-        fail: Whether to let go of the task: from a random early step on, actions are a random drift.
+        fail: If true, actions are a random drift from a random early step on.
     """
     rng = np.random.default_rng((seed, 1))
     low, high = world.spec.action_low, world.spec.action_high

@@ -22,16 +22,16 @@ import draccus
 import numpy as np
 from rich.progress import Progress
 
-from accerl_lerobot.config.ranges import Range, Section, Seed, Share
+from accerl_lerobot.config.ranges import DatasetName, NewFolder, Range, Section, Seed, Share
 from accerl_lerobot.demos.expert import Episode, make_expert, play
-from accerl_lerobot.demos.starts import Start, write_starts
 from accerl_lerobot.demos.writing import (
+    Start,
     appearing,
     check_free,
-    check_target,
     in_order,
     new_dataset,
     simulators,
+    write_starts,
 )
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import World, WorldSpec
@@ -78,14 +78,10 @@ class DemosConfig(Section, section="demos"):
     """Disjoint demonstrations for different seeds."""
     processes: Annotated[int, Range("[1, 64]")] = 2
     """Simulator processes; does not change the content."""
-    repo_id: str = "accerl/demos"
+    repo_id: DatasetName = "accerl/demos"
     """Name of the dataset, ``owner/name``; also its place on the Hub if it is pushed."""
-    root: str = "outputs/demos"
+    root: NewFolder = "outputs/demos"
     """Folder to create; must not exist."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_target(self.root, self.repo_id, "demos.")
 
 
 def record_demos(env_config: EnvConfig, config: DemosConfig) -> Path:
@@ -95,9 +91,6 @@ def record_demos(env_config: EnvConfig, config: DemosConfig) -> Path:
 
     Returns:
         The dataset's folder; open it with ``LeRobotDataset(config.repo_id, root=...)``.
-
-    Raises:
-        InputError: the folder exists, the environment has no scripted expert, or its expert keeps failing.
     """
     root = check_free(config.root, "demos.")
     env_config = env_config.shortened(config.max_steps)

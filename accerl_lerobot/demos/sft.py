@@ -19,8 +19,9 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from accerl_lerobot.checkpoint.layout import BACKBONE, displaced, relocate
+from accerl_lerobot.checkpoint.layout import displaced, relocate
 from accerl_lerobot.checkpoint.safety import Origin, check_remote_code, read_json
+from accerl_lerobot.config.dataset import DatasetConfig
 from accerl_lerobot.config.ranges import LearningRate, Range, Section, Steps, Threads
 from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
 from accerl_lerobot.errors import InputError, check_absent
@@ -29,8 +30,8 @@ from accerl_lerobot.policies.registry import discovery, register_policies
 
 logger = logging.getLogger(__name__)
 
-CODE_REVISION = "--code_revision="
-"""Our one argument of the trainer."""
+CODE_REVISION, CACHE = "--code_revision=", "--cache_items=true"
+"""Our arguments of the trainer."""
 REFUSED = "accerl refuses: "
 """Begins the last line of a trainer that met something it must not use; JSON follows."""
 LOG_EVERY = 25
@@ -54,7 +55,7 @@ class SFTConfig(Section, section="sft"):
     warmup_steps: Steps = 20
     """Without effect on a policy type whose preset has no warm-up, such as act."""
     cache: bool = True
-    """Keep the dataset's items in memory, see `cached_train`; not above 4 GiB nor with image transforms."""
+    """Keep the dataset's items in memory, see `guarded_train`; not above 4 GiB nor with image transforms."""
     num_workers: Annotated[int, Range("[0, 256]")] = 0
     """Data-loading processes; 0 loads in the trainer, which is what `cache` wants."""
     num_threads: Threads = 2
@@ -81,18 +82,13 @@ class SFTConfig(Section, section="sft"):
 
 
 def sft_command(
-    config: SFTConfig,
-    repo_id: str,
-    root: str | None,
-    output_dir: Path,
-    seed: int,
-    device: str,
-    revision: str | None = None,
+    config: SFTConfig, dataset: DatasetConfig, output_dir: Path, seed: int, device: str
 ) -> list[str]:
     """The ``lerobot-train`` command line of this warm start."""
     policy: dict[str, Any]
     if config.init_path is not None:
-        policy, kind = {"path": config.init_path}, str(_stored_config(config.init_path).get("type"))
+        stored = read_json(Path(config.init_path) / "config.json", Origin("sft.init_path", config.init_path))
+        policy, kind = {"path": config.init_path}, str(stored.get("type"))
     else:
         policy, kind = dict(config.policy), str(config.policy["type"])
         if config.backbone is not None:
@@ -108,12 +104,12 @@ def sft_command(
     policy |= {name: value for name, value in preset.items() if name in known}
     if config.init_path is not None and "pretrained_backbone_weights" in known:
         policy["pretrained_backbone_weights"] = None  # the checkpoint's replace them; spares their download
-    command = [sys.executable, "-m", f"accerl_lerobot.demos.{'cached' if config.cache else 'guarded'}_train"]
+    command = [sys.executable, "-m", "accerl_lerobot.demos.guarded_train"] + ([CACHE] if config.cache else [])
     command += [f"{CODE_REVISION}{config.code_revision}"] if config.code_revision else []
     command += [f"--policy.{key}={_as_argument(value)}" for key, value in policy.items()]
     command += discovery(kind)
-    command += [f"--dataset.repo_id={repo_id}"] + ([f"--dataset.root={root}"] if root else [])
-    command += [f"--dataset.revision={revision}"] if revision else []
+    named = {"repo_id": dataset.repo_id, "root": dataset.root, "revision": dataset.revision}
+    command += [f"--dataset.{key}={value}" for key, value in named.items() if value]
     command += [
         f"--output_dir={output_dir}",
         f"--steps={config.steps}",
@@ -131,39 +127,36 @@ def sft_command(
 
 def run_sft(
     config: SFTConfig,
-    repo_id: str,
-    root: str | None,
+    dataset: DatasetConfig,
     output_dir: Path,
     seed: int,
     device: str = "cpu",
     texts: Sequence[str] = (),
     on_step: Callable[[int, float], None] | None = None,
-    revision: str | None = None,
 ) -> Path:
     """Trains and returns the ``pretrained_model`` folder.
 
     Args:
         config: what to train, and for how long.
-        repo_id: dataset id, on the Hub or a label for `root`.
-        root: local dataset folder, or None to use the Hub cache.
+        dataset: what to train on.
         output_dir: must not exist; its parent gets ``sft.log``.
         seed: of LeRobot's trainer.
         device: cpu or cuda.
         texts: the dataset's instructions, for a new backbone's tokeniser.
         on_step: called with (step, loss) as progress is reported, from 1000 on rounded to thousands.
-        revision: Hub revision of the dataset.
 
     Raises:
         InputError: `output_dir` exists; the checkpoint to start from, or the dataset, is not to be trusted.
         RuntimeError: the trainer failed; carries the end of its log.
     """
     check_absent(output_dir)
-    config = _checked_start(config)
+    if config.init_path is not None:
+        config = replace(config, init_path=str(fetched_checkpoint(config.init_path, None, "sft.init_path")))
     output_dir.parent.mkdir(parents=True, exist_ok=True)
     if config.init_path is None and config.backbone is not None:
         write_backbone(output_dir.parent / "backbone", config.backbone, texts)
     config = _with_backbone_in_place(config, output_dir.parent / "init")
-    command = sft_command(config, repo_id, root, output_dir, seed, device, revision)
+    command = sft_command(config, dataset, output_dir, seed, device)
     logger.info("%s", shlex.join(command))
     # Whoever holds Ray's token can run code in its workers; a trainer has no business there.
     environment = {k: v for k, v in os.environ.items() if not k.startswith("RAY_AUTH")} | {
@@ -202,14 +195,6 @@ def run_sft(
     return output_dir / "checkpoints" / "last" / "pretrained_model"
 
 
-def _checked_start(config: SFTConfig) -> SFTConfig:
-    """The checkpoint to start from as a folder of this machine, once its files have been checked."""
-    if config.init_path is None:
-        return config
-    folder = fetched_checkpoint(config.init_path, None, "sft.init_path")
-    return replace(config, init_path=str(folder))
-
-
 def _with_backbone_in_place(config: SFTConfig, copy: Path) -> SFTConfig:
     """Starts from a copy where the checkpoint's own backbone is no longer where its files say it is."""
     start = Path(config.init_path or "").expanduser()
@@ -221,11 +206,7 @@ def _with_backbone_in_place(config: SFTConfig, copy: Path) -> SFTConfig:
 
 
 def policy_fields(kind: str, field: str) -> set[str]:
-    """Names of the fields of LeRobot's config of a policy type.
-
-    Raises:
-        InputError: LeRobot has no such type, or cannot fine-tune it; blames `field`.
-    """
+    """Names of the fields of LeRobot's config of a policy type; one it cannot fine-tune is refused."""
     from lerobot.configs.policies import PreTrainedConfig
 
     register_policies()
@@ -235,31 +216,6 @@ def policy_fields(kind: str, field: str) -> set[str]:
     if kind in NO_SFT:
         raise InputError(field, kind, NO_SFT[kind])
     return {f.name for f in fields(choices[kind])}
-
-
-def _stored_config(path: str) -> dict[str, Any]:
-    """The ``config.json`` of a checkpoint, on this machine or on the Hub.
-
-    Raises:
-        InputError: there is none, or it has a backbone of its own and is not in a folder where that is set.
-    """
-    from huggingface_hub import hf_hub_download
-
-    from accerl_lerobot.hub.trouble import guard_client
-
-    guard_client()
-    file = Path(path).expanduser() / "config.json"
-    if not (local := file.is_file()):
-        try:
-            file = Path(hf_hub_download(path, "config.json"))
-        except (OSError, ValueError) as error:
-            remedy = "no config.json in a folder of that name, and not loadable from the Hub"
-            raise InputError("sft.init_path", path, remedy) from error
-    config: dict[str, Any] = read_json(file, Origin("sft.init_path", path))
-    if not local and config.get("vlm_model_name") == BACKBONE:
-        remedy = "LeRobot finds its backbone only in a folder: accerl pull it, and name that"
-        raise InputError("sft.init_path", path, remedy)
-    return config
 
 
 def _as_argument(value: Any) -> str:

@@ -22,7 +22,7 @@ from accerl_lerobot.checkpoint.layout import (
     RUN_STATE,
     SUMMARY,
     TRAINING_STATE,
-    let_go,
+    prune,
     save_checkpoint,
     saved_version,
     write_atomically,
@@ -174,7 +174,7 @@ class Loop:
         write_atomically(self.directory / SUMMARY, json.dumps(summary, indent=2) + "\n")
         for left in self.directory.glob(f"{FILMED}.*"):
             left.unlink()
-        let_go(self.directory / CHECKPOINTS, self.config.save_keep)  # it has ended
+        prune(self.directory / CHECKPOINTS, self.config.save_keep)  # it has ended
         return dict(summary)
 
     def _state(self) -> dict[str, Any]:
@@ -361,7 +361,7 @@ class Loop:
 
         with self.times.clock.during(CHECKPOINT):
             path = save_checkpoint(self.directory / CHECKPOINTS, write)
-        let_go(self.directory / CHECKPOINTS, self.config.save_keep, self._began_at)
+        prune(self.directory / CHECKPOINTS, self.config.save_keep, self._began_at)
         self._saved_at = time.monotonic()
         self.console.say(f"checkpoint {path / PRETRAINED}")
 

@@ -146,7 +146,7 @@ def check_training_data(
     Raises:
         InputError: see `check_features`; LeRobot's policy refuses these features.
     """
-    from accerl_lerobot.demos.windows import open_metadata
+    from accerl_lerobot.demos.dataset_files import open_metadata
 
     meta = None if dataset.repo_id is None else open_metadata(dataset)
     offered = None if spec is None else env_features(spec)

@@ -34,8 +34,8 @@ from accerl_lerobot.checkpoint.layout import (
     DEMOS,
     PRETRAINED,
     TRAINING_STATE,
-    begun,
     go_back_to,
+    has_checkpoint,
     newest_whole,
     write_atomically,
 )
@@ -105,9 +105,9 @@ def make_engine(
 
 def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfig:
     """Record demonstrations and run SFT where the config asks for it; set ``policy.path``."""
+    from accerl_lerobot.demos.dataset_files import open_metadata, task_texts
     from accerl_lerobot.demos.record import record_demos
     from accerl_lerobot.demos.sft import run_sft
-    from accerl_lerobot.demos.windows import open_metadata, task_texts
     from accerl_lerobot.policies.loading import resolve_device
 
     if not config.sft.steps:
@@ -124,14 +124,12 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
         assert dataset.repo_id is not None
         path = run_sft(
             config.sft,
-            dataset.repo_id,
-            dataset.root,
+            dataset,
             directory / "sft",
             config.seed,
             str(resolve_device(config.policy.device)),
             task_texts(meta),
             on_step=lambda step, loss: stage.update(step, f"loss {loss:.3f}"),
-            revision=dataset.revision,
         )
     return _improving(config, path)
 
@@ -254,7 +252,7 @@ class Recovery:
 
 def _checkpoint(directory: Path, wanted: str, console: Console) -> Path | None:
     """The checkpoint to resume from; None if there is none yet."""
-    if not begun(directory / CHECKPOINTS):
+    if not has_checkpoint(directory / CHECKPOINTS):
         console.say("there is no checkpoint yet: the run begins again after its warm start")
         for name in (METRICS, EPISODES):
             (directory / name).unlink(missing_ok=True)

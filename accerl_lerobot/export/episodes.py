@@ -22,18 +22,18 @@ import numpy as np
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.checkpoint.safety import Origin, check_folder
 from accerl_lerobot.config.parsing import decode, drop_consents, read_recipe
-from accerl_lerobot.config.ranges import Choice, Range, Section, Steps
+from accerl_lerobot.config.ranges import Choice, DatasetName, NewFolder, Range, Section, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.expert import Episode
 from accerl_lerobot.demos.record import features, frames
-from accerl_lerobot.demos.starts import Start, write_starts
 from accerl_lerobot.demos.writing import (
+    Start,
     appearing,
     check_free,
-    check_target,
     in_order,
     new_dataset,
     simulators,
+    write_starts,
 )
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.envs import make_world
@@ -63,9 +63,9 @@ class ExportConfig(Section):
     """real: exploring episodes, with a picture at every env step. imagined: dreams, where
     ``imagination.record`` has kept any, with a picture at every decision. Never both: what is done between
     two frames is not the same in them."""
-    root: str = "outputs/rollouts"
+    root: NewFolder = "outputs/rollouts"
     """Folder to create; must not exist."""
-    repo_id: str = "accerl/rollouts"
+    repo_id: DatasetName = "accerl/rollouts"
     """Name of the dataset, ``owner/name``."""
     pick: Literal["all", "successes", "failures"] = "all"
     """all, successes or failures."""
@@ -80,7 +80,6 @@ class ExportConfig(Section):
         super().__post_init__()
         if self.path is None:
             raise InputError("path", None, "name the folder of an accerl train run")
-        check_target(self.root, self.repo_id)
 
 
 def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:

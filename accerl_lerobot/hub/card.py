@@ -1,26 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The card of what is pushed: metadata for the Hub, measured numbers and commands for people."""
+"""Provenance of a pushed folder (its run and measurements), and the card that tells it.
+
+A number goes with a policy only if it was measured on it: a run's summary is about its last checkpoint, and
+an evaluation names its policy.
+"""
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import yaml
 from huggingface_hub import DatasetCard, EvalResult, ModelCard, ModelCardData
 
-from accerl_lerobot.checkpoint.layout import AWAY
+from accerl_lerobot.checkpoint.layout import AWAY, BACKBONE, CHECKPOINTS, PRETRAINED, SUMMARY
 from accerl_lerobot.config.imports import DISCOVER
-from accerl_lerobot.hub.around import FOLDER, Around
-from accerl_lerobot.hub.config import REPO_ID
-from accerl_lerobot.hub.contents import RECORD, Files
-from accerl_lerobot.hub.kinds import (
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.hub.artifact_types import (
     CONFIG,
     INFO,
     LAST,
     POLICY,
     RECIPE,
+    RECORD,
+    REPO_ID,
     RUN,
     SUCCESS_MODEL,
     WORLD_MODEL,
@@ -29,49 +36,155 @@ from accerl_lerobot.hub.kinds import (
 from accerl_lerobot.policies.registry import discovery
 from accerl_lerobot.world_model.config import PIXELS
 
+Files = dict[str, Path | bytes]
+"""Name in the repository → a file, or its content."""
+FOLDER = "accerl_run"
+"""Folder in which a policy or world model carries files of its run."""
+EVALUATION, TRIAL = "evaluation.json", "trial.json"
+KEPT = {
+    POLICY: (RECIPE, SUMMARY, EVALUATION, "success_curve.png", "before_after.mp4"),
+    WORLD_MODEL: (RECIPE, TRIAL, "preview.mp4", "preview_online.mp4"),
+    SUCCESS_MODEL: (RECIPE, TRIAL),
+}
+"""Artifact type → files of its run that go with it."""
 MARK = "<!-- Written by accerl push, and anew each time. Delete this line to keep what you change. -->"
-PLUGIN = "accerl_lerobot.world_model.success_plugin"
 TITLES = {
     POLICY: "A LeRobot policy improved by online reinforcement learning",
     RUN: "A run of accerl train",
     WORLD_MODEL: "A world model for LeRobot policies",
     SUCCESS_MODEL: "A success model, which is a LeRobot reward model",
 }
+NUMBERS = {
+    "env steps": "env_steps", "episodes": "episodes", "updates": "updates", "seed": "seed",
+    "algorithm": "algorithm", "lag, mean": "lag_mean", "seconds of RL": "rl_s",
+}  # fmt: skip
 
 
-def model_card(repo_id: str, kind: str, folder: Path, files: Files, around: Around) -> str:
-    """README.md of a model repository.
+@dataclass(frozen=True, kw_only=True)
+class Provenance:
+    """Facts about a folder's run."""
 
-    Args:
-        repo_id: where it goes.
-        kind: of what is pushed.
-        folder: what is pushed.
-        files: what of it; pictures and films among them are shown.
-        around: what is known of it.
+    recipe: dict[str, Any] = field(default_factory=dict)
+    summary: dict[str, Any] = field(default_factory=dict)
+    """Summary of a run that ended with this very policy."""
+    evaluation: dict[str, Any] = field(default_factory=dict)
+    """By ``accerl eval``, of this very policy."""
+    trial: dict[str, Any] = field(default_factory=dict)
+    """Validation of the world model."""
+    files: Mapping[str, Path] = field(default_factory=dict)
+    """Name in the repository → file that goes with the folder."""
+
+
+def find_provenance(folder: Path, artifact: str, evaluation: str | None) -> Provenance:
+    """Finds the run of a folder, or the files of it that the folder carries.
+
+    `evaluation` is a folder or file of ``accerl eval``; one of another policy is refused.
     """
-    config = read_json(folder / LAST / CONFIG if kind == RUN else folder / CONFIG)
-    name = repo_id.split("/")[1]
+    if evaluation is not None and artifact not in (POLICY, RUN):
+        raise InputError("evaluation", evaluation, f"only a policy is evaluated, this is a {artifact}")
+    known, files = _known(folder, artifact)
+    if evaluation is not None:
+        path = Path(evaluation).expanduser()
+        path = path / EVALUATION if path.is_dir() else path
+        known["evaluation"] = _read_evaluation(path, folder / LAST if artifact == RUN else folder)
+        files[EVALUATION if artifact == RUN else f"{FOLDER}/{EVALUATION}"] = path
+    return Provenance(**known, files=files)
+
+
+def _known(folder: Path, artifact: str) -> tuple[dict[str, Any], dict[str, Path]]:
+    """Fields of a `Provenance`, and files of the run that go with the folder."""
+    here, names = folder.resolve(), KEPT.get(artifact, ())
+    home, measured = folder / FOLDER, True
+    if artifact == RUN:
+        home = folder
+    elif not home.is_dir() and artifact == POLICY:
+        if here.name != PRETRAINED or here.parents[1].name != CHECKPOINTS:
+            return {}, {}
+        home = here.parents[2]
+        measured = here.parent.name.isdigit() and int(here.parent.name) == _updates(home)
+        names = tuple(name for name in names if name != EVALUATION) if measured else (RECIPE,)
+    elif not home.is_dir():
+        home = here.parents[0 if artifact == WORLD_MODEL else 1]
+        if not (home / TRIAL).is_file():
+            return {}, {}
+    known = {"recipe": _read_recipe(home / RECIPE), "trial": read_json(home / TRIAL)}
+    if measured:
+        known["summary"] = read_json(home / SUMMARY)
+    if home in (folder, folder / FOLDER):  # an evaluation is there only if one was given to an earlier push
+        known["evaluation"] = read_json(home / EVALUATION)
+    kept = names if artifact != RUN else ()
+    return known, {f"{FOLDER}/{name}": home / name for name in kept if (home / name).is_file()}
+
+
+def _updates(run: Path) -> Any:
+    return read_json(run / SUMMARY).get("updates")
+
+
+def _read_recipe(path: Path) -> dict[str, Any]:
+    try:
+        tree = yaml.safe_load(path.read_text()) if path.is_file() else None
+    except (OSError, ValueError, yaml.YAMLError):
+        return {}
+    return tree if isinstance(tree, dict) else {}
+
+
+def _read_evaluation(path: Path, policy: Path) -> dict[str, Any]:
+    content = read_json(path)
+    if "success" not in content or "ci95" not in content:
+        raise InputError("evaluation", str(path), "not a file of accerl eval; name its output_dir")
+    if Path(str(content.get("policy"))).expanduser().resolve() != policy.resolve():
+        raise InputError("evaluation", str(path), f"it is of another policy, {content.get('policy')}")
+    return content
+
+
+def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenance: Provenance) -> str:
+    """README.md of a model repository; pictures and videos among `files` are shown."""
+    recipe, summary, trial = provenance.recipe, provenance.summary, provenance.trial
+    config = read_json(folder / LAST / CONFIG if artifact == RUN else folder / CONFIG)
+    env = recipe.get("env") or {}
+    tags = ["accerl-lerobot", artifact.replace(" ", "-"), config.get("type"), env.get("type")]
+    if summary:
+        tags += ["reinforcement-learning", (recipe.get("algorithm") or {}).get("type")]
+    sections = [recipe.get(name) or {} for name in ("dataset", "online")]
+    # Beside a folder the name is a label, and no dataset on the Hub.
+    datasets = [s["repo_id"] for s in sections if s.get("repo_id") and not s.get("root")]
+    measurements = _measurements(provenance)
     data = ModelCardData(
         library_name="lerobot",
         pipeline_tag="robotics",
-        tags=_tags(kind, config, around),
-        datasets=_datasets(around.recipe),
-        base_model=_base_model(around.recipe),
-        model_name=name,
-        eval_results=_results(around) or None,
+        tags=list(dict.fromkeys(str(tag) for tag in tags if tag)),
+        datasets=datasets or None,
+        base_model=_base_model(recipe),
+        model_name=repo_id.split("/")[1],
+        eval_results=_results(measurements, env.get("type", "simulation")) or None,
     )
-    parts = [f"# {name}", f"{TITLES[kind]}, made with accerl-lerobot {_of(config)}.".replace(" .", ".")]
-    parts += _numbers(around) + _trial(around) + _pictures(files)
-    parts += (
-        _use_policy(repo_id, kind, config, around)
-        if kind in (POLICY, RUN)
-        else _use_model(repo_id, kind, config, around)
+    is_policy = artifact in (POLICY, RUN)
+    local = repo_id.split("/")[1]
+    policy = f"{local}/{LAST}" if artifact == RUN else local
+    shown = sorted(name for name in files if name.startswith(f"{FOLDER}/") or "/" not in name)
+    own_recipe = files.get(RECIPE if artifact == RUN else f"{FOLDER}/{RECIPE}", b"")
+    card = ModelCard.from_template(
+        data,
+        template_str=Path(__file__).with_name("card.md.jinja").read_text(),
+        mark=MARK,
+        title=TITLES[artifact],
+        type=config.get("type"),
+        measurements=measurements,
+        numbers={name: _plain(summary[key]) for name, key in NUMBERS.items() if summary.get(key) is not None},
+        trial=trial,
+        checks={n: (_plain(c.get("value")), c.get("holds")) for n, c in (trial.get("gates") or {}).items()},
+        pictures=[name for name in shown if name.endswith((".png", ".gif", ".svg", ".jpg"))],
+        videos=[name for name in shown if name.endswith(".mp4")],
+        commands=_commands(repo_id, artifact, config, recipe),
+        stock=_stock(policy, config, env) if is_policy else None,
+        # Otherwise LeRobot finds the backbone only once a pull has set its place.
+        from_hub=artifact == POLICY
+        and not str(config.get("vlm_model_name") or "").startswith(("/", BACKBONE)),
+        is_success_model=artifact == SUCCESS_MODEL,
+        repo_id=repo_id,
+        recipe=own_recipe.decode() if isinstance(own_recipe, bytes) else "",
     )
-    recipe = files.get(RECIPE if kind == RUN else f"{FOLDER}/{RECIPE}")
-    if isinstance(recipe, bytes):
-        summary = "<summary>Every field, as <code>accerl train</code> takes it</summary>"
-        parts += ["## Recipe", f"<details>\n{summary}\n\n```yaml\n{recipe.decode()}```\n\n</details>"]
-    return str(ModelCard(f"---\n{data.to_yaml()}\n---\n\n{MARK}\n\n" + "\n\n".join(parts) + "\n"))
+    return f"{card}\n"
 
 
 def dataset_card(repo_id: str, folder: Path) -> str:
@@ -81,8 +194,8 @@ def dataset_card(repo_id: str, folder: Path) -> str:
 
     info = read_json(folder / INFO)
     counts = ", ".join(f"{info.get(f'total_{what}')} {what}" for what in ("episodes", "frames", "tasks"))
-    fields = f"accerl sft --config_path=RECIPE --dataset.repo_id={repo_id}"
-    text = f"{counts}, {info.get('fps')} frames a second.\n\n```bash\n{fields}\n```"
+    command = f"accerl sft --config_path=RECIPE --dataset.repo_id={repo_id}"
+    text = f"{counts}, {info.get('fps')} frames a second.\n\n```bash\n{command}\n```"
     card: DatasetCard = create_lerobot_dataset_card(
         tags=["accerl-lerobot"], dataset_info=load_info(folder), repo_id=repo_id, dataset_description=text
     )
@@ -90,190 +203,87 @@ def dataset_card(repo_id: str, folder: Path) -> str:
     return f"{head}\n---\n\n{MARK}\n{body}"
 
 
-def _of(config: Mapping[str, Any]) -> str:
-    return f"({config['type']})" if "type" in config else ""
-
-
-def _tags(kind: str, config: Mapping[str, Any], around: Around) -> list[str]:
-    env, algorithm = around.recipe.get("env") or {}, around.recipe.get("algorithm") or {}
-    tags = ["accerl-lerobot", kind.replace(" ", "-"), config.get("type"), env.get("type")]
-    if around.summary:
-        tags += ["reinforcement-learning", algorithm.get("type")]
-    return list(dict.fromkeys(str(tag) for tag in tags if tag))
-
-
-def _datasets(recipe: Mapping[str, Any]) -> list[str] | None:
-    rooms = [recipe.get(room) or {} for room in ("dataset", "online")]
-    # Beside a folder the name is a label, and no dataset on the Hub.
-    names = [room["repo_id"] for room in rooms if room.get("repo_id") and not room.get("root")]
-    return names or None
-
-
 def _base_model(recipe: Mapping[str, Any]) -> str | None:
     for name in ((recipe.get("policy") or {}).get("path"), (recipe.get("sft") or {}).get("init_path")):
         if name and (pulled := read_json(Path(name).expanduser() / RECORD)):
             return str(pulled.get("repo_id"))
-        if name and REPO_ID.fullmatch(name) and not Path(name).exists():
+        if name and re.fullmatch(REPO_ID, name) and not Path(name).exists():
             return None if name.startswith(f"{AWAY}/") else str(name)
     return None
 
 
-def _measured(around: Around) -> list[tuple[str, dict[str, Any]]]:
-    """(when, {success, n, ci95, tasks}) of every measurement there is."""
-    s, found = around.summary, []
-    for when, label in (("before", "before RL"), ("after", "after RL")):
-        if s.get(f"success_{when}") is not None and s.get(f"ci95_{when}"):
-            row = {"success": s[f"success_{when}"], "n": s[f"n_{when}"], "ci95": s[f"ci95_{when}"]}
-            found.append((label, row | {"tasks": s.get(f"tasks_{when}") or {}}))
-    if around.evaluation:
-        found.append(("accerl eval", dict(around.evaluation)))
-    return found
+def _measurements(provenance: Provenance) -> list[tuple[str, str, dict[str, Any]]]:
+    """(when, task, {success, n, ci95}) of every measurement: all tasks together first, then each."""
+    summary, sources = provenance.summary, []
+    for when in ("before", "after"):
+        if summary.get(f"success_{when}") is not None and summary.get(f"ci95_{when}"):
+            keys = ("success", "n", "ci95", "tasks")
+            sources.append((f"{when} RL", {key: summary.get(f"{key}_{when}") for key in keys}))
+    if provenance.evaluation:
+        sources.append(("accerl eval", dict(provenance.evaluation)))
+    rows = []
+    for when, result in sources:
+        tasks = result.get("tasks") or {}
+        rows += [(when, next(iter(tasks)) if len(tasks) == 1 else "all tasks", result)]
+        rows += [(when, task, each) for task, each in tasks.items() if len(tasks) > 1]
+    return rows
 
 
-def _results(around: Around) -> list[EvalResult]:
-    """Latest measurements, in all and per task, for the Hub's model index."""
-    rows = _measured(around)
-    if not rows or rows[-1][0] == "before RL":
-        return []
-    env, row = (around.recipe.get("env") or {}).get("type", "simulation"), rows[-1][1]
-    tasks = row.get("tasks") or {}
-    parts = tasks if len(tasks) > 1 else {}
-    lone = next(iter(tasks), "all tasks") if len(tasks) == 1 else "all tasks"
+def _results(rows: list[tuple[str, str, dict[str, Any]]], env: str) -> list[EvalResult]:
+    """Latest measurements for the Hub's model index."""
+    latest = rows[-1][0] if rows else "before RL"
     return [
         EvalResult(
             task_type="robotics",
             task_name="robotics",
             dataset_type=env,
-            dataset_name=f"{env} {name}",
-            dataset_config=name,
+            dataset_name=f"{env} {task}",
+            dataset_config=task,
             metric_type="success_rate",
             metric_name="success rate",
             metric_value=round(result["success"], 4),
             metric_args={"n": result["n"], "ci95": [round(v, 4) for v in result["ci95"]]},
         )
-        for name, result in ({lone: row} | parts).items()
+        for when, task, result in rows
+        if when == latest != "before RL"
     ]
 
 
-def _numbers(around: Around) -> list[str]:
-    rows = _measured(around)
-    if not rows:
-        return []
-    table = ["| | task | success | n | 95 % interval |", "|---|---|---|---|---|"]
-    for when, row in rows:
-        tasks = row.get("tasks") or {}
-        everything = {next(iter(tasks), "all") if len(tasks) == 1 else "all": row}
-        for task, result in (everything | (tasks if len(tasks) > 1 else {})).items():
-            low, high = result["ci95"]
-            table.append(
-                f"| {when} | {task} | {result['success']:.1%} | {result['n']} | {low:.1%} to {high:.1%} |"
-            )
-    text = "Simulated episodes on seeds that no run trains on, with LeRobot's own sampler; Wilson intervals."
-    parts = ["## Measured", "\n".join(table), text]
-    s = around.summary
-    if s:
-        wanted = (
-            ("env steps", "env_steps"), ("episodes", "episodes"), ("updates", "updates"), ("seed", "seed"),
-            ("algorithm", "algorithm"), ("lag, mean", "lag_mean"), ("seconds of RL", "rl_s"),
-        )  # fmt: skip
-        shown = [(what, s[key]) for what, key in wanted if s.get(key) is not None]
-        parts.append(
-            "| | |\n|---|---|\n" + "\n".join(f"| {what} | {_plain(value)} |" for what, value in shown)
-        )
-    return parts
-
-
-def _trial(around: Around) -> list[str]:
-    trial = around.trial
-    if "passed" not in trial:
-        return []
-    verdict = "It passed its trial" if trial["passed"] else "**It failed its trial**"
-    gates = trial.get("gates") or {}
-    rows = [
-        f"| {name} | {_plain(gate.get('value'))} | {'yes' if gate.get('holds') else 'no'} |"
-        for name, gate in gates.items()
-    ]
-    text = f"{verdict} on episodes that it had not learnt from."
-    return (
-        ["## Trial", text, "\n".join(["| gate | value | holds |", "|---|---|---|", *rows])]
-        if rows
-        else ["## Trial", text]
-    )
-
-
-def _pictures(files: Files) -> list[str]:
-    shown = []
-    for name in sorted(n for n in files if n.startswith(f"{FOLDER}/") or "/" not in n):
-        if name.endswith((".png", ".gif", ".svg", ".jpg")):
-            shown.append(f"![{Path(name).stem.replace('_', ' ')}]({name})")
-        elif name.endswith(".mp4"):
-            shown.append(f'<video controls src="{name}"></video>\n\n[{Path(name).name}]({name})')
-    return shown
-
-
-def _use_policy(repo_id: str, kind: str, config: Mapping[str, Any], around: Around) -> list[str]:
-    here = repo_id.split("/")[1]
-    policy = f"{here}/{LAST}" if kind == RUN else here
-    recipe = f"{here}/config.yaml" if kind == RUN else f"{here}/{FOLDER}/config.yaml"
-    lines = [f"accerl pull --repo_id={repo_id} --output_dir={here}"]
-    if around.recipe:
-        lines.append(f"accerl eval --config_path={recipe} --policy.path={policy} --evaluation.episodes=100")
-        lines.append(f"accerl train --config_path={recipe} --sft.steps=0 --policy.path={policy}")
-    parts = ["## Use", "With accerl-lerobot:", _bash(lines)]
-    stock = _stock(policy, config, around.recipe.get("env") or {})
-    if stock:
-        parts += [
-            "With LeRobot alone, and accerl-lerobot as its plugin for this environment:",
-            _bash([stock]),
+def _commands(repo_id: str, artifact: str, config: dict[str, Any], recipe: dict[str, Any]) -> list[str]:
+    """Commands of accerl that use what is pulled."""
+    local = repo_id.split("/")[1]
+    commands = [f"accerl pull --repo_id={repo_id} --output_dir={local}"]
+    if artifact in (POLICY, RUN) and recipe:
+        policy = f"{local}/{LAST}" if artifact == RUN else local
+        path = f"{local}/{RECIPE}" if artifact == RUN else f"{local}/{FOLDER}/{RECIPE}"
+        options = f"--config_path={path} --policy.path={policy}"
+        commands += [
+            f"accerl eval {options} --evaluation.episodes=100",
+            f"accerl train {options} --sft.steps=0",
         ]
-    if kind == POLICY and not _own_backbone(config):
-        parts.append(f"LeRobot loads it from the Hub as well: `--policy.path={repo_id}`.")
-    return parts
-
-
-def _own_backbone(config: Mapping[str, Any]) -> bool:
-    """True if LeRobot finds its backbone only once it has been pulled, which sets its place."""
-    named = str(config.get("vlm_model_name") or "")
-    return named.startswith(("/", "backbone"))
+    if artifact == WORLD_MODEL:
+        command = f"accerl world-model-eval --path={local} --dataset.repo_id=USER/DATASET"
+        model = config.get("model")
+        if isinstance(model, dict) and model.get("type", PIXELS) != PIXELS:
+            package = (recipe.get("world_model") or {}).get(DISCOVER) or "PACKAGE"
+            command += f" --{DISCOVER}={shlex.quote(str(package))}"
+        commands.append(command)
+    return commands
 
 
 def _stock(policy: str, config: Mapping[str, Any], env: Mapping[str, Any]) -> str | None:
-    command = [f"lerobot-eval --policy.path={policy}", *discovery(config.get("type"))]
+    """The command of stock ``lerobot-eval``, where it has this environment."""
     if env.get("type") == "metaworld":
-        command += ["--env.discover_packages_path=accerl_lerobot.envs.lerobot_plugin"]
-        command += ["--env.type=accerl_metaworld"]
+        options = {"discover_packages_path": "accerl_lerobot.envs.lerobot_plugin", "type": "accerl_metaworld"}
         names = ("task", "camera", "image_size", "max_steps", "lighting")
-        command += [f"--env.{name}={shlex.quote(str(env[name]))}" for name in names if name in env]
+        options |= {name: env[name] for name in names if name in env}
     elif env.get("type") == "lerobot":
-        command += [f"--env.type={env.get('name')}"]
-        command += [f"--env.{k}={shlex.quote(str(v))}" for k, v in (env.get("kwargs") or {}).items()]
+        options = {"type": str(env.get("name")), **(env.get("kwargs") or {})}
     else:
         return None
+    command = [f"lerobot-eval --policy.path={policy}", *discovery(config.get("type"))]
+    command += [f"--env.{name}={shlex.quote(str(value))}" for name, value in options.items()]
     return " \\\n  ".join([*command, "--eval.n_episodes=50 --eval.batch_size=5"])
-
-
-def _use_model(repo_id: str, kind: str, config: dict[str, Any], around: Around) -> list[str]:
-    here = repo_id.split("/")[1]
-    lines = [f"accerl pull --repo_id={repo_id} --output_dir={here}"]
-    if kind == WORLD_MODEL:
-        lines.append(f"accerl world-model-eval --path={here} --dataset.repo_id=USER/DATASET")
-        model = config.get("model")
-        if isinstance(model, dict) and model.get("type", PIXELS) != PIXELS:
-            # Of one that was promoted in a run, no recipe is known.
-            package = (around.recipe.get("world_model") or {}).get(DISCOVER) or "PACKAGE"
-            lines[-1] += f" --{DISCOVER}={shlex.quote(str(package))}"
-    parts = ["## Use", _bash(lines)]
-    if kind == SUCCESS_MODEL:
-        parts.append(
-            "LeRobot loads it as a reward model:\n\n```python\n"
-            f"from {PLUGIN}.modeling_success_pairs import SuccessPairsRewardModel\n\n"
-            f'model = SuccessPairsRewardModel.from_pretrained("{repo_id}")\n```'
-        )
-    return parts
-
-
-def _bash(lines: list[str]) -> str:
-    return "```bash\n" + "\n".join(lines) + "\n```"
 
 
 def _plain(value: Any) -> str:

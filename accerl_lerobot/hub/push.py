@@ -1,205 +1,345 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a folder to one commit on the Hub.
+"""Upload a folder to the Hub as one commit, without the paths of this machine.
 
-Large files go first, each under its hash, and the commit that names them last: a push that is cut leaves the
-repository as it was, and the next one uploads only what the Hub does not have yet. A commit says what it is
-on top of, so two pushes at a time do not mix.
+Large files go first, each under its hash, and the commit that names them last: an interrupted push leaves the
+repository as it was, and the next one uploads only what the Hub does not have yet. A commit names its parent,
+so two pushes at a time do not mix.
 """
 
 from __future__ import annotations
 
+import json
 import logging
-from pathlib import Path
+import os
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path, PurePosixPath
 from typing import Any
 
+import yaml
 from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, get_token, hf_hub_download
 from huggingface_hub.errors import EntryNotFoundError, RepositoryNotFoundError
 
+from accerl_lerobot.checkpoint import layout
+from accerl_lerobot.checkpoint.layout import (
+    AWAY,
+    BACKBONE,
+    CHECKPOINTS,
+    CONFIG_FOLDERS,
+    PREPROCESSOR,
+    PRETRAINED,
+    places_of_names,
+)
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.hub.around import look_around
-from accerl_lerobot.hub.card import MARK, dataset_card, model_card
-from accerl_lerobot.hub.config import REPO_TYPES, PushConfig
-from accerl_lerobot.hub.contents import Files, contents
-from accerl_lerobot.hub.kinds import CODEBASE_VERSION, DATASET, recognise, repo_type
-from accerl_lerobot.hub.manifest import CARD, MANIFEST, Manifest, entry_of, read_manifest, write_manifest
-from accerl_lerobot.hub.portable import cleaned, is_record
-from accerl_lerobot.hub.trouble import LOGIN, told
+from accerl_lerobot.hub.artifact_types import (
+    CARD,
+    CODEBASE_VERSION,
+    CONFIG,
+    DATASET,
+    MANIFEST,
+    MANIFEST_FORMAT,
+    POLICY,
+    RECORD,
+    REPO_TYPES,
+    RUN,
+    PushConfig,
+    read_json,
+    recognise,
+    repo_type,
+)
+from accerl_lerobot.hub.card import MARK, Files, dataset_card, find_provenance, model_card
+from accerl_lerobot.hub.errors import LOGIN, check_commit, hub_errors
 
 logger = logging.getLogger(__name__)
 
+NOT_CONTENTS = (CARD, MANIFEST, RECORD, ".gitattributes")
+RESULTS = (".yaml", ".json", ".jsonl", ".png", ".jpg", ".gif", ".svg", ".mp4", ".html")
+"""Suffixes of files at the top of a run that are pushed."""
+WEIGHTS = (".safetensors", ".bin", ".pt", ".pth")
+RECORDS = (".json", ".jsonl", ".yaml", ".yml", ".md", ".txt", ".log", ".csv", ".html")
+VOCABULARIES = ("tokenizer.json", "vocab.json", "merges.txt", "added_tokens.json", "special_tokens_map.json")
+PATH = re.compile(r"(?<![\w:/.~}>\-])(?:~|)(?:/[\w.+@%,\-]+){2,}/?")
+"""At least two names after a slash that nothing precedes which would make it a URL or a quotient."""
+ROOTS = [
+    "home",
+    "Users",
+    "root",
+    "tmp",
+    "mnt",
+    "data",
+    "workspace",
+    "var",
+    "srv",
+    "opt",
+    "private",
+    "scratch",
+]
+"""Top folders of other machines, from where a file may have come here."""
+
 
 def push(config: PushConfig) -> dict[str, Any]:
-    """Pushes; returns what was pushed and the commit it has become, plain JSON.
+    """Pushes a folder; returns what was pushed and the new commit, as plain JSON.
 
-    Raises:
-        InputError: the folder is nothing that can be pushed, or the Hub does not take it; whatever was there
-            is as before.
+    If it is refused, or fails, the repository is as before.
     """
-    folder, repo_id = Path(str(config.path)).expanduser(), str(config.repo_id)
-    kind = recognise(folder)
-    files, own_card = staged(config, folder, kind)
+    folder, repo_id = Path(config.path).expanduser(), config.repo_id
+    artifact = recognise(folder)
+    files, own_card = stage(config, folder, artifact)
     if get_token() is None:
         raise InputError("repo_id", repo_id, f"pushing needs a token; {LOGIN} that may write")
-    with told(repo_id, config.revision, writing=True):
-        return _Push(config, kind, files, own_card).run()
+    with hub_errors(repo_id, config.revision, writing=True):
+        return _upload(config, artifact, files, own_card)
 
 
-def staged(config: PushConfig, folder: Path, kind: str) -> tuple[Files, bool]:
-    """Everything that will be uploaded but the manifest, and whether the card is the user's own."""
-    around = look_around(folder, kind, config.evaluation)
-    files = contents(folder, kind, config.include)
-    for name, path in around.files.items():
-        files[name] = cleaned(name, path.read_bytes(), folder) if is_record(name) else path
-    card = folder / CARD
-    if card.is_file() and MARK not in (text := card.read_text()):
-        files[CARD] = cleaned(CARD, text.encode(), folder)
-        return files, True
-    repo_id = str(config.repo_id)
-    text = (
-        dataset_card(repo_id, folder) if kind == DATASET else model_card(repo_id, kind, folder, files, around)
-    )
-    files[CARD] = cleaned(CARD, text.encode(), folder)
-    return files, False
+def stage(config: PushConfig, folder: Path, artifact: str) -> tuple[Files, bool]:
+    """All files to upload but the manifest, and True if the card among them is the user's own."""
+    provenance = find_provenance(folder, artifact, config.evaluation)
+    files = contents(folder, artifact, config.include)
+    for name, path in provenance.files.items():
+        files[name] = scrubbed(name, path.read_bytes(), folder) if is_record(name) else path
+    card, repo_id = folder / CARD, config.repo_id
+    own = card.is_file() and MARK not in card.read_text()
+    if own:
+        text = card.read_text()
+    elif artifact == DATASET:
+        text = dataset_card(repo_id, folder)
+    else:
+        text = model_card(repo_id, artifact, folder, files, provenance)
+    files[CARD] = scrubbed(CARD, text.encode(), folder)
+    return files, own
 
 
-class _Push:
-    """One push, under way.
+def _upload(config: PushConfig, artifact: str, files: Files, own_card: bool) -> dict[str, Any]:
+    """Creates the repository if need be, and the commit."""
+    api, repo_id = HfApi(), config.repo_id
+    where: dict[str, Any] = {"repo_id": repo_id, "repo_type": repo_type(artifact)}
+    parent = _parent(api, config, artifact)
 
-    Args:
-        config: what the user wants.
-        kind: of the folder.
-        files: to upload.
-        own_card: whether the card among them is the user's.
-    """
-
-    def __init__(self, config: PushConfig, kind: str, files: Files, own_card: bool) -> None:
-        self.config, self.kind, self.files, self.own_card = config, kind, files, own_card
-        self.repo_id, self.revision = str(config.repo_id), config.revision
-        self.type = repo_type(kind)
-        self.api = HfApi()
-
-    def run(self) -> dict[str, Any]:
-        parent = self._prepare()
-        before = self._before(parent)
-        self._keep_their_card(parent)
-        entries = {name: entry_of(content) for name, content in self.files.items() if name != CARD}
-        uploads = dict(self.files) | {MANIFEST: write_manifest(Manifest(self.kind, entries))}
-        operations: list[CommitOperationAdd | CommitOperationDelete] = []
-        for name, content in uploads.items():
-            operation = CommitOperationAdd(name, content)
-            if name in entries:  # it has been read once already
-                operation.upload_info.sha256 = bytes.fromhex(str(entries[name].sha256))
-            operations.append(operation)
-        gone = sorted(before.files.keys() - uploads.keys()) if before is not None else []
-        there = self._names(parent) if gone else set()
-        operations += [CommitOperationDelete(name, is_folder=False) for name in gone if name in there]
-        message = self.config.message or f"{self.kind.capitalize()} pushed with accerl-lerobot"
-        commit = self.api.create_commit(
-            self.repo_id,
-            operations,
-            commit_message=message,
-            repo_type=self.type,
-            revision=self.revision,
-            parent_commit=parent,
-        ).oid
-        if self.kind == DATASET and self.revision == "main":
-            self._tag(commit)
-        prefix = "datasets/" if self.type == "dataset" else ""
-        return {
-            "kind": self.kind,
-            "repo_id": self.repo_id,
-            "repo_type": self.type,
-            "revision": self.revision,
-            "commit": commit,
-            "unchanged": commit == parent,
-            "private": bool(self._info().private),
-            "files": len(uploads),
-            "bytes": sum(entry.size for entry in entries.values()),
-            "url": f"{self.api.endpoint}/{prefix}{self.repo_id}",
-        }
-
-    def _prepare(self) -> str:
-        """Makes the repository if need be; returns the commit to go on top of.
-
-        Raises:
-            InputError: there is another kind of thing under this name, it is public, or has no such branch.
-        """
+    def read(name: str) -> bytes | None:
         try:
-            info = self._info()
-        except RepositoryNotFoundError:
-            self._create()
-            info = self._info()
-        if self.config.private and info.private is False:
-            remedy = "this repository is public: add --private=false, or choose another name"
-            raise InputError("private", True, remedy)
-        refs = self.api.list_repo_refs(self.repo_id, repo_type=self.type)
-        branches = {branch.name: branch.target_commit for branch in refs.branches}
-        if self.revision not in branches:
-            there = ", ".join(sorted(branches)) or "none"
-            make = f"hf repos branch create {self.repo_id} {self.revision}"
-            remedy = f"{self.repo_id} has no such branch, but {there}; make it with '{make}'"
-            raise InputError("revision", self.revision, remedy)
-        return str(branches[self.revision])
-
-    def _create(self) -> None:
-        (other,) = set(REPO_TYPES) - {self.type}
-        if self.api.repo_exists(self.repo_id, repo_type=other):
-            remedy = f"it is a {other} repository, and this is a {self.kind}; choose another name"
-            raise InputError("repo_id", self.repo_id, remedy)
-        if self.revision != "main":
-            remedy = f"{self.repo_id} is new, and has only main; push to main first"
-            raise InputError("revision", self.revision, remedy)
-        self.api.create_repo(self.repo_id, private=self.config.private, repo_type=self.type, exist_ok=True)
-
-    def _before(self, commit: str) -> Manifest | None:
-        """Manifest of the last push there.
-
-        Raises:
-            InputError: something of another kind.
-        """
-        data = self._read(MANIFEST, commit)
-        if data is None:
-            return None
-        try:
-            before = read_manifest(data, self.repo_id)
-        except InputError as error:
-            logger.warning("%s", error)  # which this push does
-            return None
-        if before.kind != self.kind:
-            remedy = f"it holds a {before.kind}, and this is a {self.kind}; choose another name or branch"
-            raise InputError("repo_id", self.repo_id, remedy)
-        return before
-
-    def _keep_their_card(self, commit: str) -> None:
-        """Somebody may have written a card on the Hub; it gives way only to one of the user's own."""
-        if self.own_card:
-            return
-        there = self._read(CARD, commit)
-        if there is not None and MARK.encode() not in there and there.strip():
-            logger.warning("the README.md on the Hub is left as it is, somebody wrote it")
-            self.files[CARD] = there
-
-    def _read(self, name: str, commit: str) -> bytes | None:
-        try:
-            path = hf_hub_download(
-                self.repo_id, name, repo_type=self.type, revision=commit, endpoint=self.api.endpoint
-            )
+            return Path(hf_hub_download(filename=name, revision=parent, **where)).read_bytes()
         except EntryNotFoundError:
             return None
-        return Path(path).read_bytes()
 
-    def _names(self, commit: str) -> set[str]:
-        return set(self.api.list_repo_files(self.repo_id, revision=commit, repo_type=self.type))
+    previous = _previous_files(read(MANIFEST), artifact, repo_id)
+    card = read(CARD)
+    if not own_card and card is not None and MARK.encode() not in card and card.strip():
+        logger.warning("the README.md on the Hub is left as it is, somebody wrote it")
+        files[CARD] = card
+    entries = {name: layout.entry(content) for name, content in files.items() if name != CARD}
+    manifest = {"format": MANIFEST_FORMAT, "kind": artifact, "files": dict(sorted(entries.items()))}
+    files = files | {MANIFEST: (json.dumps(manifest, indent=1) + "\n").encode()}
+    operations = [CommitOperationAdd(name, content) for name, content in files.items()]
+    gone = previous - files.keys()
+    gone &= set(api.list_repo_files(revision=parent, **where)) if gone else set()
+    operations += [CommitOperationDelete(name, is_folder=False) for name in sorted(gone)]
+    message = config.message or f"{artifact.capitalize()} pushed with accerl-lerobot"
+    commit = api.create_commit(
+        operations=operations, commit_message=message, revision=config.revision, parent_commit=parent, **where
+    ).oid
+    if artifact == DATASET and config.revision == "main":
+        _tag(api, where, commit)
+    return {
+        "kind": artifact,
+        **where,
+        "revision": config.revision,
+        "commit": commit,
+        "unchanged": commit == parent,
+        "private": bool(api.repo_info(**where).private),
+        "files": len(files),
+        "bytes": sum(int(entry["size"]) for entry in entries.values()),
+        "url": f"{api.endpoint}/{'datasets/' if artifact == DATASET else ''}{repo_id}",
+    }
 
-    def _tag(self, commit: str) -> None:
-        """LeRobot looks for a dataset under the tag of its format's version."""
-        refs = self.api.list_repo_refs(self.repo_id, repo_type=self.type)
-        tagged = {tag.name: tag.target_commit for tag in refs.tags}
-        if tagged.get(CODEBASE_VERSION) == commit:
-            return
-        if CODEBASE_VERSION in tagged:
-            self.api.delete_tag(self.repo_id, tag=CODEBASE_VERSION, repo_type=self.type)
-        self.api.create_tag(self.repo_id, tag=CODEBASE_VERSION, revision=commit, repo_type=self.type)
 
-    def _info(self) -> Any:
-        return self.api.repo_info(self.repo_id, repo_type=self.type)
+def _parent(api: HfApi, config: PushConfig, artifact: str) -> str:
+    """The commit to go on top of; the repository is created if need be."""
+    repo_id, kind = config.repo_id, repo_type(artifact)
+    try:
+        info = api.repo_info(repo_id, repo_type=kind)
+    except RepositoryNotFoundError:
+        (other,) = set(REPO_TYPES) - {kind}
+        if api.repo_exists(repo_id, repo_type=other):
+            remedy = f"it is a {other} repository, and this is a {artifact}; choose another name"
+            raise InputError("repo_id", repo_id, remedy) from None
+        if config.revision != "main":
+            remedy = f"{repo_id} is new, and has only main; push to main first"
+            raise InputError("revision", config.revision, remedy) from None
+        api.create_repo(repo_id, private=config.private, repo_type=kind, exist_ok=True)
+        info = api.repo_info(repo_id, repo_type=kind)
+    if config.private and info.private is False:
+        remedy = "this repository is public: add --private=false, or choose another name"
+        raise InputError("private", True, remedy)
+    branches = {b.name: b.target_commit for b in api.list_repo_refs(repo_id, repo_type=kind).branches}
+    if config.revision not in branches:
+        make = f"hf repos branch create {repo_id} {config.revision}"
+        remedy = f"{repo_id} has no such branch, but {', '.join(sorted(branches))}; make it with '{make}'"
+        raise InputError("revision", config.revision, remedy)
+    return check_commit(branches[config.revision], repo_id)
+
+
+def _previous_files(manifest: bytes | None, artifact: str, repo_id: str) -> set[str]:
+    """Files of the last push there, which must have been of the same type."""
+    if manifest is None:
+        return set()
+    try:
+        content = json.loads(manifest)
+        kind, files = content["kind"], set(content["files"])
+    except (ValueError, KeyError, TypeError, RecursionError):
+        logger.warning("the %s on the Hub is broken, and is replaced", MANIFEST)
+        return set()
+    if kind != artifact:
+        remedy = f"it holds a {kind}, and this is a {artifact}; choose another name or branch"
+        raise InputError("repo_id", repo_id, remedy)
+    return files
+
+
+def _tag(api: HfApi, where: dict[str, Any], commit: str) -> None:
+    """Tags a commit with the version of the dataset's format, under which LeRobot looks for it."""
+    tags = {tag.name: tag.target_commit for tag in api.list_repo_refs(**where).tags}
+    if tags.get(CODEBASE_VERSION) != commit:
+        if CODEBASE_VERSION in tags:
+            api.delete_tag(tag=CODEBASE_VERSION, **where)
+        api.create_tag(tag=CODEBASE_VERSION, revision=commit, **where)
+
+
+def contents(folder: Path, artifact: str, include: Sequence[str] = ()) -> Files:
+    """Files of a folder that are pushed, without paths of this machine.
+
+    It refuses an `include` that is no folder of the run, a broken checkpoint, and a policy without backbone.
+    """
+    if include and artifact != RUN:
+        raise InputError("include", list(include), f"for a run; a {artifact} is pushed completely")
+    policies: list[str] = [""] if artifact == POLICY else []
+    last = (folder / CHECKPOINTS / layout.LAST).resolve()
+    if artifact == RUN:
+        files = _of_a_run(folder, last, include)
+        policies = [f"{CHECKPOINTS}/{last.name}/{PRETRAINED}/"]
+    else:
+        files = {name: path for name, path in _walk(folder) if name not in NOT_CONTENTS}
+    if artifact == DATASET:  # LeRobot leaves images behind that are in the tables or videos now
+        files = {name: path for name, path in files.items() if not name.startswith("images/")}
+    for prefix in policies:
+        _bring_backbone(files, folder / prefix, prefix)
+    for name, content in files.items():
+        if is_record(name):
+            data = content if isinstance(content, bytes) else content.read_bytes()
+            files[name] = scrubbed(name, data, folder)
+    prefix = f"{CHECKPOINTS}/{last.name}/"
+    if artifact == RUN and (manifest := f"{prefix}{layout.MANIFEST}") in files:
+        inside = {name: content for name, content in files.items() if name.startswith(prefix)}
+        entries = {n.removeprefix(prefix): layout.entry(c) for n, c in inside.items() if n != manifest}
+        files[manifest] = layout.manifest_text(entries).encode()
+    return files
+
+
+def _walk(folder: Path) -> Iterator[tuple[str, Path]]:
+    """Files below a folder by their names in a repository, without hidden ones and linked folders."""
+    for at, folders, names in os.walk(folder):
+        folders[:] = sorted(f for f in folders if not f.startswith(".") and f != "__pycache__")
+        for name in sorted(names):
+            path = Path(at, name)
+            if not name.startswith(".") and path.is_file():
+                yield path.relative_to(folder).as_posix(), path
+
+
+def _of_a_run(run: Path, last: Path, include: Sequence[str]) -> Files:
+    if (last / layout.MANIFEST).is_file() and (why := layout.defect(last)) is not None:
+        raise InputError("path", str(last), f"the checkpoint is broken: {why}")
+    top = [path for path in sorted(run.iterdir()) if path.is_file() and path.suffix in RESULTS]
+    files: Files = {path.name: path for path in top if path.name not in NOT_CONTENTS}
+    folders = {f"{CHECKPOINTS}/{last.name}": last}
+    for name in (name.strip("/") for name in include):
+        folders[name] = run / name
+        if not (run / name).is_dir() or (run / name).name != name or name.startswith("."):
+            raise InputError("include", name, f"no such folder in {run}")
+    for name, folder in folders.items():
+        files |= {f"{name}/{below}": path for below, path in _walk(folder)}
+    return files
+
+
+def _bring_backbone(files: Files, home: Path, prefix: str) -> None:
+    """Points a policy at the backbone beside it, which is copied there if it is elsewhere on this machine."""
+    config, processor = read_json(home / CONFIG), read_json(home / PREPROCESSOR)
+    before = json.dumps([config, processor])
+    elsewhere = Path(config.get("vlm_model_name") or "")
+    if elsewhere.is_absolute() and not (home / BACKBONE).is_dir():
+        for name, path in _walk(elsewhere):
+            # The policy's own file holds its weights, unless LeRobot builds it from the backbone's.
+            if config.get("load_vlm_weights") or path.suffix not in WEIGHTS:
+                files[f"{prefix}{BACKBONE}/{name}"] = path
+    has = {own for own in CONFIG_FOLDERS.values() if any(n.startswith(f"{prefix}{own}/") for n in files)}
+    for fields, key, own in places_of_names(config, processor):
+        if not Path(named := fields.get(key) or "").is_absolute():
+            continue
+        if own not in has:
+            remedy = f"it needs {named}, which is not in it; put a copy into {BACKBONE}/ beside {CONFIG}"
+            raise InputError("path", str(home), remedy)
+        fields[key] = own
+    if json.dumps([config, processor]) != before:
+        files[f"{prefix}{CONFIG}"] = (json.dumps(config, indent=4) + "\n").encode()
+        files[f"{prefix}{PREPROCESSOR}"] = (json.dumps(processor, indent=4) + "\n").encode()
+
+
+def is_record(name: str) -> bool:
+    """True for text that may name paths, such as configs, metrics and cards; vocabularies hold any text."""
+    path = PurePosixPath(name)
+    return path.suffix in RECORDS and path.name not in VOCABULARIES
+
+
+def scrubbed(name: str, data: bytes, folder: Path) -> bytes:
+    """A record without paths of this machine; the bytes themselves if it has none.
+
+    A path below the pushed folder becomes relative to it; of any other only the last name is kept.
+    """
+    try:
+        text = data.decode()
+    except UnicodeDecodeError:
+        return data
+    if _scrub(text, folder) == text:
+        return data
+    suffix = PurePosixPath(name).suffix
+    try:
+        if suffix == ".json":
+            tree = _scrub_tree(json.loads(text), folder)
+            return (json.dumps(tree, indent=4, ensure_ascii=False) + "\n").encode()
+        if suffix in (".yaml", ".yml"):
+            return yaml.safe_dump(_scrub_tree(yaml.safe_load(text), folder), sort_keys=False).encode()
+    except (ValueError, yaml.YAMLError):
+        pass  # not what its name says: treated as text
+    return _scrub(text, folder).encode()
+
+
+def _scrub_tree(value: Any, folder: Path) -> Any:
+    if isinstance(value, dict):
+        # null lets whoever repeats the run choose a folder.
+        return {
+            k: None if k == "output_dir" and _is_path(v) else _scrub_tree(v, folder) for k, v in value.items()
+        }
+    if isinstance(value, list):
+        return [_scrub_tree(v, folder) for v in value]
+    return _scrub(value, folder) if isinstance(value, str) else value
+
+
+def _scrub(text: str, folder: Path) -> str:
+    """Text with its paths replaced; a text that is one path may hold blanks."""
+    if _is_path(text):
+        return _portable(text, folder)
+    for root in {str(folder.absolute()), str(folder.resolve())}:
+        text = text.replace(f"{root}/", "")
+    return PATH.sub(lambda m: _portable(m[0], folder) if _is_path(m[0]) else m[0], text)
+
+
+def _is_path(value: Any) -> bool:
+    """True for a path of this machine or a likely one of another."""
+    if not isinstance(value, str) or not value.startswith(("/", "~/")) or "\n" in value:
+        return False
+    top = value.split("/")[1]
+    return value[0] == "~" or value.count("/") > 1 and (top in ROOTS or Path("/", top).is_dir())
+
+
+def _portable(path: str, folder: Path) -> str:
+    for root in (folder.absolute(), folder.resolve()):
+        if Path(path).is_relative_to(root):
+            return Path(path).relative_to(root).as_posix()
+    return f"{AWAY}/{Path(path).name}"

@@ -62,7 +62,7 @@ def fetched_checkpoint(path: str, revision: str | None, field: str) -> Path:
     """
     from huggingface_hub import snapshot_download
 
-    from accerl_lerobot.hub.trouble import guard_client
+    from accerl_lerobot.hub.errors import guard_client
 
     guard_client()
     folder = Path(path).expanduser()

@@ -73,7 +73,7 @@ class FastTokenizer:
         from huggingface_hub import snapshot_download
         from transformers import PreTrainedTokenizerFast
 
-        from accerl_lerobot.hub.trouble import guard_client
+        from accerl_lerobot.hub.errors import guard_client
 
         guard_client()
         folder = Path(name)

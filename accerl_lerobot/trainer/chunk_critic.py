@@ -24,7 +24,7 @@ import torch
 from torch import Tensor, nn
 
 from accerl_lerobot.algorithms import ChunkCriticConfig
-from accerl_lerobot.checkpoint.optimizers import copied, optimizer_state, restore_optimizer
+from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded

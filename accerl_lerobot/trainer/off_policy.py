@@ -16,7 +16,7 @@ from torch import Tensor
 
 from accerl_lerobot.algorithms import OffPolicyConfig
 from accerl_lerobot.algorithms.diagnostics import lag_metrics
-from accerl_lerobot.checkpoint.optimizers import optimizer_state, restore_optimizer
+from accerl_lerobot.checkpoint.tensors import optimizer_state, restore_optimizer
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter

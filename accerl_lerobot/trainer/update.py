@@ -35,8 +35,7 @@ from accerl_lerobot.algorithms import (
 from accerl_lerobot.algorithms.advantages import decision_mask, gae, moments, normalise
 from accerl_lerobot.algorithms.diagnostics import lag_metrics
 from accerl_lerobot.algorithms.ratio import present
-from accerl_lerobot.checkpoint.optimizers import optimizer_state, restore_optimizer
-from accerl_lerobot.checkpoint.tensors import whole
+from accerl_lerobot.checkpoint.tensors import optimizer_state, restore_optimizer, whole
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.adapter import PolicyAdapter

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from accerl_lerobot.demos.dataset_files import checked
-from accerl_lerobot.demos.windows import open_metadata, origin_of
+from accerl_lerobot.demos.dataset_files import checked, open_metadata, origin_of
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.episodes import Episode

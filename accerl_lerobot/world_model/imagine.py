@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import torch
 
-from accerl_lerobot.checkpoint.optimizers import copied
+from accerl_lerobot.checkpoint.tensors import copied
 from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.experience import IMAGINED, Decision, Observation, Request, Segment
 from accerl_lerobot.rollout.segments import SegmentBuilder

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from accerl_lerobot.checkpoint.optimizers import copied, optimizer_state, restore_optimizer
+from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
 from accerl_lerobot.world_model.config import LearnConfig
 from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModelSpec
 from accerl_lerobot.world_model.episodes import Episode, Place, Windows, cut, places

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from accerl_lerobot.console import Console
-from accerl_lerobot.demos.windows import open_metadata
+from accerl_lerobot.demos.dataset_files import open_metadata
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.dataset import check_metadata, fingerprint
 from accerl_lerobot.world_model.episodes import Episode, amount

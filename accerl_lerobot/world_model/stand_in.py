@@ -173,7 +173,7 @@ def _folder(config: StandInConfig, origin: Origin) -> Path:
     if not folder.exists() and not path.startswith((".", "/", "~")):
         from huggingface_hub import snapshot_download
 
-        from accerl_lerobot.hub.trouble import guard_client
+        from accerl_lerobot.hub.errors import guard_client
 
         guard_client()
         try:

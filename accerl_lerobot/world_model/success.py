@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from accerl_lerobot.checkpoint.optimizers import copied, optimizer_state, restore_optimizer
 from accerl_lerobot.checkpoint.snapshot import kind
+from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
 from accerl_lerobot.world_model.config import SuccessLearnConfig
 from accerl_lerobot.world_model.contract import WorldModel
 from accerl_lerobot.world_model.episodes import Episode, Place

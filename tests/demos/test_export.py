@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from accerl_lerobot.cli import main
-from accerl_lerobot.demos.windows import open_metadata
+from accerl_lerobot.demos.dataset_files import open_metadata
 from accerl_lerobot.engine.config import DatasetConfig, LaunchConfig, RunConfig, encode, parse
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.evaluation.config import EvaluationConfig

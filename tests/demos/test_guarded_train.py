@@ -12,26 +12,26 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot.demos import cached_train, guarded_train, sft
+from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.demos import guarded_train, sft
 from accerl_lerobot.demos.sft import CODE_REVISION, REFUSED, SFTConfig, run_sft, sft_command
 from accerl_lerobot.errors import InputError
 from tests.policies.checkpoints import write_gaussian_actor
 from tests.policies.test_loading import remote
 from tests.policies.tiny_pi import ACTIONS, COMMIT, PALIGEMMA, hub
 
+HUB = DatasetConfig(repo_id="a/b")
 ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 
 
-def run(
-    monkeypatch: pytest.MonkeyPatch, work: Callable[[], Any], *arguments: str, module: Any = guarded_train
-) -> Any:
+def run(monkeypatch: pytest.MonkeyPatch, work: Callable[[], Any], *arguments: str) -> Any:
     """`work` where LeRobot's trainer would be; gives what it returns."""
     from lerobot.scripts import lerobot_train
 
     got: list[Any] = []
     monkeypatch.setattr(lerobot_train, "main", lambda: got.append(work()))
     monkeypatch.setattr(sys, "argv", ["lerobot-train", *arguments])
-    module.main()
+    guarded_train.main()
     return got[0]
 
 
@@ -43,13 +43,10 @@ def tokenise() -> Any:
     return type(step.action_tokenizer).__name__
 
 
-@pytest.mark.parametrize("module", [guarded_train, cached_train])
-def test_pi0_fast_s_tokeniser_is_read_and_not_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: Any
-):
+def test_pi0_fast_s_tokeniser_is_read_and_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     with hub(tmp_path):
         marker = remote(tmp_path, monkeypatch)
-        assert run(monkeypatch, tokenise, module=module) == "FastTokenizer"
+        assert run(monkeypatch, tokenise) == "FastTokenizer"
     assert not marker.exists()
 
 
@@ -75,7 +72,7 @@ def test_a_refusal_is_one_line_of_the_run(tmp_path: Path, monkeypatch: pytest.Mo
     program = f"print('Traceback')\nprint({REFUSED + said!r})\nraise SystemExit(2)"
     monkeypatch.setattr(sft, "sft_command", lambda *_: [sys.executable, "-c", program])
     with pytest.raises(InputError) as caught:
-        run_sft(SFTConfig(steps=1), "a/b", None, tmp_path / "sft", seed=0)
+        run_sft(SFTConfig(steps=1), HUB, tmp_path / "sft", seed=0)
     assert str(caught.value) == "sft.trust_remote_code='x.py': read it"
 
 
@@ -85,8 +82,13 @@ def test_a_hostile_dataset_ends_the_training_in_a_line(tmp_path: Path):
     info = json.loads((root / "meta/info.json").read_text())
     (root / "meta/info.json").write_text(json.dumps(info | {"data_path": "{chunk_index:999999999}"}))
     small = {"type": "act", "chunk_size": 4, "n_action_steps": 4, "pretrained_backbone_weights": None}
-    with pytest.raises(InputError, match="^dataset.root=.*meta/info.json: data_path: .*use a width"):
-        run_sft(SFTConfig(steps=1, policy=small), "a/b", str(root), tmp_path / "sft", seed=0)
+    with pytest.raises(InputError, match="^dataset.root=.*meta/info.json: data_path: .*and the like only"):
+        run_sft(
+            SFTConfig(steps=1, policy=small),
+            DatasetConfig(repo_id="a/b", root=str(root)),
+            tmp_path / "sft",
+            seed=0,
+        )
 
 
 def test_a_hostile_start_is_refused_before_anything_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -95,7 +97,7 @@ def test_a_hostile_start_is_refused_before_anything_runs(tmp_path: Path, monkeyp
     (start / "policy_preprocessor.json").write_text(json.dumps(steps))
     monkeypatch.setattr(sft.subprocess, "Popen", None)
     with pytest.raises(InputError, match="^sft.init_path=.*only steps with a registry_name"):
-        run_sft(SFTConfig(steps=1, init_path=str(start)), "a/b", None, tmp_path / "sft", seed=0)
+        run_sft(SFTConfig(steps=1, init_path=str(start)), HUB, tmp_path / "sft", seed=0)
     assert not marker.exists() and not (tmp_path / "sft.log").exists()
 
 
@@ -105,9 +107,9 @@ def test_trust_is_asked_for_with_a_commit(tmp_path: Path):
     with pytest.raises(InputError, match="^sft.code_revision='main': name a commit"):
         SFTConfig(trust_remote_code=True, code_revision="main")
     config = SFTConfig(steps=1, policy={"type": "act"}, trust_remote_code=True, code_revision=COMMIT)
-    command = sft_command(config, "a/b", None, tmp_path / "sft", 0, "cpu")
+    command = sft_command(config, HUB, tmp_path / "sft", 0, "cpu")
     assert f"{CODE_REVISION}{COMMIT}" in command
-    plain = sft_command(SFTConfig(steps=1, policy={"type": "act"}), "a/b", None, tmp_path / "sft", 0, "cpu")
+    plain = sft_command(SFTConfig(steps=1, policy={"type": "act"}), HUB, tmp_path / "sft", 0, "cpu")
     assert not [a for a in plain if a.startswith(CODE_REVISION)]
 
 
@@ -116,5 +118,5 @@ def test_the_trainer_does_not_get_ray_s_token(tmp_path: Path, monkeypatch: pytes
         monkeypatch.setenv(name, "secret-of-ray")
     program = "import os\nprint([k for k in os.environ if k.startswith('RAY_AUTH')])"
     monkeypatch.setattr(sft, "sft_command", lambda *_: [sys.executable, "-c", program])
-    run_sft(SFTConfig(steps=1), "a/b", None, tmp_path / "sft", seed=0)
+    run_sft(SFTConfig(steps=1), HUB, tmp_path / "sft", seed=0)
     assert (tmp_path / "sft.log").read_text().strip() == "[]"

@@ -12,11 +12,12 @@ import pytest
 from accerl_lerobot.checkpoint.safety import Origin
 from accerl_lerobot.demos.expert import make_expert, play
 from accerl_lerobot.demos.record import SIDECAR, DemosConfig, record_demos
-from accerl_lerobot.demos.starts import read_starts
-from accerl_lerobot.envs import LeRobotEnvConfig, MetaWorldConfig, SimulatedConfig, make_world
+from accerl_lerobot.demos.writing import STARTS, read_starts
+from accerl_lerobot.envs import EnvConfig, LeRobotEnvConfig, MetaWorldConfig, SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from tests.rounding import assert_close
 
+TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
 TASKS = "handle-press-v3,reach-v3"
 
 
@@ -170,3 +171,52 @@ def test_an_environment_without_experts_is_refused(tmp_path: Path):
 def test_bad_values_name_their_field(values: dict, field: str):
     with pytest.raises(InputError, match=f"^{field}="):
         DemosConfig(**values)
+
+
+def test_a_dataset_that_does_not_say_how_it_began(tmp_path: Path):
+    origin, recorded = Origin("dataset.root", "here"), tmp_path / "recorded"
+    demos = DemosConfig(episodes=8, failure_share=0.5, processes=1, root=str(recorded), repo_id="a/b")
+    record_demos(SimulatedConfig(max_steps=60, hold=25, image_size=16), demos)
+    assert {task for task, _ in read_starts(recorded, 8, origin)} == {"match"}
+    with pytest.raises(InputError, match="8 pairs|7 pairs"):
+        read_starts(recorded, 7, origin)
+    with pytest.raises(InputError, match=r"accerl_starts.json: is missing: nobody knows how its episodes"):
+        read_starts(tmp_path, 8, origin)
+    (tmp_path / "meta").mkdir()
+    for content in (
+        '{"starts": [["match", -1]]}',
+        '{"starts": [["match", true]]}',
+        '{"starts": [[1, 1]]}',
+        "{}",
+    ):
+        (tmp_path / STARTS).write_text(content)
+        with pytest.raises(InputError, match="1 pairs of a task and a seed"):
+            read_starts(tmp_path, 1, origin)
+
+
+def test_its_size_and_place():
+    assert sum(path.stat().st_size for path in TINY.rglob("*") if path.is_file()) < 5_000_000
+    assert not list(TINY.parent.rglob("__init__.py")), "a package here would shadow Hugging Face's datasets"
+
+
+def test_replaying_its_actions_gives_its_frames():
+    draccus = pytest.importorskip("draccus")
+    pytest.importorskip("metaworld")
+    lerobot_dataset = pytest.importorskip("lerobot.datasets.lerobot_dataset")
+    dataset = lerobot_dataset.LeRobotDataset("accerl/metaworld_tiny", root=TINY, video_backend="pyav")
+    assert (dataset.num_episodes, dataset.num_frames, dataset.fps) == (4, 365, 80)
+    sidecar = json.loads((TINY / SIDECAR).read_text())
+    world = make_world(draccus.decode(EnvConfig, sidecar["env"]))
+    observation, reward = world.reset(0, "drawer-open-v3"), 0.0
+    for index in range(dataset.meta.episodes[0]["length"]):
+        row = dataset[index]
+        # Bit-equal on the machine that recorded it; another processor or OpenGL may round differently.
+        assert np.allclose(row["observation.state"].numpy(), observation["observation.state"], atol=1e-3)
+        if index % 10 == 0:
+            stored = (row["observation.images.corner2"] * 255).round().byte().permute(1, 2, 0).numpy()
+            assert np.abs(stored - observation["observation.images.corner2"].astype(int)).mean() < 2
+        result = world.step_chunk(row["action"].numpy()[None])
+        observation, reward = result.observation, float(row["next.reward"])
+        assert result.rewards[0] == reward
+    assert result.terminated and reward == 1.0
+    world.close()

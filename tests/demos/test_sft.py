@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.demos import cached_train, sft
+from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.demos import guarded_train, sft
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig, run_sft, sft_command
 from accerl_lerobot.errors import InputError
@@ -25,6 +26,8 @@ from tests.policies.tiny import adapter_at
 from tests.rounding import assert_close
 
 ROOT = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
+HUB = DatasetConfig(repo_id="a/b")
+LOCAL = DatasetConfig(repo_id="accerl/metaworld_tiny", root=str(ROOT))
 CAMERA = "observation.images.corner2"
 TINY = SFTConfig(
     steps=2,
@@ -87,7 +90,7 @@ class Counting:
 
 def test_cached_items_are_the_stock_ones_at_every_reading():
     dataset = stock_dataset()
-    cached = cached_train.CachedDataset(dataset)
+    cached = guarded_train.CachedDataset(dataset)
     assert len(cached) == len(dataset) == 365
     for index in (0, 7, 88, 364):  # 364: a chunk that reaches beyond its episode
         for _ in range(2):
@@ -98,7 +101,7 @@ def test_cached_items_are_the_stock_ones_at_every_reading():
 
 def test_items_are_read_once_and_cannot_be_spoilt():
     dataset = Counting()
-    cached = cached_train.CachedDataset(dataset)
+    cached = guarded_train.CachedDataset(dataset)
     cached[1].clear()
     cached[1]["task"] = "mine"
     assert cached[1] == {"index": 1} and cached[2] == {"index": 2} and dataset.reads == [1, 2]
@@ -113,7 +116,7 @@ def test_image_memory_by_hand():
     meta = SimpleNamespace(
         camera_keys=["a", "b"], features={"a": {"shape": (8, 4, 3)}, "b": {"shape": (2, 2, 3)}}
     )
-    assert cached_train.item_bytes(meta) == 4 * (8 * 4 * 3 + 2 * 2 * 3)
+    assert guarded_train.item_bytes(meta) == 4 * (8 * 4 * 3 + 2 * 2 * 3)
 
 
 @pytest.mark.parametrize(
@@ -150,15 +153,14 @@ def test_what_cannot_be_cached_is_read_the_stock_way(
             )
         ),
     )
-    monkeypatch.setattr(cached_train, "MAX_BYTES", limit)
-    cached_train.main()
-    assert isinstance(got[0], cached_train.CachedDataset) == expected and got[1] == "evaluation"
+    monkeypatch.setattr(guarded_train, "MAX_BYTES", limit)
+    monkeypatch.setattr(sys, "argv", ["lerobot-train", "--cache_items=true"])
+    guarded_train.main()
+    assert isinstance(got[0], guarded_train.CachedDataset) == expected and got[1] == "evaluation"
 
 
 def test_two_steps_of_lerobot_s_trainer_give_a_checkpoint(tmp_path: Path):
-    path = run_sft(
-        TINY, "accerl/metaworld_tiny", str(ROOT), tmp_path / "sft", seed=0, texts=["Open a drawer"]
-    )
+    path = run_sft(TINY, LOCAL, tmp_path / "sft", seed=0, texts=["Open a drawer"])
     assert path == tmp_path / "sft" / "checkpoints" / "last" / "pretrained_model"
     assert "End of training" in (tmp_path / "sft.log").read_text()
     adapter = adapter_at(path)
@@ -185,7 +187,7 @@ def test_act_is_trained_as_well(tmp_path: Path):
         "pretrained_backbone_weights": None,
     } | small
     config = SFTConfig(steps=2, batch_size=4, num_threads=1, policy=policy)
-    adapter = adapter_at(run_sft(config, "accerl/metaworld_tiny", str(ROOT), tmp_path / "sft", seed=0))
+    adapter = adapter_at(run_sft(config, LOCAL, tmp_path / "sft", seed=0))
     assert adapter.policy.name == "act" and adapter.family.actions == 4
     assert adapter.policy.config.optimizer_lr == config.lr
 
@@ -197,7 +199,7 @@ def command_that(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
 def test_a_failing_trainer_raises_with_the_end_of_its_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     command_that(monkeypatch, "for i in range(40): print('line', i)\nraise SystemExit('out of disk')")
     with pytest.raises(RuntimeError) as caught:
-        run_sft(TINY, "a/b", None, tmp_path / "sft", seed=0)
+        run_sft(TINY, HUB, tmp_path / "sft", seed=0)
     message = str(caught.value)
     assert "exit code 1" in message and str(tmp_path / "sft.log") in message
     assert "line 39\n" in message and "line 20\n" not in message and "out of disk" in message
@@ -214,7 +216,7 @@ def test_progress_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     ]
     command_that(monkeypatch, f"print({chr(10).join(lines)!r})")
     seen: list[tuple[int, float]] = []
-    run_sft(TINY, "a/b", None, tmp_path / "sft", seed=0, on_step=lambda step, loss: seen.append((step, loss)))
+    run_sft(TINY, HUB, tmp_path / "sft", seed=0, on_step=lambda step, loss: seen.append((step, loss)))
     assert seen[:2] == [(25, 1.25), (2000, 0.5)]
     assert seen[2][0] == 1_000_000 and np.isnan(seen[2][1]) and len(seen) == 3
 
@@ -231,7 +233,7 @@ def test_an_interrupted_caller_takes_the_trainer_along(tmp_path: Path, monkeypat
 
     started = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
-        run_sft(TINY, "a/b", None, tmp_path / "sft", seed=0, on_step=interrupt)
+        run_sft(TINY, HUB, tmp_path / "sft", seed=0, on_step=interrupt)
     assert time.monotonic() - started < 300, "it was not waited for"
     with pytest.raises(ProcessLookupError):
         os.kill(seen[0], 0)
@@ -239,13 +241,18 @@ def test_an_interrupted_caller_takes_the_trainer_along(tmp_path: Path, monkeypat
 
 def test_an_existing_folder_is_never_touched(tmp_path: Path):
     with pytest.raises(InputError, match="^output_dir=.*the folder exists"):
-        run_sft(TINY, "a/b", None, tmp_path, seed=0)
+        run_sft(TINY, HUB, tmp_path, seed=0)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_the_command_line(tmp_path: Path):
-    command = sft_command(TINY, "a/b", "/data", tmp_path / "sft", 3, "cpu", "v1")
-    assert command[:3] == [sys.executable, "-m", "accerl_lerobot.demos.cached_train"]
+    command = sft_command(
+        TINY, DatasetConfig(repo_id="a/b", root="/data", revision="v1"), tmp_path / "sft", 3, "cpu"
+    )
+    assert (
+        command[:3] == [sys.executable, "-m", "accerl_lerobot.demos.guarded_train"]
+        and "--cache_items=true" in command
+    )
     for argument in (
         "--policy.type=smolvla",
         "--policy.resize_imgs_with_padding=[32, 32]",
@@ -266,8 +273,8 @@ def test_the_command_line(tmp_path: Path):
     start.mkdir()
     (start / "config.json").write_text('{"type": "smolvla"}')
     config = SFTConfig(steps=2, init_path=str(start), cache=False, extra_args=["--log_freq=1"])
-    command = sft_command(config, "a/b", None, tmp_path / "sft", 0, "cuda")
-    assert command[2] == "accerl_lerobot.demos.guarded_train" and f"--policy.path={start}" in command
+    command = sft_command(config, HUB, tmp_path / "sft", 0, "cuda")
+    assert "--cache_items=true" not in command and f"--policy.path={start}" in command
     assert command[-1] == "--log_freq=1"
     assert not [a for a in command if a.startswith(("--policy.type", "--dataset.root", "--dataset.revision"))]
 
@@ -278,21 +285,19 @@ def test_the_command_line(tmp_path: Path):
 )
 def test_a_preset_gets_only_what_it_has(tmp_path: Path, kind: str, schedule: set[str]):
     start = SFTConfig(steps=9, policy={"type": kind})
-    command = sft_command(start, "a/b", None, tmp_path / "sft", 0, "cpu")
+    command = sft_command(start, HUB, tmp_path / "sft", 0, "cpu")
     assert "--policy.optimizer_lr=0.001" in command
     assert {a for a in command if "scheduler" in a} == schedule
     assert not [a for a in command if "pretrained_backbone_weights" in a], "a new policy's own choice"
     (tmp_path / "config.json").write_text(json.dumps({"type": kind}))
-    command = sft_command(
-        SFTConfig(steps=9, init_path=str(tmp_path)), "a/b", None, tmp_path / "sft", 0, "cpu"
-    )
+    command = sft_command(SFTConfig(steps=9, init_path=str(tmp_path)), HUB, tmp_path / "sft", 0, "cpu")
     assert "--policy.pretrained_backbone_weights=null" in command, "the checkpoint replaces them"
 
 
 @pytest.mark.parametrize(
     ("stored", "sentence"),
     [
-        (None, "sft.init_path=.*: no config.json in a folder of that name, and not loadable from the Hub"),
+        (None, "sft.init_path=.*: config.json: is missing; give the whole folder"),
         ({"type": "gaussian_actor"}, "sft.init_path='gaussian_actor': only LeRobot's SAC trains it"),
         ({"type": "mine"}, "sft.init_path='mine': LeRobot has act, "),
     ],
@@ -301,7 +306,7 @@ def test_a_start_that_cannot_be_fine_tuned(tmp_path: Path, stored: dict | None, 
     if stored is not None:
         (tmp_path / "config.json").write_text(json.dumps(stored))
     with pytest.raises(InputError, match=f"^{sentence}"):
-        sft_command(SFTConfig(steps=1, init_path=str(tmp_path)), "a/b", None, tmp_path / "sft", 0, "cpu")
+        sft_command(SFTConfig(steps=1, init_path=str(tmp_path)), HUB, tmp_path / "sft", 0, "cpu")
 
 
 def test_a_moved_checkpoint_is_started_from_a_copy(
@@ -320,12 +325,10 @@ def test_a_moved_checkpoint_is_started_from_a_copy(
         return [sys.executable, "-c", ""]
 
     monkeypatch.setattr(sft, "sft_command", command)
-    run_sft(SFTConfig(steps=1, init_path=str(start)), "a/b", None, tmp_path / "one" / "sft", seed=0)
+    run_sft(SFTConfig(steps=1, init_path=str(start)), HUB, tmp_path / "one" / "sft", seed=0)
     shutil.move(start, tmp_path / "moved")
     before = (tmp_path / "moved" / "config.json").read_text()
-    run_sft(
-        SFTConfig(steps=1, init_path=str(tmp_path / "moved")), "a/b", None, tmp_path / "two" / "sft", seed=0
-    )
+    run_sft(SFTConfig(steps=1, init_path=str(tmp_path / "moved")), HUB, tmp_path / "two" / "sft", seed=0)
     assert seen == [str(start), str(tmp_path / "two" / "init")]
     assert (tmp_path / "moved" / "config.json").read_text() == before
     copied = (tmp_path / "two" / "init" / "config.json").read_text()

@@ -125,10 +125,10 @@ def main(seed: int, scratch: Path, times: int) -> dict[str, Any]:
     from huggingface_hub.utils import _http
 
     from accerl_lerobot.config.parsing import consents, read_recipe
-    from accerl_lerobot.hub import pull, trouble
-    from accerl_lerobot.hub.config import PullConfig
+    from accerl_lerobot.hub import errors, pull
+    from accerl_lerobot.hub.artifact_types import PullConfig
 
-    trouble.WINDOW_S, trouble.SILENT_S, trouble.SLOWEST = 0.5, 2.0, 1000
+    errors.WINDOW_S, errors.SILENT_S, errors.SLOWEST = 0.5, 2.0, 1000
     constants.HF_HUB_ETAG_TIMEOUT = constants.HF_HUB_DOWNLOAD_TIMEOUT = 2
     constants.HF_HUB_CACHE = str(scratch / "cache")
     constants.HF_HUB_OFFLINE, constants.HF_HUB_DISABLE_XET = False, True

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of a folder that go to the Hub, and the facts about the run around it."""
+"""Files of a folder that go to the Hub, and the facts about the run provenance it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.hub.around import look_around
-from accerl_lerobot.hub.contents import contents
+from accerl_lerobot.hub.card import find_provenance
+from accerl_lerobot.hub.push import contents
 from tests.hub.folders import SUMMARY, write_json, write_policy_folder, write_run_folder
 
 TOKENIZER = {"registry_name": "tokenizer_processor", "config": {"tokenizer_name": "x"}}
@@ -30,7 +30,7 @@ def test_of_a_run_go_its_results_and_the_last_checkpoint(tmp_path: Path):
     for name in ("nowhere", "..", "../run"):
         with pytest.raises(InputError, match="include"):
             contents(run, "run", [name])
-    with pytest.raises(InputError, match="a policy is pushed whole"):
+    with pytest.raises(InputError, match="a policy is pushed completely"):
         contents(run / last / "pretrained_model", "policy", ["demos"])
 
 
@@ -86,14 +86,14 @@ def test_names_on_the_hub_stay(tmp_path: Path):
 
 def test_numbers_go_only_with_the_policy_they_are_of(tmp_path: Path):
     run = write_run_folder(tmp_path / "run")
-    last = look_around(run / "checkpoints" / "last" / "pretrained_model", "policy", None)
+    last = find_provenance(run / "checkpoints" / "last" / "pretrained_model", "policy", None)
     assert last.summary == SUMMARY and last.recipe["algorithm"] == {"type": "gipo"}
     assert set(last.files) == {
         f"accerl_run/{n}" for n in ("config.yaml", "summary.json", "success_curve.png", "before_after.mp4")
     }
-    earlier = look_around(run / "checkpoints" / "000006" / "pretrained_model", "policy", None)
+    earlier = find_provenance(run / "checkpoints" / "000006" / "pretrained_model", "policy", None)
     assert earlier.summary == {} and set(earlier.files) == {"accerl_run/config.yaml"}
-    alone = look_around(write_policy_folder(tmp_path / "alone"), "policy", None)
+    alone = find_provenance(write_policy_folder(tmp_path / "alone"), "policy", None)
     assert not alone.recipe and not alone.files
 
 
@@ -102,11 +102,11 @@ def test_an_evaluation_is_of_this_policy_or_refused(tmp_path: Path):
     policy = run / "checkpoints" / "000006" / "pretrained_model"
     found = {"success": 0.5, "n": 10, "ci95": [0.2366, 0.7634], "tasks": {}, "policy": str(policy)}
     write_json(tmp_path / "eval" / "evaluation.json", found)
-    around = look_around(policy, "policy", str(tmp_path / "eval"))
-    assert around.evaluation == found and "accerl_run/evaluation.json" in around.files
+    provenance = find_provenance(policy, "policy", str(tmp_path / "eval"))
+    assert provenance.evaluation == found and "accerl_run/evaluation.json" in provenance.files
     with pytest.raises(InputError, match="of another policy"):
-        look_around(run / "checkpoints" / "000012" / "pretrained_model", "policy", str(tmp_path / "eval"))
-    with pytest.raises(InputError, match="not what accerl eval writes"):
-        look_around(policy, "policy", str(tmp_path))
+        find_provenance(run / "checkpoints" / "000012" / "pretrained_model", "policy", str(tmp_path / "eval"))
+    with pytest.raises(InputError, match="not a file of accerl eval"):
+        find_provenance(policy, "policy", str(tmp_path))
     with pytest.raises(InputError, match="only a policy is evaluated"):
-        look_around(tmp_path, "dataset", str(tmp_path / "eval"))
+        find_provenance(tmp_path, "dataset", str(tmp_path / "eval"))

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.hub.config import PullConfig, PushConfig
-from accerl_lerobot.hub.kinds import read_json, recognise, repo_type
+from accerl_lerobot.hub.artifact_types import PullConfig, PushConfig, read_json, recognise, repo_type
 from tests.hub.folders import write_json, write_policy_folder, write_run_folder
 
 TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
@@ -31,28 +30,30 @@ def test_kinds(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "name", ["model.safetensors", "policy_preprocessor.json", "policy_postprocessor.json"]
+    ("artifact", "missing"),
+    [
+        ("policy", "model.safetensors"),
+        ("policy", "policy_preprocessor.json"),
+        ("policy", "policy_postprocessor.json"),
+        ("run", "summary.json"),
+        ("dataset", "meta/tasks.parquet"),
+    ],
 )
-def test_a_policy_that_is_not_whole(tmp_path: Path, name: str):
-    (write_policy_folder(tmp_path / "policy") / name).unlink()
-    with pytest.raises(InputError, match=f"looks like a policy but lacks {name}"):
-        recognise(tmp_path / "policy")
+def test_an_incomplete_folder_says_what_it_lacks(tmp_path: Path, artifact: str, missing: str):
+    write = {"policy": write_policy_folder, "run": write_run_folder, "dataset": copy_dataset}[artifact]
+    (write(tmp_path / "folder") / missing).unlink()
+    with pytest.raises(InputError, match=f"looks like a {artifact} but lacks {missing}"):
+        recognise(tmp_path / "folder")
 
 
-def test_a_run_that_is_not_over(tmp_path: Path):
-    (write_run_folder(tmp_path / "run") / "summary.json").unlink()
-    with pytest.raises(InputError, match="looks like a run but lacks summary.json"):
-        recognise(tmp_path / "run")
+def copy_dataset(folder: Path) -> Path:
+    return Path(shutil.copytree(TINY, folder))
 
 
-def test_a_dataset_that_is_not_whole_or_old(tmp_path: Path):
-    shutil.copytree(TINY, tmp_path / "dataset")
-    info = tmp_path / "dataset" / "meta" / "info.json"
+def test_an_old_dataset(tmp_path: Path):
+    info = copy_dataset(tmp_path / "dataset") / "meta" / "info.json"
     info.write_text(info.read_text().replace("v3.0", "v2.1"))
     with pytest.raises(InputError, match=r"version v2\.1; convert it to v3\.0"):
-        recognise(tmp_path / "dataset")
-    shutil.rmtree(tmp_path / "dataset" / "meta" / "episodes")
-    with pytest.raises(InputError, match="looks like a dataset but lacks meta/episodes"):
         recognise(tmp_path / "dataset")
 
 
@@ -82,13 +83,13 @@ def test_what_is_no_name_of_a_repository(name: str | None):
 
 
 def test_other_fields_are_checked():
-    with pytest.raises(InputError, match="name the folder to push"):
+    with pytest.raises(InputError, match="the name of the folder to push"):
         PushConfig(repo_id="a/b")
-    with pytest.raises(InputError, match="name the folder to create"):
+    with pytest.raises(InputError, match="the name of a folder to create"):
         PullConfig(repo_id="a/b")
     with pytest.raises(InputError, match="repo_type='space': use model or dataset"):
         PullConfig(repo_id="a/b", output_dir="x", repo_type="space")
-    with pytest.raises(InputError, match="say something"):
+    with pytest.raises(InputError, match="use some text or null"):
         PushConfig(path="x", repo_id="a/b", message=" ")
 
 

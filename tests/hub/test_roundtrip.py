@@ -19,7 +19,6 @@ from safetensors.torch import load_file
 
 from accerl_lerobot import cli
 from accerl_lerobot.checkpoint.layout import defect, save_checkpoint
-from accerl_lerobot.demos.sft import SFTConfig, sft_command
 from accerl_lerobot.engine.config import LaunchConfig, encode
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
@@ -174,18 +173,6 @@ def test_a_run_that_was_pulled_can_be_gone_on_with(
     weights.write_bytes(weights.read_bytes()[:-1] + b"x")
     assert cli.main(["push", f"--path={tmp_path / 'pulled'}", "--repo_id=alice/run"]) == 2
     assert hub.files("alice/run") == uploaded, "what is broken is not pushed"
-
-
-def test_fine_tuning_one_with_its_own_backbone_wants_a_folder(hub: HubServer, run: Path, tmp_path: Path):
-    accerl("push", f"--path={run / LAST}", "--repo_id=alice/policy")
-    accerl("pull", "--repo_id=alice/policy", f"--output_dir={tmp_path / 'pulled'}")
-
-    def command(path: str) -> list[str]:
-        return sft_command(SFTConfig(steps=1, init_path=path), "a/b", None, tmp_path / "sft", 0, "cpu")
-
-    with pytest.raises(InputError, match="accerl pull it, and name that"):
-        command("alice/policy")
-    assert f"--policy.path={tmp_path / 'pulled'}" in command(str(tmp_path / "pulled"))
 
 
 def test_a_policy_that_is_not_there_is_an_error_of_one_line(hub: HubServer):

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.checkpoint.layout import BACKBONE, PRETRAINED
+from accerl_lerobot.config.dataset import DatasetConfig
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig, run_sft, sft_command
 from accerl_lerobot.engine.preflight import check_sft_policy
@@ -296,11 +297,13 @@ def test_where_lerobot_finds_the_type(path: Path, tmp_path: Path):
     # What `lerobot-eval --policy.path` makes of the flag: an override of the checkpoint's config.
     override = [flag.replace("--policy.", "--")]
     assert PreTrainedConfig.from_pretrained(path, cli_overrides=override).num_bins == BINS
-    new = sft_command(SFT, "a/b", None, tmp_path / "sft", 0, "cpu")
+    new = sft_command(SFT, DatasetConfig(repo_id="a/b"), tmp_path / "sft", 0, "cpu")
     assert flag in new and "--policy.type=smolvla_bins" in new
     further = SFTConfig(steps=1, init_path=str(path))
-    assert flag in sft_command(further, "a/b", None, tmp_path / "sft", 0, "cpu")
-    assert flag not in sft_command(SFTConfig(steps=1), "a/b", None, tmp_path / "sft", 0, "cpu")
+    assert flag in sft_command(further, DatasetConfig(repo_id="a/b"), tmp_path / "sft", 0, "cpu")
+    assert flag not in sft_command(
+        SFTConfig(steps=1), DatasetConfig(repo_id="a/b"), tmp_path / "sft", 0, "cpu"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -308,8 +311,9 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[
     """A checkpoint of LeRobot's own trainer, in a process of its own, and its loss on the way."""
     losses: list[tuple[int, float]] = []
     output = tmp_path_factory.mktemp("sft") / "sft"
+    dataset = DatasetConfig(repo_id="accerl/metaworld_tiny", root=str(DATASET))
     path = run_sft(
-        SFT, "accerl/metaworld_tiny", str(DATASET), output, seed=0, texts=["Open a drawer"],
+        SFT, dataset, output, seed=0, texts=["Open a drawer"],
         on_step=lambda step, loss: losses.append((step, loss)),
     )  # fmt: skip
     return path, losses

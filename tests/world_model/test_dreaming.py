@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from accerl_lerobot.demos.dataset_files import open_metadata
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.demos.sft import SFTConfig
-from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.engine.config import DatasetConfig, RunConfig
 from accerl_lerobot.engine.dreaming import check_imagination, make_imagination, make_learner
 from accerl_lerobot.engine.preflight import check_start

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from accerl_lerobot import cli
+from accerl_lerobot.demos.dataset_files import open_metadata
 from accerl_lerobot.demos.record import DemosConfig, record_demos
-from accerl_lerobot.demos.windows import open_metadata
 from accerl_lerobot.engine.config import DatasetConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
