@@ -173,12 +173,12 @@ def comparison_page(runs: Sequence[Run], now: float) -> dict[str, Any]:
     names = [name if names.count(name) == 1 else str(run.path) for name, run in zip(names, runs, strict=True)]
     each = dict(zip(names, runs, strict=True))
     rows = [(name, *map(shown, values)) for name, values in apart([run.config for run in runs])]
-    differ = ("Fields that are not the same in all of them", ("field", *names), rows)
+    tables = [("Fields that are not the same in all of them", ("field", *names), rows)] if rows else []
     depths = {name: (run.result or {}).get("depths", []) for name, run in each.items()}
     sections = [
         Section("Runs", tables=[(_run_table if trained else _check_table)(each, now)]),
         Section("Curves", charts=_curves(each) if trained else _side_by_side(depths)),
-        Section("Differences", "" if rows else "Their recipes are the same.", tables=[differ][: len(rows)]),
+        Section("Differences", "" if rows else "Their recipes are the same.", tables=tables),
     ]
     return {
         "title": f"{len(runs)} runs",
@@ -446,7 +446,7 @@ def _world_model_sections(run: Run) -> list[Section]:
     every, text = every_source(found) if found else [], ""
     if found:
         text = f"{count(sum(one['trials'] for one in every), 'rollout')}"
-        if all("episodes" in one for one in every):
+        if all(one.get("episodes") for one in every):
             text += f" on {count(sum(one['episodes'] for one in every), 'episode')} it had not learned from"
         text += ", each imagined from a real frame on, with the actions really made, and with others."
     sources = {str(one.get("name")): one["depths"] for one in every}
@@ -458,12 +458,14 @@ def _world_model_sections(run: Run) -> list[Section]:
         depths = found.get("depths", [])
         series = [estimates(depths, key, label, i) for i, (key, label) in enumerate(metrics.items())]
         by_depth.append(Chart(title, note, DEPTH, series, **options))
-    table = ("The same on episodes of each source", ("", *sources), rows)
-    several = compared(found)
+    by_source = Section("By source")
+    if compared(found):
+        table = ("The same on episodes of each source", ("", *sources), rows)
+        by_source = Section("By source", tables=[table], charts=_side_by_side(sources))
     return [
         Section("Held-out evaluation", text, tables=_checks("Checks it had to pass", checks)),
         Section("By depth", charts=by_depth),
-        Section("By source", tables=[table][:several], charts=_side_by_side(sources) if several else ()),
+        by_source,
         Section("Learning", charts=_loss_charts(run)),
     ]
 
@@ -473,7 +475,8 @@ def estimates(depths: Sequence[Record], key: str, name: str, colour: int) -> Ser
     x, plain = column(depths, "depth"), column(depths, key)
     if np.isfinite(plain).any():
         return line(name, x, plain, colour)
-    y, low, high = (column([d.get(key) or {} for d in depths], end) for end in ("value", "low", "high"))
+    parts = [d[key] if isinstance(d.get(key), dict) else {} for d in depths]
+    y, low, high = (column(parts, end) for end in ("value", "low", "high"))
     low, high = (np.where(np.isfinite(end), end, y) for end in (low, high))
     x, y, low, high = (values[np.isfinite(y)] for values in (x, y, low, high))
     return Series(name, x, y, colour, low, high, points=True)
@@ -535,7 +538,7 @@ def _world_model_tiles(found: Record) -> list[tuple[str, str, str]]:
     if auroc := (found.get("outcomes") or {}).get("auroc"):
         value, low, high = (number(auroc.get(key), 3) for key in ("value", "low", "high"))
         tiles.append(("AUROC of outcomes", value, f"[{low}, {high}]"))
-    return tiles + [("learning", duration(found["seconds"]), "")] if "seconds" in found else tiles
+    return tiles + [("learning", duration(found["seconds"]), "")] if found.get("seconds") else tiles
 
 
 def _run_table(runs: Mapping[str, Run], now: float) -> Table:

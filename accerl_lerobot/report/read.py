@@ -34,18 +34,24 @@ COUNTERS = ("env_steps", "decisions", "episodes")
 NUMBER = (int, float)
 SUMMARY_SCHEMA: Schema = {
     "success_after": NUMBER, "ci95_after": [NUMBER, NUMBER], "n_after": NUMBER, "success_before": NUMBER,
-    "ci95_before": [NUMBER, NUMBER], "env_steps": NUMBER, "wall_s": NUMBER, "seed": NUMBER,
+    "ci95_before": [NUMBER, NUMBER], "env_steps": NUMBER, "wall_s": NUMBER, "seed": NUMBER, "tasks": [str],
+    "episodes": NUMBER, "updates": NUMBER, "warm_start_s": NUMBER, "rl_s": NUMBER,
 }  # fmt: skip
 TRIAL_SCHEMA: Schema = {
     "passed": bool,
     "trials": NUMBER,
+    "episodes": NUMBER,
+    "seconds": NUMBER,
     "gates": {"*": {"value": (*NUMBER, type(None)), "wanted": object, "holds": bool}},
     "depths": [{"depth": NUMBER}],
 }
 TRIAL_SCHEMA["sources"] = {"*": {"name": str, **TRIAL_SCHEMA}}
 RATE: Schema = {"success": NUMBER, "ci95": [NUMBER, NUMBER], "n": NUMBER}
 EVALUATION_SCHEMA: Schema = {**RATE, "env_steps": NUMBER, "steps_mean": NUMBER, "tasks": {"*": RATE}}
-OPTIONAL = ("success_before", "ci95_before", "sources", "tasks")
+OPTIONAL = (
+    "success_before", "ci95_before", "sources", "tasks", "episodes", "updates", "warm_start_s", "rl_s",
+    "seconds",
+)  # fmt: skip
 """Fields that may be null or missing."""
 VERBS = {
     "train": {"algorithm", "trainer"},
@@ -109,7 +115,7 @@ class Run:
         return [
             {"group": when, **{key: result.get(f"{key}_{when}") for key in ("success", "ci95", "n")}}
             for when in ("before", "after")
-            if result.get(f"success_{when}") is not None
+            if result.get(f"success_{when}") is not None and result.get(f"ci95_{when}") is not None
         ]
 
     @property

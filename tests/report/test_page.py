@@ -412,19 +412,16 @@ class TestPlace:
         (tmp_path / "other" / "summary.json").rename(folder / "summary.json")
         assert "finished" in page_of(folder).text
 
-    def test_no_such_place(self, tmp_path: Path) -> None:
-        folder = write_run(tmp_path / "run")
-        with pytest.raises(InputError, match="there is no folder"):
-            page_of(folder, output=str(tmp_path / "nowhere" / "page.html"))
-        with pytest.raises(InputError, match="a folder; name a file in it"):
-            page_of(folder, output=str(tmp_path))
-
-    def test_several_runs_make_a_page_here(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_no_such_place(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         runs = [write_run(tmp_path / name) for name in ("a", "b")]
+        with pytest.raises(InputError, match="there is no folder"):
+            page_of(runs[0], output=str(tmp_path / "nowhere" / "page.html"))
+        with pytest.raises(InputError, match="a folder; name a file in it"):
+            page_of(runs[0], output=str(tmp_path))
         (tmp_path / "here").mkdir()
         monkeypatch.chdir(tmp_path / "here")
         page_of(*runs)
-        assert (tmp_path / "here" / "report.html").is_file()
+        assert (tmp_path / "here" / "report.html").is_file(), "several runs make a page here"
 
     def test_runs_of_different_kinds(self, tmp_path: Path) -> None:
         runs = write_run(tmp_path / "a"), write_world_model(tmp_path / "b")
