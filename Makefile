@@ -41,7 +41,6 @@ quickstart: setup
 	@echo "TensorBoard: .venv/bin/tensorboard --logdir $(RUN)/tensorboard"
 
 test: setup
-	@.ci/browser
 	.venv/bin/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 check: lint format-check types

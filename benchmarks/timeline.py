@@ -24,7 +24,6 @@ from accerl_lerobot.bench.host import host, spread
 from accerl_lerobot.config.ranges import Range, Repeats, Section
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.timeline.clock import Clock, NoClock
-from accerl_lerobot.timeline.parts import Parts
 from accerl_lerobot.timeline.states import COMPUTE, WAIT_IN
 
 ON, OFF, FLOOR = "on", "off", "floor"
@@ -63,7 +62,7 @@ def bench_timeline(config: BenchTimelineConfig) -> dict[str, Any]:
     before = host()
     blocks: dict[str, list[float]] = {ON: [], OFF: [], FLOOR: []}
     with tempfile.TemporaryDirectory(dir=config.folder) as folder:
-        clock, none = Clock(Parts(Path(folder), "bench")), NoClock()
+        clock, none = Clock(Path(folder), "bench"), NoClock()
         for name in (*blocks, *config.repeats * (*blocks, *reversed(blocks))):
             if name == FLOOR:
                 seconds = _ask(config.entries)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A training engine, measured a block at a time."""
+"""Measurement of a running training engine, one block of time after another."""
 
 from __future__ import annotations
 
@@ -29,33 +29,26 @@ class Block:
     seconds: float
     updates: int
     decisions_per_s: float
-    """Learned from, repetitions included."""
+    """Decisions learned from, repetitions included."""
     env_steps_per_s: float
     lag_mean: float
     lag_max: float
     trainer_waits: float
-    """Share of its time in which the trainer had no batch: its bubble."""
+    """Share of its time in which the trainer had no batch."""
     publishing: float
-    """Share of its time in which it handed over weights."""
+    """Share of its time in which it published weights."""
     batch_size: float
-    """Observations decided for together."""
+    """Observations of a forward pass."""
     request_wait_ms: float
-    """From the arrival of a request to its forward pass, on average."""
+    """Mean time from the arrival of a request to its forward pass."""
     inference_busy: float
-    """Share of its time that the service decided."""
+    """Share of its time in which the inference worker decided."""
     processors: float
-    """How busy all cores were, whoever used them."""
+    """Busy share of all cores, whoever used them."""
 
 
 class Measured:
-    """An engine that has begun to train; ``with`` it, or close it.
-
-    Args:
-        config: the run.
-        tasks: the training tasks.
-        history: env steps that an observation holds.
-        load: see `RayEngine`.
-    """
+    """An engine that has begun to train, as a context manager; for the arguments see `RayEngine`."""
 
     def __init__(
         self, config: RunConfig, tasks: tuple[str, ...], history: int = 1, load: Load | None = None
@@ -66,7 +59,7 @@ class Measured:
         from accerl_lerobot.engine.launch import RayEngine
 
         self.engine = RayEngine(config, tasks, history, load=load)
-        # What is collected once is learned from so often: a block has whole rounds of it.
+        # Each decision is learned from so often: a block has whole rounds of updates.
         self._round = math.ceil(config.replay.samples_per_insert)
         self.engine.train()
 
@@ -79,7 +72,7 @@ class Measured:
     def block(self, schedule: Schedule, seconds: float) -> Block:
         """Measures at least so many seconds of a schedule, in whole updates, after a change has settled."""
         self.engine.follow(schedule)
-        self._updates(1, 0.0)  # what was made before is heard first
+        self._updates(1, 0.0)  # updates made before are reported first
         self._updates(SETTLE + self._round, 0.0)
         processors, first, started = Processors(), self.engine.poll(), time.perf_counter()
         updates, polls = self._updates(1, seconds)
@@ -117,9 +110,7 @@ class Measured:
             if len(whole) >= count and sum(_seconds(u) for u in whole) >= seconds:
                 return whole, polls
             if progress.done:
-                raise RuntimeError(
-                    "the run that was to be measured has ended: it learns from a number of episodes only"
-                )
+                raise RuntimeError("the measured run has ended: its number of episodes is limited")
 
 
 def as_rows(blocks: list[Block]) -> list[dict[str, Any]]:
@@ -132,8 +123,7 @@ def _seconds(update: dict[str, float]) -> float:
 
 
 def _observations(inference: dict[str, float]) -> int:
-    """Counts the observations of all requests so far; each has one. A count again, which a mean times its
-    divisor is not always."""
+    """Requests so far; rounded, as a mean times its divisor need not be whole."""
     return round(inference["batches"] * inference["batch_size_mean"])
 
 

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The machine of a measurement: its parts, how busy it was, and the best they can do."""
+"""The machine of a measurement: its parts, how busy it was, its floors; and timing and memory of models."""
 
 from __future__ import annotations
 
 import os
 import platform
+import resource
 import statistics
 import time
+from collections.abc import Callable
 from importlib.metadata import version
 from typing import Any
 
@@ -29,8 +31,7 @@ def host() -> dict[str, Any]:
 
 
 def floors() -> dict[str, float]:
-    """Lower bounds of all measurements here: copying memory, waking up, a byte through a pipe and back in
-    one thread."""
+    """Lower bounds of all measurements: copying memory, waking up, a byte through a pipe and back."""
     source = np.ones(MEMCPY_BYTES, np.uint8)
     target = np.empty_like(source)
     copies = [_seconds(lambda: np.copyto(target, source)) for _ in range(9)][1:]
@@ -49,7 +50,7 @@ def floors() -> dict[str, float]:
 
 
 class Processors:
-    """How busy all cores are, whoever uses them, since the last question."""
+    """Busy share of all cores since the last question, whoever uses them."""
 
     def __init__(self) -> None:
         self._last = psutil.cpu_times()
@@ -77,3 +78,43 @@ def _seconds(work: Any) -> float:
     started = time.perf_counter()
     work()
     return time.perf_counter() - started
+
+
+def timed(work: Callable[[], Any], repeats: int, device: Any) -> dict[str, Any]:
+    """Seconds that some work takes on a torch device, after a first time that does not count."""
+    import torch
+
+    seconds = []
+    for _ in range(repeats + 1):
+        started = time.perf_counter()
+        work()
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+        seconds.append(time.perf_counter() - started)
+    counted = seconds[1:]
+    return {"median": statistics.median(counted), "min": min(counted), "max": max(counted), "all": counted}
+
+
+class Memory:
+    """Peak memory of a torch device, in GB, at moments that have a name."""
+
+    def __init__(self, device: Any) -> None:
+        self.device = device
+        self.notes: dict[str, float] = {}
+
+    def note(self, stage: str) -> None:
+        """The peak since the last moment; on a CPU, of the whole process since it began."""
+        import torch
+
+        if self.device.type == "cuda":
+            self.notes[stage] = torch.cuda.max_memory_allocated() / 1e9
+            torch.cuda.reset_peak_memory_stats()
+        else:
+            self.notes[stage] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
+
+
+def device_name(device: Any) -> str:
+    """Name of the GPU, or cpu."""
+    import torch
+
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"

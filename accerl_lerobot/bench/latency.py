@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long a world takes from a decision to its next observation, and to reset.
+"""Time of an environment from a decision to its next observation, and of a reset, under random actions.
 
     accerl bench latency --env.type=metaworld --env.task=door-open-v3
     python -m benchmarks async_vs_sync --traces='[outputs/latency/trace.txt]'
 
-Random actions are played. The second command says what asynchrony gains where many worlds take turns at these
-durations, each from another moment on; they reset together, as episodes of equal length do.
+The second command measures what asynchrony gains where many environments take these times.
 """
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -26,7 +25,6 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, World, make_world
 from accerl_lerobot.envs.simulated import RESET
 from accerl_lerobot.errors import output_folder
-from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.seeds import train_seed
 
 TRACE = "trace.txt"
@@ -38,15 +36,15 @@ class BenchLatencyConfig(Section):
     """Fields of ``accerl bench latency``."""
 
     env: EnvConfig = field(default_factory=MetaWorldConfig)
-    """Any world."""
+    """Any environment."""
     chunk: Annotated[int, Range("[1, 100000]")] = 10
     """Actions per decision."""
     decisions: Annotated[int, Range("[2, 1000000000]")] = 600
-    """Timed; more than an episode has, or no reset is."""
+    """Decisions that are timed; a reset is timed where an episode ends among them."""
     seed: Seed = 0
     """Seed of the actions and episodes."""
     output_dir: str = "outputs/latency"
-    """Folder for trace.txt (a duration on each line), latency.json, .md and .png."""
+    """Folder for trace.txt (a duration on each line), latency.json and .md."""
 
 
 def bench_latency(config: BenchLatencyConfig) -> dict[str, Any]:
@@ -65,9 +63,7 @@ def bench_latency(config: BenchLatencyConfig) -> dict[str, Any]:
         tasks = ", ".join(world.spec.tasks)
     finally:
         world.close()
-    decisions, resets = (
-        np.asarray([s for s, is_reset in lines if is_reset is kind]) for kind in (False, True)
-    )
+    decisions, resets = (np.asarray([s for s, reset in lines if reset is kind]) for kind in (False, True))
     one, other = decisions[:-1], decisions[1:]
     varied = len(one) > 1 and one.std() > 0 and other.std() > 0
     result = {
@@ -78,47 +74,42 @@ def bench_latency(config: BenchLatencyConfig) -> dict[str, Any]:
         "config": asdict(config),
         "host": host(),
     }
-    text = "".join(f"{RESET + ' ' if is_reset else ''}{1000 * s:.4f}\n" for s, is_reset in lines)
+    text = "".join(f"{RESET + ' ' if reset else ''}{1000 * s:.4f}\n" for s, reset in lines)
     (root / TRACE).write_text(f"# {tasks}, chunks of {config.chunk}, ms\n{text}")
-    write(root, "latency", result, as_markdown(_COLUMNS, _rows(result)), lambda path, _: draw(path, lines))
-    console.say(f"wrote {TRACE}, latency.json, .md and .png into {root}")
+    write(root, "latency", result, as_markdown(_COLUMNS, _rows(result)))
+    console.say(f"wrote {TRACE}, latency.json and .md into {root}")
     return result
 
 
 def timed(
-    world: World, config: BenchLatencyConfig, progress: Callable[[int], object]
+    world: World, config: BenchLatencyConfig, progress: Callable[[int], Any]
 ) -> list[tuple[float, bool]]:
-    """Seconds of each decision, and where an episode ended of its reset, in their order; True: of a reset.
-
-    The first reset, in which much is built, is not timed.
-    """
+    """Seconds of each decision and each reset between episodes, in order; True marks a reset."""
     rng, spec = np.random.default_rng(config.seed), world.spec
     low, high = np.maximum(spec.action_low, -1), np.minimum(spec.action_high, 1)
     found: list[tuple[float, bool]] = []
-    episode = 0
+    episodes = itertools.count()
 
     def reset() -> None:
-        nonlocal episode
+        episode = next(episodes)
         world.reset(train_seed(config.seed, 0, episode), spec.tasks[episode % len(spec.tasks)])
-        episode += 1
 
     reset()
     for made in range(1, config.decisions + 1):
         actions = rng.uniform(low, high, (config.chunk, spec.action_dim)).astype(np.float32)
         started = time.perf_counter()
         done = world.step_chunk(actions).done
-        found.append((time.perf_counter() - started, False))
+        ended = time.perf_counter()
+        found.append((ended - started, False))
         if done:
-            started = time.perf_counter()
             reset()
-            found.append((time.perf_counter() - started, True))
+            found.append((time.perf_counter() - ended, True))
         progress(made)
     return found
 
 
 def described(seconds: np.ndarray) -> dict[str, float]:
-    """Describes durations (T,): ``mean``, ``p50``, ``p95``, ``p99`` and ``longest`` in milliseconds, ``cv``
-    (standard deviation over mean) and ``n``."""
+    """Mean, quantiles and maximum of durations (T,) in ms, coefficient of variation, and number."""
     return {
         "mean": 1000 * float(seconds.mean()),
         **{f"p{100 * q:.0f}": 1000 * float(np.quantile(seconds, q)) for q in QUANTILES},
@@ -131,17 +122,6 @@ def described(seconds: np.ndarray) -> dict[str, float]:
 def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
     return as_table("from a decision to the next observation", _COLUMNS, _rows(result))
-
-
-def draw(path: Path, lines: Sequence[tuple[float, bool]]) -> None:
-    """Each duration in its place, resets apart."""
-    with drawing(path) as axes:
-        for kind, label in ((False, "decision"), (True, "reset")):
-            shown = [(i, 1000 * s) for i, (s, is_reset) in enumerate(lines) if is_reset is kind]
-            axes.scatter([i for i, _ in shown], [ms for _, ms in shown], s=8, label=label, linewidths=0)
-        axes.set(xlabel="one after the other", ylabel="milliseconds")
-        axes.set_ylim(bottom=0)
-        axes.legend()
 
 
 _COLUMNS = ("", "mean", "p50", "p95", "p99", "longest", "CV", "how many")

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cost of a full-size policy here: memory, decisions, updates, and the rounding of its log-probs.
+"""Cost of a full-size policy: memory, seconds of decisions and updates, and the rounding of its log-probs.
 
-Weights are random, sizes those of the published checkpoint, inputs made up: nothing is downloaded. Decisions
-are made, re-scored at equal weights, and learnt from, as inference and trainer do it.
+Weights are random, sizes those of the published checkpoint, inputs generated: nothing is downloaded.
 """
 
 from __future__ import annotations
@@ -10,17 +9,19 @@ from __future__ import annotations
 import platform
 import tempfile
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from rich.table import Table
 
-from accerl_lerobot.bench.measure import Memory, device_name, timed
-from accerl_lerobot.config.ranges import Choice, Device, Range, Repeats, Section
+from accerl_lerobot.bench.host import Memory, device_name, ranged, timed
+from accerl_lerobot.bench.tables import as_table
+from accerl_lerobot.config.ranges import Device, Range, Repeats, Section
 from accerl_lerobot.policies.config import TuningConfig
 
+STATE = "observation.state"
 STATE_DIM, ACTION_DIM, TOKENS = 8, 7, 48
 """LIBERO's sizes: end-effector state, end-effector action; length of a padded instruction."""
 
@@ -29,12 +30,12 @@ STATE_DIM, ACTION_DIM, TOKENS = 8, 7, 48
 class BenchPolicyConfig(Section):
     """Fields of ``accerl bench policy``."""
 
-    type: Annotated[str, Choice(BUILDERS)] = "smolvla"
-    """smolvla, pi0 or pi05."""
+    type: Literal["smolvla", "pi0", "pi05"] = "smolvla"
+    """LeRobot's policy type."""
     cameras: Annotated[int, Range("[1, 64]")] = 2
     """Pictures in an observation."""
     batch: Annotated[int, Range("[1, 65536]")] = 8
-    """Decisions made at once, and learnt from at once."""
+    """Decisions made together, and learned from together."""
     num_steps: Annotated[int, Range("[1, 10000]")] | None = None
     """Denoising steps; None: the published 10."""
     stochastic: Literal["last", "all", "one"] = "last"
@@ -59,6 +60,7 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
     import numpy as np
     import torch
 
+    from accerl_lerobot.experience import TASK, Request
     from accerl_lerobot.policies.adapter import stack_observations
     from accerl_lerobot.policies.loading import resolve_device
 
@@ -69,7 +71,10 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
         adapter = _adapter(config, device, Path(directory))
     built = time.perf_counter() - started
     memory.note("built")
-    requests = _requests(config.batch)
+    requests = [
+        Request(observation={STATE: np.full(1, i, np.float32), TASK: "do it"}, noise_seed=i)
+        for i in range(config.batch)
+    ]
     one = timed(lambda: adapter.decide(requests[:1], 0), config.repeats, device)
     many = timed(lambda: adapter.decide(requests, 0), config.repeats, device)
     memory.note("decided")
@@ -99,52 +104,36 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
 
     updated = timed(update, config.repeats, device)
     memory.note("updated")
+    sizes = {"all": adapter.policy.parameters(), "trained": trainable.values()}
+    clipped = ((ratio > 1.2) | (ratio < 0.8)).float().mean()
+    threads, machine = torch.get_num_threads(), platform.machine()
     return {
         "config": asdict(config),
-        "parameters": {
-            "all": sum(p.numel() for p in adapter.policy.parameters()),
-            "trained": sum(p.numel() for p in trainable.values()),
-        },
+        "parameters": {name: sum(p.numel() for p in tensors) for name, tensors in sizes.items()},
         "seconds": {"build": built, "decide_one": one, "decide": many, "score": scored, "update": updated},
         "memory_gb": memory.notes,
-        "mismatch": {
-            "mean": float(gap.mean()),
-            "max": float(gap.max()),
-            "clip": float(((ratio > 1.2) | (ratio < 0.8)).float().mean()),
-        },
-        "host": {
-            "device": device_name(device),
-            "machine": platform.machine(),
-            "threads": torch.get_num_threads(),
-        },
+        "mismatch": {"mean": float(gap.mean()), "max": float(gap.max()), "clip": float(clipped)},
+        "host": {"device": device_name(device), "machine": machine, "threads": threads},
     }
 
 
 def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
     config, parameters, batch = result["config"], result["parameters"], result["config"]["batch"]
-    shown = Table(
-        title=f"{config['type']} {config['precision']}, {config['tuning']['mode']}: "
-        f"{parameters['all'] / 1e6:,.0f} M parameters, {parameters['trained'] / 1e6:,.0f} M trained, on "
-        f"{result['host']['device']}"
-    )
-    for heading in ("what", "seconds", "range", "decisions/s"):
-        shown.add_column(heading, justify="left" if heading == "what" else "right")
-    shown.add_row("build", f"{result['seconds']['build']:.1f}", "", "")
+    millions = [f"{parameters[which] / 1e6:,.0f} M" for which in ("all", "trained")]
+    title = f"{config['type']} {config['precision']}, {config['tuning']['mode']}: {millions[0]} parameters, "
+    title += f"{millions[1]} trained, on {result['host']['device']}"
+    rows = [("build", f"{result['seconds']['build']:.1f}", "")]
     for name, count in (("decide_one", 1), ("decide", batch), ("score", batch), ("update", batch)):
-        t = result["seconds"][name]
-        spread = f"{t['min']:.3f} to {t['max']:.3f}"
-        shown.add_row(f"{name} ({count})", f"{t['median']:.3f}", spread, f"{count / t['median']:.1f}")
-    for stage, size in result["memory_gb"].items():
-        shown.add_row(f"memory, {stage}", f"{size:.1f} GB", "", "")
+        seconds = result["seconds"][name]
+        rows.append((f"{name} ({count})", ranged(seconds, ".3f"), f"{count / seconds['median']:.1f}"))
+    rows += [(f"memory, {stage}", f"{size:.1f} GB", "") for stage, size in result["memory_gb"].items()]
     gap = result["mismatch"]
-    shown.add_row("mismatch at equal weights", f"{gap['mean']:.1e} nats", f"max {gap['max']:.1e}", "")
-    return shown
+    rows.append(("mismatch at equal weights", f"{gap['mean']:.1e} nats, at most {gap['max']:.1e}", ""))
+    return as_table(title, ("part", "seconds (range)", "decisions/s"), rows)
 
 
 def _adapter(config: BenchPolicyConfig, device: Any, directory: Path) -> Any:
-    from dataclasses import replace
-
     import torch
     from lerobot.policies.factory import get_policy_class
 
@@ -157,23 +146,22 @@ def _adapter(config: BenchPolicyConfig, device: Any, directory: Path) -> Any:
     from accerl_lerobot.policies.value_head import ValueHead
 
     torch.manual_seed(0)
-    lerobot_config = BUILDERS[config.type](config, directory)
-    lerobot_config.device = str(device)
+    settings = lerobot_config(config, directory)
+    settings.device = str(device)
     if config.num_steps is not None:
-        lerobot_config = replace(lerobot_config, **{str(steps_field(lerobot_config)): config.num_steps})
-    policy = get_policy_class(config.type)(lerobot_config).to(device)
+        settings = replace(settings, **{str(steps_field(settings)): config.num_steps})
+    policy = get_policy_class(config.type)(settings).to(device)
     model = imported(POLICIES[config.type][0])(policy)
     family = FlowFamily(model, FlowSamplerConfig(stochastic=config.stochastic, noise_level=0.2))
-    processing: Any = _MadeUp(config, device)
-    adapter = LeRobotAdapter(
-        policy, processing, model, family, ValueHead(model.width, ValueHeadConfig()), config.precision
-    )
+    inputs: Any = _RandomInputs(config, device)
+    critic = ValueHead(model.width, ValueHeadConfig())
+    adapter = LeRobotAdapter(policy, inputs, model, family, critic, config.precision)
     tune(policy, model, family, config.tuning)
     return adapter
 
 
-class _MadeUp:
-    """Stands where LeRobot's processors do: a preprocessed batch of random content, the same each time."""
+class _RandomInputs:
+    """Replaces LeRobot's processors: a preprocessed batch of random content, the same each time."""
 
     def __init__(self, config: BenchPolicyConfig, device: Any) -> None:
         self.config, self.device = config, device
@@ -183,13 +171,13 @@ class _MadeUp:
         import torch
 
         rows = []
-        for i in observations["observation.state"][:, 0].astype(int):
+        for i in observations[STATE][:, 0].astype(int):
             generator = torch.Generator().manual_seed(int(i))
             row = {
                 f"observation.images.camera{c}": torch.rand(3, 256, 256, generator=generator)
                 for c in range(self.config.cameras)
             }
-            row["observation.state"] = torch.randn(STATE_DIM, generator=generator)
+            row[STATE] = torch.randn(STATE_DIM, generator=generator)
             row["observation.language.tokens"] = torch.randint(1, 200, (TOKENS,), generator=generator)
             row["observation.language.attention_mask"] = torch.arange(TOKENS) < 12
             rows.append(row)
@@ -200,50 +188,19 @@ class _MadeUp:
         return chunk
 
 
-def _features(config: BenchPolicyConfig) -> dict[str, Any]:
+def lerobot_config(config: BenchPolicyConfig, directory: Path) -> Any:
+    """LeRobot's config of a policy of the published size; files that it needs go into `directory`."""
     from lerobot.configs.types import FeatureType, PolicyFeature
-
-    inputs = {
-        f"observation.images.camera{c}": PolicyFeature(type=FeatureType.VISUAL, shape=(3, 256, 256))
-        for c in range(config.cameras)
-    }
-    inputs["observation.state"] = PolicyFeature(type=FeatureType.STATE, shape=(STATE_DIM,))
-    action = PolicyFeature(type=FeatureType.ACTION, shape=(ACTION_DIM,))
-    return {"input_features": inputs, "output_features": {"action": action}, "push_to_hub": False}
-
-
-def _smolvla(config: BenchPolicyConfig, directory: Path) -> Any:
     from lerobot.policies.factory import make_policy_config
 
     from accerl_lerobot.demos.backbone import SMOLVLM2_500M, write_backbone
 
-    backbone = write_backbone(directory / "backbone", SMOLVLM2_500M)
-    return make_policy_config(
-        "smolvla",
-        **_features(config),
-        device="cpu",
-        vlm_model_name=str(backbone),
-        load_vlm_weights=False,
-        num_vlm_layers=16,
-    )
-
-
-def _pi(config: BenchPolicyConfig, directory: Path) -> Any:
-    from lerobot.policies.factory import make_policy_config
-
-    return make_policy_config(config.type, **_features(config), device="cpu")
-
-
-BUILDERS: dict[str, Callable[[BenchPolicyConfig, Path], Any]] = {"smolvla": _smolvla, "pi0": _pi, "pi05": _pi}
-"""Policy type → its LeRobot config at the published size."""
-
-
-def _requests(count: int) -> list[Any]:
-    import numpy as np
-
-    from accerl_lerobot.experience import TASK, Request
-
-    return [
-        Request(observation={"observation.state": np.full(1, i, np.float32), TASK: "do it"}, noise_seed=i)
-        for i in range(count)
-    ]
+    picture = PolicyFeature(type=FeatureType.VISUAL, shape=(3, 256, 256))
+    inputs = {f"observation.images.camera{c}": picture for c in range(config.cameras)}
+    inputs[STATE] = PolicyFeature(type=FeatureType.STATE, shape=(STATE_DIM,))
+    outputs = {"action": PolicyFeature(type=FeatureType.ACTION, shape=(ACTION_DIM,))}
+    fields: dict[str, Any] = {"input_features": inputs, "output_features": outputs, "push_to_hub": False}
+    if config.type == "smolvla":
+        backbone = write_backbone(directory / "backbone", SMOLVLM2_500M)
+        fields |= {"vlm_model_name": str(backbone), "load_vlm_weights": False, "num_vlm_layers": 16}
+    return make_policy_config(config.type, **fields, device="cpu")

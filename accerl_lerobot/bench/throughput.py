@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How fast a recipe collects and learns on this machine, under each schedule, and where everything goes.
+"""Speed of a recipe on this machine, collecting and learning, under each schedule.
 
-Real worlds, a real policy, the real engine. What is generated is accounted for: each decision is in the
-replay, was thrown away for a reason that is counted, or is under way.
+Environments, policy and engine are those of the run. Each decision is accounted for: it is in the replay
+buffer, was dropped for a reason that is counted, or is under way.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.table import Table
 
 from accerl_lerobot.bench.blocks import ARMS, Block, Measured, as_rows
@@ -66,17 +67,10 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
     from accerl_lerobot.engine.preflight import check_policy, check_world
 
     console, root = Console(), expanded(config.output_dir, "output_dir")
-    run: RunConfig = parse(
-        RunConfig,
-        [
-            f"--config_path={config.recipe}",
-            f"--policy.path={config.policy_path}",
-            "--sft.steps=0",
-            "--trainer.updates=1000000",
-            "--trainer.schedule=constant",
-        ],
-    )
-    for schedule in config.schedules:  # what cannot be under one of them is refused
+    fixed = ["--sft.steps=0", "--trainer.updates=1000000", "--trainer.schedule=constant"]
+    named = [f"--config_path={config.recipe}", f"--policy.path={config.policy_path}"]
+    run: RunConfig = parse(RunConfig, named + fixed)
+    for schedule in config.schedules:  # a recipe that one of them does not allow is refused
         replace(run, launch=replace(run.launch, schedule=schedule))
     spec = check_world(run.env)
     tasks, history = spec.tasks, check_policy(run, spec)
@@ -91,10 +85,9 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
                 stage.update(len(blocks), f"{schedule}: {blocks[-1].env_steps_per_s:.0f} env steps/s")
         progress = engine.engine.poll()
     result["books"] = books(run, progress.rollout, progress.replay)
-    result["schedules"] = {
-        name: _summed([b for b in blocks if b.schedule == name]) for name in config.schedules
-    }
-    result |= {"host_after": host()}
+    schedules = {name: [b for b in blocks if b.schedule == name] for name in config.schedules}
+    result["schedules"] = {name: _summarised(own) for name, own in schedules.items()}
+    result["host_after"] = host()
     write(root, "throughput", result, f"{_books(result)}\n\n{as_markdown(_COLUMNS, _rows(result))}", _draw)
     console.say(f"wrote throughput.json, .md and .png into {root}")
     return result
@@ -141,34 +134,32 @@ def _books(result: dict[str, Any]) -> str:
 def _rows(result: dict[str, Any]) -> list[list[str]]:
     rows = []
     for name, found in result["schedules"].items():
-        cells = [name]
-        for key in ("env_steps_per_s", "decisions_per_s"):
-            cells.append(ranged(found[key], ".0f"))
+        counts = (ranged(found[key], ".0f") for key in ("env_steps_per_s", "decisions_per_s"))
         shares = (f"{found[key]:.0%}" for key in ("trainer_waits", "inference_busy", "processors"))
-        rows.append([*cells, f"{found['updates_per_s']:.2f}", f"{found['lag_mean']:.1f}", *shares])
+        rows.append([name, *counts, f"{found['updates_per_s']:.2f}", f"{found['lag_mean']:.1f}", *shares])
     return rows
 
 
 def _draw(path: Path, result: dict[str, Any]) -> None:
-    """Draws the decisions collected and learned from, for each schedule; whiskers are ranges of blocks."""
+    """Draws env steps and decisions per second of each schedule; whiskers are ranges of blocks."""
     schedules = result["schedules"]
     with drawing(path) as axes:
-        for place, (key, label) in zip(
-            (-0.2, 0.2),
-            (("env_steps_per_s", "env steps"), ("decisions_per_s", "decisions learned from")),
-            strict=True,
+        for offset, key, label in (
+            (-0.2, "env_steps_per_s", "env steps"),
+            (0.2, "decisions_per_s", "decisions learned from"),
         ):
-            found = [schedule[key] for schedule in schedules.values()]
-            middle = [f["median"] for f in found]
-            ends = [[f["median"] - f["min"] for f in found], [f["max"] - f["median"] for f in found]]
-            axes.bar([i + place for i in range(len(found))], middle, 0.4, yerr=ends, capsize=3, label=label)
+            middle, low, high = (
+                [f[key][end] for f in schedules.values()] for end in ("median", "min", "max")
+            )
+            ends = np.abs(np.array([low, high]) - middle)
+            axes.bar(np.arange(len(middle)) + offset, middle, 0.4, yerr=ends, capsize=3, label=label)
         names = [f"{name}\ntrainer waits {f['trainer_waits']:.0%}" for name, f in schedules.items()]
         axes.set_xticks(range(len(names)), names)
         axes.set(ylabel="per second", title=Path(result["config"]["recipe"]).name)
         axes.legend()
 
 
-def _summed(blocks: list[Block]) -> dict[str, Any]:
+def _summarised(blocks: list[Block]) -> dict[str, Any]:
     median = {
         key: statistics.median(getattr(b, key) for b in blocks)
         for key in ("lag_mean", "trainer_waits", "inference_busy", "processors", "batch_size")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How fast our MetaWorld is next to LeRobot's: both step random actions, in turns, on the same machine.
+"""Speed of our MetaWorld next to LeRobot's: both step random actions, in turns, on the same machine.
 
 Three arms: ``ours`` (a picture per decision), ``ours_every_step`` (chunks of one, so a picture per step) and
 ``stock`` (LeRobot's own wrapper: 480 pixels, default lights, a picture per step). Blocks go forth and back
@@ -19,7 +19,8 @@ from typing import Annotated, Any
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot.bench.host import host, spread
+from accerl_lerobot.bench.host import host, ranged, spread
+from accerl_lerobot.bench.tables import as_table
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Section
 from accerl_lerobot.demos.writing import simulators
 from accerl_lerobot.envs.gl import import_mujoco
@@ -30,7 +31,7 @@ from accerl_lerobot.seeds import train_seed
 OURS, EVERY_STEP, STOCK = "ours", "ours_every_step", "stock"
 _ARMS = (OURS, EVERY_STEP, STOCK)
 Decide = Callable[[], int]
-"""Makes one decision's worth of steps; gives how many env steps that was."""
+"""Steps an environment for one decision and returns the number of env steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,41 +70,33 @@ def bench_world(config: BenchWorldConfig) -> dict[str, Any]:
     """
     blocks: dict[str, list[tuple[float, float]]] = {name: [] for name in _ARMS}
     with contextlib.ExitStack() as stack:
-        # A process for each arm: two OpenGL contexts in one process get in each other's way.
+        # A process for each arm: two OpenGL contexts in one process disturb each other.
         pools = {name: stack.enter_context(simulators(1, _start, name, config)) for name in _ARMS}
         for name in (*_ARMS, *config.rounds * (*_ARMS, *reversed(_ARMS))):
             blocks[name].append(pools[name].submit(_measure, config.seconds).result())
         machine = pools[OURS].submit(_host).result()
-    blocks = {
-        name: values[1:] for name, values in blocks.items()
-    }  # the first round built and warmed everything
-    rates = {
-        name: {
-            "env_steps_per_s": spread([steps for steps, _ in values]),
-            "decisions_per_s": spread([decisions for _, decisions in values]),
-        }
-        for name, values in blocks.items()
-    }
-    pairs = [ours[0] / theirs[0] for ours, theirs in zip(blocks[OURS], blocks[STOCK], strict=True)]
-    return {"config": asdict(config), "arms": rates, "ratio": spread(pairs), "host": machine}
+    arms = {}
+    for name, values in blocks.items():
+        steps, decisions = (
+            spread(list(rates)) for rates in zip(*values[1:], strict=True)
+        )  # the first: warm-up
+        arms[name] = {"env_steps_per_s": steps, "decisions_per_s": decisions}
+    ours, stock = (arms[name]["env_steps_per_s"]["blocks"] for name in (OURS, STOCK))
+    ratio = spread([own / other for own, other in zip(ours, stock, strict=True)])
+    return {"config": asdict(config), "arms": arms, "ratio": ratio, "host": machine}
 
 
 def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
     config, ratio = result["config"], result["ratio"]
-    shown = Table(
-        title=f"{config['task']}, chunk {config['chunk']}: {ratio['median']:.0f} times the env steps of "
-        f"LeRobot's world ({ratio['min']:.0f} to {ratio['max']:.0f})"
+    title = (
+        f"{config['task']}, chunk {config['chunk']}: {ranged(ratio, '.0f')} times the env steps of LeRobot's"
     )
-    for heading in ("arm", "env steps/s", "range", "decisions/s", "range"):
-        shown.add_column(heading, justify="left" if heading == "arm" else "right")
-    for name, rates in result["arms"].items():
-        cells = [name]
-        for kind in ("env_steps_per_s", "decisions_per_s"):
-            rate = rates[kind]
-            cells += [f"{rate['median']:,.1f}", f"{rate['min']:,.1f} to {rate['max']:,.1f}"]
-        shown.add_row(*cells)
-    return shown
+    rows = [
+        (name, *(ranged(rates[kind], ",.1f") for kind in ("env_steps_per_s", "decisions_per_s")))
+        for name, rates in result["arms"].items()
+    ]
+    return as_table(title, ("arm", "env steps/s (range)", "decisions/s (range)"), rows)
 
 
 _decide: Decide

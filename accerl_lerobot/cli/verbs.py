@@ -38,9 +38,9 @@ from accerl_lerobot.errors import (
 from accerl_lerobot.export.episodes import ExportConfig
 from accerl_lerobot.hub.artifact_types import PullConfig, PushConfig
 from accerl_lerobot.policies.config import Load
-from accerl_lerobot.report.config import ReportConfig
+from accerl_lerobot.report import ReportConfig, write_report
 from accerl_lerobot.rollout.runner import EpisodeResult
-from accerl_lerobot.timeline.config import TimelineConfig
+from accerl_lerobot.timeline.show import TimelineConfig, show_timelines, timeline_table
 
 NO_DATASET = "name a LeRobotDataset, on the Hub or with dataset.root"
 
@@ -161,7 +161,7 @@ def evaluate(arguments: list[str]) -> int:
     from accerl_lerobot.engine.loop import run_plans
     from accerl_lerobot.engine.preflight import check_machine
     from accerl_lerobot.evaluation.config import evaluation_plans
-    from accerl_lerobot.evaluation.summary import summarise, table
+    from accerl_lerobot.evaluation.stats import summarise, table
 
     sections = ("seed", "env", "policy", "rollout", "inference", "evaluation", "launch")
     whole = RunConfig(**{name: getattr(config, name) for name in sections})
@@ -262,8 +262,6 @@ def pull(arguments: list[str]) -> int:
 def report(arguments: list[str]) -> int:
     """``accerl report``."""
     config: ReportConfig = parse(ReportConfig, arguments)
-    from accerl_lerobot.report.page import write_report
-
     sys.stdout.write(f"{write_report(config, CONFIGS)}\n")
     return 0
 
@@ -271,10 +269,8 @@ def report(arguments: list[str]) -> int:
 def timeline(arguments: list[str]) -> int:
     """``accerl timeline``."""
     config: TimelineConfig = parse(TimelineConfig, arguments)
-    from accerl_lerobot.timeline.show import show_timelines, table
-
     found = show_timelines(config)
-    Console().rich.print(table(found))
+    Console().rich.print(timeline_table(found))
     sys.stdout.write(json.dumps(found, indent=2) + "\n")
     return 0
 

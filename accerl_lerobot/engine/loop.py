@@ -33,11 +33,11 @@ from accerl_lerobot.engine.contract import Engine, Progress
 from accerl_lerobot.engine.stopping import Stopping, raise_if_stopped
 from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.evaluation.pictures import before_after, success_curve
-from accerl_lerobot.evaluation.summary import summarise
+from accerl_lerobot.evaluation.stats import summarise
 from accerl_lerobot.metrics import MetricsLog, plain
 from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.timeline import CHECKPOINT, EVALUATION, TIMELINE, TRAINING, Clock, NoClock
-from accerl_lerobot.timeline.watch import Watch
+from accerl_lerobot.timeline.read import Watch
 
 FILMED = ".before"
 """Name of the filmed episodes of the first evaluation, kept until the video is made."""

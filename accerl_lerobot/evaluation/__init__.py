@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers one can trust: paired seeds, how many episodes, and how sure one may be."""
+"""Success rates on fixed seeds with their intervals, and pictures of them."""

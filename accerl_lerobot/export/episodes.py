@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The episodes of a run as a LeRobotDataset: real ones, or what it dreamt, for which see `export_dreams`.
+"""The episodes of a run as a LeRobotDataset: real ones, or imagined ones, for which see `dreams.py`.
 
     accerl export --path=RUN --root=outputs/rollouts
 
-A run looks at its worlds once per decision and keeps no pictures. Its journal says what was done in them, so
-it is done again here, a step at a time, and every step is seen. An episode that goes another way than it had
-gone, by its rewards and its outcome, is left out and counted.
+A run observes its environments once per decision and keeps no pictures. Its journal has seeds and actions, so
+episodes are replayed here with a picture at every step. An episode whose rewards or outcome differ from the
+journal is left out and counted.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ from accerl_lerobot.replay.journal import EPISODES, Done, read_journal, whole_ep
 from accerl_lerobot.world_model.recorded import DREAMS, read_dreams
 
 SIDECAR = Path("meta") / "accerl_rollouts.json"
-"""Inside the dataset: where it is from, and what came of it."""
+"""File of the dataset: its origin, and how many episodes it has."""
 VERSION = "policy_version"
 """Feature: updates behind the weights that chose the action."""
 TOLERANCE = 1e-4
-"""By which the rewards of a decision may differ, which are summed in another order."""
+"""By how much rewards of a decision may differ, as they are summed in another order."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,17 +60,17 @@ class ExportConfig(Section):
     path: str | None = None
     """Folder of an ``accerl train`` run."""
     source: Annotated[str, Choice((REAL, IMAGINED))] = REAL
-    """real: exploring episodes, with a picture at every env step. imagined: dreams, where
-    ``imagination.record`` has kept any, with a picture at every decision. Never both: what is done between
-    two frames is not the same in them."""
+    """real: exploring episodes, with a picture at every env step. imagined: imagined rollouts that
+    ``imagination.record`` has kept, with a picture at every decision. Never both, as the time between two
+    frames differs."""
     root: NewFolder = "outputs/rollouts"
     """Folder to create; must not exist."""
     repo_id: DatasetName = "accerl/rollouts"
     """Name of the dataset, ``owner/name``."""
     pick: Literal["all", "successes", "failures"] = "all"
-    """all, successes or failures."""
+    """Episodes by their outcome."""
     last: Steps = 0
-    """So many of the newest of these; 0: all of them."""
+    """Number of the newest of these; 0: all of them."""
     processes: Annotated[int, Range("[1, 64]")] = 2
     """Simulator processes; does not change the content."""
     hub_path: str | None = None
@@ -86,7 +86,7 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
     """Writes the dataset, which appears at ``config.root`` when it is complete.
 
     Returns:
-        ``episodes``, ``frames``, ``successes``, and ``unlike``, those that did not repeat and were left out.
+        ``episodes``, ``frames``, ``successes``, and ``unlike``, those that differed and were left out.
 
     Raises:
         InputError: the folder exists, there is no run or no whole episode in it, or none can be repeated.
@@ -106,9 +106,9 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
     with appearing(root) as partial:
         tally = _write(settings, config, chosen, partial, console)
         if not tally["episodes"]:
-            remedy = "none of its episodes repeats itself: this world does not show the same again"
+            remedy = "none of its episodes could be repeated: this environment is not deterministic"
             raise InputError("path", str(run), remedy)
-        _say_what_it_is(config, run, settings, tally, partial)
+        _write_sidecar(config, run, settings, tally, partial)
     return tally
 
 
@@ -137,14 +137,16 @@ def _export_dreams(
 ) -> dict[str, Any]:
     chosen = _picked(read_dreams(run / DREAMS), lambda dream: dream.success, config)
     if not chosen:
-        raise InputError("path", str(run), f"no dream in its {DREAMS}/ of those asked for ({config.pick})")
+        raise InputError(
+            "path", str(run), f"no imagined rollout in its {DREAMS}/ of those asked for ({config.pick})"
+        )
     with appearing(root) as partial:
         tally = write_dreams(chosen, partial, config.repo_id, settings.env.type, console)
-        _say_what_it_is(config, run, settings, tally, partial)
+        _write_sidecar(config, run, settings, tally, partial)
     return tally
 
 
-def _say_what_it_is(
+def _write_sidecar(
     config: ExportConfig, run: Path, settings: RunConfig, tally: dict[str, Any], root: Path
 ) -> None:
     about = {"export": asdict(config) | {"path": run.name}, "seed": settings.seed, **tally}
@@ -169,10 +171,10 @@ def _write(
     cost = settings.rollout.decision_cost
     starts: list[Start] = []
     with (
-        console.stage("doing it again", total=len(chosen)) as stage,
+        console.stage("replaying episodes", total=len(chosen)) as stage,
         simulators(config.processes, _start, settings.env, cost) as pool,
     ):
-        repeated = in_order(pool, _repeat, chosen, ahead=2 * config.processes)
+        repeated = in_order(pool, _replay, chosen, ahead=2 * config.processes)
         with new_dataset(root, config.repo_id, spec.fps, settings.env.type, table) as dataset:
             for number, (episode, parts) in enumerate(zip(repeated, chosen, strict=True), start=1):
                 stage.update(number, f"{tally['successes']} successes")
@@ -188,9 +190,7 @@ def _write(
                 tally["successes"] += episode.success
     write_starts(root, starts)
     if tally["unlike"]:
-        console.say(
-            f"{tally['unlike']} of {len(chosen)} episodes did not go as they had gone, and are left out"
-        )
+        console.say(f"{tally['unlike']} of {len(chosen)} episodes differed from the run and are left out")
     return tally
 
 
@@ -205,13 +205,13 @@ _cost: float
 
 
 def _start(env: EnvConfig, cost: float) -> None:
-    """Makes a process ready: one world for all its episodes."""
+    """Initialises a process with one environment for all its episodes."""
     global _world, _cost
     _world, _cost = make_world(env), cost
 
 
-def _repeat(parts: list[Done]) -> Episode | None:
-    """An episode, seen at every step; None if it goes in another way."""
+def _replay(parts: list[Done]) -> Episode | None:
+    """An episode with an observation at every step; None if it differs from the journal."""
     origin = parts[0].origin
     observation = _world.reset(origin.seed, origin.task)
     seen, rewards, success_at, done = [], [], -1, False
@@ -225,7 +225,7 @@ def _repeat(parts: list[Done]) -> Episode | None:
         observation, done = result.observation, result.done
         if result.success and success_at < 0:
             success_at = i
-    if not _alike(parts, np.array(rewards), success_at >= 0):
+    if not _matches(parts, np.array(rewards), success_at >= 0):
         return None
     return Episode(
         observations={key: np.stack([row[key] for row in seen]) for key in seen[0] if key != "task"},
@@ -238,7 +238,7 @@ def _repeat(parts: list[Done]) -> Episode | None:
     )
 
 
-def _alike(parts: list[Done], rewards: np.ndarray, success: bool) -> bool:
+def _matches(parts: list[Done], rewards: np.ndarray, success: bool) -> bool:
     steps = np.concatenate([part.steps for part in parts])
     brought = np.add.reduceat(rewards, np.concatenate([[0], np.cumsum(steps)[:-1]])) - _cost
     expected = np.concatenate([part.rewards for part in parts])

@@ -1,7 +1,115 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One page per run, to look at: what became of it, in one HTML file that needs nothing else.
+"""``accerl report``: one HTML file about a run, or about several, with its style, charts and videos inside.
 
-`read.py` turns a run's folder into plain data, `run_page.py`, `world_model_page.py` and `comparison.py` say
-what stands on a page in terms of `blocks.py`, `charts.py` draws, and `page.py` writes the file. Only the last
-and the first touch the disk. Free of torch.
+The template escapes all text, and a content security policy forbids the browser every script and request, so
+text of a run that got past the escaping could do nothing. Free of torch.
 """
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+from urllib.parse import quote
+
+from accerl_lerobot import __version__
+from accerl_lerobot.config.ranges import NonNegative, Section
+from accerl_lerobot.errors import InputError, expanded
+
+NAME = "report.html"
+MARK = '<meta name="generator" content="accerl report'
+"""Tells a page of ours from any other file; within its first 1000 characters."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportConfig(Section):
+    """Fields of ``accerl report``.
+
+    Example:
+        >>> ReportConfig(runs=("outputs/a", "outputs/b"), output="both.html")
+    """
+
+    BARE: ClassVar[str] = "runs"
+
+    runs: tuple[str, ...] = ()
+    """Folders of runs, of one kind; several make one page that compares them. Bare arguments are runs."""
+    output: str | None = None
+    """The page. None: ``report.html`` in the run's folder, or here if there are several. An older page of
+    accerl is replaced; any other file is left alone."""
+    video_mb: NonNegative = 20.0
+    """Videos up to so many megabytes each are put into the page, larger ones are linked."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.runs:
+            raise InputError("runs", "", "name the folder of a run: accerl report RUN")
+
+
+def write_report(config: ReportConfig, recipes: Mapping[str, type[Any]]) -> Path:
+    """Reads the runs and writes the page.
+
+    Args:
+        config: which runs, and where to.
+        recipes: verb → class of its config.
+
+    Raises:
+        InputError: a run cannot be read, runs are of different kinds, or the page cannot be written there.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    from accerl_lerobot.report.charts import POINTS
+    from accerl_lerobot.report.content import comparison_page, run_page
+    from accerl_lerobot.report.read import read_run
+
+    output = None if config.output is None else expanded(config.output, "output")
+    runs = [read_run(Path(name).expanduser()) for name in config.runs]
+    if len({run.path.resolve() for run in runs}) < len(runs):
+        raise InputError("runs", ",".join(config.runs), "name each run once")
+    verbs = dict.fromkeys(run.verb for run in runs)
+    if len(verbs) > 1:
+        remedy = f"a page compares runs of one kind; these are of accerl {' and '.join(verbs)}"
+        raise InputError("runs", ",".join(config.runs), remedy)
+    if output is None:
+        output = runs[0].path / NAME if len(runs) == 1 else Path(NAME)
+    _check_output(output)
+    now = time.time()
+    page = comparison_page(runs, now) if len(runs) > 1 else run_page(runs[0], recipes[runs[0].verb], now)
+    folder = output.resolve().parent
+    template = Environment(
+        loader=PackageLoader("accerl_lerobot", "report"), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    ).get_template("page.html")  # fmt: skip
+    html = template.render(
+        **page,
+        version=__version__,
+        points=POINTS,
+        video_mb=config.video_mb,
+        base64=lambda path: base64.b64encode(path.read_bytes()).decode(),
+        address=lambda path: quote(os.path.relpath(path.resolve(), folder)),
+    )
+    part = output.with_name(f".{output.name}.part")
+    try:
+        part.write_text(html, encoding="utf-8")
+        os.replace(part, output)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            part.unlink()
+        raise InputError("output", str(output), f"cannot be written: {error.strerror}") from error
+    return output
+
+
+def _check_output(output: Path) -> None:
+    """Refuses to write over anything but an older page."""
+    if output.is_dir():
+        raise InputError("output", str(output), f"a folder; name a file in it, such as {output / NAME}")
+    if not output.parent.is_dir():
+        raise InputError("output", str(output), f"there is no folder {output.parent}; make it first")
+    if output.exists():
+        with output.open(encoding="utf-8", errors="replace") as file:
+            if MARK not in file.read(1000):
+                raise InputError("output", str(output), "there is another file of this name; choose another")

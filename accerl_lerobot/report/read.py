@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run's folder as plain data. Reads only; what is torn or missing is said and not guessed.
+"""A run's folder as plain data.
 
-A run that is going on or has died has no ``summary.json`` (or ``trial.json``), and the last line of its
-``metrics.jsonl`` may be half a line. Both are common and no error. A line before the last that is none is.
+A run that is still going or has crashed has no result file, and the last line of its ``metrics.jsonl`` may be
+incomplete. Both are common and no error; any other damage is an error that names the file.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,65 +24,41 @@ from accerl_lerobot.metrics import METRICS
 from accerl_lerobot.world_model.imagination_config import FILMS
 
 Record = dict[str, Any]
+Schema = dict[str, Any]
+"""Required field → its type, or a dict or list of such; ``*`` stands for every field."""
 
 TRIAL = "trial.json"
+COUNTERS = ("env_steps", "decisions", "episodes")
+"""Counters of workers, which may restart at 0 when a run is resumed."""
 
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
-def _is_interval(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))
-
-
-def _is_list(value: Any) -> bool:
-    return isinstance(value, list) and all(
-        isinstance(row, dict) and _is_number(row.get("depth")) for row in value
-    )
-
-
-def _is_gates(value: Any) -> bool:
-    return isinstance(value, dict) and all(
-        isinstance(gate, dict) and {"value", "wanted", "holds"} <= gate.keys() for gate in value.values()
-    )
-
-
-def _is_trial(value: Any) -> bool:
-    return isinstance(value, dict) and "name" in value and not _lacking(value, TRIAL_NEEDS)
-
-
-Needs = dict[str, Callable[[Any], bool]]
-"""Fields that a page cannot do without, and their types."""
-
-SUMMARY_NEEDS: Needs = {
-    "success_after": _is_number,
-    "ci95_after": _is_interval,
-    "n_after": _is_number,
-    "success_before": lambda value: value is None or _is_number(value),
-    "ci95_before": lambda value: value is None or _is_interval(value),
-    "env_steps": _is_number,
-    "wall_s": _is_number,
-    "seed": _is_number,
+NUMBER = (int, float)
+SUMMARY_SCHEMA: Schema = {
+    "success_after": NUMBER, "ci95_after": [NUMBER, NUMBER], "n_after": NUMBER, "success_before": NUMBER,
+    "ci95_before": [NUMBER, NUMBER], "env_steps": NUMBER, "wall_s": NUMBER, "seed": NUMBER, "tasks": [str],
+    "episodes": NUMBER, "updates": NUMBER, "warm_start_s": NUMBER, "rl_s": NUMBER,
+}  # fmt: skip
+TRIAL_SCHEMA: Schema = {
+    "passed": bool,
+    "trials": NUMBER,
+    "episodes": NUMBER,
+    "seconds": NUMBER,
+    "gates": {"*": {"value": (*NUMBER, type(None)), "wanted": object, "holds": bool}},
+    "depths": [{"depth": NUMBER}],
 }
-TRIAL_NEEDS: Needs = {
-    "passed": lambda value: isinstance(value, bool),
-    "trials": _is_number,
-    "gates": _is_gates,
-    "depths": _is_list,
-    "sources": lambda value: (
-        value is None or (isinstance(value, dict) and all(map(_is_trial, value.values())))
-    ),
+TRIAL_SCHEMA["sources"] = {"*": {"name": str, **TRIAL_SCHEMA}}
+RATE: Schema = {"success": NUMBER, "ci95": [NUMBER, NUMBER], "n": NUMBER}
+EVALUATION_SCHEMA: Schema = {**RATE, "env_steps": NUMBER, "steps_mean": NUMBER, "tasks": {"*": RATE}}
+OPTIONAL = (
+    "success_before", "ci95_before", "sources", "tasks", "episodes", "updates", "warm_start_s", "rl_s",
+    "seconds",
+)  # fmt: skip
+"""Fields that may be null or missing."""
+VERBS = {
+    "train": {"algorithm", "trainer"},
+    "world-model": {"world_model"},
+    "world-model-eval": {"path", "trial"},
 }
-EVALUATION_NEEDS: Needs = {
-    "success": _is_number,
-    "ci95": _is_interval,
-    "n": _is_number,
-    "env_steps": _is_number,
-    "steps_mean": _is_number,
-}
-GROWING = ("wall_s", "env_steps", "decisions", "episodes")
-"""Counters of workers: a run that was taken up again may count them from 0."""
+"""Verbs that write runs, and sections by which their config is recognised."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,24 +67,22 @@ class Run:
 
     path: Path
     verb: str
-    """Verb that wrote it: train, world-model or world-model-eval."""
+    """Verb that wrote it, one of `VERBS`."""
     config: Record
     config_text: str
-    """The file itself."""
     records: dict[str, list[Record]]
     """Lines of metrics.jsonl by their kind, in order."""
     result: Record | None
-    """summary.json of train, trial.json of the others; None: not finished."""
-    torn: bool
+    """summary.json or trial.json; None: not finished."""
+    truncated: bool
     """True if the last line of metrics.jsonl is incomplete."""
     sessions: int
-    """How often it was started: 1 if it was never taken up again."""
+    """1 + the number of times that it was resumed."""
     written: float
     """When something was last written, in seconds since 1970."""
     videos: tuple[Path, ...]
-    dreams: tuple[Path, ...]
-    """Pictures of held-out episodes beside their dreams, in the order of the trials that they were made
-    after."""
+    imagined_videos: tuple[Path, ...]
+    """Held-out episodes beside imagined ones, the oldest first."""
     checkpoint: Path | None
     """The newest policy, a LeRobot checkpoint."""
 
@@ -117,10 +91,43 @@ class Run:
         """Name of its folder."""
         return self.path.resolve().name
 
-    def room(self, name: str) -> Record:
-        """Section of its config; one that another version did not have is empty."""
-        room = self.config.get(name)
-        return room if isinstance(room, dict) else {}
+    @property
+    def train(self) -> list[Record]:
+        """Records of the trainer, one per update."""
+        return self.records.get("train", [])
+
+    @property
+    def rollout(self) -> list[Record]:
+        """Records of all other workers."""
+        return self.records.get("rollout", [])
+
+    @property
+    def evaluations(self) -> list[Record]:
+        """In the order of the policy's experience."""
+        return sorted(self.records.get("evaluation", []), key=lambda e: e["env_steps"])
+
+    @property
+    def outcomes(self) -> list[Record]:
+        """``group``, ``success``, ``ci95`` and ``n`` before and after training; or the newest."""
+        result = self.result
+        if result is None:
+            return self.evaluations[-1:]
+        return [
+            {"group": when, **{key: result.get(f"{key}_{when}") for key in ("success", "ci95", "n")}}
+            for when in ("before", "after")
+            if result.get(f"success_{when}") is not None and result.get(f"ci95_{when}") is not None
+        ]
+
+    @property
+    def wall_s(self) -> float | None:
+        """Seconds that it took, or has taken so far."""
+        walls = [newest(records, "wall_s") for records in self.records.values()]
+        return (self.result or {}).get("wall_s", max((w for w in walls if w is not None), default=None))
+
+    def section(self, name: str) -> Record:
+        """Section of its config; empty if another version wrote it without."""
+        section = self.config.get(name)
+        return section if isinstance(section, dict) else {}
 
 
 def read_run(path: Path) -> Run:
@@ -134,35 +141,33 @@ def read_run(path: Path) -> Run:
         raise InputError("runs", str(path), remedy)
     config_path = path / CONFIG
     if not config_path.is_file():
-        raise InputError(
-            "runs", str(path), f"no run in it: there is no {CONFIG}, which every run writes first"
-        )
+        remedy = f"no run in it: there is no {CONFIG}, which every run writes first"
+        raise InputError("runs", str(path), remedy)
     check_folder(path, Origin("runs", str(path)))
     check_recipe_size(config_path, "runs")
     text = _text(config_path)
     config = _mapping(config_path, text)
-    verb = _verb(config)
+    verb = next((verb for verb, keys in VERBS.items() if keys <= config.keys()), None)
     if verb is None:
         remedy = "no run in it: its config.yaml is not one of accerl train, world-model or world-model-eval"
         raise InputError("runs", str(path), remedy)
-    lines, torn = _lines(path / METRICS)
+    lines, truncated = _lines(path / METRICS)
     records, sessions = _continuous(lines)
-    newest = path / CHECKPOINTS / LAST / PRETRAINED
+    result = (SUMMARY, SUMMARY_SCHEMA) if verb == "train" else (TRIAL, TRIAL_SCHEMA)
+    checkpoint = path / CHECKPOINTS / LAST / PRETRAINED
     return Run(
         path=path,
         verb=verb,
         config=config,
         config_text=text,
         records=records,
-        result=_result(path / SUMMARY, SUMMARY_NEEDS)
-        if verb == "train"
-        else _result(path / TRIAL, TRIAL_NEEDS),
-        torn=torn,
+        result=_result(path / result[0], result[1]),
+        truncated=truncated,
         sessions=sessions,
         written=max(file.stat().st_mtime for file in path.iterdir() if file.suffix != ".html"),
         videos=tuple(sorted(path.glob("*.mp4"))),
-        dreams=tuple(sorted(path.glob(f"{FILMS}/[0-9]*.mp4"))),
-        checkpoint=newest if newest.is_dir() else None,
+        imagined_videos=tuple(sorted(path.glob(f"{FILMS}/[0-9]*.mp4"))),
+        checkpoint=checkpoint if checkpoint.is_dir() else None,
     )
 
 
@@ -172,78 +177,76 @@ def column(records: Sequence[Record], name: str) -> np.ndarray:
     return np.array([v if isinstance(v, (int, float)) else np.nan for v in values], dtype=np.float64)
 
 
-def has(records: Sequence[Record], name: str) -> bool:
-    """True if any record has this number."""
-    return any(isinstance(record.get(name), (int, float)) for record in records)
-
-
 def newest(records: Sequence[Record], name: str) -> float | None:
-    """The last of these numbers that there is."""
+    """The last finite value of this number."""
     values = column(records, name)
-    found = values[np.isfinite(values)]
-    return float(found[-1]) if len(found) else None
-
-
-def _verb(config: Record) -> str | None:
-    for verb, keys in (
-        ("train", {"algorithm", "trainer"}),
-        ("world-model", {"world_model"}),
-        ("world-model-eval", {"path", "trial"}),
-    ):
-        if keys <= config.keys():
-            return verb
-    return None
+    finite = values[np.isfinite(values)]
+    return float(finite[-1]) if len(finite) else None
 
 
 def _text(path: Path) -> str:
     try:
         return path.read_text()
     except UnicodeDecodeError as error:
-        raise InputError("runs", str(path), f"not text, at byte {error.start}; restore the file") from error
+        raise _damaged(path, f"not text, at byte {error.start}") from error
 
 
 def _mapping(path: Path, text: str) -> Record:
-    """YAML and JSON alike, as JSON is YAML; but large JSON is read faster as such."""
+    """The content of a YAML or JSON file."""
     try:
         tree = json.loads(text) if path.suffix == ".json" else load_yaml(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        remedy = f"damaged ({str(error).splitlines()[0]}); restore it, or remove it"
-        raise InputError("runs", str(path), remedy) from error
+        raise _damaged(path, str(error).splitlines()[0]) from error
     if not isinstance(tree, dict):
-        raise InputError("runs", str(path), "damaged: not a mapping; restore it, or remove it")
+        raise _damaged(path, "not a mapping")
     return tree
 
 
-def _result(path: Path, needs: Needs) -> Record | None:
+def _result(path: Path, schema: Schema) -> Record | None:
     if not path.is_file():
         return None
     result = _mapping(path, _text(path))
-    if lacking := _lacking(result, needs):
-        remedy = f"it has no good {lacking}: it is damaged, or of another version; restore or remove it"
-        raise InputError("runs", str(path), remedy)
+    if field := _invalid(result, schema):
+        raise _damaged(path, f"it has no good {field}")
     return result
 
 
-def _lacking(record: Record, needs: Needs) -> str:
-    """The first field that is missing or of the wrong kind; empty if all is well."""
-    return next((key for key, good in needs.items() if not good(record.get(key))), "")
+def _damaged(path: Path, why: str) -> InputError:
+    remedy = f"damaged, or of another version ({why}); restore it, or remove it"
+    return InputError("runs", str(path), remedy)
+
+
+def _invalid(record: Record, schema: Schema) -> str:
+    """The first field that is missing or of another type; empty if there is none."""
+    for key, form in schema.items():
+        values = record.values() if key == "*" else [record.get(key)]
+        if not all(_matches(value, form) or (value is None and key in OPTIONAL) for value in values):
+            return key
+    return ""
+
+
+def _matches(value: Any, form: Any) -> bool:
+    if isinstance(form, dict):
+        return isinstance(value, dict) and not _invalid(value, form)
+    if isinstance(form, list):
+        fits = isinstance(value, list) and len(form) in (1, len(value))
+        return fits and all(_matches(item, form[0]) for item in value)
+    return isinstance(value, form)
 
 
 def _lines(path: Path) -> tuple[list[Record], bool]:
-    """All records, and whether the last line is torn; a run that has not come to it has no file."""
+    """All records, and whether the last line is incomplete."""
     if not path.is_file():
         return [], False
-    found: list[Record] = []
+    records: list[Record] = []
     lines = path.read_bytes().splitlines()
     for number, line in enumerate(lines, 1):
         if (record := _record(line)) is not None:
-            found.append(record)
+            records.append(record)
         elif number < len(lines):
-            shown = line[:60].decode(errors="replace")
-            raise InputError(
-                "runs", f"{path}:{number}", f"{shown!r} is not a whole record; mend or remove this line"
-            )
-    return found, len(found) < len(lines)
+            remedy = f"{line[:60].decode(errors='replace')!r} is not a whole record; mend or remove this line"
+            raise InputError("runs", f"{path}:{number}", remedy)
+    return records, len(records) < len(lines)
 
 
 def _record(line: bytes) -> Record | None:
@@ -253,42 +256,40 @@ def _record(line: bytes) -> Record | None:
         return None
     if not isinstance(record, dict) or not isinstance(record.get("kind"), str):
         return None
-    return None if record["kind"] == "evaluation" and _lacking(record, EVALUATION_NEEDS) else record
+    return None if record["kind"] == "evaluation" and _invalid(record, EVALUATION_SCHEMA) else record
 
 
 def _continuous(lines: list[Record]) -> tuple[dict[str, list[Record]], int]:
-    """Records by kind, as if the run had never stopped; and how many times it was started.
+    """Records by kind as if the run had never stopped, and the number of its sessions.
 
-    Each start counts seconds anew, and updates from its checkpoint: what an earlier one did beyond that was
-    done again, so it is left out. Counters that fall go on where they were.
+    A resumed run counts seconds from 0 and updates from its checkpoint. Updates that an earlier session made
+    after that checkpoint were made again, so they are dropped; counters that fall are continued.
     """
     records: dict[str, list[Record]] = {}
-    ends: dict[str, float] = {}
-    """Newest value of each counter since this start."""
-    carried = dict.fromkeys(GROWING, 0.0)
-    sessions, last = 1, 0.0
+    newest_values: dict[str, float] = {}
+    offsets = dict.fromkeys(("wall_s", *COUNTERS), 0.0)
+    sessions, last_wall = 1, 0.0
     for record in lines:
-        wall = _number(record, "wall_s", last)
-        if wall < last:
+        wall = _number(record, "wall_s", last_wall)
+        if wall < last_wall:
             sessions += 1
-            carried["wall_s"] += last
-            update = _number(record, "update", 0)
-            # The first record of a start has the checkpoint's version, or the first update after it.
-            again = update - (record["kind"] == "train")
+            offsets["wall_s"] += last_wall
+            # The first record of a session has the checkpoint's version, or is the first update after it.
+            checkpoint = _number(record, "update", 0) - (record["kind"] == "train")
             for kind, earlier in records.items():
-                records[kind] = [r for r in earlier if _number(r, "update", 0) <= again]
-        last = wall
+                records[kind] = [r for r in earlier if _number(r, "update", 0) <= checkpoint]
+        last_wall = wall
         if record["kind"] == "rollout":
-            for name in GROWING[1:]:
+            for name in COUNTERS:
                 value = _number(record, name, 0.0)
-                if value < ends.get(name, 0.0):
-                    carried[name] += ends[name]
-                ends[name] = value
-        moved = {name: _number(record, name, 0) + by for name, by in carried.items() if by and name in record}
+                if value < newest_values.get(name, 0.0):
+                    offsets[name] += newest_values[name]
+                newest_values[name] = value
+        moved = {name: _number(record, name, 0) + by for name, by in offsets.items() if by and name in record}
         records.setdefault(record["kind"], []).append({**record, **moved})
     return records, sessions
 
 
-def _number(record: Record, name: str, otherwise: float) -> float:
+def _number(record: Record, name: str, default: float) -> float:
     value = record.get(name)
-    return value if isinstance(value, (int, float)) else otherwise
+    return value if isinstance(value, (int, float)) else default

@@ -1,28 +1,53 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Says what a worker does, at the moment it begins to: the recorder of the timeline.
+"""The recorder of one worker's states.
 
 Entering a state ends the one before, so states exclude each other and their times add up to the time of the
-process by construction. Time is that of the monotonic clock, which processes of one machine share; what it
-was by the calendar when a process began is noted, for others. An entry is about a microsecond, as
-`benchmarks/timeline.py` measures.
+process by construction. Time is that of the monotonic clock, which processes of one machine share; the
+calendar time at which a process began is noted too.
+
+``RUN/timeline/rollout-0.1.3.bin`` is part 3 of the second process (1) of ``rollout 0``: a line of JSON, then
+8 bytes per entry, nanoseconds since the process began << 4 | state, little-endian. The newest two parts are
+kept. A part's first line has the totals before it, so those are exact although older parts are gone. Nothing
+is overwritten: a killed process leaves at worst half an entry, which is not read.
 """
 
 from __future__ import annotations
 
+import json
+import os
 import threading
 import time
 from array import array
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO, NamedTuple
 
-from accerl_lerobot.timeline.parts import BITS, Parts
-from accerl_lerobot.timeline.states import RECOVERY, STATES
+from accerl_lerobot.fault_points import fault_point
+from accerl_lerobot.timeline.states import RECOVERY, STATES, role_of
 
+FORMAT = 1
+BITS = 4
+"""Bits of an entry that hold the state."""
 BATCH = 512
 """Entries that are written at once."""
 FLUSH_NS = 1_000_000_000
 """An entry is on its way to the disk after so long, if another follows or `Clock.beat` is called."""
+PART_BYTES = 4_000_000
+SUFFIX = ".bin"
+BOOT = Path("/proc/sys/kernel/random/boot_id")
+"""Tells one machine's monotonic clock from another's; without such a file all are taken for one."""
+
+
+class Moment(NamedTuple):
+    """A moment by two clocks."""
+
+    node: str
+    """Whose monotonic clock it is."""
+    clock_ns: int
+    """By that."""
+    wall_ns: int
+    """By the calendar, in nanoseconds since 1970."""
 
 
 class Clock:
@@ -31,21 +56,42 @@ class Clock:
     Example:
         >>> clock = open_clock(folder, "trainer")
         >>> clock.enter(WAIT_IN)         # from one thread
-        >>> clock.beat()                 # from any: what is not written yet is, up to now
+        >>> clock.beat()                 # from any: entries so far are written, up to now
         >>> clock.totals_ns()["wait_in"]
 
     Args:
-        parts: where entries are kept.
+        folder: of the timeline; made if it is not there.
+        worker: its name; the part before a number is its role.
+        begins: when its process does; None: now.
+        part_bytes: after which another part begins.
         now: the monotonic clock, in nanoseconds.
     """
 
-    def __init__(self, parts: Parts, now: Callable[[], int] = time.monotonic_ns) -> None:
-        self._parts, self._now = parts, now
-        self._lock = threading.Lock()
-        self._state, self._origin = RECOVERY, parts.clock_ns
+    def __init__(
+        self,
+        folder: Path,
+        worker: str,
+        *,
+        begins: Moment | None = None,
+        part_bytes: int = PART_BYTES,
+        now: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        if begins is None:
+            node = BOOT.read_text().strip() if BOOT.is_file() else ""
+            begins = Moment(node, time.monotonic_ns(), time.time_ns())
+        self._now, self._lock = now, threading.Lock()
+        self._state, self._origin = RECOVERY, begins.clock_ns
         self._since, self._due = self._origin, self._origin + FLUSH_NS
         self._totals = [0] * len(STATES)
         self._entries = array("Q")
+        self._head = {"timeline": FORMAT, "worker": worker, "pid": os.getpid(), **begins._asdict()}
+        self._point = f"{role_of(worker).split()[-1]}.timeline"
+        folder.mkdir(parents=True, exist_ok=True)
+        slug = worker.replace(" ", "-")
+        earlier = [path.name.split(".") for path in folder.glob(f"{slug}.*.*{SUFFIX}")]
+        process = 1 + max((int(number) for _, number, *_ in earlier), default=-1)
+        self._stem, self._part, self._part_bytes = folder / f"{slug}.{process}", -1, part_bytes
+        self._file = self._next_part()
 
     def enter(self, state: int) -> None:
         """Ends the state before, unless it is the same."""
@@ -66,7 +112,7 @@ class Clock:
             self.enter(before)
 
     def beat(self) -> None:
-        """Notes that the worker is still at it, and writes what has not been written."""
+        """Notes that the worker is still in its state, and writes all entries."""
         with self._lock:
             self._note(self._state)
             self._write()
@@ -78,9 +124,9 @@ class Clock:
 
     def close(self) -> None:
         """Ends the timeline of this worker; safe to call twice."""
-        if not self._parts.closed:
+        if not self._file.closed:
             self.beat()
-            self._parts.close()
+            self._file.close()
 
     def _note(self, state: int) -> None:
         now = self._now()
@@ -89,9 +135,29 @@ class Clock:
         self._state, self._since = state, now
 
     def _write(self) -> None:
+        """Appends to the file; the entries survive this process when this returns."""
         entries, self._entries = self._entries, array("Q")
-        self._parts.write(entries, self._since - self._origin, self._state, self._totals)
+        fault_point(self._point)
+        self._file.write(entries.tobytes())
+        self._file.flush()
         self._due = self._since + FLUSH_NS
+        if self._file.tell() >= self._part_bytes:
+            self._file.close()
+            self._file = self._next_part()
+
+    def _next_part(self) -> BinaryIO:
+        """Opens a new file and removes the one before the last."""
+        self._part += 1
+        head = {**self._head, "at_ns": self._since - self._origin, "state": STATES[self._state]}
+        head["totals_ns"] = dict(zip(STATES, self._totals, strict=True))
+        file = self._path(self._part).open("xb")
+        file.write((json.dumps(head) + "\n").encode())
+        file.flush()
+        self._path(self._part - 2).unlink(missing_ok=True)
+        return file
+
+    def _path(self, part: int) -> Path:
+        return self._stem.with_name(f"{self._stem.name}.{part}{SUFFIX}")
 
 
 class NoClock(Clock):
@@ -114,10 +180,5 @@ class NoClock(Clock):
 
 
 def open_clock(folder: Path | None, worker: str) -> Clock:
-    """The clock of a worker, beside those that it had before.
-
-    Args:
-        folder: of the timeline; made if it is not there. None: nothing is recorded.
-        worker: its name; what stands before a number in it is its role.
-    """
-    return NoClock() if folder is None else Clock(Parts(folder, worker))
+    """The clock of a worker; one that records nothing where there is no folder of the timeline."""
+    return NoClock() if folder is None else Clock(folder, worker)

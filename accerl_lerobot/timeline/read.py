@@ -3,24 +3,27 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.checkpoint.safety import Origin, check_folder
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.timeline.parts import Section, read_sections
-from accerl_lerobot.timeline.states import CHECKPOINT, ROLES, STATES, TIMELINE, TRAINING, role_of
+from accerl_lerobot.timeline.clock import BITS, FORMAT, SUFFIX, Moment
+from accerl_lerobot.timeline.states import CHECKPOINT, ROLES, STATES, TIMELINE, TRAINING, bubble, role_of
 
 ABSENT = len(STATES)
 """State of a worker of which there is no process, or whose older entries are not kept."""
 Window = tuple[float, float]
 """First and last second, since the timeline began."""
 Shares = dict[str, dict[str, float]]
-"""Role → state → share of the time of its workers; states that they have not been in are left out."""
+"""Role → state → share of the time of its workers; states with no time are left out."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,47 +110,18 @@ def divided(spent: np.ndarray) -> dict[str, float]:
     return {STATES[i]: float(spent[i] / spent.sum()) for i in np.flatnonzero(spent)}
 
 
-def shares(
-    run_directory: Path, start_s: float | None = None, seconds: float | None = None, *, training: bool = False
-) -> Shares:
+def shares(run_directory: Path, *, training: bool = False) -> Shares:
     """How the time of each role of a run divides among the states; `states.bubble` adds up the waiting.
 
     Args:
         run_directory: the run's folder.
-        start_s: where to begin, in seconds since the timeline began; None: at its beginning.
-        seconds: how long; None: to the end.
-        training: only what lies within the training, if the driver has recorded any. What is too old to be
-            kept is missing, as in any window.
+        training: only of the training, if the driver has recorded any, as far as it is kept.
 
     Raises:
-        InputError: there is no timeline, it is damaged, or the window is not within it.
+        InputError: there is no timeline, or it is damaged.
     """
     timeline = read_timeline(run_directory)
-    if start_s is None and seconds is None and not training:
-        return timeline.shares()
-    start, end = window_of(timeline, start_s, seconds)
-    windows = timeline.training() if training else [(start, end)]
-    within = [(max(start, first), min(end, last)) for first, last in windows if start < last and first < end]
-    if not within:
-        when = " and ".join(f"{first:.1f} to {last:.1f}" for first, last in windows)
-        raise InputError("start_s", start_s, f"the training of {run_directory} is from {when}")
-    return timeline.shares(within)
-
-
-def window_of(timeline: Timeline, start_s: float | None, seconds: float | None) -> Window:
-    """The part of a timeline that is asked for.
-
-    Raises:
-        InputError: it is not within the run.
-    """
-    whole = timeline.seconds
-    start = 0.0 if start_s is None else start_s
-    if not 0 <= start < whole:
-        remedy = f"use 0 or more, below {whole:.1f}, the seconds of {timeline.run}"
-        raise InputError("start_s", start_s, remedy)
-    if seconds is not None and not 0 < seconds < float("inf"):
-        raise InputError("seconds", seconds, "use a positive number of seconds")
-    return start, whole if seconds is None else min(whole, start + seconds)
+    return timeline.shares(timeline.training() if training else None)
 
 
 def read_timeline(run_directory: Path) -> Timeline:
@@ -161,61 +135,215 @@ def read_timeline(run_directory: Path) -> Timeline:
         remedy = "a file; name the folder of a run" if run_directory.exists() else "no such folder"
         raise InputError("runs", str(run_directory), remedy)
     check_folder(run_directory, Origin("runs", str(run_directory)))
-    sections = read_sections(folder)
-    if not sections and not (run_directory / CONFIG).is_file() and not folder.is_dir():
+    processes = read_processes(folder)
+    if not processes and not (run_directory / CONFIG).is_file() and not folder.is_dir():
         remedy = f"no run in it: there is no {CONFIG}, which every run writes first"
         raise InputError("runs", str(run_directory), remedy)
-    if not sections:
+    if not processes:
         remedy = "a run without a timeline: it was made with launch.timeline=false, or no worker has begun"
         raise InputError("runs", str(run_directory), remedy)
-    return Timeline(run=run_directory, rows=_rows(sections))
+    return Timeline(run=run_directory, rows=_rows(processes))
 
 
-def _rows(sections: list[Section]) -> tuple[Row, ...]:
+class Head(NamedTuple):
+    """First line of a part."""
+
+    worker: str
+    begins: Moment
+    """When its process did."""
+    at_ns: int
+    """When the part begins, since the process did."""
+    state: int
+    """In which it begins."""
+    totals_ns: np.ndarray
+    """int64, in each state up to then."""
+    size: int
+    """Bytes of the line."""
+
+
+class Process(NamedTuple):
+    """Kept part of one process; the intervals between `times` are spent in `states`."""
+
+    head: Head
+    """Head of the oldest part that is kept."""
+    times: np.ndarray
+    """int64 (n + 1,), nanoseconds since the process began."""
+    states: np.ndarray
+    """uint8 (n,)."""
+
+
+def part_paths(folder: Path) -> dict[tuple[str, int], list[Path]]:
+    """Parts that there are, in order, by worker and number of the process."""
+    found: dict[tuple[str, int], list[Path]] = {}
+    for path in sorted(folder.glob(f"*{SUFFIX}"), key=_numbers):
+        found.setdefault(_numbers(path)[:2], []).append(path)
+    return found
+
+
+def read_processes(folder: Path) -> list[Process]:
+    """All that is kept, in no order.
+
+    Raises:
+        InputError: a file is damaged, but for an incomplete end.
+    """
+    processes = []
+    for paths in part_paths(folder).values():
+        parts = []
+        for path in paths:
+            with contextlib.suppress(FileNotFoundError):  # its worker has begun another part meanwhile
+                if (head := read_head(path)) is not None:
+                    parts.append((head, *read_entries(path, head.size, head.at_ns)))
+        if parts:
+            head = parts[0][0]
+            times = np.concatenate([[head.at_ns], *(times for _, times, _ in parts)])
+            states = np.concatenate([[head.state], *(states for *_, states in parts)])
+            processes.append(Process(head, times, states[:-1].astype(np.uint8)))
+    return processes
+
+
+def read_head(path: Path) -> Head | None:
+    """A part's first line; None if it is incomplete.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    with path.open("rb") as file:
+        line = file.readline()
+    if not line.endswith(b"\n"):
+        return None
+    try:
+        content = json.loads(line)
+        if content["timeline"] != FORMAT:
+            raise ValueError(f"format {content['timeline']}, not {FORMAT}")
+        return Head(
+            worker=str(content["worker"]),
+            begins=Moment(str(content["node"]), int(content["clock_ns"]), int(content["wall_ns"])),
+            at_ns=int(content["at_ns"]),
+            state=STATES.index(content["state"]),
+            totals_ns=np.array([int(content["totals_ns"].get(name, 0)) for name in STATES], dtype=np.int64),
+            size=len(line),
+        )
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise _damaged(path, " ".join(str(error).split())[:80]) from error
+
+
+def read_entries(path: Path, start: int, after_ns: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times and states of the whole entries of a part.
+
+    Args:
+        path: of the part.
+        start: byte to begin at.
+        after_ns: time of the entry before.
+
+    Raises:
+        InputError: they are no entries.
+    """
+    with path.open("rb") as file:
+        file.seek(start)
+        data = file.read()
+    entries = np.frombuffer(data[: len(data) // 8 * 8], "<u8")
+    times, states = (entries >> np.uint64(BITS)).astype(np.int64), (entries % 2**BITS).astype(np.uint8)
+    if (np.diff(times, prepend=after_ns) < 0).any():
+        raise _damaged(path, "time goes back")
+    if (states >= len(STATES)).any():
+        raise _damaged(path, "no such state")
+    return times, states
+
+
+def _numbers(path: Path) -> tuple[str, int, int]:
+    """Worker, process and part."""
+    try:
+        slug, process, part = path.name.removesuffix(SUFFIX).rsplit(".", 2)
+        return slug, int(process), int(part)
+    except ValueError as error:
+        raise _damaged(path, "no part of a timeline has such a name") from error
+
+
+def _damaged(path: Path, why: str) -> InputError:
+    return InputError("runs", str(path), f"damaged ({why}); restore it, or remove it")
+
+
+def _rows(processes: list[Process]) -> tuple[Row, ...]:
     """One for each worker, on a common axis.
 
-    Clocks of one machine agree to the nanosecond, so that its sections are set to the calendar together, by
-    what the first of them noted.
+    Clocks of one machine agree to the nanosecond, so all its processes are placed on the calendar together,
+    by the moment that the first of them noted.
     """
-    sections = sorted(sections, key=lambda section: section.head.begins.wall_ns)
-    moments = [section.head.begins for section in sections]
     offsets: dict[str, int] = {}
-    for moment in moments:
+    for moment in sorted((process.head.begins for process in processes), key=lambda moment: moment.wall_ns):
         offsets.setdefault(moment.node, moment.wall_ns - moment.clock_ns)
-    begins = [moment.clock_ns + offsets[moment.node] for moment in moments]
-    workers: dict[str, list[tuple[Section, int]]] = {}
-    for section, begun in zip(sections, begins, strict=True):
-        workers.setdefault(section.head.worker, []).append((section, begun - min(begins)))
-    rows = (_row(worker, own) for worker, own in workers.items())
-    return tuple(sorted(rows, key=lambda row: _place(row.worker)))
+    begins = [p.head.begins.clock_ns + offsets[p.head.begins.node] for p in processes]
+    workers: dict[str, list[tuple[int, Process]]] = {}
+    for begun, process in sorted(zip(begins, processes, strict=True), key=lambda pair: pair[0]):
+        workers.setdefault(process.head.worker, []).append((begun - min(begins), process))
+    return tuple(sorted((_row(worker, own) for worker, own in workers.items()), key=_place))
 
 
-def _row(worker: str, sections: list[tuple[Section, int]]) -> Row:
+def _row(worker: str, processes: list[tuple[int, Process]]) -> Row:
     times: np.ndarray = np.empty(0, np.int64)
     states: np.ndarray = np.empty(0, np.uint8)
     older, kept_from = np.zeros(len(STATES), np.int64), 0
-    for section, begun in sections:
-        own = section.times + begun
-        if len(times):
-            # What its process before still noted while it was being ended is cut off.
+    for begun, process in processes:
+        own = process.times + begun
+        if len(times):  # the last entries of a process that was being ended are cut where the next one begins
             left = max(1, int(np.searchsorted(times, own[0])))
             times, states = times[:left], np.append(states[: left - 1], np.uint8(ABSENT))
-        times, states = np.concatenate([times, own]), np.concatenate([states, section.states])
-        older += section.head.totals_ns
-        if section.head.at_ns:
+        times, states = np.concatenate([times, own]), np.concatenate([states, process.states])
+        older += process.head.totals_ns
+        if process.head.at_ns:
             kept_from = int(own[0])
-    # Beats are no changes of state.
-    change = np.flatnonzero(np.diff(states, prepend=-1) != 0)
-    return Row(
-        worker=worker,
-        times=np.append(times[:-1][change], times[-1]),
-        states=states[change],
-        older_ns=older,
-        kept_from=kept_from,
-    )
+    change = np.flatnonzero(np.diff(states, prepend=-1) != 0)  # beats are no changes of state
+    times = np.append(times[:-1][change], times[-1])
+    return Row(worker=worker, times=times, states=states[change], older_ns=older, kept_from=kept_from)
 
 
-def _place(worker: str) -> tuple[int, int, str]:
-    role = role_of(worker)
-    number = worker[len(role) :].strip()
-    return ROLES.index(role) if role in ROLES else len(ROLES), int(number or 0), role
+def _place(row: Row) -> tuple[int, int, str]:
+    number = row.worker[len(row.role) :].strip()
+    return ROLES.index(row.role) if row.role in ROLES else len(ROLES), int(number or 0), row.role
+
+
+class Watch:
+    """Shares of a run that is still going, for its metrics; reads on where it stopped.
+
+    Args:
+        folder: of the timeline; need not be there.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._seen: dict[tuple[str, int], tuple[Path, Head]] = {}
+        """Newest part of each process, and a head as if that part began where reading has stopped."""
+        self.news()
+
+    def news(self) -> dict[str, float]:
+        """``timeline_<role>_<state>_share`` and ``timeline_<role>_bubble`` since the last call."""
+        spent: dict[str, np.ndarray] = {}
+        for process, paths in part_paths(self._folder).items():
+            # Its worker has begun another part meanwhile; or it is damaged, which must not end a run.
+            with contextlib.suppress(FileNotFoundError, InputError):
+                path, before = self._seen.get(process, (None, None))
+                head = before if path == paths[-1] else read_head(paths[-1])
+                if head is not None:
+                    head = _read_on(paths[-1], head)
+                    self._seen[process] = paths[-1], head
+                    new = head.totals_ns if before is None else head.totals_ns - before.totals_ns
+                    role = role_of(head.worker)
+                    spent[role] = spent.get(role, 0) + new
+        news: dict[str, float] = {}
+        for role, own in spent.items():
+            if own.sum() > 0:
+                parts, name = divided(own), f"timeline_{role.replace(' ', '_')}"
+                news |= {f"{name}_{state}_share": share for state, share in parts.items()}
+                news[f"{name}_bubble"] = bubble(parts)
+        return news
+
+
+def _read_on(path: Path, head: Head) -> Head:
+    """The head that a part would have if it began after its last entry."""
+    times, states = read_entries(path, head.size, head.at_ns)
+    if not len(times):
+        return head
+    totals = head.totals_ns.copy()
+    np.add.at(totals, np.append(np.uint8(head.state), states[:-1]), np.diff(times, prepend=head.at_ns))
+    size = head.size + 8 * len(times)
+    return head._replace(at_ns=int(times[-1]), state=int(states[-1]), totals_ns=totals, size=size)

@@ -41,7 +41,6 @@ def test_a_world_of_known_durations_is_timed(tmp_path: Path):
     assert len(trace.resets) == result["reset_ms"]["n"] == 5
     assert -1.0 <= result["neighbours"] <= 1.0
     assert json.loads((tmp_path / "latency.json").read_text()) == json.loads(json.dumps(result))
-    assert (tmp_path / "latency.png").stat().st_size > 1000
     assert "| reset |" in (tmp_path / "latency.md").read_text()
     with Console().rich.capture():
         Console().rich.print(table(result))

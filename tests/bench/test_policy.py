@@ -17,7 +17,7 @@ from accerl_lerobot.policies.config import TuningConfig
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    build = bench.BUILDERS["smolvla"]
+    build = bench.lerobot_config
     sizes = backbone.BackboneConfig(
         hidden=32, heads=2, kv_heads=1, vision_hidden=16, vision_layers=1, patch=32
     )
@@ -29,7 +29,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         made.resize_imgs_with_padding = (64, 64)
         return made
 
-    monkeypatch.setitem(bench.BUILDERS, "smolvla", shrunk)
+    monkeypatch.setattr(bench, "lerobot_config", shrunk)
 
 
 @pytest.mark.parametrize(("precision", "low", "high"), [("fp32", 0.0, 1e-4), ("bf16", 0.0, 30.0)])

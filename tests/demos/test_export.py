@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run's episodes as a LeRobotDataset: what was done is done again."""
+"""A run's episodes as a LeRobotDataset, replayed from its journal."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_some_of_them(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert (found["episodes"], found["successes"]) == (3, 3)
 
 
-def test_what_does_not_repeat_itself_is_left_out(
+def test_episodes_that_cannot_be_repeated_are_left_out(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     other = tmp_path / "run"
@@ -90,10 +90,10 @@ def test_what_does_not_repeat_itself_is_left_out(
     capsys.readouterr()
     assert exported(other, tmp_path / "set") == 0
     out, err = capsys.readouterr()
-    assert json.loads(out)["unlike"] == 1 and "did not go as they had gone, and are left out" in err
+    assert json.loads(out)["unlike"] == 1 and "differed from the run and are left out" in err
     (other / "episodes.jsonl").write_text(json.dumps(changed | {"ended": True}) + "\n")
     assert exported(other, tmp_path / "second") == 2
-    assert "none of its episodes repeats itself" in capsys.readouterr().err
+    assert "none of its episodes could be repeated" in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run", "set"], "nothing half made is left"
 
 

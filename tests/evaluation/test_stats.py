@@ -1,24 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Intervals and tests against hand-computed numbers, and against simulation."""
+"""Intervals against hand-computed numbers and simulation; summaries of episodes; the planned episodes."""
 
+from __future__ import annotations
+
+import io
+import json
 import math
 import random
 
 import pytest
+from rich.console import Console
 
-from accerl_lerobot.evaluation.stats import (
-    Outcomes,
-    Rate,
-    compare,
-    format_rate,
-    mcnemar_p,
-    mean_interval,
-    paired_interval,
-    per_task,
-    task_mean,
-    total,
-    wilson_interval,
-)
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.config import EvaluationConfig, evaluation_plans
+from accerl_lerobot.evaluation.stats import Rate, mean_interval, summarise, table, wilson_interval
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
+from accerl_lerobot.seeds import DEMO_SEEDS, EVAL_SEEDS, TRAIN_SEEDS
 
 
 @pytest.mark.parametrize(
@@ -63,7 +60,8 @@ def test_wilson_covers_about_as_often_as_it_says() -> None:
     for p in (0.1, 0.5, 0.9):
         n = 50
         chance = [math.comb(n, k) * p**k * (1 - p) ** (n - k) for k in range(n + 1)]
-        coverage = sum(c for k, c in enumerate(chance) if p in wilson_interval(k, n))
+        ends = [wilson_interval(k, n) for k in range(n + 1)]
+        coverage = sum(c for c, (low, high) in zip(chance, ends, strict=True) if low <= p <= high)
         assert 0.93 < coverage < 0.98
 
 
@@ -73,83 +71,12 @@ def test_knowing_nothing() -> None:
     assert math.isnan(Rate(successes=0, n=0).value) and str(Rate(successes=0, n=0)) == "no episodes"
 
 
-def test_format() -> None:
-    assert format_rate(93, 100) == "93.0 % [86.3, 96.6] n=100"
-    assert str(Rate(successes=93, n=100)) == "93.0 % [86.3, 96.6] n=100"
-    assert format_rate(0, 20) == "0.0 % [0.0, 16.1] n=20"
-    assert format_rate(20, 20) == "100.0 % [83.9, 100.0] n=20"
-
-
 @pytest.mark.parametrize(
-    ("wins", "losses", "p"),
-    [
-        (0, 0, 1.0),
-        (1, 0, 1.0),
-        (5, 0, 2 / 32),
-        (6, 0, 2 / 64),
-        (8, 2, 2 * (1 + 10 + 45) / 1024),
-        (5, 5, 1.0),  # twice the tail exceeds 1
-    ],
+    ("successes", "n", "text"),
+    [(93, 100, "93.0 % [86.3, 96.6]"), (0, 20, "0.0 % [0.0, 16.1]"), (20, 20, "100.0 % [83.9, 100.0]")],
 )
-def test_mcnemar_by_hand(wins: int, losses: int, p: float) -> None:
-    assert mcnemar_p(wins, losses) == p == mcnemar_p(losses, wins)
-
-
-def test_mcnemar_of_thousands_neither_overflows_nor_rounds_to_nonsense() -> None:
-    assert mcnemar_p(2000, 2000) == 1.0
-    assert 0.0 < mcnemar_p(2200, 1800) < 1e-8
-
-
-def test_mcnemar_keeps_its_level() -> None:
-    """Under no difference a p-value below 0.05 comes up in at most 5 % of all experiments."""
-    for n in (5, 10, 25, 60):
-        share = sum(math.comb(n, k) for k in range(n + 1) if mcnemar_p(k, n - k) <= 0.05) / 2**n
-        assert share <= 0.05
-
-
-def test_paired_interval_by_hand() -> None:
-    # n = 98: a = 11/100, b = 3/100, half = 1.959964·√((0.14 − 0.0064)/100) = 0.071640
-    interval = paired_interval(10, 2, 98)
-    assert interval.low == pytest.approx(0.08 - 0.071640, abs=1e-6)
-    assert interval.high == pytest.approx(0.08 + 0.071640, abs=1e-6)
-
-
-def test_paired_interval_has_width_without_disagreement() -> None:
-    interval = paired_interval(0, 0, 50)
-    assert interval.low == -interval.high and interval.high > 0.04
-
-
-def test_paired_interval_covers_about_as_often_as_it_says() -> None:
-    rng = random.Random(0)
-    for p_win, p_loss in [(0.2, 0.05), (0.02, 0.02), (0.3, 0.3)]:
-        hits = 0
-        for _ in range(1500):
-            draws = [rng.random() for _ in range(60)]
-            wins = sum(d < p_win for d in draws)
-            losses = sum(p_win <= d < p_win + p_loss for d in draws)
-            hits += (p_win - p_loss) in paired_interval(wins, losses, 60)
-        assert hits / 1500 > 0.93
-
-
-def outcomes(task: str, text: str) -> Outcomes:
-    """``"10"``: seed 0 succeeds, seed 1 fails."""
-    return {(task, seed): letter == "1" for seed, letter in enumerate(text)}
-
-
-def test_compare_counts_pairs() -> None:
-    result = compare(outcomes("push", "1111100000"), outcomes("push", "1000010000"))
-    assert (result.n, result.wins, result.losses) == (10, 4, 1)
-    assert result.difference == pytest.approx(0.3)
-    assert result.p_value == 2 * (1 + 5) / 32
-    assert result.difference in result.interval
-    assert str(result).startswith("+30.0 points [") and "n=10 (4 won, 1 lost) p=0.38" in str(result)
-
-
-def test_compare_turned_round_changes_only_the_sign() -> None:
-    a, b = outcomes("push", "110101"), outcomes("push", "011000")
-    there, back = compare(a, b), compare(b, a)
-    assert back.difference == -there.difference and back.p_value == there.p_value
-    assert back.interval.low == pytest.approx(-there.interval.high)
+def test_a_rate_as_text(successes: int, n: int, text: str) -> None:
+    assert str(Rate(successes=successes, n=n)) == f"{text} n={n}"
 
 
 def test_a_mean_over_runs_is_as_unsure_as_they_differ() -> None:
@@ -162,44 +89,11 @@ def test_a_mean_over_runs_is_as_unsure_as_they_differ() -> None:
     assert mean_interval([0.3, 0.3]).low == pytest.approx(0.3)
     rng = random.Random(0)
     draws = [[rng.gauss(1.0, 2.0) for _ in range(5)] for _ in range(4000)]
-    held = sum(1.0 in mean_interval(values, 0.9) for values in draws) / 4000
-    assert held == pytest.approx(0.9, abs=0.02)
+    ends = [mean_interval(values, 0.9) for values in draws]
+    assert sum(low <= 1.0 <= high for low, high in ends) / 4000 == pytest.approx(0.9, abs=0.02)
     for values, confidence in (([0.5], 0.95), ([], 0.95), ([0.1, 0.2], 1.0)):
         with pytest.raises(ValueError):
             mean_interval(values, confidence)
-
-
-def test_pairing_sees_what_two_intervals_do_not() -> None:
-    """a solves all that b solves and seven more: the Wilson intervals overlap, the paired test is clear."""
-    a = outcomes("push", "1" * 60 + "1" * 7 + "0" * 33)
-    b = outcomes("push", "1" * 60 + "0" * 7 + "0" * 33)
-    assert total(a).interval().low < total(b).interval().high
-    assert compare(a, b).p_value < 0.02 and compare(a, b).interval.low > 0.0
-
-
-def test_compare_matches_by_task_and_seed_and_not_by_order() -> None:
-    a = {("push", 0): True, ("push", 1): False, ("reach", 0): False}
-    b = dict(reversed(list(a.items())))
-    assert (compare(a, b).wins, compare(a, b).losses) == (0, 0)
-
-
-def test_unpaired_episodes_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"1 episodes have no partner, such as \('push', 2\)"):
-        compare(outcomes("push", "111"), outcomes("push", "11"))
-    with pytest.raises(ValueError, match="no episodes"):
-        compare({}, {})
-
-
-def test_per_task_and_means() -> None:
-    both = {**outcomes("reach", "11"), **outcomes("push", "1000")}
-    rates = per_task(both)
-    assert list(rates) == ["push", "reach"]
-    assert rates["push"] == Rate(successes=1, n=4) and rates["reach"] == Rate(successes=2, n=2)
-    assert total(both) == Rate(successes=3, n=6)
-    assert task_mean(rates) == pytest.approx(0.625)  # not 3/6: tasks count alike
-    assert math.isnan(task_mean({}))
-    with pytest.raises(ValueError, match="reach has no episode"):
-        task_mean({"reach": Rate(successes=0, n=0)})
 
 
 def test_nonsense_is_refused() -> None:
@@ -211,7 +105,103 @@ def test_nonsense_is_refused() -> None:
     for confidence in (0.0, 1.0, 95.0, math.nan):
         with pytest.raises(ValueError, match="confidence"):
             wilson_interval(1, 2, confidence)
-    with pytest.raises(ValueError, match="pairs"):
-        paired_interval(3, 3, 5)
-    with pytest.raises(ValueError, match="wins"):
-        mcnemar_p(-1, 2)
+
+
+def result(task: str, seed: int, success: bool, versions: tuple[int, int] = (3, 3)) -> EpisodeResult:
+    plan = EpisodePlan(task=task, seed=seed, explore=False)
+    return EpisodeResult(
+        plan=plan,
+        success=success,
+        episode_return=1.0 if success else -0.5,
+        steps=50 if success else 150,
+        decisions=15,
+        versions=versions,
+    )
+
+
+RESULTS = [
+    *(result("door", i, success=i < 8, versions=(3, 5)) for i in range(10)),
+    *(result("drawer", i, success=i < 1, versions=(2, 4)) for i in range(10)),
+]
+
+
+class TestSummarise:
+    """Plain numbers, by hand."""
+
+    def test_in_all(self) -> None:
+        summary = summarise(RESULTS)
+        assert (summary["success"], summary["n"]) == (0.45, 20)
+        # Wilson, 9 of 20: (p + z²/2n ± z √(p(1 − p)/n + z²/4n²)) / (1 + z²/n) with z = 1.959964
+        assert summary["ci95"] == pytest.approx([0.258199, 0.657906], abs=1e-5)
+        assert summary["return_mean"] == pytest.approx((9 - 11 * 0.5) / 20)
+        assert summary["steps_mean"] == pytest.approx((9 * 50 + 11 * 150) / 20)
+        assert (summary["version_min"], summary["version_max"]) == (2, 5)
+
+    def test_per_task(self) -> None:
+        tasks = summarise(RESULTS)["tasks"]
+        assert list(tasks) == ["door", "drawer"]
+        assert [(t["success"], t["n"]) for t in tasks.values()] == [(0.8, 10), (0.1, 10)]
+        assert all(t["ci95"][0] < t["success"] < t["ci95"][1] for t in tasks.values())
+
+    def test_says_which_starts_failed(self) -> None:
+        task = summarise(RESULTS)["tasks"]["door"]
+        assert task["seeds"] == [0, 9] and task["failed_seeds"] == [8, 9]
+
+    def test_is_json_and_of_something(self) -> None:
+        summary = summarise(RESULTS)
+        assert json.loads(json.dumps(summary)) == summary
+        with pytest.raises(ValueError, match="no episodes"):
+            summarise([])
+
+
+def test_a_table_has_a_row_per_task_and_one_for_all() -> None:
+    def printed(results: list[EpisodeResult]) -> str:
+        file = io.StringIO()
+        Console(file=file, width=100).print(table(summarise(results), "policy"))
+        return file.getvalue()
+
+    text = printed(RESULTS)
+    assert "door" in text and "80.0 %" in text and "all" in text and "45.0 %" in text and "n=20" in text
+    assert "all" not in printed(RESULTS[:10]), "one task needs no sum"
+
+
+class TestPlans:
+    """Which episodes are run."""
+
+    def test_are_paired_across_evaluations_and_runs(self) -> None:
+        before = evaluation_plans(("a", "b"), 10, "before")
+        after = evaluation_plans(("a", "b"), 10, "after")
+        assert [(p.task, p.seed) for p in before] == [(p.task, p.seed) for p in after]
+        assert len({(p.task, p.seed) for p in before}) == 10
+
+    def test_another_seed_has_other_starts(self) -> None:
+        seeds = [{p.seed for p in evaluation_plans(("a", "b"), 10, "x", seed=seed)} for seed in (0, 1)]
+        assert len(seeds[0]) == len(seeds[1]) == 5 and not seeds[0] & seeds[1]
+
+    def test_smaller_evaluations_are_the_beginning_of_larger_ones(self) -> None:
+        few, many = (evaluation_plans(("a", "b"), n, "x") for n in (6, 12))
+        assert few == many[:6]
+
+    def test_seeds_are_never_trained_on(self) -> None:
+        for plan in evaluation_plans(("a",), 50, "x"):
+            assert plan.seed in EVAL_SEEDS
+            assert plan.seed not in TRAIN_SEEDS and plan.seed not in DEMO_SEEDS
+
+    def test_tasks_share_evenly(self) -> None:
+        plans = evaluation_plans(("a", "b", "c"), 8, "x")
+        assert [sum(p.task == t for p in plans) for t in "abc"] == [3, 3, 2]
+
+    def test_do_not_explore_and_are_filmed_first(self) -> None:
+        plans = evaluation_plans(("a",), 4, "x", film=2)
+        assert not any(p.explore for p in plans)
+        assert [p.film for p in plans] == [True, True, False, False]
+        assert [p.index for p in plans] == [0, 1, 2, 3] and {p.group for p in plans} == {"x"}
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("episodes", 0), ("episodes_during", 0), ("video_size", 0), ("video_every", 0), ("videos", -1)],
+)
+def test_ranges(field: str, value: int) -> None:
+    with pytest.raises(InputError, match=f"evaluation.{field}={value}"):
+        EvaluationConfig(**{field: value})

@@ -41,8 +41,8 @@ def metaworld(**fields: Any) -> RunConfig:
     return run_config(env=MetaWorldConfig(task="door-open-v3", max_steps=150), **fields)
 
 
-def dreaming() -> RunConfig:
-    """The same with dreams."""
+def imagining() -> RunConfig:
+    """The same with imagined rollouts."""
     return run_config(imagination=ImaginationConfig(share=0.5, model="oracle"))
 
 
@@ -134,7 +134,7 @@ def summary(config: RunConfig, evaluations: Sequence[dict[str, Any]], tasks: Seq
     }  # fmt: skip
 
 
-def dreams(share: float = 0.5, on: float = 1.0) -> dict[str, Any]:
+def imagined(share: float = 0.5, on: float = 1.0) -> dict[str, Any]:
     """Numbers of the workers where something is imagined."""
     return {
         "imagination_dreams": 100.0, "imagination_decisions": 700.0, "imagination_successes": 60.0,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A page tells a run's facts and nothing else, and harms nobody."""
+"""A page tells a run's facts and nothing else, and cannot be turned against its reader."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import yaml
 
 from accerl_lerobot.cli.verbs import CONFIGS
 from accerl_lerobot.console import Console
@@ -20,15 +22,17 @@ from accerl_lerobot.engine import run
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig, parse
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import EvaluationConfig
-from accerl_lerobot.report.commands import commands
-from accerl_lerobot.report.config import ReportConfig
-from accerl_lerobot.report.page import write_report
+from accerl_lerobot.report import ReportConfig, write_report
+from accerl_lerobot.report.charts import Chart
+from accerl_lerobot.report.content import evaluated, exploring
 from accerl_lerobot.report.read import read_run
+from accerl_lerobot.report.recipe import commands
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.world_model.imagination_config import FILMS
 from tests.report.folders import (
     HOSTILE,
-    dreaming,
-    dreams,
+    imagined,
+    imagining,
     metaworld,
     ppo,
     run_config,
@@ -43,6 +47,17 @@ def page_of(*runs: Path, **fields: Any) -> Seen:
     """Writes the report of runs, and reads it."""
     path = write_report(ReportConfig(runs=tuple(map(str, runs)), **fields), CONFIGS)
     return Seen(path.read_text())
+
+
+@pytest.fixture
+def pictures() -> None:
+    """Charts are drawn, which takes a second a page; tests of other things do without."""
+
+
+@pytest.fixture(autouse=True)
+def stand_in(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if "pictures" not in request.fixturenames:
+        monkeypatch.setattr(Chart, "svg", lambda chart: '<svg aria-hidden="true"/>')
 
 
 @pytest.fixture(scope="module")
@@ -76,21 +91,19 @@ class TestARealRun:
     def test_it_says_what_became_of_the_run(self, real: Path, seen: Seen) -> None:
         summary = json.loads((real / "summary.json").read_text())
         low, high = (f"{100 * end:.0f}" for end in summary["ci95_after"])
-        assert f"{100 * summary['success_after']:.3g} % [{low}, {high}]" in seen.text
-        assert "95 % Wilson intervals, on 8 episodes" in seen.text
-        for part in (f"{summary['env_steps']:,}", "GIPO", "seed 0", "finished", "12"):
+        assert f"success after {100 * summary['success_after']:.3g} % [{low}, {high}] %, n = 8" in seen.text
+        assert f"{100 * summary['success_after']:.3g} % [{low}, {high}] 8" in seen.text, (
+            "the evaluation's row"
+        )
+        for part in (f"env steps {summary['env_steps']:,}", "GIPO", "seed 0", "finished", "updates 12 of 12"):
             assert part in seen.text
-
-    def test_evaluations_and_lag_are_those_of_the_run(self, real: Path, seen: Seen) -> None:
-        series = {s["name"]: s for chart in seen.charts for s in chart["series"]}
-        assert len(series["evaluation, 95 % Wilson"]["x"]) == 3
-        lag = series["largest of a batch"]
-        assert lag["x"] == list(range(1, 13)) and max(lag["y"]) <= series_limit(series)
-        assert {"env steps", "decisions", "updates", "policy loss", "value loss"} <= set(series)
+        for name in ("lag", "env steps", "decisions", "updates", "policy loss", "value loss"):
+            assert f" {name} " in seen.text
+        assert len(evaluated(read_run(real), "", 0).x) == 3
 
     def test_the_video_is_inside(self, seen: Seen) -> None:
         (video,) = seen.named("video")
-        assert video["src"].startswith("data:video/mp4;base64,") and "autoplay" in video
+        assert video["src"].startswith("data:video/mp4;base64,") and "controls" in video
 
     def test_the_recipe_and_the_commands(self, real: Path, seen: Seen) -> None:
         assert "trainer.updates 12 1000" in seen.text and "env.type simulated metaworld" in seen.text
@@ -110,13 +123,7 @@ class TestARealRun:
         assert page_of(real).text == seen.text
 
 
-def series_limit(series: dict[str, Any]) -> float:
-    """Value of the line across the lag's chart."""
-    (bound,) = [s for name, s in series.items() if name.startswith("bound of the recipe")]
-    return float(bound["y"][0])
-
-
-def test_everything_needed_is_inside(tmp_path: Path) -> None:
+def test_everything_needed_is_inside(pictures: None, tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run")
     (folder / "before_after.mp4").write_bytes(b"not really a video")
     html = write_report(ReportConfig(runs=(str(folder),)), CONFIGS).read_text()
@@ -125,23 +132,21 @@ def test_everything_needed_is_inside(tmp_path: Path) -> None:
         for name in ("src", "href", "srcset", "poster", "data", "action"):
             value = attributes.get(name, "")
             assert value == "" or value.startswith(("data:", "#")), (tag, value)
-    assert not re.search(r"@import|url\(", html)
+    assert not re.search(r"@import|url\((?!#)", html) and seen.named("script") == []
     (policy,) = [m["content"] for m in seen.named("meta") if m.get("http-equiv") == "Content-Security-Policy"]
-    assert "default-src 'none'" in policy and "script-src 'sha256-" in policy
+    assert "default-src 'none'" in policy and "script" not in policy
     assert seen.named("html")[0]["lang"] == "en"
     assert any(m.get("name") == "viewport" for m in seen.named("meta"))
 
 
-def test_charts_and_tables_speak_to_those_who_do_not_see_them(tmp_path: Path) -> None:
+def test_the_structure_is_one_that_assistive_technology_follows(pictures: None, tmp_path: Path) -> None:
     seen = page_of(write_run(tmp_path / "run", tasks=("a", "b")))
-    plots = [a for _, a in seen.elements if a.get("class") == "plot"]
-    assert len(plots) == len(seen.charts) >= 12
-    assert all(a["role"] == "img" and " over " in a["aria-label"] for a in plots)
-    assert all("scope" in a for a in seen.named("th")) and len(seen.named("caption")) == len(
-        seen.named("table")
-    )
+    assert len(seen.named("svg")) >= 14 and all(svg["aria-hidden"] == "true" for svg in seen.named("svg"))
+    assert all("scope" in a for a in seen.named("th"))
+    assert len(seen.named("caption")) == len(seen.named("table")) > 0
     ids = [a["id"] for _, a in seen.elements if "id" in a]
     assert len(ids) == len(set(ids))
+    assert {f"#{a['id']}" for a in seen.named("section")} == {a["href"] for a in seen.named("a")}
 
 
 @pytest.mark.parametrize(
@@ -160,22 +165,20 @@ def test_the_headline_does_not_promise_more_than_was_measured(
 
 
 def test_numbers_of_a_known_run(tmp_path: Path) -> None:
-    seen = page_of(write_run(tmp_path / "run"))
-    series = {s["name"]: s for chart in seen.charts for s in chart["series"]}
-    assert series["evaluation, 95 % Wilson"]["x"] == [0, 4000] and series["evaluation, 95 % Wilson"]["y"] == [
-        0.4,
-        0.9,
-    ]
+    folder = write_run(tmp_path / "run")
+    text, run = page_of(folder).text, read_run(folder)
+    points = evaluated(run, "evaluation", 0)
+    assert (points.x.tolist(), points.y.tolist()) == ([0, 4000], [0.4, 0.9])
     # The 1000 env steps of the evaluation before are not experience; the first 24 episodes say nothing.
-    assert series["while exploring"]["x"] == [100.0 * i for i in range(25, 41)]
-    assert series["env steps"]["y"] == pytest.approx([100.0] * len(series["env steps"]["y"]), rel=1e-3)
-    # 0.75 s of work and 0.25 s of waiting in each second; forward passes in 30 % of it.
-    assert series["trainer"]["y"] == pytest.approx([0.75] * len(series["trainer"]["y"]), rel=1e-3)
-    assert series["inference"]["y"] == pytest.approx([0.3] * len(series["inference"]["y"]), rel=1e-3)
-    assert "The trainer was busy for 75 % of its time" in seen.text
-    assert "updating 70 %, 28 s" in seen.text and "waiting for a batch 25 %, 10 s" in seen.text
-    assert "Collecting was the slower side, and inference had time left" in seen.text
-    assert "Segments stood at the replay's door for 20 s" in seen.text
+    steps, share = exploring(run)
+    assert steps[np.isfinite(share)].tolist() == [100.0 * i for i in range(25, 41)]
+    assert "while exploring 45 % → 60 % evaluation 40 % → 90 %" in text
+    assert "env steps 100 → 100" in text and "updates 1 → 1" in text
+    assert "mean of a batch 4 → 3 largest 8 → 8" in text and "the bound of the recipe, 39" in text
+    # 0.75 s of work and 0.25 s of waiting in each second.
+    assert "The trainer was busy for 75 % of its time" in text
+    assert "Collecting was the slower side, and inference had time left" in text
+    assert "Segments waited to enter the replay buffer for 20 s" in text
 
 
 def test_the_time_of_every_role_divides_as_the_timeline_says(tmp_path: Path) -> None:
@@ -187,16 +190,15 @@ def test_the_time_of_every_role_divides_as_the_timeline_says(tmp_path: Path) -> 
         "timeline_driver_training_share": 1.0, "timeline_driver_bubble": 0.0,
     }  # fmt: skip
     text = page_of(write_run(tmp_path / "run", rollout=shares)).text
-    assert "rollout compute: 50 % wait in: 40 % transport: 10 %" in text
-    assert "trainer compute: 25 % wait in: 75 %" in text
-    assert "driver" not in text and "deciding" not in text
+    assert "rollout compute 50 % wait in 40 % transport 10 %" in text
+    assert "trainer compute 25 % wait in 75 %" in text and "driver" not in text
 
 
 @pytest.mark.parametrize(
     ("waited", "busy", "said"),
     [
-        (0.01, 0.5, "Learning was the slower side: more worlds would wait at the door."),
-        (2.0, 0.95, "Inference, busy for 95 % of the time, held collecting up."),
+        (0.01, 0.5, "Learning was the slower side: more environments would only wait."),
+        (2.0, 0.95, "Inference, busy for 95 % of the time, limited collecting."),
         (2.0, 0.3, "Collecting was the slower side, and inference had time left"),
     ],
 )
@@ -207,10 +209,11 @@ def test_who_waited_for_whom(tmp_path: Path, waited: float, busy: float, said: s
     assert said in page_of(folder).text
 
 
-def test_several_tasks_have_a_table(tmp_path: Path) -> None:
-    several = page_of(write_run(tmp_path / "a", tasks=("door-open-v3", "drawer-open-v3")))
-    assert "Success of each task" in several.text and "Success on 2 tasks rose" in several.text
-    assert "Success of each task" not in page_of(write_run(tmp_path / "b")).text
+def test_evaluations_have_a_row_per_task(tmp_path: Path) -> None:
+    text = page_of(write_run(tmp_path / "a", tasks=("door-open-v3", "drawer-open-v3"))).text
+    assert "Success on 2 tasks rose" in text
+    assert "after 4,000 drawer-open-v3 90 % [83, 94] 50 after 4,000 all 90 % [83, 94] 100" in text
+    assert " all 90 %" not in page_of(write_run(tmp_path / "b")).text
 
 
 def test_stock_lerobot_is_told_the_world(tmp_path: Path) -> None:
@@ -231,8 +234,11 @@ def test_nothing_goes_wrong_so_nothing_is_warned_of(tmp_path: Path) -> None:
     ("numbers", "said"),
     [
         ({"restarts": 2.0}, "2 restarts of a rollout worker"),
-        ({"dropped_nonfinite": 1.0}, "1 decision thrown away, because the world returned NaN"),
-        ({"replay_retired_unused": 7.0}, "7 segments left the replay unused because they were older"),
+        ({"dropped_nonfinite": 1.0}, "1 decision thrown away, because the environment returned NaN"),
+        (
+            {"replay_retired_unused": 7.0},
+            "7 segments left the replay buffer unused, being older than replay.max_lag",
+        ),
         ({"groups_dropped": 9.0, "groups_kept": 1.0}, "9 groups of equal starts thrown away and 1 kept"),
     ],
 )
@@ -247,64 +253,73 @@ def test_a_run_that_is_going_on_and_one_that_has_died(tmp_path: Path) -> None:
     going = page_of(folder)
     assert "still going" in going.text and "there is no summary.json yet" in going.text
     assert "40 of 40 updates on door-open-v3 so far, with 60 % success while exploring" in going.text
-    assert "The last line of metrics.jsonl is incomplete" in going.text and len(going.charts) >= 12
+    assert "The last line of metrics.jsonl is incomplete" in going.text and len(going.named("svg")) >= 14
+    assert f"accerl train --resume=true --config_path={folder}/config.yaml" in going.text
     for path in folder.iterdir():
         os.utime(path, (time.time() - 7200, time.time() - 7200))
     died = page_of(folder).text
-    assert "not finished" in died and "it ended early, or waits for something" in died
-    assert "2 h 00 min before this page" in died and "accerl eval" not in died
+    assert "not finished" in died and "it ended early, or waits" in died
+    assert "2 h 00 min ago" in died and "accerl eval" not in died
 
 
 def test_a_run_that_died_before_its_first_record(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run", finished=False)
     (folder / "metrics.jsonl").unlink()
     seen = page_of(folder)
-    assert "the run has not come to its first record" in seen.text and seen.charts == []
+    assert "the run has not come to its first record" in seen.text and seen.named("svg") == []
     assert "0 of 40 updates on match so far" in seen.text
 
 
-def test_dreams(tmp_path: Path) -> None:
-    seen = page_of(write_run(tmp_path / "on", config=dreaming(), rollout=dreams()))
-    assert "100 dreams of 700 decisions; 60 % of them succeeded, and 3 ended early" in seen.text
-    assert "The world model passed 1 of 3 trials in this run." in seen.text
-    assert "skill_changed_first 0.7 above 0.3 holds" in seen.text
-    assert "false_success 0.8 at most 0.5 fails" in seen.text
-    series = {s["name"]: s for chart in seen.charts for s in chart["series"]}
-    assert set(series["so far"]["y"]) == {0.75} and set(series["reality"]["y"]) == {0.4}
-    off = page_of(write_run(tmp_path / "off", config=dreaming(), rollout=dreams(on=0.0))).text
-    assert "Dreams were switched off in the end: 70 % of them succeeded, and 40 % of real episodes." in off
-    assert "dreams of" not in page_of(write_run(tmp_path / "none")).text
+def test_imagined_rollouts(tmp_path: Path) -> None:
+    text = page_of(write_run(tmp_path / "on", config=imagining(), rollout=imagined())).text
+    assert "100 imagined rollouts of 700 decisions; 60 % of them succeeded, and 3 ended early" in text
+    assert "The world model passed 1 of 3 held-out evaluations." in text
+    assert "75 % of the decisions learned from were imagined" in text and "real 40 % → 40 %" in text
+    assert "skill_changed_first 0.7 above 0.3 holds" in text
+    assert "false_success 0.8 at most 0.5 fails" in text
+    off = page_of(write_run(tmp_path / "off", config=imagining(), rollout=imagined(on=0.0))).text
+    assert "Imagination was switched off: 70 % success imagined, 40 % in reality." in off
+    assert "imagined rollouts" not in page_of(write_run(tmp_path / "none")).text
 
 
-def test_films_of_dreams(tmp_path: Path) -> None:
-    folder = write_run(tmp_path / "run", config=dreaming(), rollout=dreams())
-    (folder / "dreams").mkdir()
+def test_videos_of_imagined_rollouts(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "run", config=imagining(), rollout=imagined())
+    (folder / FILMS).mkdir()
     for name in ("0001_failed", "0002_failed", "0013_passed", ".0014_failed"):
-        (folder / "dreams" / f"{name}.mp4").write_bytes(name.encode())
+        (folder / FILMS / f"{name}.mp4").write_bytes(name.encode())
     text = page_of(folder).text
-    assert "Trial 1, failed: an episode that was held out" in text and "Trial 13, passed: " in text
-    assert "Trial 2," not in text and "Trial 14" not in text
+    assert "Held-out evaluation 1, failed: a recorded episode" in text
+    assert "evaluation 13, passed: " in text
+    assert "evaluation 2, failed" not in text and "evaluation 14" not in text
     html = (folder / "report.html").read_text()
     for name, there in (("0001_failed", True), ("0002_failed", False), ("0013_passed", True)):
         assert (base64.b64encode(name.encode()).decode() in html) is there
 
 
 def test_a_world_model(tmp_path: Path) -> None:
-    seen = page_of(write_world_model(tmp_path / "good"))
-    assert "The world model passed its trial: all 2 gates hold" in seen.text
-    assert "50 trials on 8 episodes it had not learnt from" in seen.text
-    series = {s["name"]: s for chart in seen.charts for s in chart["series"]}
-    assert series["where pixels changed"]["y"] == [0.8] * 3 and series["image"]["x"][:2] == [20, 40]
-    held = series["image, held out"]
-    assert held["x"] == [200, 400] and held["y"] == [0.01, 0.005] and "points" in held["style"]
-    assert "state, held out" not in series and "grad norm" not in series
+    text = page_of(write_world_model(tmp_path / "good")).text
+    assert "The world model passed its held-out evaluation: all 2 checks hold" in text
+    assert "50 rollouts on 8 episodes it had not learned from" in text
+    assert "where pixels changed 0.8 → 0.8" in text and "image 0.05 → 0.0025" in text
+    assert "image, held out 0.01 → 0.005" in text and "state, held out" not in text
     failed = page_of(write_world_model(tmp_path / "bad", passed=False)).text
-    assert "The world model failed its trial: recall" in failed and "recall 0.1 above 0.3 fails" in failed
+    assert "The world model failed its held-out evaluation: recall" in failed
+    assert "recall 0.1 above 0.3 fails" in failed
     begun = page_of(write_world_model(tmp_path / "begun", finished=False)).text
-    assert "A world model after 400 steps, not tried yet" in begun and "there is no trial.json yet" in begun
+    assert "A world model after 400 steps, not evaluated yet" in begun
+    assert "there is no trial.json yet" in begun
 
 
-def test_a_world_model_that_was_tried_again(tmp_path: Path) -> None:
+def test_a_world_model_on_several_sources(tmp_path: Path) -> None:
+    folder = write_world_model(tmp_path / "model")
+    found = json.loads((folder / "trial.json").read_text())
+    found |= {"name": "demos", "sources": {"online": {**found, "name": "online"}}}
+    (folder / "trial.json").write_text(json.dumps(found))
+    text = page_of(folder).text
+    assert "100 rollouts on 16 episodes" in text and "demos online" in text and "online 0.8 → 0.8" in text
+
+
+def test_a_world_model_that_was_evaluated_again(tmp_path: Path) -> None:
     folder = write_world_model(tmp_path / "tried")
     (folder / "metrics.jsonl").unlink()
     (folder / "config.yaml").write_text("path: model/world_model\ntrial: {depth: 9}\n")
@@ -313,46 +328,53 @@ def test_a_world_model_that_was_tried_again(tmp_path: Path) -> None:
     assert "There are no metrics" not in text  # it makes none
 
 
-def test_runs_beside_each_other(tmp_path: Path) -> None:
+def test_runs_side_by_side(tmp_path: Path) -> None:
     a = write_run(tmp_path / "a" / "seed0", successes=(40, 90))
     b = write_run(tmp_path / "b" / "seed0", config=ppo(seed=1), successes=(30, 60))
     c = write_run(tmp_path / "c", finished=False)
-    seen = page_of(a, b, c, output=str(tmp_path / "all.html"))
-    assert "2 of 3 finished" in seen.text
-    assert "Success from 40 % (c) to 90 % (a/seed0)" in seen.text
-    assert "a/seed0 GIPO 0 40 % [31, 50] 90 % [83, 94] 4,000" in seen.text
-    assert "b/seed0 PPO 1 30 % [22, 40] 60 % [50, 69] 4,000" in seen.text
-    assert "algorithm.type gipo ppo gipo" in seen.text and "replay.capacity" not in seen.text
-    evaluated = seen.charts[0]["series"]
-    assert [len(s["x"]) for s in evaluated] == [2, 2, 1]
+    text = page_of(a, b, c, output=str(tmp_path / "all.html")).text
+    assert "2 of 3 finished" in text and "3 training runs" in text
+    assert f"{a} 40 % [31, 50] 90 % [83, 94] GIPO 0 4,000 3.5" in text
+    assert f"{b} 30 % [22, 40] 60 % [50, 69] PPO 1 4,000 3.5" in text
+    assert "c 40 % [31, 50] 40 % [31, 50] GIPO" in text and "c: The run is still going" in text
+    assert "algorithm.type gipo ppo gipo" in text and "replay.capacity" not in text
+    assert f"{a} 40 % → 90 %" in text
 
 
 def test_more_runs_than_colours(tmp_path: Path) -> None:
     runs = [write_run(tmp_path / f"run{i}", config=run_config(seed=i)) for i in range(12)]
     seen = page_of(*runs, output=str(tmp_path / "all.html"))
-    styles = [s["style"] for s in seen.charts[0]["series"]]
-    assert len(set(styles)) == 12 and "c3 dashed points" in styles
+    keys = [a["style"] for a in seen.named("i") if a.get("class") == "key"]
+    assert len(set(keys[:12])) == 12 and "border-top:3px dashed var(--c3)" in keys
 
 
-def test_world_models_beside_each_other(tmp_path: Path) -> None:
+def test_world_models_side_by_side(tmp_path: Path) -> None:
     models = [write_world_model(tmp_path / "a"), write_world_model(tmp_path / "b", passed=False)]
-    seen = page_of(*models, output=str(tmp_path / "all.html"))
-    assert "a passed 0.7 0.1" in seen.text and "b failed 0.7 0.1" in seen.text
-    assert "Nothing: their recipes are the same." in seen.text
+    text = page_of(*models, output=str(tmp_path / "all.html")).text
+    assert "a passed 0.7 0.1" in text and "b failed 0.7 0.1, fails" in text
+    assert "Their recipes are the same." in text
 
 
-def test_text_of_a_run_is_text(tmp_path: Path) -> None:
+def test_text_of_a_run_is_text(pictures: None, tmp_path: Path) -> None:
     """In tasks, recipes, file names and on the axes of every chart; no element of it comes to be."""
     config = metaworld(job_name=HOSTILE, output_dir=HOSTILE)
     folder = write_run(tmp_path / "<b>&run", config=config, tasks=(HOSTILE, "door-open-v3"))
     (folder / "<i onclick='x'>.mp4").write_bytes(b"")
     other = write_run(tmp_path / "<script>2", config=config, tasks=(HOSTILE,))
     for seen in (page_of(folder), page_of(folder, other, output=str(tmp_path / "both.html"))):
-        assert len(seen.named("script")) == len(seen.charts) + 1
-        assert seen.named("img") == seen.named("i onclick") == []
+        assert seen.named("script") == seen.named("img") == seen.named("i onclick") == []
         assert not any(name.startswith("on") for _, attributes in seen.elements for name in attributes)
         assert "<b>&run" in seen.text
     assert HOSTILE in page_of(folder).text
+
+
+def test_text_of_a_run_is_one_word_of_a_command(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "a run; true", config=metaworld())
+    tree = yaml.safe_load((folder / "config.yaml").read_text())
+    tree["evaluation"]["episodes"], tree["env"]["camera"] = "1; true", "$(true)"
+    (folder / "config.yaml").write_text(yaml.safe_dump(tree))
+    for _, command in commands(read_run(folder)):
+        assert ";" not in re.sub(r"'[^']*'", "", command) and "$" not in re.sub(r"'[^']*'", "", command)
 
 
 def test_a_large_video_is_linked(tmp_path: Path) -> None:
@@ -364,19 +386,13 @@ def test_a_large_video_is_linked(tmp_path: Path) -> None:
     assert "before_after.mp4 is 2 MB, too large" in seen.text
 
 
-def test_a_long_run_makes_a_small_page_soon(tmp_path: Path) -> None:
+def test_a_long_run_makes_a_small_page_soon(pictures: None, tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run", config=run_config(trainer=TrainerConfig(updates=10_000)))
     started = time.process_time()
     path = write_report(ReportConfig(runs=(str(folder),)), CONFIGS)
-    assert time.process_time() - started < 10
+    assert time.process_time() - started < 20
     assert path.stat().st_size < 500_000
-    lag = next(
-        s
-        for chart in Seen(path.read_text()).charts
-        for s in chart["series"]
-        if s["name"].startswith("largest")
-    )
-    assert len(lag["x"]) == 100 and max(lag["y"]) == 9.0
+    assert "largest 9 → 9" in Seen(path.read_text()).text
 
 
 class TestPlace:
@@ -396,19 +412,16 @@ class TestPlace:
         (tmp_path / "other" / "summary.json").rename(folder / "summary.json")
         assert "finished" in page_of(folder).text
 
-    def test_no_such_place(self, tmp_path: Path) -> None:
-        folder = write_run(tmp_path / "run")
-        with pytest.raises(InputError, match="there is no folder"):
-            page_of(folder, output=str(tmp_path / "nowhere" / "page.html"))
-        with pytest.raises(InputError, match="a folder; name a file in it"):
-            page_of(folder, output=str(tmp_path))
-
-    def test_several_runs_make_a_page_here(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_no_such_place(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         runs = [write_run(tmp_path / name) for name in ("a", "b")]
+        with pytest.raises(InputError, match="there is no folder"):
+            page_of(runs[0], output=str(tmp_path / "nowhere" / "page.html"))
+        with pytest.raises(InputError, match="a folder; name a file in it"):
+            page_of(runs[0], output=str(tmp_path))
         (tmp_path / "here").mkdir()
         monkeypatch.chdir(tmp_path / "here")
         page_of(*runs)
-        assert (tmp_path / "here" / "report.html").is_file()
+        assert (tmp_path / "here" / "report.html").is_file(), "several runs make a page here"
 
     def test_runs_of_different_kinds(self, tmp_path: Path) -> None:
         runs = write_run(tmp_path / "a"), write_world_model(tmp_path / "b")

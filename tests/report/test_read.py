@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run's folder as data: what is torn, missing or damaged, and a run that was taken up again."""
+"""A run's folder as data: truncated, missing or damaged files, and a run that was resumed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def append(folder: Path, *records: dict[str, Any]) -> None:
 
 def test_a_finished_run(tmp_path: Path) -> None:
     run = read_run(write_run(tmp_path / "run"))
-    assert run.verb == "train" and run.name == "run" and not run.torn and run.sessions == 1
+    assert run.verb == "train" and run.name == "run" and not run.truncated and run.sessions == 1
     assert {kind: len(records) for kind, records in run.records.items()} == {
         "train": 40, "rollout": 40, "evaluation": 2,
     }  # fmt: skip
@@ -30,16 +30,13 @@ def test_a_finished_run(tmp_path: Path) -> None:
     assert run.checkpoint == tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
 
 
-def test_a_run_that_is_not_finished(tmp_path: Path) -> None:
-    run = read_run(write_run(tmp_path / "run", finished=False))
-    assert run.result is None and run.checkpoint is None and len(run.records["train"]) == 40
-
-
-def test_a_run_that_did_not_come_to_its_metrics(tmp_path: Path) -> None:
+def test_a_run_that_is_not_finished_or_did_not_come_to_its_metrics(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run", finished=False)
+    run = read_run(folder)
+    assert run.result is None and run.checkpoint is None and len(run.records["train"]) == 40
     (folder / "metrics.jsonl").unlink()
     run = read_run(folder)
-    assert run.records == {} and not run.torn
+    assert run.records == {} and not run.truncated and run.outcomes == []
 
 
 @pytest.mark.parametrize("tail", [b'{"kind": "tra', b"\xff\xfe", b'{"kind": "evaluation", "n": 3}', b"7"])
@@ -48,7 +45,7 @@ def test_a_last_line_that_is_no_record_is_left_out(tmp_path: Path, tail: bytes) 
     with (folder / "metrics.jsonl").open("ab") as file:
         file.write(tail)
     run = read_run(folder)
-    assert run.torn and len(run.records["train"]) == 40 and len(run.records["evaluation"]) == 2
+    assert run.truncated and len(run.records["train"]) == 40 and len(run.records["evaluation"]) == 2
 
 
 def test_a_line_in_the_middle_that_is_no_record_is_named(tmp_path: Path) -> None:
@@ -103,7 +100,7 @@ def test_a_damaged_trial_is_named(tmp_path: Path) -> None:
         read_run(folder)
 
 
-def test_a_run_that_was_taken_up_again_reads_as_one(tmp_path: Path) -> None:
+def test_a_resumed_run_reads_as_one(tmp_path: Path) -> None:
     """It died after update 40 and went on from a checkpoint of update 30, with all counters from 0."""
     folder = write_run(tmp_path / "run", finished=False)
     again = []

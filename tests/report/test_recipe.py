@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Differences from the defaults, between runs, and the bound that a recipe implies."""
+"""Differences from the defaults and between runs, and the bound that a recipe implies."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_a_recipe_of_another_version() -> None:
     assert ("algorithm.type", "reinforce", "gipo") in differences(RunConfig, tree)
 
 
-def test_a_room_that_is_off_unless_given() -> None:
+def test_a_section_that_is_off_unless_given() -> None:
     config = RunConfig(sft=SFTConfig(steps=5, backbone=BackboneConfig(hidden=8)))
     assert changed(config) == {"sft.backbone": "given", "sft.steps": 5, "sft.backbone.hidden": 8}
 

@@ -6,8 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from accerl_lerobot.timeline.clock import Clock
-from accerl_lerobot.timeline.parts import Moment, Parts
+from accerl_lerobot.timeline.clock import Clock, Moment
 from accerl_lerobot.timeline.states import TIMELINE
 
 SECOND = 10**9
@@ -16,7 +15,7 @@ UP = 10**15
 
 
 class Hands:
-    """A clock's: they stand still unless a test turns them."""
+    """Hands of a clock, which stand still unless a test turns them."""
 
     def __init__(self, now: int = UP) -> None:
         self.now = now
@@ -31,7 +30,7 @@ def a_clock(
     """A worker's clock, and its hands."""
     begins = begins or Moment("here", UP, 2 * UP)
     hands = Hands(begins.clock_ns)
-    return Clock(Parts(run / TIMELINE, worker, begins, part_bytes), hands), hands
+    return Clock(run / TIMELINE, worker, begins=begins, part_bytes=part_bytes, now=hands), hands
 
 
 def write_worker(
@@ -44,7 +43,7 @@ def write_worker(
         worker: its name.
         spans: states, and how many seconds it was in each.
         at_s: when it began.
-        part_bytes: see `Parts`.
+        part_bytes: see `Clock`.
     """
     at = round(at_s * SECOND)
     begins = Moment("here", UP + at, 2 * UP + at)

@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +19,7 @@ from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline import TIMELINE
-from accerl_lerobot.timeline.read import ABSENT, Timeline, read_timeline, shares
+from accerl_lerobot.timeline.read import ABSENT, Timeline, read_head, read_timeline, shares
 from accerl_lerobot.trainer import worker as trainer_worker
 from tests.light_workers import LightInference, LightTrainer, light_ray
 from tests.runs import collect, drive, tiny_run
@@ -79,42 +77,26 @@ def test_the_asynchronous_engine(light: None, tmp_path: Path) -> None:
     assert found["replay"].keys() == {"recovery", "compute", "wait_in"}
     # The whole life of replay is in it, from before it was ready to when it was asked last.
     (path,) = (tmp_path / TIMELINE).glob("replay.*")
-    from accerl_lerobot.timeline.parts import read_head
-
-    head, _ = read_head(path)
+    head = read_head(path)
     assert head is not None
     first = head.begins.clock_ns
     assert begun < first < ready
     assert asked < first + int(rows["replay"].times[-1] - rows["replay"].times[0]) < ended
 
 
-def test_a_run_that_wants_none(light: None, tmp_path: Path) -> None:
-    config = tiny_run(
-        Path("nowhere"), output_dir=str(tmp_path), launch=LaunchConfig(stall_s=120, timeline=False)
-    )
-    engine = RayEngine(config, ("match",))
+@pytest.mark.parametrize("recorded", [True, False])
+def test_the_engine_in_one_process_is_one_row(tiny_checkpoint: Path, tmp_path: Path, recorded: bool) -> None:
+    launch = LaunchConfig(engine="local", timeline=recorded)
+    engine = LocalEngine(tiny_run(tiny_checkpoint, output_dir=str(tmp_path), launch=launch), ("match",))
     try:
         engine.train()
         drive(engine)
+        engine.save(tmp_path / "saved")
     finally:
         engine.close()
-    assert (tmp_path / "episodes.jsonl").stat().st_size and not (tmp_path / TIMELINE).exists()
-
-
-@pytest.fixture
-def in_one_process(tiny_checkpoint: Path, tmp_path: Path) -> Iterator[LocalEngine]:
-    config = tiny_run(tiny_checkpoint, output_dir=str(tmp_path))
-    engine = LocalEngine(replace(config, launch=replace(config.launch, engine="local")), ("match",))
-    yield engine
-    engine.close()
-
-
-def test_the_engine_in_one_process_is_one_row(in_one_process: LocalEngine, tmp_path: Path) -> None:
-    in_one_process.train()
-    drive(in_one_process)
-    in_one_process.save(tmp_path / "saved")
-    in_one_process.close()
-    timeline = read_timeline(tmp_path)
-    adds_up(timeline)
-    assert [row.worker for row in timeline.rows] == ["local"]
-    assert timeline.shares()["local"].keys() == {"recovery", "compute", "wait_in", "checkpoint"}
+    assert (tmp_path / "episodes.jsonl").stat().st_size and (tmp_path / TIMELINE).exists() is recorded
+    if recorded:
+        timeline = read_timeline(tmp_path)
+        adds_up(timeline)
+        assert [row.worker for row in timeline.rows] == ["local"]
+        assert timeline.shares()["local"].keys() == {"recovery", "compute", "wait_in", "checkpoint"}

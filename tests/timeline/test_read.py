@@ -19,10 +19,9 @@ from accerl_lerobot.timeline import (
     WAIT_IN,
     WAIT_OUT,
 )  # fmt: skip
-from accerl_lerobot.timeline.parts import Moment
-from accerl_lerobot.timeline.read import ABSENT, read_timeline, shares
+from accerl_lerobot.timeline.clock import Moment
+from accerl_lerobot.timeline.read import ABSENT, Watch, read_timeline, shares
 from accerl_lerobot.timeline.states import bubble
-from accerl_lerobot.timeline.watch import Watch
 from tests.timeline.folders import SECOND, UP, a_clock, write_worker
 
 
@@ -46,35 +45,20 @@ def test_shares_are_of_the_time_of_all_workers_of_a_role(run: Path) -> None:
 
 
 def test_shares_of_a_part(run: Path) -> None:
-    assert shares(run, 4.0, 2.0)["trainer"] == pytest.approx({"wait_in": 0.5, "compute": 0.5})
-    assert shares(run, 9.0)["rollout"] == pytest.approx({"wait_in": 0.5, "wait_out": 0.5})
+    timeline = read_timeline(run)
+    assert timeline.shares([(4.0, 6.0)])["trainer"] == pytest.approx({"wait_in": 0.5, "compute": 0.5})
+    assert timeline.shares([(9.0, 10.0)])["rollout"] == pytest.approx({"wait_in": 0.5, "wait_out": 0.5})
+    assert timeline.shares([(0.0, 0.5)]).keys() == {"driver", "rollout"}, "the trainer had not begun"
     # From second 2 to 8, the checkpoint included.
     assert shares(run, training=True)["trainer"] == pytest.approx({"wait_in": 0.5, "compute": 0.5})
-    assert shares(run, 7.0, training=True)["trainer"] == pytest.approx({"compute": 1.0})
-    assert shares(run, 0.0, 0.5).keys() == {"driver", "rollout"}, "the trainer had not begun"
 
 
-@pytest.mark.parametrize(
-    ("start", "length", "field"),
-    [(10.5, None, "start_s"), (-1.0, None, "start_s"), (float("nan"), 1.0, "start_s"), (0.0, 0.0, "seconds")],
-)
-def test_a_part_that_is_not_within_the_run(run: Path, start: float, length: float | None, field: str) -> None:
-    with pytest.raises(InputError, match=f"^{field}="):
-        shares(run, start, length)
-
-
-def test_a_part_that_is_not_within_the_training(run: Path) -> None:
-    with pytest.raises(InputError, match=r"^start_s=8\.5: .*training.* 2\.0 to 8\.0"):
-        shares(run, 8.5, training=True)
-
-
-def test_a_run_that_was_gone_on_with_has_trained_twice(run: Path) -> None:
+def test_a_resumed_run_has_trained_twice(run: Path) -> None:
     write_worker(run, "driver", [(RECOVERY, 5), (CHECKPOINT, 1), (RECOVERY, 1), (TRAINING, 3)], at_s=100)
     write_worker(run, "trainer", [(RECOVERY, 6), (COMPUTE, 4)], at_s=100)
     timeline = read_timeline(run)
     assert timeline.training() == [(2.0, 8.0), (107.0, 110.0)]
     assert shares(run, training=True)["trainer"] == pytest.approx({"wait_in": 3 / 9, "compute": 6 / 9})
-    assert shares(run, 50.0, training=True)["trainer"] == pytest.approx({"compute": 1.0})
 
 
 def test_a_worker_that_was_started_again_is_one_row_with_a_gap(tmp_path: Path) -> None:
@@ -86,7 +70,7 @@ def test_a_worker_that_was_started_again_is_one_row_with_a_gap(tmp_path: Path) -
     assert shares(tmp_path)["rollout"] == pytest.approx({"compute": 0.75, "recovery": 0.25})
 
 
-def test_the_last_words_of_a_process_are_cut_where_its_successor_begins(tmp_path: Path) -> None:
+def test_the_last_entries_of_a_process_are_cut_where_its_successor_begins(tmp_path: Path) -> None:
     write_worker(tmp_path, "rollout 0", [(COMPUTE, 2), (WAIT_IN, 3)])
     write_worker(tmp_path, "rollout 0", [(COMPUTE, 1)], at_s=4)
     (row,) = read_timeline(tmp_path).rows
@@ -116,7 +100,7 @@ def test_workers_are_in_order(tmp_path: Path) -> None:
     assert names == ["driver", "rollout 9", "rollout 10", "trainer", "world learning", "someone new"]
 
 
-def test_what_is_no_run_and_a_run_without_a_timeline(tmp_path: Path) -> None:
+def test_a_folder_without_a_run_and_a_run_without_a_timeline(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     (tmp_path / "empty").mkdir()
     (tmp_path / "bare").mkdir()
@@ -127,7 +111,7 @@ def test_what_is_no_run_and_a_run_without_a_timeline(tmp_path: Path) -> None:
             shares(tmp_path / name)
 
 
-def test_news_are_of_the_time_since_the_last(tmp_path: Path) -> None:
+def test_news_cover_the_time_since_the_last_call(tmp_path: Path) -> None:
     write_worker(tmp_path, "trainer", [(WAIT_IN, 100)], at_s=-200)  # before anyone watched
     clock, hands = a_clock(tmp_path, "trainer", part_bytes=80)
     watch = Watch(tmp_path / TIMELINE)
@@ -156,7 +140,4 @@ def test_news_are_of_the_time_since_the_last(tmp_path: Path) -> None:
         "timeline_world_learning_compute_share": 1.0,
         "timeline_world_learning_bubble": 0.0,
     }
-
-
-def test_nobody_to_watch(tmp_path: Path) -> None:
     assert Watch(tmp_path / "nowhere").news() == {}

@@ -17,11 +17,17 @@ from rich.console import Console
 from accerl_lerobot.cli import main
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.timeline import COMPUTE, RECOVERY, TRAINING, WAIT_IN
-from accerl_lerobot.timeline.chrome import COLOURS, trace
-from accerl_lerobot.timeline.config import TimelineConfig
-from accerl_lerobot.timeline.picture import COLUMNS, columns
 from accerl_lerobot.timeline.read import read_timeline
-from accerl_lerobot.timeline.show import choose_windows, show_timelines, table
+from accerl_lerobot.timeline.show import (
+    COLOURS,
+    COLUMNS,
+    TimelineConfig,
+    choose_window,
+    columns,
+    show_timelines,
+    timeline_table,
+    trace,
+)
 from accerl_lerobot.timeline.states import STATES
 from tests.timeline.folders import write_worker
 
@@ -41,7 +47,7 @@ def run(tmp_path: Path) -> Path:
     return write_run(tmp_path / "run")
 
 
-def test_the_trace_is_one_that_viewers_read(run: Path) -> None:
+def test_the_trace_is_one_that_viewers_understand(run: Path) -> None:
     timeline = read_timeline(run)
     made = json.loads(json.dumps(trace(timeline, (0.0, timeline.seconds))))
     assert made["displayTimeUnit"] == "ms"
@@ -54,7 +60,9 @@ def test_the_trace_is_one_that_viewers_read(run: Path) -> None:
     spans: dict[tuple[int, int], list[dict[str, Any]]] = {}
     for event in events:
         if event["ph"] == "X":
-            assert event["name"] in STATES and event["cname"] in COLOURS and event["dur"] > 0
+            assert (
+                event["name"] in STATES and event["cname"] == COLOURS[event["name"]][1] and event["dur"] > 0
+            )
             assert threads[event["pid"], event["tid"]].startswith(processes[event["pid"]])
             spans.setdefault((event["pid"], event["tid"]), []).append(event)
     assert spans.keys() == threads.keys()
@@ -81,14 +89,13 @@ def test_a_column_of_the_picture_shares_itself_among_the_states(run: Path) -> No
     ).all()
 
 
-def test_a_window_is_in_the_middle_of_the_training_and_shows_some_updates(run: Path, tmp_path: Path) -> None:
-    slow = write_run(tmp_path / "slow", turn=2.0, turns=20)
-    ((start, end),) = choose_windows([read_timeline(run)], None, None)
-    assert end - start == pytest.approx(16 * 0.5) and (start + end) / 2 == pytest.approx(5 + 50)
-    both = choose_windows([read_timeline(run), read_timeline(slow)], None, None)
-    assert [end - start for start, end in both] == pytest.approx([32.0, 32.0]), "one scale, the slower one's"
-    assert choose_windows([read_timeline(run)], 7.0, 3.0) == [(7.0, 10.0)]
-    assert choose_windows([read_timeline(run)], 100.0, 30.0) == [(100.0, read_timeline(run).seconds)]
+def test_a_window_is_in_the_middle_of_the_training_unless_it_is_chosen(run: Path) -> None:
+    timeline = read_timeline(run)
+    assert choose_window(timeline, None, 10.0) == pytest.approx((50.0, 60.0)), "the training is from 5 to 105"
+    assert choose_window(timeline, 7.0, 3.0) == (7.0, 10.0)
+    assert choose_window(timeline, 100.0, 30.0) == (100.0, timeline.seconds)
+    with pytest.raises(InputError, match=r"^start_s=200\.0: use 0 or more, below 110\.0"):
+        choose_window(timeline, 200.0, 10.0)
 
 
 def test_pictures_stand_above_each_other_and_are_replaced(run: Path, tmp_path: Path, monkeypatch) -> None:
@@ -106,7 +113,7 @@ def test_pictures_stand_above_each_other_and_are_replaced(run: Path, tmp_path: P
     with Image.open(tmp_path / "timeline.png") as image:
         assert image.width == one[0] and image.height > 1.5 * one[1]
     console = Console(width=79, record=True, file=io.StringIO())
-    console.print(table(show_timelines(TimelineConfig(runs=(str(run), str(other))))))
+    console.print(timeline_table(show_timelines(TimelineConfig(runs=(str(run), str(other))))))
     text = console.export_text()
     assert "other" in text and "bubble" in text and "50.0" in text
 
@@ -131,7 +138,7 @@ def test_no_picture_over_anything_else(run: Path, tmp_path: Path) -> None:
         ({"runs": ()}, "runs"),
         ({"start_s": -1.0}, "start_s"),
         ({"seconds": 0.0}, "seconds"),
-        ({"trace_seconds": float("inf")}, "trace_seconds"),
+        ({"seconds": float("inf")}, "seconds"),
     ],
 )
 def test_bad_values_name_their_field(values: dict[str, Any], field: str) -> None:

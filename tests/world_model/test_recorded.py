@@ -143,7 +143,7 @@ def test_some_of_them_and_none(run: Path, tmp_path: Path, capsys: pytest.Capture
         if int(path.stem) % 2:
             path.unlink()
     assert exported(run, tmp_path / "none", "--pick=failures") == 2
-    assert "no dream in its imagined/ of those asked for (failures)" in capsys.readouterr().err
+    assert "no imagined rollout in its imagined/ of those asked for (failures)" in capsys.readouterr().err
     assert exported(run, tmp_path / "none", "--source=both") == 2
     assert "source='both': use real or imagined" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()

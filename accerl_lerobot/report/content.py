@@ -1,0 +1,581 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Contents of the pages: of a training run, of a world model, and of several runs side by side."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from accerl_lerobot.console import ABSENT, count, duration, number, percent, rate
+from accerl_lerobot.report.charts import COLOURS, Chart, Series, line, rates
+from accerl_lerobot.report.read import SUMMARY, TRIAL, Record, Run, column, newest
+from accerl_lerobot.report.recipe import apart, commands, differences, lag_bound, unreadable
+from accerl_lerobot.timeline.states import ROLES, STATES
+from accerl_lerobot.world_model.by_source import compared, every_source, source_rows
+
+RECENT_S = 120.0
+"""A run that has written something since is taken to be still going."""
+FEW = 25
+"""Exploring episodes below which their success says nothing; the first to end are the short ones."""
+STATE_COLOURS = dict(zip(STATES, (0, 7, 1, 3, 2, 6, 5, 4, 4), strict=True))
+MISMATCH = 1e-4
+"""Nats between acting and learning at equal weights that rounding in float32 does not explain."""
+STEPS, DEPTH = "env steps of online experience", "depth of the imagined rollout in chunks"
+SHARE: dict[str, Any] = {"share": True, "bottom": -0.03, "top": 1.04}
+"""Options of a chart of shares, such that points at both ends are whole."""
+VIDEOS = {
+    "before_after.mp4": "The same episodes before training, left, and after it, right, under the success of "
+    "the whole evaluation. The frame at the end of a clip is green for a success and red for a failure.",
+    "preview.mp4": "Top to bottom: recorded episodes; what the world model imagines with the same actions; "
+    "and with those of another episode.",
+    "preview_online.mp4": "The same of episodes that a policy collected.",
+}
+"""Captions of the videos that runs make."""
+WARNINGS = {
+    "restarts": ("restart", "of a rollout worker, which crashed or hung"),
+    "dropped_nonfinite": ("decision", "thrown away, because the environment returned NaN or infinity"),
+    "replay_evicted_unused": ("segment", "left the replay buffer unused because it was full"),
+    "replay_retired_unused": ("segment", "left the replay buffer unused, being older than replay.max_lag"),
+    "replay_lost_unused": ("segment", "not learned from were lost when the run was resumed"),
+    "replay_dropped_nonfinite": ("segment", "refused by the replay buffer because of a NaN or infinity"),
+    "replay_duplicates": ("segment", "received twice and ignored"),
+}
+"""Counter → what is counted, and what happened; a run in which it is 0 needs no warning."""
+
+Spec = tuple[str, str, dict[str, str], dict[str, Any]]
+"""Title, note, metric → label, and options of a chart."""
+LEARNING: tuple[Spec, ...] = (
+    ("Policy loss", "The algorithm's own term.", {"policy_loss": "policy loss"}, {}),
+    ("Value loss", "Squared error of the critic against the returns.", {"value_loss": "value loss"}, {}),
+    ("KL divergence", "How far the policy has left its samples; in the loss, far samples are bounded.",
+     {"approx_kl": "unbounded", "kl": "in the loss", "kl_reference": "to the start"}, {"unit": "nats"}),
+    ("Samples that count little", "Ratios outside the range of PPO, and samples weighed below a tenth.",
+     {"clip_fraction": "outside the clip", "low_weight": "weight below 0.1"}, {"share": True, "bottom": 0}),
+    ("Effective sample size", "100 %: all samples count alike.", {"ess": "share of the batch"}, SHARE),
+    ("Explained variance of the critic", "1 is perfect, 0 a constant; below −1 is not shown.",
+     {"explained_variance": "explained variance"}, {"bottom": -1.04, "top": 1.04}),
+    ("Gradient norm", "Before each is clipped.", {"grad_norm": "policy", "value_grad_norm": "critic"},
+     {"bottom": 0}),
+    ("Return", "Mean of the returns that the critic is regressed to.", {"return_mean": "return"}, {}),
+    ("Learning rate", "0 while only the critic learns.", {"lr": "policy"}, {"bottom": 0}),
+)  # fmt: skip
+INFERENCE: tuple[Spec, ...] = (
+    ("Requests decided together", "Mean since the start.", {"inference_batch_size_mean": "observations"},
+     {"unit": "observations a forward pass", "bottom": 0}),
+    ("Wait of a request", "From its arrival to its forward pass, mean since the start.",
+     {"inference_wait_mean_s": "seconds"}, {"unit": "s", "bottom": 0}),
+)  # fmt: skip
+IMAGINATION: tuple[Spec, ...] = (
+    ("Success, imagined and real", "Imagined success far above the real one misleads the policy.",
+     {"imagination_success": "imagined", "imagination_success_real": "real",
+      "imagination_success_beside": "imagined, weighted as the real outcomes"}, SHARE),
+    ("Imagined share", "", {"replay_imagined_share": "of a batch"}, SHARE),
+    ("Real episodes that the world model has learned from", "",
+     {"imagination_learn_episodes": "episodes"}, {"bottom": 0}),
+    ("Skill of the world model", "At each held-out evaluation: 1 is perfect, 0 a copy of the last frame.",
+     {"imagination_gate_skill_changed_first": "after one chunk",
+      "imagination_gate_skill_changed_last": "at the horizon"}, {"top": 1}),
+)  # fmt: skip
+BY_DEPTH: tuple[Spec, ...] = (
+    ("Skill", "1 is perfect, 0 is a copy of the last frame.",
+     {"skill_changed": "where pixels changed", "skill": "all pixels"}, {"top": 1}),
+    ("Sensitivity to actions", "Growth of the error with wrong actions; 1: the model ignores them.",
+     {"sensitivity_shuffled": "another episode's", "sensitivity_zero": "none",
+      "sensitivity_opposite": "the opposite"}, {"unit": "times the error", "bottom": 0}),
+    ("Error of the state", "",
+     {"state_error": "imagined", "state_error_copy": "copy of the last state"}, {"bottom": 0}),
+    ("Taken for a success", "Share of imagined rollouts, by their actions; with its own: of failures.",
+     {"false_success_true": "its own", "false_success_shuffled": "another episode's",
+      "false_success_zero": "none", "false_success_opposite": "the opposite",
+      "false_success_failed": "a failed episode's"}, {"share": True, "bottom": 0}),
+)  # fmt: skip
+CHECKS = {
+    "skill_changed_first": ("skill_first", "better than a copy of the last frame, where pixels changed"),
+    "skill_changed_last": ("skill_last", "the same at the end of the horizon"),
+    "skill_last": ("skill_last", "the same on all pixels"),
+    "sensitivity_low": ("sensitivity", "how much worse it gets with another episode's actions"),
+    "auroc": ("auroc", "tells episodes that succeed from those that fail, lower end of the interval"),
+    "false_success": ("false_success", "failed episodes that are imagined as successes"),
+    "false_success_still": ("false_success", "rollouts imagined without actions, taken for successes"),
+    "recall": ("recall", "successes that are imagined as such"),
+}
+"""Check of a world model → the recipe's field with its threshold, and its meaning."""
+
+
+Table = tuple[str, Sequence[str], Sequence[Sequence[str]]]
+"""Caption, columns and rows; the first cell of a row is its heading."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading and what is under it, in this order."""
+
+    title: str
+    text: str = ""
+    _: KW_ONLY
+    bars: Mapping[str, Sequence[tuple[str, float, str, int]]] = field(default_factory=dict)
+    """Role → name, share, text and colour of the parts of its time."""
+    charts: Sequence[Chart] = ()
+    tables: Sequence[Table] = ()
+    videos: Sequence[tuple[Path, str]] = ()
+    changes: Sequence[tuple[str, str, str]] = ()
+    """Field, value and default."""
+    commands: Sequence[tuple[str, str]] = ()
+    details: str = ""
+
+    @property
+    def empty(self) -> bool:
+        """True if there is nothing under the heading."""
+        rest = (self.text, self.bars, self.tables, self.videos, self.changes, self.commands, self.details)
+        return not any(rest) and not any(chart.drawable for chart in self.charts)
+
+
+def run_page(run: Run, config_class: type[Any], now: float) -> dict[str, Any]:
+    """Values for the template: the page of one run.
+
+    Args:
+        run: of any verb.
+        config_class: of its recipe.
+        now: in seconds since 1970.
+    """
+    trained, why = run.verb == "train", unreadable(config_class, run.config)
+    bound = lag_bound(config_class, run.config) if trained else None
+    changes = [(name, shown(v), shown(default)) for name, v, default in differences(config_class, run.config)]
+    text = f"This accerl cannot read the recipe: {why}." if why else "Fields that differ from the defaults:"
+    first, *others = _training_sections(run, bound) if trained else _world_model_sections(run)
+    sections = [
+        first,
+        Section("Videos", videos=[(path, VIDEOS.get(path.name, path.name)) for path in run.videos]),
+        *others,
+        Section("Recipe", text, changes=changes, details=run.config_text),
+        Section("Commands", commands=commands(run)),
+    ]
+    return {
+        "title": run.name,
+        "verb": run.verb,
+        "status": status(run, now),
+        "headline": _headline(run) if trained else _verdict(run),
+        "tiles": _tiles(run, bound) if trained else _world_model_tiles(run.result or {}),
+        "warnings": list(warnings(run, bound, now)),
+        "sections": [section for section in sections if not section.empty],
+    }
+
+
+def comparison_page(runs: Sequence[Run], now: float) -> dict[str, Any]:
+    """Values for the template: several runs of one verb. No winner is named, as their intervals overlap."""
+    trained, names = runs[0].verb == "train", [run.name for run in runs]
+    names = [name if names.count(name) == 1 else str(run.path) for name, run in zip(names, runs, strict=True)]
+    each = dict(zip(names, runs, strict=True))
+    rows = [(name, *map(shown, values)) for name, values in apart([run.config for run in runs])]
+    tables = [("Fields that are not the same in all of them", ("field", *names), rows)] if rows else []
+    depths = {name: (run.result or {}).get("depths", []) for name, run in each.items()}
+    sections = [
+        Section("Runs", tables=[(_run_table if trained else _check_table)(each, now)]),
+        Section("Curves", charts=_curves(each) if trained else _side_by_side(depths)),
+        Section("Differences", "" if rows else "Their recipes are the same.", tables=tables),
+    ]
+    return {
+        "title": f"{len(runs)} runs",
+        "verb": runs[0].verb,
+        "status": f"{sum(run.result is not None for run in runs)} of {len(runs)} finished",
+        "headline": count(len(runs), "training run" if trained else "world model"),
+        "tiles": (),
+        "warnings": [f"{name}: {text}" for name, run in each.items() for text in warnings(run, None, now)],
+        "sections": [section for section in sections if not section.empty],
+    }
+
+
+def status(run: Run, now: float) -> str:
+    """How a run stands."""
+    if run.result is None:
+        return "still going" if now - run.written < RECENT_S else "not finished"
+    return "finished" if run.verb == "train" else "passed" if run.result["passed"] else "failed"
+
+
+def warnings(run: Run, bound: int | None, now: float) -> Iterator[str]:
+    """Caveats of a run's numbers: one plain sentence each, none if all is well."""
+    if run.result is None:
+        file, age = SUMMARY if run.verb == "train" else TRIAL, now - run.written
+        at = datetime.datetime.fromtimestamp(run.written).strftime("%d %B %Y, %H:%M")
+        if age < RECENT_S:
+            yield f"The run is still going: there is no {file} yet. This page shows it {at}."
+        else:
+            yield f"The run has no {file}: it ended early, or waits. It last wrote {at}, {duration(age)} ago."
+    if not run.records and run.verb != "world-model-eval":
+        yield "There are no metrics: the run has not come to its first record."
+    if run.truncated:
+        yield "The last line of metrics.jsonl is incomplete and left out: the run was writing it, or crashed."
+    if run.sessions > 1:
+        yield f"The run was resumed {count(run.sessions - 1, 'time')}; updates made twice count once."
+    for name, (thing, what) in WARNINGS.items():
+        if n := int(newest(run.rollout, name) or 0):
+            yield f"{count(n, thing)} {what}."
+    dropped, kept = (int(newest(run.rollout, f"groups_{name}") or 0) for name in ("dropped", "kept"))
+    if dropped > kept:
+        yield f"{count(dropped, 'group')} of equal starts thrown away and {kept:,} kept: most had equal ends."
+    if skipped := int(newest(run.train, "skipped") or 0):
+        yield f"{count(skipped, 'update')} skipped, because loss or gradient was not finite."
+    lag, mismatch = (np.nanmax([0.0, *column(run.train, k)]) for k in ("lag_max", "logprob/mismatch_max"))
+    if bound is not None and lag > bound:
+        yield f"The lag reached {number(lag)} updates, above the bound of {bound}."
+    if run.section("policy").get("precision", "fp32") == "fp32" and mismatch > MISMATCH:
+        yield f"Acting and learning disagreed by up to {mismatch:.2g} nats at equal weights, beyond rounding."
+    if run.section("imagination").get("share"):
+        rollouts = newest(run.rollout, "imagination_dreams")
+        means = [percent(newest(run.rollout, f"imagination_success_{of}")) for of in ("beside", "real")]
+        if rollouts and newest(run.rollout, "imagination_on") == 0:
+            yield f"Imagination was switched off: {means[0]} success imagined, {means[1]} in reality."
+        elif run.rollout and not rollouts and not newest(run.rollout, "imagination_promoted"):
+            yield "No rollout was imagined: no world model passed its held-out evaluation."
+
+
+def shown(value: Any) -> str:
+    """A value as one would type it."""
+    if isinstance(value, str):
+        return value
+    text = yaml.safe_dump(value, default_flow_style=True, width=10_000, allow_unicode=True)
+    return text.removesuffix("\n").removesuffix("\n...")
+
+
+def _charts(records: Sequence[Record], specs: Sequence[Spec]) -> list[Chart]:
+    """Charts of metrics over updates."""
+    update = column(records, "update")
+    charts = []
+    for title, note, names, options in specs:
+        lines = [line(label, update, column(records, key), i) for i, (key, label) in enumerate(names.items())]
+        charts.append(Chart(title, note, "updates", lines, **options))
+    return charts
+
+
+def _training_sections(run: Run, bound: int | None) -> list[Section]:
+    note = "LeRobot's own sampler on seeds that no run trains on, with 95 % Wilson intervals; exploring: the "
+    note += "policy with its noise, over the newest 100 episodes."
+    curves = [line("while exploring", *exploring(run), 7), evaluated(run, "evaluation", 0)]
+    rows = []
+    for e in run.evaluations:
+        tasks = e.get("tasks") or {}
+        for task, one in (tasks if len(tasks) == 1 else tasks | {"all": e}).items():
+            success = rate(one["success"], one["ci95"])
+            rows.append((str(e.get("group")), number(e["env_steps"]), task, success, number(one["n"])))
+    table = ("Evaluations, with 95 % Wilson intervals", ("", "env steps", "task", "success", "n"), rows)
+    update, mean, largest = (column(run.train, name) for name in ("update", "lag_mean", "lag_max"))
+    lags = [line("mean of a batch", update, mean), line("largest", update, largest, 1, largest=True)]
+    dashed = "" if bound is None else f" Dashed: the bound of the recipe, {bound}."
+    options: dict[str, Any] = {"unit": "updates", "limit": bound, "bottom": 0, "wide": True}
+    lag = Chart("Lag", f"Age of the weights that decided.{dashed}", "updates", lags, **options)
+    chart = Chart("Success rate", note, STEPS, curves, wide=True, **SHARE)
+    return [
+        Section("Success", charts=[chart], tables=[table] if rows else []),
+        _imagination(run),
+        Section("Staleness", charts=[lag]),
+        _speed(run),
+        Section("Learning", charts=_charts(run.train, LEARNING)),
+    ]
+
+
+def exploring(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """Env steps since training began, and the success of the newest exploring episodes.
+
+    Counters of workers include the evaluation before training, which is subtracted: its episodes times their
+    mean length.
+    """
+    before = [e for e in run.evaluations if e.get("group") == "before"]
+    steps = column(run.rollout, "env_steps") - sum(e["steps_mean"] * e["n"] for e in before)
+    episodes = column(run.rollout, "episodes") - sum(e["n"] for e in before)
+    if run.result is not None:  # workers go on during the final evaluation
+        steps = np.minimum(steps, run.result["env_steps"])
+    return steps, np.where(episodes >= FEW, column(run.rollout, "success_exploring"), np.nan)
+
+
+def evaluated(run: Run, name: str, colour: int) -> Series:
+    """The evaluations of a run with their intervals."""
+    ends = np.array([e["ci95"] for e in run.evaluations], dtype=np.float64).reshape(-1, 2)
+    x, y = column(run.evaluations, "env_steps"), column(run.evaluations, "success")
+    return Series(name, x, y, colour, ends[:, 0], ends[:, 1], points=True)
+
+
+def _imagination(run: Run) -> Section:
+    """Imagined rollouts: how many, how true, and the checks that the world model had to pass."""
+    title, settings, rollout = "Imagined rollouts", run.section("imagination"), run.rollout
+    if not settings.get("share") or newest(rollout, "imagination_dreams") is None:
+        return Section(title)
+    names = ("dreams", "decisions", "successes", "doubted", "promoted", "refused")
+    total, decisions, successes, uncertain, passed, failed = (
+        int(newest(rollout, f"imagination_{name}") or 0) for name in names
+    )
+    text = f"{count(total, 'imagined rollout')} of {count(decisions, 'decision')}; "
+    text += f"{percent(successes / total if total else None)} of them succeeded"
+    text += f", and {uncertain:,} ended early because the model was too uncertain." if uncertain else "."
+    if passed + failed:
+        text += f" The world model passed {passed} of {count(passed + failed, 'held-out evaluation')}."
+    real, imagined = (newest(rollout, f"replay_{kind}trained_decisions") or 0.0 for kind in ("", "imagined_"))
+    if real + imagined:
+        text += f" {percent(imagined / (real + imagined))} of the decisions learned from were imagined."
+    thresholds, checks = (settings.get("learn") or {}).get("trial") or {}, []
+    for name, (threshold, _) in CHECKS.items():
+        value, bound = newest(rollout, f"imagination_gate_{name}"), thresholds.get(threshold)
+        if value is not None and bound is not None and threshold == "false_success":
+            checks.append((name, value, f"at most {bound}", value <= bound))
+        elif value is not None and bound is not None:
+            checks.append((name, value, f"above {bound}", value > bound))
+    caption = "a recorded episode above, and what the world model imagined with the same actions below. The "
+    caption += "frame at the end is green for a success and red for a failure."
+    videos = [
+        (path, f"Held-out evaluation {path.stem.replace('_', ', ').lstrip('0')}: {caption}")
+        for path in dict.fromkeys([*run.imagined_videos[:1], *run.imagined_videos[-1:]])
+    ]
+    tables = _checks("The last held-out evaluation of the world model", checks)
+    return Section(title, text, charts=_charts(rollout, IMAGINATION), tables=tables, videos=videos)
+
+
+def _checks(caption: str, rows: Sequence[tuple[str, float | None, str, bool]]) -> list[Table]:
+    """A table of checks: name, value, what is wanted, and whether it holds; none without rows."""
+    cells = [
+        (name, number(value, 3), wanted, "holds" if holds else "fails",
+         CHECKS.get(name.rpartition(".")[2], ("", ""))[1])
+        for name, value, wanted, holds in rows
+    ]  # fmt: skip
+    return [(caption, ("check", "value", "wanted", "", "meaning"), cells)] if rows else []
+
+
+def _time_shares(run: Run) -> dict[str, list[tuple[str, float, str, int]]]:
+    """How the time of each role divides, as `Section.bars`; nothing for a run without a timeline."""
+    bars = {}
+    for role in ROLES[1:]:  # the driver neither works nor waits
+        prefix = f"timeline_{role.replace(' ', '_')}"
+        own = {s: _time_mean(run.rollout, f"{prefix}_{s}_share", f"{prefix}_bubble") for s in STATES}
+        if any(own.values()):
+            bars[role] = [(s.replace("_", " "), v, percent(v), STATE_COLOURS[s]) for s, v in own.items() if v]
+    return bars
+
+
+def _time_mean(records: Sequence[Record], name: str, present: str = "") -> float | None:
+    """Mean of shares of the time since the record before, over the records that have `present`."""
+    length = np.diff(column(records, "wall_s"), prepend=np.nan)
+    there = np.isfinite(column(records, present or name)) & (length > 0)
+    if not there.any():
+        return None
+    return float(np.average(np.nan_to_num(column(records, name)[there]), weights=length[there]))
+
+
+def _speed(run: Run) -> Section:
+    """How fast a run went, and what its workers did with their time."""
+    x_label, counters = "minutes since the workers began to start", ("env_steps", "decisions")
+    curves = {name: (column(run.rollout, "wall_s"), column(run.rollout, name)) for name in counters}
+    curves["updates"] = (column(run.train, "wall_s"), column(run.train, "update"))
+    charts = []
+    for key, (seconds, counter) in curves.items():
+        name = key.replace("_", " ")
+        series = [rates(name, seconds, counter)]
+        charts.append(Chart(name.capitalize(), "", x_label, series, unit="per second", bottom=0))
+    busy_s = float(np.nansum(column(run.train, "update_s")) + np.nansum(column(run.train, "publish_s")))
+    wait_s = float(np.nansum(column(run.train, "wait_s")))
+    if not busy_s + wait_s:  # the engine in one process, in which nobody waits
+        return Section("Speed", charts=charts)
+    waited, inference = wait_s / (busy_s + wait_s), _time_mean(run.rollout, "inference_busy_share")
+    text = f"The trainer was busy for {percent(1 - waited)} of its time and waited for batches in the rest. "
+    if (blocked := newest(run.rollout, "replay_insert_wait_s")) is not None:
+        text += f"Segments waited to enter the replay buffer for {duration(blocked)}, all of them together. "
+    if waited <= 0.1:
+        text += "Learning was the slower side: more environments would only wait."
+    elif inference is not None and inference > 0.8:
+        text += f"Inference, busy for {percent(inference)} of the time, limited collecting."
+    else:
+        text += "Collecting was the slower side, and inference had time left for more environments."
+    charts += _charts(run.rollout, INFERENCE)
+    return Section("Speed", text, bars=_time_shares(run), charts=charts)
+
+
+def _headline(run: Run) -> str:
+    """The result in one sentence."""
+    last, env = run.evaluations[-1:], run.section("env")
+    names = (run.result or {}).get("tasks") or sorted((last[0].get("tasks") if last else None) or ())
+    names = names or [env.get("task") or env.get("name") or env.get("type")]
+    tasks = str(names[0]) if len(names) == 1 else count(len(names), "task")
+    if run.result is None:
+        share = newest(run.rollout, "success_exploring")
+        so_far = "" if share is None else f", with {percent(share)} success while exploring"
+        return (
+            f"{len(run.train)} of {run.section('trainer').get('updates')} updates on {tasks} so far{so_far}"
+        )
+    *before, after = run.outcomes
+    if not before:
+        return f"{percent(after['success'])} success on {tasks} after training"
+    (low, high), old, new = before[0]["ci95"], before[0]["success"], after["success"]
+    if old == new:
+        return f"Success on {tasks} stayed at {percent(new)}"
+    change = f"from {percent(old)} to {percent(new)}"
+    if after["ci95"][0] <= high and low <= after["ci95"][1]:
+        return f"Success on {tasks} went {change}, and the intervals overlap"
+    return f"Success on {tasks} {'rose' if new > old else 'fell'} {change}"
+
+
+def _tiles(run: Run, bound: int | None) -> list[tuple[str, str, str]]:
+    result, algorithm = run.result or {}, run.section("algorithm")
+    mean = float(np.nanmean(column(run.train, "lag_mean"))) if run.train else None
+    largest = float(np.nanmax(column(run.train, "lag_max"))) if run.train else None
+    parts = {"warm start": result.get("warm_start_s", 0.0), "RL": result.get("rl_s", 0.0)}
+    tiles = []
+    for e in run.outcomes:
+        interval = rate(e["success"], e["ci95"]).partition("[")[2]
+        tiles.append((f"success {e.get('group')}", percent(e["success"]), f"[{interval} %, n = {e['n']}"))
+    steps = result.get("env_steps", next(iter(exploring(run)[0][::-1].tolist()), None))
+    episodes = number(result.get("episodes", newest(run.rollout, "episodes")))
+    spent = ", ".join(f"{name} {duration(seconds)}" for name, seconds in parts.items() if seconds >= 1)
+    updates = number(result.get("updates", len(run.train)))
+    return [
+        *tiles,
+        ("env steps", number(steps), f"{episodes} episodes"),
+        ("wall time", duration(run.wall_s), spent),
+        ("updates", updates, f"of {run.section('trainer').get('updates')}"),
+        ("lag", number(mean, 2), f"largest {number(largest)}, bound {number(bound)}"),
+        ("algorithm", str(algorithm.get("type")).upper(), f"advantage {algorithm.get('advantage')}"),
+        ("seed", str(run.config.get("seed")), ""),
+    ]
+
+
+def _world_model_sections(run: Run) -> list[Section]:
+    found = run.result or {}
+    checks = [(name, g["value"], g["wanted"], g["holds"]) for name, g in found.get("gates", {}).items()]
+    every, text = every_source(found) if found else [], ""
+    if found:
+        text = f"{count(sum(one['trials'] for one in every), 'rollout')}"
+        if all(one.get("episodes") for one in every):
+            text += f" on {count(sum(one['episodes'] for one in every), 'episode')} it had not learned from"
+        text += ", each imagined from a real frame on, with the actions really made, and with others."
+    sources = {str(one.get("name")): one["depths"] for one in every}
+    rows = (
+        [(name, *(cell or ABSENT for cell in cells)) for name, cells in source_rows(every)] if every else []
+    )
+    by_depth = []
+    for title, note, metrics, options in BY_DEPTH:
+        depths = found.get("depths", [])
+        series = [estimates(depths, key, label, i) for i, (key, label) in enumerate(metrics.items())]
+        by_depth.append(Chart(title, note, DEPTH, series, **options))
+    by_source = Section("By source")
+    if compared(found):
+        table = ("The same on episodes of each source", ("", *sources), rows)
+        by_source = Section("By source", tables=[table], charts=_side_by_side(sources))
+    return [
+        Section("Held-out evaluation", text, tables=_checks("Checks it had to pass", checks)),
+        Section("By depth", charts=by_depth),
+        by_source,
+        Section("Learning", charts=_loss_charts(run)),
+    ]
+
+
+def estimates(depths: Sequence[Record], key: str, name: str, colour: int) -> Series:
+    """An estimate at each depth with its interval; numbers without one are a plain line."""
+    x, plain = column(depths, "depth"), column(depths, key)
+    if np.isfinite(plain).any():
+        return line(name, x, plain, colour)
+    parts = [d[key] if isinstance(d.get(key), dict) else {} for d in depths]
+    y, low, high = (column(parts, end) for end in ("value", "low", "high"))
+    low, high = (np.where(np.isfinite(end), end, y) for end in (low, high))
+    x, y, low, high = (values[np.isfinite(y)] for values in (x, y, low, high))
+    return Series(name, x, y, colour, low, high, points=True)
+
+
+def _side_by_side(depths: Mapping[str, Sequence[Record]]) -> list[Chart]:
+    """Estimates by depth of several models, or of one model on several sources."""
+    charts = []
+    for title, key in (
+        ("Skill where pixels changed", "skill_changed"),
+        ("Sensitivity to another episode's actions", "sensitivity_shuffled"),
+        ("AUROC of the chunk", "auroc_dreamt"),
+    ):
+        series = [estimates(rows, key, name, i) for i, (name, rows) in enumerate(depths.items())]
+        charts.append(Chart(title, "", DEPTH, series))
+    return charts
+
+
+def _loss_charts(run: Run) -> list[Chart]:
+    """Training losses as lines, and the same on held-out windows as points."""
+    names = dict.fromkeys(name for record in run.records.get("world_model", []) for name in record)
+    parts = [name for name in names if name not in ("kind", "step", "loss", "grad_norm")] or ["loss"]
+    charts = []
+    for kind, metrics in (("world_model", parts), ("success_model", ["loss", "accuracy"])):
+        learned, held_out = (run.records.get(f"{kind}{suffix}", []) for suffix in ("", "_held_out"))
+        series = []
+        for i, name in enumerate(metrics):
+            label, x, y = name.replace("_", " "), column(held_out, "step"), column(held_out, name)
+            series.append(line(label, column(learned, "step"), column(learned, name), i))
+            series.append(replace(line(f"{label}, held out", x, y, i), points=True))
+        charts.append(Chart(kind.replace("_", " ").capitalize(), "", "gradient steps", series, bottom=0))
+    return charts
+
+
+def _verdict(run: Run) -> str:
+    """The result of a world model in one sentence."""
+    if run.result is None:
+        steps = max((int(r.get("step", 0)) for r in run.records.get("world_model", [])), default=0)
+        return f"A world model after {count(steps, 'step')}, not evaluated yet"
+    failed = [name for name, gate in run.result["gates"].items() if not gate["holds"]]
+    if failed:
+        return f"The world model failed its held-out evaluation: {', '.join(failed)}"
+    return f"The world model passed its held-out evaluation: all {len(run.result['gates'])} checks hold"
+
+
+def _world_model_tiles(found: Record) -> list[tuple[str, str, str]]:
+    tiles = [
+        (
+            name,
+            count(found[key].get("episodes", 0), "episode"),
+            f"{number(found[key].get('env_steps'))} env steps",
+        )
+        for key, name in (("learnt", "learned from"), ("held_out", "held out"))
+        if isinstance(found.get(key), dict)
+    ]
+    for row in found.get("depths", [])[-1:]:
+        skill = (row.get("skill_changed") or {}).get("value")
+        tiles.append(("skill", number(skill, 2), f"after {count(row['depth'], 'chunk')}"))
+    if auroc := (found.get("outcomes") or {}).get("auroc"):
+        value, low, high = (number(auroc.get(key), 3) for key in ("value", "low", "high"))
+        tiles.append(("AUROC of outcomes", value, f"[{low}, {high}]"))
+    return tiles + [("learning", duration(found["seconds"]), "")] if found.get("seconds") else tiles
+
+
+def _run_table(runs: Mapping[str, Run], now: float) -> Table:
+    rows = []
+    for name, run in runs.items():
+        before = [e for e in run.evaluations if e.get("group") == "before"]
+        ends = [*(before[:1] or [{}]), *(run.outcomes[-1:] or [{}])]
+        success = (rate(e.get("success"), e.get("ci95")) for e in ends)
+        tiles = {key: value for key, value, _ in _tiles(run, None)}
+        numbers = (tiles[key] for key in ("algorithm", "seed", "env steps", "lag", "wall time"))
+        rows.append((name, *success, *numbers, status(run, now)))
+    columns = ("run", "before", "newest", "algorithm", "seed", "env steps", "mean lag", "wall time", "")
+    return "Success before training and in the newest evaluation, with 95 % Wilson intervals", columns, rows
+
+
+def _check_table(runs: Mapping[str, Run], now: float) -> Table:
+    every = {name: (run.result or {}).get("gates", {}) for name, run in runs.items()}
+    checks = list(dict.fromkeys(check for gates in every.values() for check in gates))
+    rows = []
+    for name, gates in every.items():
+        own = [gates.get(check, {"value": None, "holds": True}) for check in checks]
+        cells = (f"{number(gate['value'], 2)}{'' if gate['holds'] else ', fails'}" for gate in own)
+        rows.append((name, status(runs[name], now), *cells))
+    return "Checks of the held-out evaluation", ("run", "", *checks), rows
+
+
+def _curves(runs: Mapping[str, Run]) -> list[Chart]:
+    """Success and lag; where there are more runs than colours, without bands and intervals."""
+    each = [(name, run, i) for i, (name, run) in enumerate(runs.items())]
+    share: dict[str, Any] = {**SHARE, "wide": True, "bands": len(runs) <= len(COLOURS)}
+    ended = [evaluated(run, name, i) for name, run, i in each]
+    explored = [line(name, *exploring(run), i) for name, run, i in each]
+    lags = [line(n, column(run.train, "update"), column(run.train, "lag_mean"), i) for n, run, i in each]
+    sampler = "LeRobot's own sampler on seeds that no run trains on."
+    noise = "The policy with its noise, over the newest 100 episodes."
+    return [
+        Chart("Success in evaluation", sampler, STEPS, ended, **share),
+        Chart("Success while exploring", noise, STEPS, explored, **share),
+        Chart("Mean lag", "", "updates", lags, unit="updates", bottom=0, bands=False, wide=True),
+    ]
