@@ -99,7 +99,7 @@ def bench_policy(config: BenchPolicyConfig) -> dict[str, Any]:
         optimizer.zero_grad(set_to_none=True)
         evaluation = adapter.evaluate(*observations, latent)
         ratio = (evaluation.log_prob - old).sum(1).clamp(-1, 1).exp()
-        (ratio.mean() + evaluation.value.error(torch.ones(len(old), device=device)).mean()).backward()
+        (ratio.mean() + (evaluation.value - 1).square().mean()).backward()
         optimizer.step()
 
     updated = timed(update, config.repeats, device)
