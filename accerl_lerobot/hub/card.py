@@ -151,18 +151,17 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenan
     sections = [recipe.get(name) or {} for name in ("dataset", "online")]
     # Beside a folder the name is a label, and no dataset on the Hub.
     datasets = [s["repo_id"] for s in sections if s.get("repo_id") and not s.get("root")]
-    measurements = _measurements(provenance)
+    measurements, local = _measurements(provenance), repo_id.split("/")[1]
     data = ModelCardData(
         library_name="lerobot",
         pipeline_tag="robotics",
         tags=list(dict.fromkeys(str(tag) for tag in tags if tag)),
         datasets=datasets or None,
         base_model=_base_model(recipe),
-        model_name=repo_id.split("/")[1],
+        model_name=local,
         eval_results=_results(measurements, env.get("type", "simulation")) or None,
     )
     is_policy = artifact in (POLICY, RUN)
-    local = repo_id.split("/")[1]
     policy = f"{local}/{LAST}" if artifact == RUN else local
     shown = sorted(name for name in files if name.startswith(f"{FOLDER}/") or "/" not in name)
     own_recipe = files.get(RECIPE if artifact == RUN else f"{FOLDER}/{RECIPE}", b"")
@@ -170,6 +169,7 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenan
         data,
         template_str=Path(__file__).with_name("card.md.jinja").read_text(),
         mark=MARK,
+        heading=local,
         title=TITLES[artifact],
         type=config.get("type"),
         measurements=measurements,
