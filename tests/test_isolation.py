@@ -163,9 +163,7 @@ def test_a_good_checkpoint_is_tried_once(theirs: Path, monkeypatch: pytest.Monke
         lambda path: vision_layers(path, 10**6),
         lambda path: edit_config(path, resize_imgs_with_padding=[4096, 4096]),
         lambda path: cameras(path, 98, 4096),
-        lambda path: edit_config(path, num_steps=10**9),
         lambda path: edit_config(path, chunk_size=10**9),
-        lambda path: edit_config(path, empty_cameras=10**9),
     ],
 )  # fmt: skip
 def test_checkpoints_that_nobody_can_load_are_refused_in_a_line(

@@ -93,31 +93,34 @@ def find_provenance(folder: Path, artifact: str, evaluation: str | None) -> Prov
 
 def _known(folder: Path, artifact: str) -> tuple[dict[str, Any], dict[str, Path]]:
     """Fields of a `Provenance`, and files of the run that go with the folder."""
-    here, names = folder.resolve(), KEPT.get(artifact, ())
-    home, measured = folder / FOLDER, True
-    if artifact == RUN:
-        home = folder
-    elif not home.is_dir() and artifact == POLICY:
-        if here.name != PRETRAINED or here.parents[1].name != CHECKPOINTS:
-            return {}, {}
-        home = here.parents[2]
-        measured = here.parent.name.isdigit() and int(here.parent.name) == _updates(home)
-        names = tuple(name for name in names if name != EVALUATION) if measured else (RECIPE,)
-    elif not home.is_dir():
-        home = here.parents[0 if artifact == WORLD_MODEL else 1]
-        if not (home / TRIAL).is_file():
-            return {}, {}
+    carried = folder / FOLDER
+    own = folder if artifact == RUN else carried if carried.is_dir() else None
+    home = own or _run_of(folder.resolve(), artifact)
+    if home is None:
+        return {}, {}
+    summary, number = read_json(home / SUMMARY), folder.resolve().parent.name
+    is_last = number.isdigit() and int(number) == summary.get("updates")
+    measured = own is not None or artifact != POLICY or is_last
+    names = KEPT.get(artifact, ()) if measured else (RECIPE,)
     known = {"recipe": _read_recipe(home / RECIPE), "trial": read_json(home / TRIAL)}
-    if measured:
-        known["summary"] = read_json(home / SUMMARY)
-    if home in (folder, folder / FOLDER):  # an evaluation is there only if one was given to an earlier push
-        known["evaluation"] = read_json(home / EVALUATION)
-    kept = names if artifact != RUN else ()
-    return known, {f"{FOLDER}/{name}": home / name for name in kept if (home / name).is_file()}
+    if measured and artifact in (POLICY, RUN):
+        known["summary"] = summary
+    if own is not None:  # an evaluation is there only if one was given to an earlier push
+        known["evaluation"] = read_json(own / EVALUATION)
+    else:
+        names = tuple(name for name in names if name != EVALUATION)
+    return known, {f"{FOLDER}/{name}": home / name for name in names if (home / name).is_file()}
 
 
-def _updates(run: Path) -> Any:
-    return read_json(run / SUMMARY).get("updates")
+def _run_of(folder: Path, artifact: str) -> Path | None:
+    """The folder of the run, or of the training of a world model, in which a folder lies."""
+    if artifact == POLICY and folder.name == PRETRAINED and folder.parents[1].name == CHECKPOINTS:
+        home, sign = folder.parents[2], RECIPE
+    elif artifact in (WORLD_MODEL, SUCCESS_MODEL):
+        home, sign = folder.parents[0 if artifact == WORLD_MODEL else 1], TRIAL
+    else:
+        return None
+    return home if (home / sign).is_file() else None
 
 
 def _read_recipe(path: Path) -> dict[str, Any]:
@@ -148,18 +151,17 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenan
     sections = [recipe.get(name) or {} for name in ("dataset", "online")]
     # Beside a folder the name is a label, and no dataset on the Hub.
     datasets = [s["repo_id"] for s in sections if s.get("repo_id") and not s.get("root")]
-    measurements = _measurements(provenance)
+    measurements, local = _measurements(provenance), repo_id.split("/")[1]
     data = ModelCardData(
         library_name="lerobot",
         pipeline_tag="robotics",
         tags=list(dict.fromkeys(str(tag) for tag in tags if tag)),
         datasets=datasets or None,
         base_model=_base_model(recipe),
-        model_name=repo_id.split("/")[1],
+        model_name=local,
         eval_results=_results(measurements, env.get("type", "simulation")) or None,
     )
     is_policy = artifact in (POLICY, RUN)
-    local = repo_id.split("/")[1]
     policy = f"{local}/{LAST}" if artifact == RUN else local
     shown = sorted(name for name in files if name.startswith(f"{FOLDER}/") or "/" not in name)
     own_recipe = files.get(RECIPE if artifact == RUN else f"{FOLDER}/{RECIPE}", b"")
@@ -167,6 +169,7 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenan
         data,
         template_str=Path(__file__).with_name("card.md.jinja").read_text(),
         mark=MARK,
+        heading=local,
         title=TITLES[artifact],
         type=config.get("type"),
         measurements=measurements,

@@ -47,6 +47,7 @@ def test_numbers_films_and_recipe_for_people(tmp_path: Path):
         (run / "checkpoints/last/pretrained_model", "policy", "accerl_run/"),
     ):
         text = card_of(folder, kind)
+        assert "\n# door\n" in text
         assert "| before RL | match | 25.0% | 40 | 14.2% to 40.2% |" in text
         assert "| after RL | match | 75.0% | 40 | 59.8% to 85.8% |" in text
         assert "| env steps | 12,345 |" in text and "| updates | 12 |" in text and "| seed | 3 |" in text
