@@ -401,9 +401,8 @@ def _headline(run: Run) -> str:
     if run.result is None:
         share = newest(run.rollout, "success_exploring")
         so_far = "" if share is None else f", with {percent(share)} success while exploring"
-        return (
-            f"{len(run.train)} of {run.section('trainer').get('updates')} updates on {tasks} so far{so_far}"
-        )
+        of = run.section("trainer").get("updates")
+        return f"{len(run.train)} of {of} updates on {tasks} so far{so_far}"
     *before, after = run.outcomes
     if not before:
         return f"{percent(after['success'])} success on {tasks} after training"
@@ -420,7 +419,7 @@ def _tiles(run: Run, bound: int | None) -> list[tuple[str, str, str]]:
     result, algorithm = run.result or {}, run.section("algorithm")
     mean = float(np.nanmean(column(run.train, "lag_mean"))) if run.train else None
     largest = float(np.nanmax(column(run.train, "lag_max"))) if run.train else None
-    parts = {"warm start": result.get("warm_start_s", 0.0), "RL": result.get("rl_s", 0.0)}
+    parts = {"warm start": result.get("warm_start_s") or 0.0, "RL": result.get("rl_s") or 0.0}
     tiles = []
     for e in run.outcomes:
         interval = rate(e["success"], e["ci95"]).partition("[")[2]
@@ -442,26 +441,23 @@ def _tiles(run: Run, bound: int | None) -> list[tuple[str, str, str]]:
 
 def _world_model_sections(run: Run) -> list[Section]:
     found = run.result or {}
-    checks = [(name, g["value"], g["wanted"], g["holds"]) for name, g in found.get("gates", {}).items()]
-    every, text = every_source(found) if found else [], ""
+    depths, text, by_source = found.get("depths", []), "", Section("By source")
     if found:
-        text = f"{count(sum(one['trials'] for one in every), 'rollout')}"
+        every = every_source(found)
+        text = count(sum(one["trials"] for one in every), "rollout")
         if all(one.get("episodes") for one in every):
             text += f" on {count(sum(one['episodes'] for one in every), 'episode')} it had not learned from"
         text += ", each imagined from a real frame on, with the actions really made, and with others."
-    sources = {str(one.get("name")): one["depths"] for one in every}
-    rows = (
-        [(name, *(cell or ABSENT for cell in cells)) for name, cells in source_rows(every)] if every else []
-    )
-    by_depth = []
-    for title, note, metrics, options in BY_DEPTH:
-        depths = found.get("depths", [])
-        series = [estimates(depths, key, label, i) for i, (key, label) in enumerate(metrics.items())]
-        by_depth.append(Chart(title, note, DEPTH, series, **options))
-    by_source = Section("By source")
     if compared(found):
+        sources = {str(one.get("name")): one["depths"] for one in every}
+        rows = [(name, *(cell or ABSENT for cell in cells)) for name, cells in source_rows(every)]
         table = ("The same on episodes of each source", ("", *sources), rows)
         by_source = Section("By source", tables=[table], charts=_side_by_side(sources))
+    checks = [(k, g["value"], str(g.get("wanted")), g["holds"]) for k, g in found.get("gates", {}).items()]
+    by_depth = []
+    for title, note, metrics, options in BY_DEPTH:
+        series = [estimates(depths, key, label, i) for i, (key, label) in enumerate(metrics.items())]
+        by_depth.append(Chart(title, note, DEPTH, series, **options))
     return [
         Section("Held-out evaluation", text, tables=_checks("Checks it had to pass", checks)),
         Section("By depth", charts=by_depth),
