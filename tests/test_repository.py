@@ -29,7 +29,7 @@ CONDUCTOR = {"launch.py", "cluster.py", "own_ray.py", "seats.py", "services.py",
 SHELLS = CONDUCTOR | {
     "doctor.py",
     "worker.py",
-    "dream_workers.py",
+    "imagination_workers.py",
     "peers.py",
     "ray_channel.py",
     "ray_calls.py",

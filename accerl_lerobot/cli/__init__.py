@@ -25,8 +25,11 @@ VERBS = {
     "demos": ("verbs:demos", "record scripted-expert demonstrations into a LeRobotDataset"),
     "sft": ("verbs:sft", "fine-tune on a LeRobotDataset with LeRobot's own trainer"),
     "eval": ("verbs:evaluate", "success of a checkpoint, with its confidence interval"),
-    "world-model": ("verbs:world_model", "learn to dream a world from LeRobotDatasets, and be tried on them"),
-    "world-model-eval": ("verbs:world_model_eval", "try a world model on episodes of one or several sources"),
+    "world-model": (
+        "verbs:world_model",
+        "train a world model and validate it on held-out episodes",
+    ),
+    "world-model-eval": ("verbs:world_model_eval", "validate a world model on one or two LeRobotDatasets"),
     "push": ("verbs:push", "a policy, world model, dataset or run to the Hub, as one commit"),
     "pull": ("verbs:pull", "what was pushed into a new folder, pinned and checked"),
     "report": ("verbs:report", "one HTML page of a run, or of several beside each other, to look at"),

@@ -16,11 +16,10 @@ from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.world_model.config import (
-    StandInConfig,
-    TrialConfig,
+    ExternalRewardModelConfig,
+    ValidationConfig,
     WorldModelConfig,
 )
-from accerl_lerobot.world_model.sizes import TinyConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,20 +78,20 @@ class WorldModelRun(Section):
     job_name: str = "world_model"
     """Last part of the folder's name."""
     device: Device = "auto"
-    """cpu, cuda, or auto: where both networks learn and are tried."""
+    """cpu, cuda, or auto: where both networks are trained and validated."""
     env: EnvConfig = field(default_factory=MetaWorldConfig)
-    """The world it is to be a model of: its cameras, sizes, rate and tasks."""
+    """The environment to model: its cameras, sizes, rate and tasks."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """Demonstrations, some of which fail."""
     online: DatasetConfig = field(default_factory=DatasetConfig)
-    """Episodes of a policy, as ``accerl export`` writes them, learnt from together with those; without a name
-    there are none. How a policy fails no demonstration shows."""
-    world_model: WorldModelConfig = field(default_factory=TinyConfig)
+    """Episodes of a policy, as ``accerl export`` writes them, to train on as well; without a name there are
+    none. Demonstrations do not show how a policy fails."""
+    world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorldModelEvalRun(Section):
-    """``accerl world-model-eval``: a saved world model on episodes of one or several sources."""
+    """``accerl world-model-eval``: a saved world model on one or two LeRobotDatasets."""
 
     path: str | None = None
     """The folder named world_model that ``accerl world-model`` wrote."""
@@ -105,15 +104,15 @@ class WorldModelEvalRun(Section):
     job_name: str = "world_model_eval"
     """Last part of the folder's name."""
     device: Device = "auto"
-    """cpu, cuda, or auto: where the world model dreams and successes are told."""
+    """cpu, cuda, or auto: where the world model and the success model run."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    """Episodes it has not learnt from; of the dataset that it has, those that were held out are taken."""
+    """Episodes it was not trained on; of a dataset that it was trained on, the held-out ones are taken."""
     online: DatasetConfig = field(default_factory=DatasetConfig)
-    """Episodes of a policy, as ``accerl export`` writes them, of which the same is true; without a name there
+    """Episodes of a policy, as ``accerl export`` writes them, chosen in the same way; without a name there
     are none."""
-    success: StandInConfig = field(default_factory=StandInConfig)
-    """A reward model that tells successes in place of the one beside the world model."""
-    trial: TrialConfig = field(default_factory=TrialConfig)
+    success: ExternalRewardModelConfig = field(default_factory=ExternalRewardModelConfig)
+    """A reward model used in place of the success model beside the world model."""
+    validation: ValidationConfig = field(default_factory=ValidationConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -82,7 +82,7 @@ def main(arguments: list[str]) -> int:
     config, history, checks = _resolve(arguments) if arguments else (None, 1, [])
     checks += [*pulled(arguments), *machine(config, history)]
     if config is not None:
-        checks += [*pace(config), *dreams(config), *placement(config)]
+        checks += [*pace(config), *imagination_checks(config), *placement(config)]
     for check in checks:
         sys.stdout.write(f"{check.status:5} {check.name:10} {check.text}\n")
     failed = sum(check.status == FAIL for check in checks)
@@ -272,30 +272,30 @@ def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
     yield Check(name="disk", status=WARN if short else OK, text=text)
 
 
-def dreams(config: RunConfig) -> Iterator[Check]:
-    """True if what is to be imagined fits the world and the policy."""
+def imagination_checks(config: RunConfig) -> Iterator[Check]:
+    """Checks that the world model fits environment and policy."""
     if not config.imagination.share:
         return
-    from accerl_lerobot.engine.dreaming import check_imagination
+    from accerl_lerobot.engine.imagination import check_imagination
 
     try:
         check_imagination(config)
     except InputError as error:
-        yield Check(name="dreams", status=FAIL, text=str(error))
+        yield Check(name="imagination", status=FAIL, text=str(error))
     else:
         kind, share = config.imagination.model, config.imagination.share
-        yield Check(name="dreams", status=OK, text=f"{share:.0%} of every batch; what dreams: {kind}")
+        yield Check(name="imagination", status=OK, text=f"{share:.0%} of every batch; world model: {kind}")
         yield from _unwatched(config)
 
 
 def _unwatched(config: RunConfig) -> Iterator[Check]:
-    """Says so where the kill switch hardly ever trips: too few real episodes end beside dreams."""
+    """Warns where the kill switch hardly ever trips: too few real episodes end during imagination."""
     imagination, episodes = config.imagination, config.rollout.episodes
-    beside = imagination.horizon is None and imagination.beginnings > 0
-    if beside and 0 < episodes <= imagination.witnesses:
-        why = f"that takes more real episodes than imagination.witnesses, {imagination.witnesses}"
-        text = f"are hardly ever switched off where they flatter: {why}, and rollout.episodes is {episodes}"
-        yield Check(name="dreams", status=WARN, text=text)
+    if imagination.start_at_reset_prob and 0 < episodes <= imagination.guard.min_real_episodes:
+        least = imagination.guard.min_real_episodes
+        why = f"that takes more real episodes than imagination.guard.min_real_episodes, {least}"
+        text = f"is hardly ever switched off where it flatters: {why}, and rollout.episodes is {episodes}"
+        yield Check(name="imagination", status=WARN, text=text)
 
 
 def placement(config: RunConfig) -> Iterator[Check]:

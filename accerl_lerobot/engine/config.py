@@ -36,7 +36,7 @@ from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline import TIMELINE
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.transport.endpoint import Transport
-from accerl_lerobot.world_model.imagination_config import ImaginationConfig
+from accerl_lerobot.world_model.config import ImaginationConfig
 
 __all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "check_chunk", "decode", "encode", "parse"]
 
@@ -60,7 +60,7 @@ class LaunchConfig(Section, section="launch"):
     then learned from. overlap: the next one is collected meanwhile. These two are for measuring what the
     first gains; with several inference services, the worlds of each are in step."""
     transport: Transport = "auto"
-    """How rollout workers and dreams reach inference and replay, and weights reach inference. shared_memory:
+    """How workers reach inference and replay, and weights reach inference. shared_memory:
     a message is written where the other process reads it. ray: it is copied, to any node. auto: shared memory
     between processes of one node, if the system has it, and Ray otherwise.
     """
@@ -202,13 +202,12 @@ class RunConfig(Section):
             # real episode.
             self.replay.check(batch_decisions=batch, segment_decisions=self.rollout.segment_length)
             if imagination.share:
-                # A whole dream is as long as the world lets it be: `engine.dreaming` looks at that.
-                longest = imagination.horizon or 1
+                # `engine.imagination` checks it again with the length of a whole rollout.
                 imagination.replay.check(
-                    batch_decisions=batch, segment_decisions=longest, field="imagination.replay"
+                    batch_decisions=batch, segment_decisions=1, field="imagination.replay"
                 )
         if imagination.share and self.launch.schedule != ASYNCHRONOUS:
-            remedy = "use asynchronous: those who dream take no turns"
+            remedy = "use asynchronous: imagination takes no turns"
             raise InputError("launch.schedule", self.launch.schedule, remedy)
         for name in ("episodes", "group_size"):
             if getattr(self.rollout, name) and self.launch.schedule != ASYNCHRONOUS:
@@ -218,9 +217,7 @@ class RunConfig(Section):
                 raise InputError("launch.schedule", self.launch.schedule, remedy)
         if imagination.share and self.rollout.group_size:
             # Nor could the episodes of a group, which bear one name, be told from each other.
-            remedy = (
-                "leave it out with imagination.share: dreams do not begin alike, so they are not compared"
-            )
+            remedy = "leave it out with imagination.share: imagined rollouts start at different states"
             raise InputError("rollout.group_size", self.rollout.group_size, remedy)
 
     def _check_off_policy(self) -> None:

@@ -7,7 +7,7 @@
                           │      │
                           └──► trainer                          macro-asynchrony: no barrier, a measured lag
 
-    dreams ──requests──► inference ──decisions──► dreams ──segments──► replay        where any are imagined
+    imagination ──requests──► inference ──decisions──► imagination ──segments──► replay
        ▲                                                                 │
        └────── world models that have passed ◄── world learning ◄──real──┘
 
@@ -44,7 +44,7 @@ from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from accerl_lerobot.transport.endpoint import Endpoint, listens
-from accerl_lerobot.world_model.pool import together as dreamt_together
+from accerl_lerobot.world_model.imagination.guard import IMAGINATION, combine_metrics
 
 logger = logging.getLogger(__name__)
 
@@ -86,9 +86,9 @@ class RayEngine(Engine):
         self._updates: list[dict[str, float]] = []
         self._replay_metrics: dict[str, float] = {}
         self._inference_metrics: dict[str, float] = {}
-        self._of_dreamers: dict[str, dict[str, float]] = {}
+        self._imagination_metrics: dict[str, dict[str, float]] = {}
         self._of_learner: dict[str, float] = {}
-        self._dreamers: list[Watched] = []
+        self._imagination: list[Watched] = []
         self._learner: Watched | None = None
         self._ranks: list[Watched] = []
         """The trainer's, but the first."""
@@ -119,11 +119,11 @@ class RayEngine(Engine):
         self._trainer.work = self._trainer.actor.run.remote(
             self._replay.actor, readers, self._config.launch.transport
         )
-        dreaming = [dreamer.actor for dreamer in self._dreamers]
-        for dreamer, (deciding, inserting) in zip(self._dreamers, self._dreams_ask, strict=True):
-            dreamer.work = dreamer.actor.run.remote(deciding, inserting, self._replay.actor)
+        imaginers = [worker.actor for worker in self._imagination]
+        for worker, (deciding, inserting) in zip(self._imagination, self._imagination_endpoints, strict=True):
+            worker.work = worker.actor.run.remote(deciding, inserting, self._replay.actor)
         if self._learner is not None:
-            self._learner.work = self._learner.actor.run.remote(dreaming, self._replay.actor)
+            self._learner.work = self._learner.actor.run.remote(imaginers, self._replay.actor)
 
     def follow(self, schedule: Schedule) -> None:
         """From now on, collecting and learning take turns like this, see `replay.turns`."""
@@ -156,7 +156,7 @@ class RayEngine(Engine):
             rollout=self._seats.counters(),
             replay=self._replay_metrics,
             inference=self._inference_metrics,
-            imagination=dreamt_together(list(self._of_dreamers.values())) | self._of_learner,
+            imagination=combine_metrics(list(self._imagination_metrics.values())) | self._of_learner,
         )
         self._check_moving(progress)
         return progress
@@ -170,8 +170,8 @@ class RayEngine(Engine):
         limit = max(START_S, self._limit)  # files may be large
         alive = {"timeout": limit, "silence": self._limit}
         version, records = self._trainer.call("hold", timeout=self._limit)  # it waits for an update at most
-        # At once, so that little comes in that was decided by weights of later updates. Those who dream may
-        # know of more than replay then; they are told anew of what comes after.
+        # At once, so that little comes in that was decided by weights of later updates. Workers that imagine
+        # may know of more than replay then; they are told anew of what comes after.
         self._replay.call("save", state, version, **alive)
         for imaginer in self._imaginers:
             imaginer.call("save", directory, **alive)
@@ -207,8 +207,8 @@ class RayEngine(Engine):
 
     @property
     def _imaginers(self) -> list[Watched]:
-        """In the order in which they are saved: who learns, then who dreams of it."""
-        return [*([self._learner] if self._learner is not None else []), *self._dreamers]
+        """In the order in which they are saved: the learner, then the workers that use its model."""
+        return [*([self._learner] if self._learner is not None else []), *self._imagination]
 
     def _everyone(self) -> Iterator[Watched]:
         """All workers, those that others depend on first."""
@@ -240,11 +240,11 @@ class RayEngine(Engine):
         self._ranks = [self._other(*rank) for rank in zip(peers, ranks, strict=True)]
         self._trainer = self._other("trainer", trainer)
         if imagination.share:
-            from accerl_lerobot.engine.dream_workers import DreamWorker, WorldLearningWorker
+            from accerl_lerobot.engine.imagination_workers import ImaginationWorker, WorldLearningWorker
 
-            for i, n in enumerate(numbered("dream", imagination.workers)):
-                dreams = make(n, DreamWorker, 4, c, self._state, timeline, i)
-                self._dreamers.append(self._other(n, dreams))
+            for i, n in enumerate(numbered(IMAGINATION, imagination.workers)):
+                worker = make(n, ImaginationWorker, 4, c, self._state, timeline, i)
+                self._imagination.append(self._other(n, worker))
             if imagination.learns:
                 learns = make("world learning", WorldLearningWorker, 4, c, self._state, timeline)
                 self._learner = self._other("world learning", learns)
@@ -256,7 +256,9 @@ class RayEngine(Engine):
         way = c.launch.transport, self._limit
         deciding, inserting = self._inference.open(), self._replay.endpoint("insert", *way)
         # Those that get one rollout worker more come first.
-        self._dreams_ask = [(deciding[-1 - i % len(deciding)], inserting) for i in range(len(self._dreamers))]
+        self._imagination_endpoints = [
+            (deciding[-1 - i % len(deciding)], inserting) for i in range(len(self._imagination))
+        ]
         self._replay.work = self._replay.actor.run.remote()
         self._seats.set_to_work(deciding, inserting)
 
@@ -268,10 +270,10 @@ class RayEngine(Engine):
         """Tells those who ask an inference service where it is now."""
         self._seats.move(number, inference)
         services = self._config.inference.workers
-        for i, dreamer in enumerate(self._dreamers):
+        for i, worker in enumerate(self._imagination):
             if services - 1 - i % services == number:
-                self._dreams_ask[i] = inference, self._dreams_ask[i][1]
-                dreamer.call("move", inference, timeout=self._limit)
+                self._imagination_endpoints[i] = inference, self._imagination_endpoints[i][1]
+                worker.call("move", inference, timeout=self._limit)
 
     def _ask(self) -> None:
         self._inference.ask()
@@ -331,8 +333,10 @@ class RayEngine(Engine):
         self._inference_metrics = self._inference.listen()
         for rank in self._ranks:
             self._hear(rank)
-        for dreamer in self._dreamers:
-            self._of_dreamers[dreamer.name] = self._hear(dreamer) or self._of_dreamers.get(dreamer.name, {})
+        for worker in self._imagination:
+            self._imagination_metrics[worker.name] = self._hear(worker) or self._imagination_metrics.get(
+                worker.name, {}
+            )
         if self._learner is not None:
             self._of_learner = self._hear(self._learner) or self._of_learner
         episodes = self._seats.listen()
@@ -365,7 +369,7 @@ class RayEngine(Engine):
         Raises:
             WorkerError: neither decisions nor updates for `LaunchConfig.stall_s`.
         """
-        imagined = tuple(progress.imagination.get(k) for k in ("decisions", "learn_steps", "trial_s"))
+        imagined = tuple(progress.imagination.get(k) for k in ("decisions", "learn_steps", "validation_s"))
         state = (progress.version, progress.rollout.get("decisions"), progress.rollout["restarts"], imagined)
         now = time.monotonic()
         waiting = self._seats.outstanding or (self._training and not self._done)

@@ -44,7 +44,7 @@ FILMED = ".before"
 """Name of the filmed episodes of the evaluation before, kept until the video is made."""
 FRUITLESS_GROUPS = 50
 """So many groups thrown away in a row are said aloud: no update is made of them."""
-DREAMT = 10
+IMAGINED_EVERY = 10
 """Updates between two records of the workers' counters when no episode ends."""
 RECENT = 100
 """Exploring episodes over which the training success of the curve is averaged."""
@@ -295,8 +295,8 @@ class Loop:
         # The first episodes to end are the short ones, which are successes.
         if explored and len(self.recent) >= RECENT // 4:
             self.curve.append((self._steps(progress), share))
-        # Once all real episodes have been played, dreams and the learning from them go on.
-        if explored or any(metrics["update"] % DREAMT == 0 for metrics in progress.updates):
+        # Once all real episodes have been played, imagination and the learning from it go on.
+        if explored or any(metrics["update"] % IMAGINED_EVERY == 0 for metrics in progress.updates):
             values = progress.rollout | {"success_exploring": share}
             for part in ("replay", "inference", "imagination"):
                 values |= {f"{part}_{k}": v for k, v in getattr(progress, part).items()}

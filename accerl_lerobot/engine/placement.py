@@ -151,7 +151,7 @@ def asked(config: RunConfig) -> list[Asked]:
         Asked("inference", tuple(numbered("inference", c.inference.workers)), placement.inference),
     ]
     if c.imagination.share:
-        names = numbered("dream", c.imagination.workers)
+        names = numbered("imagination", c.imagination.workers)
         learns = ["world learning"] if c.imagination.learns else []
         found.append(Asked("imagination", (*names, *learns), placement.imagination))
     rollouts = tuple(f"rollout {i}" for i in range(c.rollout.workers))

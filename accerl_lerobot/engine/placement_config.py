@@ -43,7 +43,7 @@ class PlacementConfig(Section, section="launch.placement"):
     inference: RoleConfig = field(default_factory=RoleConfig)
     """Each of the services."""
     imagination: RoleConfig = field(default_factory=RoleConfig)
-    """Each that dreams, and the one that goes on learning the world."""
+    """Each worker that imagines, and the one that trains the world model."""
     rollout: RoleConfig = field(default_factory=RoleConfig)
     """Each rollout worker."""
 

@@ -352,12 +352,12 @@ def _start(config: RunConfig, directory: Path) -> str | None:
 
 def _check_imagination(config: RunConfig, going_on: bool) -> None:
     if config.imagination.share:
-        from accerl_lerobot.engine.dreaming import check_imagination
+        from accerl_lerobot.engine.imagination import check_imagination
 
         path = config.imagination.path
         if going_on and path is not None and not Path(path).expanduser().is_dir():
             remedy = (
-                "no such folder; what a run begins to dream with is not in its checkpoints: put a copy there"
+                "no such folder; the world model of the start is not in the checkpoints: put a copy there"
             )
             raise InputError("imagination.path", path, remedy)
         check_imagination(config)

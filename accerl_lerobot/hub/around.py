@@ -20,11 +20,11 @@ from accerl_lerobot.hub.kinds import POLICY, RECIPE, RUN, SUCCESS_MODEL, WORLD_M
 
 FOLDER = "accerl_run"
 """Where a policy or world model carries what is known of its run."""
-EVALUATION, TRIAL = "evaluation.json", "trial.json"
+EVALUATION, VALIDATION = "evaluation.json", "validation.json"
 KEPT = {
     POLICY: (RECIPE, SUMMARY, EVALUATION, "success_curve.png", "before_after.mp4"),
-    WORLD_MODEL: (RECIPE, TRIAL, "preview.mp4", "preview_online.mp4"),
-    SUCCESS_MODEL: (RECIPE, TRIAL),
+    WORLD_MODEL: (RECIPE, VALIDATION, "preview.mp4", "preview_online.mp4"),
+    SUCCESS_MODEL: (RECIPE, VALIDATION),
 }
 """Kind → files of its run that go with it."""
 
@@ -38,8 +38,8 @@ class Around:
     """Summary of a run that ended with this very policy."""
     evaluation: dict[str, Any] = field(default_factory=dict)
     """By ``accerl eval``, of this very policy."""
-    trial: dict[str, Any] = field(default_factory=dict)
-    """Trial of the world model."""
+    validation: dict[str, Any] = field(default_factory=dict)
+    """Held-out validation of the world model."""
     files: Mapping[str, Path] = field(default_factory=dict)
     """Name in the repository → file that goes with the folder."""
 
@@ -81,7 +81,7 @@ def _known(folder: Path, kind: str) -> tuple[dict[str, Any], dict[str, Path]]:
         names = tuple(name for name in names if name != EVALUATION)
     else:
         return {}, {}
-    known = records | {"recipe": _recipe(home / RECIPE), "trial": read_json(home / TRIAL)}
+    known = records | {"recipe": _recipe(home / RECIPE), "validation": read_json(home / VALIDATION)}
     return known, {f"{FOLDER}/{name}": home / name for name in names if (home / name).is_file()}
 
 
@@ -89,7 +89,7 @@ def _run_of(folder: Path, kind: str) -> Path | None:
     if kind == POLICY and folder.name == PRETRAINED and folder.parents[1].name == CHECKPOINTS:
         run, sign = folder.parents[2], RECIPE
     elif kind in (WORLD_MODEL, SUCCESS_MODEL):
-        run, sign = folder.parents[0 if kind == WORLD_MODEL else 1], TRIAL
+        run, sign = folder.parents[0 if kind == WORLD_MODEL else 1], VALIDATION
     else:
         return None
     return run if (run / sign).is_file() else None

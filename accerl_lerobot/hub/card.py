@@ -61,7 +61,7 @@ def model_card(repo_id: str, kind: str, folder: Path, files: Files, around: Arou
         eval_results=_results(around) or None,
     )
     parts = [f"# {name}", f"{TITLES[kind]}, made with accerl-lerobot {_of(config)}.".replace(" .", ".")]
-    parts += _numbers(around) + _trial(around) + _pictures(files)
+    parts += _numbers(around) + _validation(around) + _pictures(files)
     parts += (
         _use_policy(repo_id, kind, config, around)
         if kind in (POLICY, RUN)
@@ -183,21 +183,21 @@ def _numbers(around: Around) -> list[str]:
     return parts
 
 
-def _trial(around: Around) -> list[str]:
-    trial = around.trial
-    if "passed" not in trial:
+def _validation(around: Around) -> list[str]:
+    validation = around.validation
+    if "passed" not in validation:
         return []
-    verdict = "It passed its trial" if trial["passed"] else "**It failed its trial**"
-    gates = trial.get("gates") or {}
+    verdict = "It passed validation" if validation["passed"] else "**It failed validation**"
+    checks = validation.get("checks") or {}
     rows = [
-        f"| {name} | {_plain(gate.get('value'))} | {'yes' if gate.get('holds') else 'no'} |"
-        for name, gate in gates.items()
+        f"| {name} | {_plain(check.get('value'))} | {'yes' if check.get('holds') else 'no'} |"
+        for name, check in checks.items()
     ]
-    text = f"{verdict} on episodes that it had not learnt from."
+    text = f"{verdict} on held-out episodes."
     return (
-        ["## Trial", text, "\n".join(["| gate | value | holds |", "|---|---|---|", *rows])]
+        ["## Validation", text, "\n".join(["| check | value | holds |", "|---|---|---|", *rows])]
         if rows
-        else ["## Trial", text]
+        else ["## Validation", text]
     )
 
 

@@ -119,10 +119,10 @@ def _trained(runs: Sequence[Run], names: Sequence[str], now: float) -> Table:
 
 
 def _tried(runs: Sequence[Run], names: Sequence[str], now: float) -> Table:
-    gates = list(dict.fromkeys(gate for run in runs for gate in (run.result or {}).get("gates", {})))
+    gates = list(dict.fromkeys(gate for run in runs for gate in (run.result or {}).get("checks", {})))
     rows = []
     for i, (run, name) in enumerate(zip(runs, names, strict=True)):
-        found = (run.result or {}).get("gates", {})
+        found = (run.result or {}).get("checks", {})
         cells = [
             Cell(
                 text=number(found.get(gate, {}).get("value"), 2),
@@ -132,7 +132,7 @@ def _tried(runs: Sequence[Run], names: Sequence[str], now: float) -> Table:
             for gate in gates
         ]
         rows.append((Cell(text=name, colour=i), _state(run, now), *cells))
-    return Table(caption="Gates of the trial", columns=("run", "", *gates), rows=rows)
+    return Table(caption="Checks of the validation", columns=("run", "", *gates), rows=rows)
 
 
 def _state(run: Run, now: float) -> Cell:

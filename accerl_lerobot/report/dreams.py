@@ -14,16 +14,16 @@ from accerl_lerobot.report.blocks import Block, Cell, Film, Table, Words, figure
 from accerl_lerobot.report.charts import WHOLE, Chart, line
 from accerl_lerobot.report.read import Record, column, has, newest
 
-GATE = "imagination_gate_"
+GATE = "imagination_check_"
 MEANING = {
     "skill_changed_first": "better than a copy of the last frame, where pixels changed, after one chunk",
     "skill_changed_last": "the same at the end of the horizon",
     "skill_last": "the same on all pixels",
     "sensitivity_low": "how much worse it gets with another episode's actions",
     "auroc": "tells episodes that succeed from those that fail, lower end of the interval",
-    "false_success": "failed episodes that are dreamt as successes",
-    "false_success_still": "dreams without actions that are taken for successes",
-    "recall": "successes that are dreamt as such",
+    "false_success": "failed episodes whose imagined rollout is classified as a success",
+    "false_success_idle": "rollouts without actions that are classified as successes",
+    "recall": "successes whose imagined rollout is classified as one",
 }
 FIELDS = {
     "skill_changed_first": "skill_first",
@@ -32,16 +32,16 @@ FIELDS = {
     "sensitivity_low": "sensitivity",
     "auroc": "auroc",
     "false_success": "false_success",
-    "false_success_still": "false_success",
+    "false_success_idle": "false_success",
     "recall": "recall",
 }
 """Gate → the field of the trial's config that holds what is wanted."""
-AT_MOST = ("false_success", "false_success_still")
+AT_MOST = ("false_success", "false_success_idle")
 
 
 def dream_blocks(rollout: Sequence[Record], imagination: Mapping[str, Any]) -> list[Block]:
     """Blocks about a run that imagines; nothing for one that does not."""
-    if not imagination.get("share") or not has(rollout, "imagination_dreams"):
+    if not imagination.get("share") or not has(rollout, "imagination_rollouts"):
         return []
     return [Words(text=_amount(rollout)), *figures(*_charts(rollout)), *_trial(rollout, imagination)]
 
@@ -52,9 +52,9 @@ def dream_films(paths: Sequence[Path]) -> list[Block]:
     for path in dict.fromkeys([*paths[:1], *paths[-1:]]):
         trial, _, outcome = path.stem.partition("_")
         caption = (
-            f"Trial {trial.lstrip('0')}, {outcome}: an episode that was held out, above, and what the world "
-            "model dreamt with the same actions, below. The frame at the end is green for a success, red for "
-            "a failure."
+            f"Validation {trial.lstrip('0')}, {outcome}: a held-out episode, above, and what the world model "
+            "predicted with the same actions, below. The frame at the end is green for a success, red for a "
+            "failure."
         )
         found.append(Film(path=path, caption=caption))
     return found
@@ -64,7 +64,7 @@ def gate_table(caption: str, rows: Sequence[tuple[str, float | None, str, bool]]
     """Gates of a trial: name, value, what is wanted, and whether it holds."""
     return Table(
         caption=caption,
-        columns=("gate", "found", "wanted", "", "meaning"),
+        columns=("check", "found", "wanted", "", "meaning"),
         rows=[
             (
                 Cell(text=name),
@@ -82,14 +82,14 @@ def _amount(rollout: Sequence[Record]) -> str:
     def last(name: str) -> int:
         return int(newest(rollout, f"imagination_{name}") or 0)
 
-    dreams, decisions = last("dreams"), last("decisions")
-    text = f"{count(dreams, 'dream')} of {count(decisions, 'decision')}; "
+    dreams, decisions = last("rollouts"), last("decisions")
+    text = f"{count(dreams, 'imagined rollout')} of {count(decisions, 'decision')}; "
     text += f"{percent(last('successes') / dreams if dreams else None)} of them succeeded"
-    if last("doubted"):
-        text += f", and {last('doubted'):,} ended early because the model was too uncertain"
-    tried = last("promoted") + last("refused")
+    if last("uncertain"):
+        text += f", and {last('uncertain'):,} ended early because the model was too uncertain"
+    tried = last("promoted") + last("rejected")
     if tried:
-        text += f". The world model passed {last('promoted')} of {count(tried, 'trial')} in this run"
+        text += f". The world model passed {last('promoted')} of {count(tried, 'validation')} in this run"
     return f"{text}."
 
 
@@ -99,17 +99,17 @@ def _charts(rollout: Sequence[Record]) -> list[Chart]:
     with np.errstate(invalid="ignore", divide="ignore"):
         learnt = imagined / (real + imagined)
     of_dreams = [
-        ("dreams", "success", 0),
-        ("dreams, at each real outcome", "success_beside", 2),
+        ("imagined rollouts", "success", 0),
+        ("imagined rollouts, at each real outcome", "success_imagined", 2),
         ("reality", "success_real", 1),
     ]
     return [
         Chart(
-            title="Success in dreams and in reality",
+            title="Success in imagination and in reality",
             x_label="updates",
             share=True,
             limits=WHOLE,
-            note="Dreams far above reality flatter the policy.",
+            note="Imagined rollouts far above reality flatter the policy.",
             series=tuple(
                 line(label, update, column(rollout, f"imagination_{name}"), colour=colour)
                 for label, name, colour in of_dreams
@@ -138,7 +138,7 @@ def _charts(rollout: Sequence[Record]) -> list[Chart]:
         Chart(
             title="Skill of the world model",
             x_label="updates",
-            note="At each trial: 1 is perfect, 0 a copy of the last frame.",
+            note="At each validation: 1 is perfect, 0 a copy of the last frame.",
             limits=(None, 1.0),
             series=tuple(
                 line(label, update, column(rollout, f"{GATE}{name}"), colour=i)
@@ -153,7 +153,7 @@ def _charts(rollout: Sequence[Record]) -> list[Chart]:
 
 def _trial(rollout: Sequence[Record], imagination: Mapping[str, Any]) -> list[Block]:
     """The gates of the last trial, where the recipe says what was wanted."""
-    wanted = imagination.get("learn", {}).get("trial", {})
+    wanted = imagination.get("learn", {}).get("validation", {})
     rows = []
     for name, field in FIELDS.items():
         value, bound = newest(rollout, f"{GATE}{name}"), wanted.get(field)
@@ -161,4 +161,4 @@ def _trial(rollout: Sequence[Record], imagination: Mapping[str, Any]) -> list[Bl
             continue
         holds = value <= bound if name in AT_MOST else value > bound
         rows.append((name, value, f"{'at most' if name in AT_MOST else 'above'} {bound}", holds))
-    return [gate_table("The last trial of the world model", rows)] if rows else []
+    return [gate_table("The last validation of the world model", rows)] if rows else []

@@ -43,7 +43,7 @@ def notes(run: Run, bound: int | None, now: float) -> list[str]:
 
 def _state(run: Run, now: float) -> Iterator[str]:
     if run.result is None:
-        file = "summary.json" if run.verb == "train" else "trial.json"
+        file = "summary.json" if run.verb == "train" else "validation.json"
         ago = now - run.written
         if ago < RECENT_S:
             yield f"The run is still going: there is no {file} yet. This page shows it {_at(now)}."
@@ -98,11 +98,11 @@ def _dreams(run: Run) -> Iterator[str]:
     if not run.room("imagination").get("share"):
         return
     promoted = newest(rollout, "imagination_promoted") or 0
-    if newest(rollout, "imagination_on") == 0 and (newest(rollout, "imagination_dreams") or 0) > 0:
-        dreamt, real = (percent(newest(rollout, f"imagination_success_{of}")) for of in ("beside", "real"))
-        yield f"Dreams were switched off in the end: {dreamt} of them succeeded, and {real} of real episodes."
-    elif rollout and not promoted and not newest(rollout, "imagination_dreams"):
-        yield "Nothing was dreamt: no world model passed its trial."
+    if newest(rollout, "imagination_on") == 0 and (newest(rollout, "imagination_rollouts") or 0) > 0:
+        dreamt, real = (percent(newest(rollout, f"imagination_success_{of}")) for of in ("imagined", "real"))
+        yield f"Imagination was switched off: {dreamt} of rollouts succeeded, and {real} of real episodes."
+    elif rollout and not promoted and not newest(rollout, "imagination_rollouts"):
+        yield "Nothing was imagined: no world model passed validation."
 
 
 def _at(moment: float) -> str:

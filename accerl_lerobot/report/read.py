@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run's folder as plain data. Reads only; what is torn or missing is said and not guessed.
 
-A run that is going on or has died has no ``summary.json`` (or ``trial.json``), and the last line of its
+A run that is going on or has died has no ``summary.json`` (or ``validation.json``), and the last line of its
 ``metrics.jsonl`` may be half a line. Both are common and no error. A line before the last that is none is.
 """
 
@@ -21,11 +21,11 @@ from accerl_lerobot.checkpoint.safety import Origin, check_folder
 from accerl_lerobot.config.parsing import check_recipe_size, load_yaml
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.metrics import METRICS
-from accerl_lerobot.world_model.imagination_config import FILMS
+from accerl_lerobot.world_model.config import VIDEOS
 
 Record = dict[str, Any]
 
-TRIAL = "trial.json"
+TRIAL = "validation.json"
 
 
 def _is_number(value: Any) -> bool:
@@ -67,10 +67,10 @@ SUMMARY_NEEDS: Needs = {
 }
 TRIAL_NEEDS: Needs = {
     "passed": lambda value: isinstance(value, bool),
-    "trials": _is_number,
-    "gates": _is_gates,
+    "windows": _is_number,
+    "checks": _is_gates,
     "depths": _is_list,
-    "sources": lambda value: (
+    "datasets": lambda value: (
         value is None or (isinstance(value, dict) and all(map(_is_trial, value.values())))
     ),
 }
@@ -98,7 +98,7 @@ class Run:
     records: dict[str, list[Record]]
     """Lines of metrics.jsonl by their kind, in order."""
     result: Record | None
-    """summary.json of train, trial.json of the others; None: not finished."""
+    """summary.json of train, validation.json of the others; None: not finished."""
     torn: bool
     """True if the last line of metrics.jsonl is incomplete."""
     sessions: int
@@ -161,7 +161,7 @@ def read_run(path: Path) -> Run:
         sessions=sessions,
         written=max(file.stat().st_mtime for file in path.iterdir() if file.suffix != ".html"),
         videos=tuple(sorted(path.glob("*.mp4"))),
-        dreams=tuple(sorted(path.glob(f"{FILMS}/[0-9]*.mp4"))),
+        dreams=tuple(sorted(path.glob(f"{VIDEOS}/[0-9]*.mp4"))),
         checkpoint=newest if newest.is_dir() else None,
     )
 
@@ -188,7 +188,7 @@ def _verb(config: Record) -> str | None:
     for verb, keys in (
         ("train", {"algorithm", "trainer"}),
         ("world-model", {"world_model"}),
-        ("world-model-eval", {"path", "trial"}),
+        ("world-model-eval", {"path", "validation"}),
     ):
         if keys <= config.keys():
             return verb

@@ -46,12 +46,12 @@ FILMS = {
         "evaluation. The frame at the end of a clip says how it ended: green is success, red failure.",
     ),
     "preview.mp4": (
-        "Dreams beside reality",
-        "Top to bottom: what happened; what the world model dreamt with the same actions; and with those of "
-        "another episode.",
+        "Predictions beside reality",
+        "Top to bottom: what happened; what the world model predicted with the same actions; and with "
+        "those of another episode.",
     ),
     "preview_online.mp4": (
-        "Dreams of a policy's episodes",
+        "Predictions of a policy's episodes",
         "The same of episodes that a policy lived through.",
     ),
 }
@@ -83,7 +83,10 @@ def run_page(run: Run, config_class: type[Any], now: float) -> Page:
             *section("success", "Success", figures(success_chart(run)), _tasks(run)),
             *films(run),
             *section(
-                "dreams", "Dreams", dream_blocks(rollout, run.room("imagination")), dream_films(run.dreams)
+                "imagination",
+                "Imagination",
+                dream_blocks(rollout, run.room("imagination")),
+                dream_films(run.dreams),
             ),
             *section("lag", "Staleness", figures(lag_chart(train, bound)) if train else []),
             *section(

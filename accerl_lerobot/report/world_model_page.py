@@ -16,9 +16,9 @@ from accerl_lerobot.report.dreams import gate_table
 from accerl_lerobot.report.notes import notes, status
 from accerl_lerobot.report.read import Record, Run, column, has
 from accerl_lerobot.report.run_page import films, recipe_blocks
-from accerl_lerobot.world_model.by_source import compared, every_source, source_rows
+from accerl_lerobot.world_model.validation.tables import dataset_rows, has_several, per_dataset
 
-DEPTH = "depth of the dream in chunks"
+DEPTH = "depth of the prediction in chunks"
 ARMS = {
     "true": "its own actions",
     "shuffled": "another episode's",
@@ -30,7 +30,6 @@ ARMS = {
 BY_SOURCE: tuple[tuple[str, str, tuple[float | None, float | None]], ...] = (
     ("Skill where pixels changed", "skill_changed", (None, 1.0)),
     ("Sensitivity to another episode's actions", "sensitivity_shuffled", (0.0, None)),
-    ("AUROC of the chunk", "auroc_dreamt", (None, 1.0)),
 )
 """Title, measure and limits of a chart with a line per source."""
 
@@ -56,10 +55,10 @@ def world_model_page(run: Run, config_class: type[Any], now: float) -> Page:
         tiles=_tiles(found),
         warnings=notes(run, None, now),
         sections=[
-            *section("trial", "Trial", _gates(found)),
+            *section("checks", "Checks", _gates(found)),
             *films(run),
-            *section("depth", "The deeper the dream", figures(*depth_charts(found.get("depths", [])))),
-            *section("sources", "By source", *source_blocks(found)),
+            *section("depth", "By depth", figures(*depth_charts(found.get("depths", [])))),
+            *section("datasets", "By dataset", *source_blocks(found)),
             *section("learning", "Learning", figures(*_learning(run))),
             *section("recipe", "Recipe", recipe_blocks(run, config_class)),
             *section("next", "What to do next", [Commands(commands=commands(run))]),
@@ -110,7 +109,7 @@ def depth_charts(depths: Sequence[Record]) -> list[Chart]:
             x_label=DEPTH,
             limits=(0.0, None),
             series=(
-                estimates(depths, "state_error", "dreamt", 0),
+                estimates(depths, "state_error", "predicted", 0),
                 estimates(depths, "state_error_copy", "copy of the last state", 7),
             ),
         ),
@@ -130,16 +129,16 @@ def depth_charts(depths: Sequence[Record]) -> list[Chart]:
 
 def source_blocks(found: Record) -> list[list[Block]]:
     """A table and charts of the trials on several sources; nothing where there was one."""
-    if not compared(found):
+    if not has_several(found):
         return []
-    every = every_source(found)
+    every = per_dataset(found)
     names = [str(one.get("name")) for one in every]
     table = Table(
         caption="The same measures on episodes from each source",
         columns=("", *names),
         rows=[
             (Cell(text=name), *(Cell(text=text or ABSENT, number=True) for text in cells))
-            for name, cells in source_rows(every)
+            for name, cells in dataset_rows(every)
         ],
     )
     charts = [
@@ -160,24 +159,22 @@ def source_blocks(found: Record) -> list[list[Block]]:
 def _headline(run: Run) -> str:
     if run.result is None:
         steps = max((int(r.get("step", 0)) for r in run.records.get("world_model", [])), default=0)
-        return f"A world model after {count(steps, 'step')}, not tried yet"
-    gates = run.result["gates"]
+        return f"A world model after {count(steps, 'step')}, not validated yet"
+    gates = run.result["checks"]
     failed = [name for name, gate in gates.items() if not gate["holds"]]
     if not failed:
-        return f"The world model passed its trial: all {len(gates)} gates hold"
-    return f"The world model failed its trial: {', '.join(failed)}"
+        return f"The world model passed validation: all {len(gates)} checks hold"
+    return f"The world model failed validation: {', '.join(failed)}"
 
 
 def _lead(found: Record) -> str:
     if not found:
         return ""
-    every = every_source(found)
-    text = count(sum(one["trials"] for one in every), "trial")
+    every = per_dataset(found)
+    text = count(sum(one["windows"] for one in every), "window")
     if all("episodes" in one for one in every):
         text += f" on {count(sum(one['episodes'] for one in every), 'episode')} it had not learnt from"
-    return (
-        f"{text}; each dreams on from a real frame with the actions that were really made, and with others."
-    )
+    return f"{text}; each predicted from a real frame with the executed actions, and with others."
 
 
 def _tiles(found: Record) -> list[Tile]:
@@ -200,7 +197,7 @@ def _tiles(found: Record) -> list[Tile]:
 
 
 def _gates(found: Record) -> list[Block]:
-    gates = found.get("gates", {})
+    gates = found.get("checks", {})
     rows = [(name, gate["value"], gate["wanted"], gate["holds"]) for name, gate in gates.items()]
     return [gate_table("What it had to pass", rows)] if rows else []
 

@@ -265,25 +265,25 @@ def test_a_run_that_died_before_its_first_record(tmp_path: Path) -> None:
 
 def test_dreams(tmp_path: Path) -> None:
     seen = page_of(write_run(tmp_path / "on", config=dreaming(), rollout=dreams()))
-    assert "100 dreams of 700 decisions; 60 % of them succeeded, and 3 ended early" in seen.text
-    assert "The world model passed 1 of 3 trials in this run." in seen.text
+    assert "100 imagined rollouts of 700 decisions; 60 % of them succeeded, and 3 ended early" in seen.text
+    assert "The world model passed 1 of 3 validations in this run." in seen.text
     assert "skill_changed_first 0.7 above 0.3 holds" in seen.text
     assert "false_success 0.8 at most 0.5 fails" in seen.text
     series = {s["name"]: s for chart in seen.charts for s in chart["series"]}
     assert set(series["so far"]["y"]) == {0.75} and set(series["reality"]["y"]) == {0.4}
     off = page_of(write_run(tmp_path / "off", config=dreaming(), rollout=dreams(on=0.0))).text
-    assert "Dreams were switched off in the end: 70 % of them succeeded, and 40 % of real episodes." in off
-    assert "dreams of" not in page_of(write_run(tmp_path / "none")).text
+    assert "Imagination was switched off: 70 % of rollouts succeeded, and 40 % of real episodes." in off
+    assert "imagined rollouts of" not in page_of(write_run(tmp_path / "none")).text
 
 
 def test_films_of_dreams(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run", config=dreaming(), rollout=dreams())
-    (folder / "dreams").mkdir()
+    (folder / "validation").mkdir()
     for name in ("0001_failed", "0002_failed", "0013_passed", ".0014_failed"):
-        (folder / "dreams" / f"{name}.mp4").write_bytes(name.encode())
+        (folder / "validation" / f"{name}.mp4").write_bytes(name.encode())
     text = page_of(folder).text
-    assert "Trial 1, failed: an episode that was held out" in text and "Trial 13, passed: " in text
-    assert "Trial 2," not in text and "Trial 14" not in text
+    assert "Validation 1, failed: a held-out episode" in text and "Validation 13, passed: " in text
+    assert "Validation 2," not in text and "Validation 14" not in text
     html = (folder / "report.html").read_text()
     for name, there in (("0001_failed", True), ("0002_failed", False), ("0013_passed", True)):
         assert (base64.b64encode(name.encode()).decode() in html) is there
@@ -291,25 +291,28 @@ def test_films_of_dreams(tmp_path: Path) -> None:
 
 def test_a_world_model(tmp_path: Path) -> None:
     seen = page_of(write_world_model(tmp_path / "good"))
-    assert "The world model passed its trial: all 2 gates hold" in seen.text
-    assert "50 trials on 8 episodes it had not learnt from" in seen.text
+    assert "The world model passed validation: all 2 checks hold" in seen.text
+    assert "50 windows on 8 episodes it had not learnt from" in seen.text
     series = {s["name"]: s for chart in seen.charts for s in chart["series"]}
     assert series["where pixels changed"]["y"] == [0.8] * 3 and series["image"]["x"][:2] == [20, 40]
     held = series["image, held out"]
     assert held["x"] == [200, 400] and held["y"] == [0.01, 0.005] and "points" in held["style"]
     assert "state, held out" not in series and "grad norm" not in series
     failed = page_of(write_world_model(tmp_path / "bad", passed=False)).text
-    assert "The world model failed its trial: recall" in failed and "recall 0.1 above 0.3 fails" in failed
+    assert "The world model failed validation: recall" in failed and "recall 0.1 above 0.3 fails" in failed
     begun = page_of(write_world_model(tmp_path / "begun", finished=False)).text
-    assert "A world model after 400 steps, not tried yet" in begun and "there is no trial.json yet" in begun
+    assert (
+        "A world model after 400 steps, not validated yet" in begun
+        and "there is no validation.json yet" in begun
+    )
 
 
 def test_a_world_model_that_was_tried_again(tmp_path: Path) -> None:
     folder = write_world_model(tmp_path / "tried")
     (folder / "metrics.jsonl").unlink()
-    (folder / "config.yaml").write_text("path: model/world_model\ntrial: {depth: 9}\n")
+    (folder / "config.yaml").write_text("path: model/world_model\nvalidation: {depth: 9}\n")
     text = page_of(folder).text
-    assert "accerl world-model-eval · tried" in text and "trial.depth 9 6" in text
+    assert "accerl world-model-eval · tried" in text and "validation.depth 9 6" in text
     assert "There are no metrics" not in text  # it makes none
 
 
