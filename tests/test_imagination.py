@@ -75,7 +75,7 @@ def world_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def imagining(
-    checkpoint: Path, *, episodes: int = 6, rooms: dict[str, Any] | None = None, **config: Any
+    checkpoint: Path, *, episodes: int = 6, sections: dict[str, Any] | None = None, **config: Any
 ) -> RunConfig:
     watched = {k: config.pop(k) for k in ("window", "min_real_episodes", "max_gap") if k in config}
     guard = GuardConfig(**({"window": 10_000} | watched))
@@ -86,7 +86,7 @@ def imagining(
         imagination=ImaginationConfig(**(fields | config)),
         rollout=RolloutConfig(worlds=4, segment_length=4, episodes=episodes, time_limit="fail"),
         trainer=TrainerConfig(updates=12, batch_decisions=16, warmup_updates=2, value_warmup_updates=2),
-        **(rooms or {}),
+        **(sections or {}),
     )
 
 
@@ -118,7 +118,7 @@ def test_half_of_what_is_learned_from_is_imagined(tiny_checkpoint: Path):
     assert history[-1].imagination["rollouts"] > 20 and history[-1].imagination["on"] == 1
 
 
-def test_when_the_real_episodes_have_been_played_rollouts_go_on(tiny_checkpoint: Path):
+def test_when_the_real_episodes_have_been_played_imagination_goes_on(tiny_checkpoint: Path):
     history, batches, engine = run_locally(imagining(tiny_checkpoint, model="oracle"))
     explored = [e for p in history for e in p.episodes if e.plan.explore]
     assert len(explored) == 6 and history[-1].rollout["episodes"] == 6
@@ -132,7 +132,7 @@ def test_when_the_real_episodes_have_been_played_rollouts_go_on(tiny_checkpoint:
     assert engine._replay.real_ended
 
 
-def test_without_rollouts_a_run_ends_when_its_episodes_are_used_up(tiny_checkpoint: Path):
+def test_without_imagination_a_run_ends_when_its_episodes_are_used_up(tiny_checkpoint: Path):
     config = imagining(tiny_checkpoint, share=0.0)
     history, batches, _ = run_locally(config)
     assert history[-1].done and 0 < len(batches) < 12
@@ -198,7 +198,7 @@ def test_a_run_that_was_left_goes_on_as_if_it_had_not(
     assert (tmp_path / "world_model" / "model.safetensors").is_file() is promoted
 
 
-def test_whole_rollouts_of_a_model_that_learns_are_watched(tiny_checkpoint: Path, world_model: Path):
+def test_rollouts_of_a_model_that_is_trained_are_compared(tiny_checkpoint: Path, world_model: Path):
     learn = OnlineLearnConfig(
         steps_per_episode=1.0, validate_every=8, held_out=0.5, validation=LOOSE, batch=4
     )
@@ -237,7 +237,7 @@ def test_nothing_is_imagined_before_the_model_has_passed(tiny_checkpoint: Path, 
     assert 0 < len(batches) < 12 and not any(decisions(b, IMAGINED) for b in batches)
 
 
-def test_rollouts_of_a_copy_are_known_for_what_they_are(tiny_checkpoint: Path, world_model: Path):
+def test_nothing_moves_in_rollouts_of_a_copy(tiny_checkpoint: Path, world_model: Path):
     _, batches, _ = run_locally(imagining(tiny_checkpoint, model="copy", path=str(world_model)))
     imagined = [s for b in batches for s in b if s.source == IMAGINED]
     assert imagined
@@ -246,9 +246,7 @@ def test_rollouts_of_a_copy_are_known_for_what_they_are(tiny_checkpoint: Path, w
         assert all(np.array_equal(f, frames[0]) for f in frames)
 
 
-def test_it_runs_asynchronously_with_two_who_rollout(
-    tiny_checkpoint: Path, world_model: Path, tmp_path: Path
-):
+def test_it_runs_asynchronously_with_two_workers(tiny_checkpoint: Path, world_model: Path, tmp_path: Path):
     from accerl_lerobot.engine.launch import RayEngine
 
     learn = OnlineLearnConfig(

@@ -80,7 +80,7 @@ def models(monkeypatch: pytest.MonkeyPatch) -> ImaginationModels:
 
 
 @pytest.mark.parametrize(("aside", "rate"), [(0.0, (1, 1)), (0.4, (0.2, 0.9)), (9.0, (0, 0))])
-def test_a_policy_does_in_true_rollouts_what_it_does(
+def test_a_policy_does_the_same_in_a_true_world_model(
     models: ImaginationModels, aside: float, rate: tuple[float, float]
 ):
     worlds = [make_world(replace(WORLD, hold=1)) for _ in range(4)]

@@ -96,7 +96,7 @@ def test_the_same_measures_on_every_dataset(
     assert "By dataset" in page and "that a policy real_episode through" in page
 
 
-def test_what_rollouts_and_what_classifies_go_to_the_device(
+def test_both_models_go_to_the_device(
     folders: tuple[Path, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     asked, went = moved(monkeypatch)

@@ -81,7 +81,7 @@ def test_frames_get_the_size_that_it_wants(tmp_path: Path):
     assert probabilities(made, *white) == pytest.approx(0.5, rel=1e-4) and seen == [(5, 3, 32, 32)]
 
 
-def test_our_own_replaces_for_itself(tmp_path: Path):
+def test_our_own_success_model_can_be_loaded_as_one(tmp_path: Path):
     torch.manual_seed(0)
     own = new_success_model(K).eval()
     own.save_pretrained(tmp_path / "own")
@@ -138,7 +138,7 @@ def test_lerobot_s_classifier(tmp_path: Path):
         ({CAMERA: image(), "observation.image": image()}, {}, "this camera, and the world model has"),
     ],
 )
-def test_what_a_rollout_cannot_be_shown_to_is_refused(
+def test_a_reward_model_that_reads_more_is_refused(
     inputs: dict[str, PolicyFeature] | None, config: dict[str, Any], why: str, tmp_path: Path
 ):
     given = saved(tmp_path / "model", inputs, **config)
@@ -213,7 +213,7 @@ def test_it_is_named_on_the_command_line(
     assert "success.threshold=0.5: it belongs to the model in success.path" in capsys.readouterr().err
 
 
-def test_a_run_rollouts_with_it(tmp_path: Path):
+def test_a_run_uses_it(tmp_path: Path):
     spec = world_spec(WORLD_MODEL, ENV)
     save_world_model(tmp_path / "world", PixelWorldModel(spec, WORLD_MODEL.model))
     given = replace(saved(tmp_path / "model", {spec.cameras[0]: image()}), threshold=0.3)

@@ -65,7 +65,7 @@ def test_one_that_does_not_flatter_is_left_alone():
         assert not switch.tripped
 
 
-def test_what_no_rollouts_stand_beside_is_not_counted():
+def test_real_outcomes_before_the_window_is_full_do_not_count():
     switch = KillSwitch(max_gap=0.3, window=4, outcomes=2)
     rollout(switch, 1, 1, 1)
     for _ in range(5):
@@ -100,7 +100,7 @@ def test_more_than_the_gap_not_as_much():
 @pytest.mark.parametrize(
     ("rollouts", "workers", "parts"), [(32, 1, [32]), (32, 3, [11, 11, 10]), (4, 4, [1] * 4)]
 )
-def test_all_rollouts_are_somebody_s(rollouts: int, workers: int, parts: list[int]):
+def test_every_rollout_has_a_worker(rollouts: int, workers: int, parts: list[int]):
     config = ImaginationConfig(share=0.5, model="oracle", rollouts=rollouts, workers=workers)
     assert [worker_config(config, i).rollouts for i in range(workers)] == parts
     assert all(

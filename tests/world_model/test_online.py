@@ -92,7 +92,7 @@ def test_episodes_are_put_together_from_their_segments():
         assert np.array_equal(getattr(made._learnt[0], name), getattr(whole, name))
 
 
-def test_rollouts_are_refused():
+def test_imagined_segments_are_refused():
     [segment] = real_episode(1)
     with pytest.raises(ValueError, match=f"real segments, and {segment.key} is imagined"):
         learner().add(replace(segment, source=IMAGINED))
@@ -109,7 +109,7 @@ def test_less_than_a_step_in_a_validation_s_time_is_made_later():
 
 
 def test_what_never_ends_is_forgotten():
-    unfinished = UnfinishedEpisodes(max_windows=2)
+    unfinished = UnfinishedEpisodes(most=2)
     first, second, third = (real_episode(seed, length=2) for seed in (1, 2, 3))
     assert unfinished.add(first[0]) is unfinished.add(second[0]) is unfinished.add(third[0]) is None
     assert unfinished.add(first[1]) is None and unfinished.add(third[1]) == third

@@ -90,7 +90,7 @@ def test_from_a_dataset_to_a_validation(demos: Path, tmp_path: Path, capsys: pyt
         "false_success_idle",
         "recall",
     }
-    assert found["threshold"] >= 0.5 and found["outcomes"]["predictions"] > 2
+    assert found["threshold"] >= 0.5 and found["outcomes"]["rollouts"] > 2
     kinds = [json.loads(line)["kind"] for line in (out / "metrics.jsonl").read_text().splitlines()]
     assert kinds == ["world_model"]
     assert " windows: " in stderr and stderr.count(" wanted") == 8 and "preview.mp4" in stderr
@@ -247,7 +247,7 @@ def test_a_placebo_is_learned_where_one_is_asked_for(
     told = [*arguments(demos, tmp_path / "out")[1:], f"--world_model.shuffle_actions={shuffled}"]
     config = parse(WorldModelRun, told, recipe_class=RunConfig)
     with pytest.raises(InterruptedError, match=str(shuffled)):
-        pretrain.train_from_scratch(config, tmp_path, console.Console())
+        pretrain.pretrain(config, tmp_path, console.Console())
 
 
 def test_both_networks_learn_on_the_device_and_are_saved_for_any(
@@ -329,7 +329,7 @@ def test_a_policys_episodes_that_are_refused(
     assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
-def test_what_is_saved_rollouts_the_same(tmp_path: Path):
+def test_a_saved_model_predicts_the_same(tmp_path: Path):
     of = windows(dots(2))
     made = awake(model())
     made.fit_statistics(of)

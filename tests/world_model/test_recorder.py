@@ -51,7 +51,7 @@ def recorded(folder: Path, numbers: range, most: int = 100, pace: float = 16.0) 
         recorder.write(a_rollout(number, success=number % 2 == 0))
 
 
-def test_what_was_imagined_is_read_again(tmp_path: Path):
+def test_what_was_recorded_is_read_again(tmp_path: Path):
     recorded(tmp_path, range(1, 4))
     found = list(read_imagined(tmp_path))
     assert [rollout.number for rollout in found] == [1, 2, 3]
@@ -72,7 +72,7 @@ def test_what_was_imagined_is_read_again(tmp_path: Path):
 
 
 def test_only_the_newest_are_kept_and_what_was_after_a_checkpoint_gives_way(tmp_path: Path):
-    recorded(tmp_path, range(1, 9), max_windows=5)
+    recorded(tmp_path, range(1, 9), most=5)
     assert [rollout.number for rollout in read_imagined(tmp_path)] == [4, 5, 6, 7, 8]
     again = Recorder(tmp_path, 5, 16.0)  # the run goes on from where six had been imagined
     again.write(a_rollout(7, length=1))
@@ -84,7 +84,7 @@ def test_only_the_newest_are_kept_and_what_was_after_a_checkpoint_gives_way(tmp_
     assert sorted(p.name for p in tmp_path.iterdir()) == ["00000007.safetensors", "00000008.safetensors"]
 
 
-def test_what_is_no_rollout_is_refused(tmp_path: Path):
+def test_broken_files_are_refused(tmp_path: Path):
     with pytest.raises(InputError, match=r"run it with --imagination\.record=1000"):
         list(read_imagined(tmp_path / FOLDER))
     recorded(tmp_path, range(1, 2))
@@ -160,9 +160,7 @@ def test_worlds_are_not_mixed(run: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert not (tmp_path / "set").exists()
 
 
-def test_a_pace_that_lerobot_cannot_tell_is_said(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_a_rate_that_is_no_integer_is_reported(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     for path in (run / FOLDER).iterdir():
         path.unlink()
     recorded(run / FOLDER, range(1, 2), pace=6.25)

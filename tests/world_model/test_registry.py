@@ -68,7 +68,7 @@ def starts_of(*seeds: int, solve_at: int = 99) -> tuple[list[Start], dict[int, o
 
 
 @pytest.mark.parametrize("simulators", [1, 3, 12])
-def test_the_oracle_lives_through_what_happened(simulators: int):
+def test_the_oracle_repeats_what_happened(simulators: int):
     made: list[World] = []
 
     def make() -> World:
@@ -121,7 +121,7 @@ def test_an_oracle_must_know_what_led_to_a_start():
         oracle.begin(Context(*torch.zeros(5, 1)), ["go"], [None])
 
 
-def test_a_copy_shows_the_last_frame_for_ever():
+def test_a_copy_never_changes():
     starts, _ = starts_of(1, 2)
     copy = CopyModel(SPEC)
     state = begun(copy, starts)
@@ -133,7 +133,7 @@ def test_a_copy_shows_the_last_frame_for_ever():
         state = rollout.state
 
 
-def test_shuffled_actions_are_the_next_rollout_s():
+def test_shuffled_actions_are_those_of_the_row_before():
     starts, _ = starts_of(1, 2)
     oracle = OracleModel(SPEC, lambda: make_world(WORLD), 12)
     shuffled = ShuffledModel(oracle)
@@ -232,7 +232,7 @@ def test_help_names_them_all():
     ("name", "made"),
     [("learned", PixelWorldModel), ("shuffled", ShuffledModel), ("copy", CopyModel), ("oracle", OracleModel)],
 )
-def test_the_table_says_what_is_so(name: str, made: type, tmp_path: Path):
+def test_entries_of_the_table_are_true(name: str, made: type, tmp_path: Path):
     world, kind, path = make_world(real.WORLD), MODELS[name], None
     if kind.needs_path:
         network = NetworkConfig(channels=(8, 8), condition=8, planes=2)
@@ -256,7 +256,7 @@ def test_the_table_says_what_is_so(name: str, made: type, tmp_path: Path):
     world.close()
 
 
-def test_nobody_who_rollouts_with_other_actions_rollouts_alone():
+def test_rollouts_with_other_actions_are_never_alone():
     for workers in range(1, 6):
         for rollouts in range(workers, 16):
             fields: dict[str, Any] = {"share": 0.5, "path": "x", "rollouts": rollouts, "workers": workers}
@@ -271,7 +271,7 @@ def test_nobody_who_rollouts_with_other_actions_rollouts_alone():
 
 @pytest.mark.parametrize("whole", [True, False])
 @pytest.mark.usefixtures("snow")
-def test_rollouts_begin_only_where_their_kind_can(whole: bool, monkeypatch: pytest.MonkeyPatch):
+def test_rollouts_start_only_where_their_model_can(whole: bool, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(MODELS, "snow", replace(SNOW, needs_history=whole))
     config = ImaginationConfig(share=0.5, model="snow", rollouts=2)
     world = make_world(real.WORLD)

@@ -142,7 +142,7 @@ def test_a_success_ends_a_rollout_and_nothing_follows_it(bright: Any):
 
 
 @pytest.mark.parametrize("fails", [True, False])
-def test_a_rollout_ends_where_the_world_s_time_does(bright: Any, fails: bool):
+def test_a_rollout_ends_at_the_time_limit(bright: Any, fails: bool):
     batch, made = imagination(Counting(), bright, fails=fails, rollouts=16)
     batch.remember(real_episode(3)[0])  # 4 decisions of 4 steps are all there is time for
     play(batch, 4, size=0.5)
@@ -179,7 +179,7 @@ def test_what_is_no_number_ends_a_rollout_and_is_not_kept(bright: Any):
     assert batch.counters.uncertain == 1, "its row has begun anew"
 
 
-def test_rollouts_begin_anew_beside_those_that_go_on():
+def test_ended_rollouts_start_anew_beside_the_others():
     oracle = OracleModel(SPEC, lambda: make_world(WORLD), 8)
     batch, made = imagination(oracle, rollouts=8)
     for seed in range(3):
@@ -210,7 +210,7 @@ def test_rollouts_begin_anew_beside_those_that_go_on():
         assert segment.success is result.success
 
 
-def test_rollouts_that_are_too_good_are_switched_off_until_another_model_is_promoted(bright: Any):
+def test_rollouts_that_succeed_too_often_are_switched_off_until_a_promotion(bright: Any):
     batch, _ = imagination(
         Counting(),
         bright,
@@ -231,7 +231,7 @@ def test_rollouts_that_are_too_good_are_switched_off_until_another_model_is_prom
     assert len(batch.requests()) == 4 and batch.version == 12 and batch.metrics()["on"] == 1
 
 
-def test_whole_rollouts_are_held_against_real_episodes(bright: Any):
+def test_rollouts_from_resets_are_compared_with_real_episodes(bright: Any):
     batch, made = imagination(
         Counting(),
         bright,
@@ -253,14 +253,14 @@ def test_whole_rollouts_are_held_against_real_episodes(bright: Any):
 
 
 @pytest.mark.parametrize("fails", [True, False])
-def test_a_whole_rollout_lasts_as_long_as_the_world_lets_it(bright: Any, fails: bool):
+def test_a_rollout_from_a_reset_lasts_to_the_time_limit(bright: Any, fails: bool):
     batch, made = imagination(Counting(), bright, start_at_reset_prob=1.0, fails=fails)
     batch.remember(real_episode(3)[0])
     play(batch, 4, size=0.0)
     assert {(len(s), s.terminated, s.truncated, s.success) for s in made} == {(4, fails, not fails, False)}
 
 
-def test_a_model_that_learns_rollouts_once_it_has_passed(bright: Any):
+def test_a_model_that_is_trained_is_used_once_it_has_passed(bright: Any):
     batch, _ = imagination(Counting(), bright, learn=OnlineLearnConfig(steps_per_episode=1))
     batch.remember(real_episode(3)[0])
     assert batch.requests() == [] and not batch.on
@@ -268,7 +268,7 @@ def test_a_model_that_learns_rollouts_once_it_has_passed(bright: Any):
     assert batch.on and len(batch.requests()) == 4
 
 
-def test_rollouts_under_way_are_dropped_when_another_model_is_promoted(bright: Any):
+def test_unfinished_rollouts_are_dropped_when_a_model_is_promoted(bright: Any):
     batch, made = imagination(Counting(), bright, start_at_reset_prob=1.0, world=SHORT)
     batch.remember(real_episode(3)[0])
     play(batch, 1, 0.1)
@@ -279,7 +279,7 @@ def test_rollouts_under_way_are_dropped_when_another_model_is_promoted(bright: A
     assert {s.world_version for s in made} == {12} and all(len(s) == 2 for s in made)
 
 
-def test_a_model_that_is_uncertain_of_everything_is_not_asked_for_ever(bright: Any):
+def test_a_model_that_is_uncertain_of_everything_is_switched_off(bright: Any):
     model = Counting(uncertainty=9.0)
     batch, made = imagination(
         model, bright, rollouts=1, max_uncertainty=2.0, guard=GuardConfig(window=5), world=ENDLESS

@@ -81,7 +81,7 @@ def test_it_goes_on_with_what_it_has_learned_from_and_never_with_what_was_held_o
 
     swapped = OnlineLearnConfig(dataset=rollouts, online=demos)
     learner = make_learner(run(tiny_checkpoint, tmp_path / "swapped", swapped, sources))
-    assert (len(learner._offline), len(learner._held_offline)) == (5, 4), "whichever room it is named in"
+    assert (len(learner._offline), len(learner._held_offline)) == (5, 4), "whichever section it is named in"
     learner = make_learner(run(tiny_checkpoint, tmp_path / "none", both, []))
     assert (len(learner._offline), len(learner._held_offline)) == (9, 0), (
         "what it does not know it takes whole"
@@ -135,12 +135,14 @@ def test_a_dataset_that_is_named_twice_is_refused(
             refused(config)
 
 
-@pytest.mark.parametrize("room", ["dataset", "online"])
+@pytest.mark.parametrize("section", ["dataset", "online"])
 def test_a_dataset_that_is_not_there_is_named_by_its_section(
-    room: str, tiny_checkpoint: Path, tmp_path: Path
+    section: str, tiny_checkpoint: Path, tmp_path: Path
 ):
-    learn = OnlineLearnConfig(**{room: DatasetConfig(repo_id="a/b", root="nowhere")})
+    learn = OnlineLearnConfig(**{section: DatasetConfig(repo_id="a/b", root="nowhere")})
     config = run(tiny_checkpoint, tmp_path / "model", learn, [])
     for refused in (check_imagination, make_learner):
-        with pytest.raises(InputError, match=rf"^imagination.learn.{room}.root='nowhere': no meta/info.json"):
+        with pytest.raises(
+            InputError, match=rf"^imagination.learn.{section}.root='nowhere': no meta/info.json"
+        ):
             refused(config)

@@ -21,7 +21,6 @@ from torch import nn
 from accerl_lerobot import cli, console
 from accerl_lerobot.cli.configs import WorldModelEvalRun, WorldModelRun
 from accerl_lerobot.config.parsing import encode
-from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import parse
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
@@ -39,7 +38,6 @@ from accerl_lerobot.world_model.learning.pretrain import world_spec
 from accerl_lerobot.world_model.model.contract import LearnableWorldModel, learnable_class, new_learnable
 from accerl_lerobot.world_model.model.store import load_world_model, save_world_model
 from benchmarks.ranking import BenchRankingConfig
-from benchmarks.world_model import BenchWorldModelConfig, bench_world_model, table
 from tests.runs import drive, replacing
 from tests.test_imagination import LOOSE, decisions, imagining, run_locally
 from tests.world_model.test_pixels import SPEC, dots, windows
@@ -285,30 +283,6 @@ def test_in_processes_of_their_own_they_find_it_too(tiny_checkpoint: Path, tmp_p
     finally:
         engine.close()
     assert last.version == 12 and last.imagination["promoted"] >= 1 and last.imagination["rollouts"] > 0
-
-
-def test_it_can_be_told_the_wrong_actions(tmp_path: Path):
-    config = ImaginationConfig(share=0.5, model="shuffled", path=str(saved(tmp_path / "w")))
-    named = replace(config, discover_packages_path=PACKAGE)
-    model, success = make_models(named, ENV, None, 4, "cpu")  # type: ignore[arg-type]  # only an oracle asks
-    state = {"frames": torch.zeros(2, 1, 32, 32, 3, dtype=torch.uint8), "robot": torch.zeros(2, 4)}
-    actions = torch.stack([torch.zeros(4, 2), torch.ones(4, 2)])
-    right, wrong = (m.step(state, actions, [0, 0]).robot for m in (model.model, model))  # type: ignore[attr-defined]
-    assert success is not None and torch.equal(right.flip(0), wrong) and not torch.equal(right, wrong)
-
-
-def test_what_it_costs_is_measured():
-    said = [
-        *NAMED,
-        "--batches=2",
-        "--repeats=1",
-        "--world_model.image_size=16",
-        "--world_model.learn.batch=2",
-    ]
-    result = bench_world_model(parse(BenchWorldModelConfig, said))
-    assert result["config"]["world_model"]["model"]["type"] == "linear"
-    assert str(table(result).title).startswith("linear, 16 px")
-    Console().rich.print(table(result))
 
 
 class Moody(LearnableWorldModel):
