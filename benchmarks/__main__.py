@@ -13,7 +13,6 @@ from accerl_lerobot.config.parsing import parse
 from accerl_lerobot.errors import InputError
 from benchmarks.async_vs_sync import BenchAsyncVsSyncConfig
 from benchmarks.batching import BenchBatchingConfig
-from benchmarks.dream import BenchDreamConfig
 from benchmarks.efficiency import BenchEfficiencyConfig
 from benchmarks.faults import BenchFaultsConfig
 from benchmarks.few_shot import BenchFewShotConfig
@@ -25,6 +24,7 @@ from benchmarks.soak import BenchSoakConfig
 from benchmarks.timeline import BenchTimelineConfig
 from benchmarks.transport import BenchTransportConfig
 from benchmarks.weights import BenchWeightsConfig
+from benchmarks.world_model import BenchWorldModelConfig
 
 CONFIGS: dict[str, type[Any]] = {
     "few_shot": BenchFewShotConfig,
@@ -40,7 +40,7 @@ CONFIGS: dict[str, type[Any]] = {
     "timeline": BenchTimelineConfig,
     "transport": BenchTransportConfig,
     "weights": BenchWeightsConfig,
-    "dream": BenchDreamConfig,
+    "world_model": BenchWorldModelConfig,
 }
 """Module with a function ``bench_NAME`` and a ``table`` of what it returns → its fields."""
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """How many real episodes a policy needs, with and without a world model.
 
-    python -m benchmarks efficiency --recipe=recipes/dreams.yaml --budgets=16,64,256
+    python -m benchmarks efficiency --recipe=recipes/imagination.yaml --budgets=16,64,256
 
-Every cell may collect so many real episodes, and makes as many updates as any other unless its dreams are
-switched off; where nothing is imagined, each real decision is learnt from so much more often. What was real
+Every cell may collect so many real episodes, and makes as many updates as any other unless its imagination
+is switched off; where nothing is imagined, each real decision is used so much more often. What was real
 before, the demonstrations of the warm start and the episodes of the pre-training, comes on top in all cells.
 """
 
@@ -48,7 +48,7 @@ ARMS = {
     "shuffled": ("--imagination.model=shuffled",),
     "oracle": ("--imagination.model=oracle",),
 }
-"""World model of each arm's dreams."""
+"""Options of each arm."""
 SPARE = 1.25
 """Draws that a budget of real episodes gives, beside what the updates of a cell need: nobody knows before how
 long the episodes are."""
@@ -58,15 +58,15 @@ long the episodes are."""
 class BenchEfficiencyConfig(StudyConfig):
     """Fields of ``python -m benchmarks efficiency``."""
 
-    recipe: str = "recipes/dreams.yaml"
+    recipe: str = "recipes/imagination.yaml"
     """The run that every cell is a variation of; read once, when the study starts."""
     output_dir: str = "outputs/efficiency"
     """Folder of the runs and of efficiency.json, .md and .png; finished cells in it are kept."""
     seeds: tuple[Seed, ...] = (0, 1, 2, 3, 4)
     """Each a warm start of its own."""
     arms: tuple[Annotated[str, Choice(ARMS)], ...] = tuple(ARMS)
-    """Compared world models: none, learned (goes on learning), frozen (does not), oracle (a simulator), and
-    the placebos copy (nothing moves) and shuffled (is told other actions)."""
+    """Compared world models: none, learned (is trained on), frozen (is not), oracle (a simulator), and
+    the placebos copy (nothing moves) and shuffled (gets other actions)."""
     budgets: tuple[Annotated[int, Range("[1, 1000000]")], ...] = (16, 64, 256)
     """Real episodes of a cell, ``rollout.episodes``."""
     decisions: Annotated[int, Range("[1, 100000]")] = 15
@@ -113,14 +113,14 @@ def bench_efficiency(config: BenchEfficiencyConfig) -> dict[str, Any]:
 
     Returns:
         ``starts`` (success of each seed's warm start), ``cells`` (of each run success, n, real episodes and
-        env steps, updates, and what was dreamt), ``groups`` (arm, budget, what `together` and `over_none`
+        env steps, updates, and what was imagined), ``groups`` (arm, budget, what `together` and `over_none`
         give, and means of real episodes and env steps and of updates) and ``beside``, see there.
 
     Raises:
         InputError: see `Study.run`.
         RuntimeError: see there.
     """
-    from accerl_lerobot.engine.dreaming import check_imagination
+    from accerl_lerobot.engine.imagination import check_imagination
 
     recipe = parse(RunConfig, [f"--config_path={config.recipe}"])
     study, console = Study(config, cells(config, recipe)), Console()
@@ -182,7 +182,7 @@ def beside(study: Study, recipe: RunConfig) -> dict[str, dict[str, float]]:
         found["demonstrations"] = {name: total / len(used) for name, total in _totals(used).items()}
     learn = recipe.imagination.learn
     learnt = [dataset for dataset in (learn.dataset, learn.online) if dataset.repo_id is not None]
-    if learnt and any(run.imagination.share and run.imagination.kind.folder for run in study.runs):
+    if learnt and any(run.imagination.share and run.imagination.kind.needs_path for run in study.runs):
         found["world model"] = _totals(learnt)
     return found
 

@@ -51,7 +51,7 @@ POINTS: dict[str, tuple[str, ...]] = {
     "trainer.publish": CRASHES,
     "trainer.write": (*SAVING, FULL),
     "rank.step": CRASHES,
-    "dream.step": CRASHES,
+    "imagination.step": CRASHES,
     "learning.step": CRASHES,
     "driver.metrics": (*UNWATCHED, FULL),
     "driver.save": (*UNWATCHED, FULL),
@@ -59,7 +59,7 @@ POINTS: dict[str, tuple[str, ...]] = {
     "driver.renamed": (*UNWATCHED, TORN),
 } | {
     f"{role}.timeline": (FULL,)
-    for role in ("rollout", "inference", "replay", "trainer", "dream", "learning", "driver")
+    for role in ("rollout", "inference", "replay", "trainer", "imagination", "learning", "driver")
 }
 """Point → what can be made to happen there. What stands before the dot is whose it is; ``trainer.loss`` and
 ``trainer.backward`` are reached by all of its ranks."""

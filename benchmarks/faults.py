@@ -40,7 +40,7 @@ from benchmarks.light_run import light_config
 from benchmarks.study import last_words
 from benchmarks.victims import CLASSES, DRIVER, EVERYTHING, LIGHT, TRAIN, Victim, alive
 
-IMAGINING = ("dream", "world learning")
+IMAGINING = ("imagination", "world learning")
 """Targets that are there where anything is imagined."""
 TARGETS = (*CLASSES, *RAY_PROCESSES, DRIVER, EVERYTHING)
 GRACE_S = 60.0
@@ -71,8 +71,8 @@ class BenchFaultsConfig(Section):
         "everything",
     )
     """Processes to strike: these, and Ray's own: gcs_server, raylet, dashboard agent, runtime env agent and
-    log monitor; where anything is imagined, dream and world learning too. driver: the process of the run
-    itself, which is gone on with by its command line. everything: it and all below it, at once."""
+    log monitor; where anything is imagined, imagination and world learning too. driver: the run's own
+    process, which is gone on with by its command line. everything: it and all below it, at once."""
     faults: tuple[str, ...] = FAULTS
     """kill, stop: SIGKILL and SIGSTOP, at a point or at any moment. exception, exit (with code 0), hang (of
     one thread), nan, nans (in as many updates in a row as end the trainer), full (the disk), torn (a file of

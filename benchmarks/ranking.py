@@ -4,7 +4,7 @@
     python -m benchmarks ranking --path=outputs/door_model/world_model --env.task=door-open-v3 \\
       --env.image_size=64 --env.max_steps=150 --policies=RUN_A/checkpoints/last/pretrained_model,RUN_B/…
 
-Every policy plays the same episodes, in the world and in dreams that begin at the same observations.
+Every policy plays the same episodes, in the environment and in imagination, from the same observations.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ from accerl_lerobot.evaluation.stats import Rate
 
 @dataclass(frozen=True, kw_only=True)
 class BenchRankingConfig(Section):
-    """Which policies, in which world, and in dreams of what."""
+    """Success rates of policies in an environment and in its world model."""
 
     path: str | None = None
     """The folder named world_model that ``accerl world-model`` wrote."""
     discover_packages_path: str | None = None
     """Package to import that registers the type of the world model, where that is not one of ours."""
     policies: tuple[str, ...] = ()
-    """Checkpoints. One is enough for the threshold by which it succeeds as often in dreams as in reality; 3
+    """Checkpoints. One is enough for the threshold by which it succeeds as often as in reality; 3
     can be ranked, and 12 and more say something."""
     env: EnvConfig = field(default_factory=MetaWorldConfig)
-    """The world."""
+    """The environment."""
     episodes: Annotated[int, Range("[1, 1000000]")] = 50
-    """Episodes of each policy, in the world and in dreams."""
+    """Episodes of each policy, in the environment and in imagination."""
     worlds: Annotated[int, Range("[1, 1000]")] = 8
-    """Episodes at a time in the world."""
+    """Environments at a time."""
     device: Device = "auto"
     """cpu, cuda, or auto."""
     num_threads: Threads = 1
@@ -59,14 +59,13 @@ class BenchRankingConfig(Section):
 
 
 def bench_ranking(config: BenchRankingConfig) -> dict[str, Any]:
-    """Plays and dreams.
+    """Plays and imagines.
 
     Returns:
-        ``policies``: path, real and dreamt successes of each; ``threshold`` of the success model, by which
-        they are; ``agreement``, see `agreement.agreement`; ``outcomes``: by policy and start, whether it was
-        a ``real`` success, and the highest P(success) that was ``said`` of its dream; ``even``: another
-        ``threshold``, see `even_threshold`, with ``dreamt`` successes of each and ``agreement`` by that;
-        ``config``.
+        ``policies``: path, real and imagined successes of each; ``threshold`` of the success model, by which
+        they are; ``agreement``, see `paired_eval.agreement`; ``outcomes``: by policy and start, the
+        ``real`` success and the imagined ``score``; ``even``: another ``threshold``, see `even_threshold`,
+        with ``imagined`` successes of each and ``agreement`` by that; ``config``.
 
     Raises:
         InputError: the world model, or a policy, cannot be loaded or does not fit the world.
@@ -78,18 +77,16 @@ def bench_ranking(config: BenchRankingConfig) -> dict[str, Any]:
     from accerl_lerobot.evaluation.config import evaluation_plans
     from accerl_lerobot.policies.config import PolicyConfig
     from accerl_lerobot.policies.loading import load_adapter, rehearsed_config, resolve_device
-    from accerl_lerobot.world_model.agreement import agreement, even_threshold
-    from accerl_lerobot.world_model.fit import check_fit
-    from accerl_lerobot.world_model.imagine import Dreamer
-    from accerl_lerobot.world_model.side_by_side import dreamt, lived
-    from accerl_lerobot.world_model.store import load_world_model, rehearse_world_model
+    from accerl_lerobot.world_model.imagination.registry import ImaginationModels, check_fit
+    from accerl_lerobot.world_model.model.store import load_world_model, rehearse_world_model
+    from benchmarks.paired_eval import agreement, even_threshold, rollout_imagined, rollout_real
 
     torch.set_num_threads(config.num_threads)
     device, console = resolve_device(config.device, "device"), Console()
     path = Path(str(config.path)).expanduser()
     rehearse_world_model(path, config.discover_packages_path)
-    model, judge = load_world_model(path, config.discover_packages_path)
-    dreamer = Dreamer(model.to(device), None if judge is None else judge.to(device))
+    model, success = load_world_model(path, config.discover_packages_path)
+    models = ImaginationModels(model.to(device), None if success is None else success.to(device))
     of = [PolicyConfig(path=path, device=config.device) for path in config.policies]
     worlds = [make_world(config.env) for _ in range(min(config.worlds, config.episodes))]
     try:
@@ -97,35 +94,35 @@ def bench_ranking(config: BenchRankingConfig) -> dict[str, Any]:
         for policy in of:
             settings = rehearsed_config(policy)
             executed = getattr(settings, "n_action_steps", 1)
-            check_fit(model.spec, spec, executed, settings.n_obs_steps, judge is not None)
+            check_fit(model.spec, spec, executed, settings.n_obs_steps, success is not None)
         starts = [(plan.task, plan.seed) for plan in evaluation_plans(spec.tasks, config.episodes, "ranking")]
-        real, said = [], []
+        real, scores = [], []
         for number, policy in enumerate(of, 1):
             adapter = load_adapter(policy)
             with console.stage(f"policy {number} of {len(of)}", total=len(starts)) as stage:
-                real.append(lived(adapter, worlds, starts, stage.update))
-                said.append(dreamt(adapter, dreamer, worlds[0], starts))
+                real.append(rollout_real(adapter, worlds, starts, stage.update))
+                scores.append(rollout_imagined(adapter, models, worlds[0], starts))
     finally:
         for world in worlds:
             world.close()
-    happened, promised = np.stack(real), np.stack(said)
-    assert judge is not None  # as `check_fit` has found
-    threshold = judge.config.threshold
-    imagined, even = promised > threshold, even_threshold(happened, promised)
+    outcomes, score = np.stack(real), np.stack(scores)
+    assert success is not None  # as `check_fit` has found
+    threshold = success.config.threshold
+    imagined, even = score > threshold, even_threshold(outcomes, score)
     result = {
         "config": asdict(config),
         "policies": [
-            {"path": path, "real": int(r.sum()), "dreamt": int(d.sum()), "n": len(starts)}
-            for path, r, d in zip(config.policies, happened, imagined, strict=True)
+            {"path": path, "real": int(r.sum()), "imagined": int(d.sum()), "n": len(starts)}
+            for path, r, d in zip(config.policies, outcomes, imagined, strict=True)
         ],
         "threshold": threshold,
-        "agreement": agreement(happened, imagined),
+        "agreement": agreement(outcomes, imagined),
         "even": {
             "threshold": even,
-            "dreamt": (promised > even).sum(1).tolist(),
-            "agreement": agreement(happened, promised > even),
+            "imagined": (score > even).sum(1).tolist(),
+            "agreement": agreement(outcomes, score > even),
         },
-        "outcomes": {"real": happened.tolist(), "said": promised.tolist()},
+        "outcomes": {"real": outcomes.tolist(), "score": score.tolist()},
     }
     if config.output_dir is not None:
         folder = Path(config.output_dir).expanduser()
@@ -141,20 +138,20 @@ def table(result: dict[str, Any]) -> Table:
     even = result["even"]
     shown = Table(
         title=f"{len(result['policies'])} policies, by a threshold of {result['threshold']:.6g}: "
-        f"{_said(result['agreement'])}\nby {even['threshold']:.6g}, where dreams succeed as often: "
-        f"{_said(even['agreement'])}"
+        f"{_estimates(result['agreement'])}\nby {even['threshold']:.6g}, with equal success: "
+        f"{_estimates(even['agreement'])}"
     )
-    for column in ("policy", "real", "dreamt", f"by {even['threshold']:.6g}"):
+    for column in ("policy", "real", "imagined", f"by {even['threshold']:.6g}"):
         shown.add_column(column)
-    for row, dreamt in zip(result["policies"], even["dreamt"], strict=True):
-        rates = (Rate(successes=made, n=row["n"]) for made in (row["real"], row["dreamt"], dreamt))
+    for row, imagined in zip(result["policies"], even["imagined"], strict=True):
+        rates = (Rate(successes=made, n=row["n"]) for made in (row["real"], row["imagined"], imagined))
         shown.add_row(row["path"], *map(str, rates))
     return shown
 
 
-def _said(found: dict[str, Any]) -> str:
+def _estimates(found: dict[str, Any]) -> str:
     names = {
-        "Spearman": "spearman", "Pearson": "pearson", "MMRV": "mmrv", "dreams less reality": "bias",
+        "Spearman": "spearman", "Pearson": "pearson", "MMRV": "mmrv", "imagination less reality": "bias",
         "start by start": "mcc",
     }  # fmt: skip
     return ", ".join(
@@ -164,13 +161,13 @@ def _said(found: dict[str, Any]) -> str:
 
 
 def draw(path: Path, result: dict[str, Any]) -> None:
-    """Real over dreamt success, a dot with 95 % Wilson intervals per policy."""
+    """Real over imagined success, a dot with 95 % Wilson intervals per policy."""
     with drawing(path, (4.5, 4.5)) as axes:
         axes.plot([0, 1], [0, 1], color="0.7", lw=1, ls="--")
         for row in result["policies"]:
-            real, dreamt = (Rate(successes=row[kind], n=row["n"]) for kind in ("real", "dreamt"))
-            ends = [[[r.value - r.interval().low], [r.interval().high - r.value]] for r in (dreamt, real)]
+            real, imagined = (Rate(successes=row[kind], n=row["n"]) for kind in ("real", "imagined"))
+            ends = [[[r.value - r.interval().low], [r.interval().high - r.value]] for r in (imagined, real)]
             axes.errorbar(
-                dreamt.value, real.value, xerr=ends[0], yerr=ends[1], fmt="o", color="C0", alpha=0.7
+                imagined.value, real.value, xerr=ends[0], yerr=ends[1], fmt="o", color="C0", alpha=0.7
             )
-        axes.set(xlabel="success in dreams", ylabel="success", xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
+        axes.set(xlabel="success in imagination", ylabel="success", xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))

@@ -29,7 +29,7 @@ CLASSES = {
     "replay": "ReplayWorker",
     "trainer": "TrainerWorker",
     "trainer rank": "TrainerRank",
-    "dream": "DreamWorker",
+    "imagination": "ImaginationWorker",
     "world learning": "WorldLearningWorker",
 }
 """Target → how Ray calls its processes."""

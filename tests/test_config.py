@@ -54,12 +54,14 @@ class TestOverrides:
     def test_the_other_fields_of_a_room_keep_the_values_that_help_shows(self) -> None:
         """Also for a section whose default in this place is not that of its class."""
         usual = RunConfig().imagination
-        config = parse(RunConfig, ["--imagination.replay.ahead=100", "--imagination.learn.trial.most=7"])
+        config = parse(
+            RunConfig, ["--imagination.replay.ahead=100", "--imagination.learn.validation.max_windows=7"]
+        )
         assert config.imagination.replay == replace(usual.replay, ahead=100)
-        assert config.imagination.learn.trial == replace(usual.learn.trial, most=7)
+        assert config.imagination.learn.validation == replace(usual.learn.validation, max_windows=7)
         text = help_text("train", RunConfig, "train", "all")
         assert f"--imagination.replay.capacity={usual.replay.capacity} " in text
-        assert f"--imagination.learn.trial.auroc={usual.learn.trial.auroc} " in text
+        assert f"--imagination.learn.validation.auroc={usual.learn.validation.auroc} " in text
 
     @pytest.mark.parametrize("form", ["--config_path={}", "--config_path {}", "{}"])
     def test_forms_of_naming_a_recipe(self, recipe: str, form: str) -> None:

@@ -275,16 +275,16 @@ class TestResources:
         assert doctor.cuda(None).status == OK
 
 
-def test_dreams_are_checked_where_there_are_any(capsys: pytest.CaptureFixture[str]) -> None:
-    recipe = str(QUICKSTART.with_name("dreams.yaml"))
+def test_imagination_is_checked_where_there_is_any(capsys: pytest.CaptureFixture[str]) -> None:
+    recipe = str(QUICKSTART.with_name("imagination.yaml"))
     assert doctor.main([recipe, "--imagination.path=nowhere"]) == 1
-    assert "FAIL  dreams     imagination.path='nowhere': config.json: is missing" in capsys.readouterr().out
+    assert "FAIL  imagination imagination.path='nowhere': config.json: is missing" in capsys.readouterr().out
     doctor.main([recipe, "--imagination.model=oracle"])
     told = capsys.readouterr().out
-    assert "ok    dreams     90% of every batch; what dreams: oracle" in told
+    assert "ok    imagination 90% of every batch; world model: oracle" in told
     assert (
-        "warn  dreams     are hardly ever switched off where they flatter: that takes more real episodes"
+        "warn  imagination is hardly ever switched off where it flatters: that takes more real episodes"
         in told
     )
     doctor.main([recipe, "--imagination.model=oracle", "--rollout.episodes=17"])
-    assert "where they flatter" not in capsys.readouterr().out
+    assert "where it flatters" not in capsys.readouterr().out

@@ -29,7 +29,7 @@ ENGINE = {"launch.py", "placement.py", "ray_session.py", "replicas.py", "supervi
 SHELLS = ENGINE | {
     "doctor.py",
     "worker.py",
-    "dream_workers.py",
+    "imagination_workers.py",
     "peers.py",
     "factory.py",
     "endpoint.py",

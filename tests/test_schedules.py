@@ -27,7 +27,7 @@ from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.replay.turns import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Turns
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.world_model.imagination_config import ImaginationConfig
+from accerl_lerobot.world_model.config import ImaginationConfig
 from benchmarks.simulated_policy import SimulatedPolicyConfig, load_simulated
 from tests.light_workers import light_ray
 from tests.replay.segments import make_segment
@@ -281,5 +281,5 @@ def test_schedules_that_cannot_be_are_refused():
         RunConfig(launch=launch, rollout=RolloutConfig(episodes=8))
     with pytest.raises(InputError, match=r"launch\.schedule.*rollout\.group_size"):
         RunConfig(launch=launch, rollout=RolloutConfig(group_size=4))
-    with pytest.raises(InputError, match=r"launch\.schedule.*dream"):
+    with pytest.raises(InputError, match=r"launch\.schedule.*imagination"):
         RunConfig(launch=launch, imagination=ImaginationConfig(share=0.5, path="somewhere"))

@@ -16,11 +16,10 @@ from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.world_model.config import (
-    StandInConfig,
-    TrialConfig,
+    ExternalRewardModelConfig,
+    ValidationConfig,
     WorldModelConfig,
 )
-from accerl_lerobot.world_model.sizes import TinyConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,12 +86,12 @@ class WorldModelRun(Section):
     online: DatasetConfig = field(default_factory=DatasetConfig)
     """Episodes of a policy, as ``accerl export`` writes them, to train on as well; none without a name. No
     demonstration shows how a policy fails."""
-    world_model: WorldModelConfig = field(default_factory=TinyConfig)
+    world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorldModelEvalRun(Section):
-    """``accerl world-model-eval``: a saved world model on episodes of one or several sources."""
+    """``accerl world-model-eval``: a saved world model on one or two LeRobotDatasets."""
 
     path: str | None = None
     """The folder named world_model that ``accerl world-model`` wrote."""
@@ -110,9 +109,9 @@ class WorldModelEvalRun(Section):
     """Episodes it was not trained on; of its own dataset, those that were held out."""
     online: DatasetConfig = field(default_factory=DatasetConfig)
     """Likewise, episodes of a policy as ``accerl export`` writes them; none without a name."""
-    success: StandInConfig = field(default_factory=StandInConfig)
+    success: ExternalRewardModelConfig = field(default_factory=ExternalRewardModelConfig)
     """Reward model to use instead of the success model beside the world model."""
-    trial: TrialConfig = field(default_factory=TrialConfig)
+    validation: ValidationConfig = field(default_factory=ValidationConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()

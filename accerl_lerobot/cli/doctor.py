@@ -83,7 +83,7 @@ def main(arguments: list[str]) -> int:
     config, history, checks = _resolve(arguments) if arguments else (None, 1, [])
     checks += [*pulled(arguments), *machine(config, history)]
     if config is not None:
-        checks += [*pace(config), *dreams(config), *placement(config)]
+        checks += [*pace(config), *imagination_checks(config), *placement(config)]
     for check in checks:
         sys.stdout.write(f"{check.status:5} {check.name:10} {check.text}\n")
     failed = sum(check.status == FAIL for check in checks)
@@ -245,24 +245,26 @@ def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
     yield Check("disk", WARN if short else OK, text)
 
 
-def dreams(config: RunConfig) -> Iterator[Check]:
+def imagination_checks(config: RunConfig) -> Iterator[Check]:
     """Imagination settings against the environment and the policy."""
     imagination, episodes = config.imagination, config.rollout.episodes
     if not imagination.share:
         return
-    from accerl_lerobot.engine.dreaming import check_imagination
+    from accerl_lerobot.engine.imagination import check_imagination
 
     try:
         check_imagination(config)
     except InputError as error:
-        yield Check("dreams", FAIL, str(error))
+        yield Check("imagination", FAIL, str(error))
         return
-    yield Check("dreams", OK, f"{imagination.share:.0%} of every batch; what dreams: {imagination.model}")
-    beside = imagination.horizon is None and imagination.beginnings > 0
-    if beside and 0 < episodes <= imagination.witnesses:
-        why = f"that takes more real episodes than imagination.witnesses, {imagination.witnesses}"
-        text = f"are hardly ever switched off where they flatter: {why}, and rollout.episodes is {episodes}"
-        yield Check("dreams", WARN, text)
+    yield Check(
+        "imagination", OK, f"{imagination.share:.0%} of every batch; world model: {imagination.model}"
+    )
+    least = imagination.guard.min_real_episodes
+    if imagination.start_at_reset_prob and 0 < episodes <= least:
+        why = f"that takes more real episodes than imagination.guard.min_real_episodes, {least}"
+        text = f"is hardly ever switched off where it flatters: {why}, and rollout.episodes is {episodes}"
+        yield Check("imagination", WARN, text)
 
 
 def placement(config: RunConfig) -> Iterator[Check]:

@@ -188,28 +188,34 @@ def evaluate(arguments: list[str]) -> int:
 
 
 def world_model(arguments: list[str]) -> int:
-    """``accerl world-model``; 1 if it fails its validation."""
+    """``accerl world-model``; 1 if it fails validation."""
     config: WorldModelRun = parse(WorldModelRun, arguments, recipe_class=RunConfig)
     if config.dataset.repo_id is None:
         raise InputError("dataset.repo_id", None, NO_DATASET)
-    from accerl_lerobot.world_model.offline import learn_world_model
+    from accerl_lerobot.world_model.learning.pretrain import pretrain
 
-    return _tried(config, lambda directory, console: learn_world_model(config, directory, console))
+    return _validated(config, lambda directory, console: pretrain(config, directory, console))
 
 
 def world_model_eval(arguments: list[str]) -> int:
-    """``accerl world-model-eval``; 1 if it fails its validation."""
+    """``accerl world-model-eval``; 1 if it fails validation."""
     config: WorldModelEvalRun = parse(WorldModelEvalRun, arguments, recipe_class=RunConfig)
-    from accerl_lerobot.world_model.evaluate import evaluate
+    from accerl_lerobot.world_model.validation.evaluate import evaluate
 
-    return _tried(config, lambda directory, console: evaluate(config, directory, console))
+    return _validated(config, lambda directory, console: evaluate(config, directory, console))
 
 
-def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Console], dict[str, Any]]) -> int:
+def _validated(
+    config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Console], dict[str, Any]]
+) -> int:
     """Does the work in a new folder and shows the validation that it ends with."""
     from accerl_lerobot.engine.run import make_output_dir
-    from accerl_lerobot.world_model.by_source import compared
-    from accerl_lerobot.world_model.show import gates, sources_table, table
+    from accerl_lerobot.world_model.validation.tables import (
+        check_lines,
+        datasets_table,
+        depth_table,
+        has_several,
+    )
 
     directory = make_output_dir(config)
     (directory / CONFIG).write_text(yaml.safe_dump(encode(config), sort_keys=False))
@@ -221,10 +227,10 @@ def _tried(config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Cons
     except InputError:
         _discard_unused(directory)
         raise
-    console.rich.print(table(found))
-    if compared(found):
-        console.rich.print(sources_table(found))
-    for line in gates(found):
+    console.rich.print(depth_table(found))
+    if has_several(found):
+        console.rich.print(datasets_table(found))
+    for line in check_lines(found):
         console.say(line)
     console.say(f"{'passed' if found['passed'] else 'FAILED'}; see {directory / 'preview.mp4'}")
     sys.stdout.write(json.dumps(found, indent=2) + "\n")

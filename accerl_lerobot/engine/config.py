@@ -35,7 +35,7 @@ from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline import TIMELINE
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.transport.endpoint import Transport
-from accerl_lerobot.world_model.imagination_config import ImaginationConfig
+from accerl_lerobot.world_model.config import ImaginationConfig
 
 __all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "check_chunk", "decode", "encode", "parse"]
 
@@ -235,13 +235,12 @@ class RunConfig(Section):
             # real episode.
             self.replay.check(batch_decisions=batch, segment_decisions=self.rollout.segment_length)
             if imagination.share:
-                # A whole dream is as long as the world lets it be: `engine.dreaming` looks at that.
-                longest = imagination.horizon or 1
+                # `engine.imagination` checks it again with the length of a whole rollout.
                 imagination.replay.check(
-                    batch_decisions=batch, segment_decisions=longest, field="imagination.replay"
+                    batch_decisions=batch, segment_decisions=1, field="imagination.replay"
                 )
         if imagination.share and self.launch.schedule != ASYNCHRONOUS:
-            remedy = "use asynchronous: those who dream take no turns"
+            remedy = "use asynchronous: imagination takes no turns"
             raise InputError("launch.schedule", self.launch.schedule, remedy)
         for name in ("episodes", "group_size"):
             if getattr(self.rollout, name) and self.launch.schedule != ASYNCHRONOUS:
@@ -251,9 +250,7 @@ class RunConfig(Section):
                 raise InputError("launch.schedule", self.launch.schedule, remedy)
         if imagination.share and self.rollout.group_size:
             # Nor could the episodes of a group, which bear one name, be told from each other.
-            remedy = (
-                "leave it out with imagination.share: dreams do not begin alike, so they are not compared"
-            )
+            remedy = "leave it out with imagination.share: imagined rollouts start at different states"
             raise InputError("rollout.group_size", self.rollout.group_size, remedy)
 
     def _check_off_policy(self) -> None:

@@ -42,7 +42,7 @@ from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from accerl_lerobot.transport.endpoint import Endpoint, uses_shared_memory
-from accerl_lerobot.world_model.pool import together as dreamt_together
+from accerl_lerobot.world_model.imagination.guard import IMAGINATION, combine_metrics
 
 logger = logging.getLogger(__name__)
 
@@ -152,7 +152,7 @@ class RayEngine(Engine):
             rollout=self._rollouts.counters(),
             replay=self._metrics.get("replay", {}),
             inference=self._metrics.get("inference", {}),
-            imagination=dreamt_together(imagined) | learned,
+            imagination=combine_metrics(imagined) | learned,
         )
         self._check_moving(progress)
         return progress
@@ -231,10 +231,10 @@ class RayEngine(Engine):
             self._add(name, rank)
         self._trainer = self._add("trainer", trainer)
         if imagination.share:
-            from accerl_lerobot.engine.dream_workers import DreamWorker, WorldLearningWorker
+            from accerl_lerobot.engine.imagination_workers import ImaginationWorker, WorldLearningWorker
 
-            for i, name in enumerate(numbered("dream", imagination.workers)):
-                imaginer = make(name, DreamWorker, 4, c, self._state, timeline, i)
+            for i, name in enumerate(numbered(IMAGINATION, imagination.workers)):
+                imaginer = make(name, ImaginationWorker, 4, c, self._state, timeline, i)
                 self._imaginers.append(self._add(name, imaginer))
             if imagination.learns:
                 learns = make("world learning", WorldLearningWorker, 4, c, self._state, timeline)
@@ -353,7 +353,7 @@ class RayEngine(Engine):
         Raises:
             WorkerError: neither decisions nor updates for `LaunchConfig.stall_s`.
         """
-        imagined = tuple(progress.imagination.get(k) for k in ("decisions", "learn_steps", "trial_s"))
+        imagined = tuple(progress.imagination.get(k) for k in ("decisions", "learn_steps", "validation_s"))
         state = (progress.version, progress.rollout.get("decisions"), progress.rollout["restarts"], imagined)
         now = time.monotonic()
         waiting = self._rollouts.outstanding or (self._training and not self._done)

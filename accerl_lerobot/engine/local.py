@@ -34,11 +34,12 @@ from accerl_lerobot.seeds import global_generators, restore_global_generators
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.nonfinite import keeping
 from accerl_lerobot.weights.publisher import PublishDelay
+from accerl_lerobot.world_model.imagination.guard import IMAGINATION
 
 logger = logging.getLogger(__name__)
 
-LOCAL, DREAMS = "local", "dreams"
-"""Names of this engine's parts of a checkpoint."""
+LOCAL = "local"
+"""Name of this engine's own state."""
 
 
 class LocalEngine(Engine):
@@ -82,13 +83,13 @@ class LocalEngine(Engine):
         folder, counted = journal_folder(config), config.rollout.episodes > 0
         journal = None if folder is None else Journal(folder / EPISODES)
         self._replay = MixedReplay(config.replay, imagination.replay, imagination.share, counted, journal)
-        self._dreams = self._world_learner = None
+        self._imagination = self._world_learner = None
         if imagination.share:
-            from accerl_lerobot.engine.dreaming import make_imagination, make_learner
+            from accerl_lerobot.engine.imagination import make_imagination, make_learner
 
-            self._dreams = make_imagination(config, "dream", self._replay.insert)
+            self._imagination = make_imagination(config, IMAGINATION, self._replay.insert)
             if imagination.learns:
-                self._world_learner = make_learner(config, self._dreams.dreamer)
+                self._world_learner = make_learner(config, self._imagination.models)
         self._rng = np.random.default_rng(config.seed)
         self._outstanding: set[tuple[str, int]] = set()
         self._episodes: list[EpisodeResult] = []
@@ -132,7 +133,7 @@ class LocalEngine(Engine):
         self._act()
         self._store()
         self._learn_world()
-        self._dream()
+        self._imagine()
         updates = []
         n = self._config.trainer.batch_decisions
         if self._exploring and self._replay.may_sample(n):
@@ -175,10 +176,10 @@ class LocalEngine(Engine):
             "runner": self._runner.state(),
         }
         snapshot.save(state / LOCAL, engine)
-        if self._dreams is not None:
+        if self._imagination is not None:
             learner = None if self._world_learner is None else self._world_learner.state()
-            snapshot.save(state / DREAMS, {"dreams": self._dreams.state(), "learner": learner})
-            self._dreams.save_promoted(directory / WORLD_MODEL)
+            snapshot.save(state / IMAGINATION, {"imagination": self._imagination.state(), "learner": learner})
+            self._imagination.save_promoted(directory / WORLD_MODEL)
         self._clock.enter(WAIT_IN)
         return Saved(self._update.version, [])
 
@@ -202,9 +203,9 @@ class LocalEngine(Engine):
         self._runner.restore(engine["runner"])
         requests = ((slot, self._runner.request(slot)) for slot in range(len(self._runner)))
         self._due = {slot: request for slot, request in requests if request is not None}
-        if self._dreams is not None:
-            imagined = snapshot.load(directory / DREAMS)
-            self._dreams.restore(imagined["dreams"])
+        if self._imagination is not None:
+            imagined = snapshot.load(directory / IMAGINATION)
+            self._imagination.restore(imagined["imagination"])
             if self._world_learner is not None:
                 self._world_learner.restore(imagined["learner"])
         restore_global_generators(engine["generators"])
@@ -213,8 +214,8 @@ class LocalEngine(Engine):
         try:
             self._clock.close()
             self._runner.close()
-            if self._dreams is not None:
-                self._dreams.close()
+            if self._imagination is not None:
+                self._imagination.close()
         except Exception:
             logger.exception("could not close all worlds")
 
@@ -248,32 +249,29 @@ class LocalEngine(Engine):
             else:
                 self._due[slot] = request
 
-    def _dream(self) -> None:
+    def _imagine(self) -> None:
         """One decision in every imagined rollout, if any is wanted."""
-        if self._dreams is None or not self._training:
+        if self._imagination is None or not self._training:
             return
-        if self._replay.real_ended:
-            self._dreams.end_real()
-        learner, on = self._world_learner, self._dreams.on
-        awaited = learner is not None and learner.promising(self._replay.real_ended)
-        awaited = awaited or self._dreams.prepares
+        learner, on = self._world_learner, self._imagination.on
+        awaited = learner is not None and learner.may_promote(self._replay.real_ended)
         self._replay.mix(self._config.imagination.share if on else 0.0, on or awaited)
         if not self._exploring:
             return
-        if self._replay.may_insert(IMAGINED) and (requests := self._dreams.requests()):
-            self._dreams.advance(self._acting.decide(requests, self._acting_version))
+        if self._replay.may_insert(IMAGINED) and (requests := self._imagination.requests()):
+            self._imagination.advance(self._acting.decide(requests, self._acting_version))
 
     def _learn_world(self) -> None:
-        """One gradient step of the world model, or its held-out evaluation, if either is due."""
+        """One gradient step of the world model, or its validation, if either is due."""
         learner, last = self._world_learner, self._replay.real_ended
-        if learner is None or self._dreams is None or not self._training:
+        if learner is None or self._imagination is None or not self._training:
             return
-        if learner.owed >= 1:
+        if learner.pending_steps >= 1:
             learner.step()
-        elif learner.due(last) and (promotion := learner.promote(last)):
-            self._dreams.swap(promotion)
-            learner.handed_over()
-        self._replay.hold(learner.due(last=False) and not last)
+        elif learner.validation_due(last) and (promotion := learner.promote(last)):
+            self._imagination.swap(promotion)
+            learner.mark_served()
+        self._replay.hold(learner.validation_due(last=False) and not last)
 
     def _publish(self) -> None:
         """Give weights to the acting policy, which is the trainer's own unless they are delayed."""
@@ -294,8 +292,8 @@ class LocalEngine(Engine):
             segment = self._outbox.popleft()
             if not self._replay.insert(segment):
                 continue
-            if self._dreams is not None:
-                self._dreams.remember(segment)
+            if self._imagination is not None:
+                self._imagination.remember(segment)
             if self._world_learner is not None:
                 self._world_learner.add(segment)
         if self._plans.spent and not self._outbox and not self._runner.exploring:
@@ -303,7 +301,7 @@ class LocalEngine(Engine):
 
     def _imagined(self) -> dict[str, float]:
         learner = {} if self._world_learner is None else self._world_learner.metrics()
-        return {} if self._dreams is None else self._dreams.metrics() | learner
+        return {} if self._imagination is None else self._imagination.metrics() | learner
 
     def _ended(self, result: EpisodeResult) -> None:
         self._plans.report(result)

@@ -308,7 +308,7 @@ def _start(config: RunConfig, directory: Path) -> str | None:
 
 def _check_imagination(config: RunConfig, resuming: bool) -> None:
     if config.imagination.share:
-        from accerl_lerobot.engine.dreaming import check_imagination
+        from accerl_lerobot.engine.imagination import check_imagination
 
         path = config.imagination.path
         if resuming and path is not None and not Path(path).expanduser().is_dir():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The episodes of a run as a LeRobotDataset: real ones, or imagined ones, for which see `dreams.py`.
+"""The episodes of a run as a LeRobotDataset: real ones, or imagined ones, see `recorder.write_dataset`.
 
     accerl export --path=RUN --root=outputs/rollouts
 
@@ -41,9 +41,8 @@ from accerl_lerobot.envs.base import World
 from accerl_lerobot.envs.config import EnvConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL
-from accerl_lerobot.export.dreams import write_dreams
 from accerl_lerobot.replay.journal import EPISODES, Done, read_journal, whole_episodes
-from accerl_lerobot.world_model.recorded import DREAMS, read_dreams
+from accerl_lerobot.world_model.imagination.recorder import FOLDER, read_imagined, write_dataset
 
 SIDECAR = Path("meta") / "accerl_rollouts.json"
 """File of the dataset: its origin, and how many episodes it has."""
@@ -97,7 +96,7 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
     check_folder(run, Origin("path", str(run)))
     settings = _settings(run, config.hub_path)
     if config.source == IMAGINED:
-        return _export_dreams(settings, config, run, root, console)
+        return _export_imagined(settings, config, run, root, console)
     chosen = _picked(whole_episodes(read_journal(run / EPISODES)), lambda parts: parts[-1].success, config)
     if not chosen:
         raise InputError(
@@ -132,16 +131,16 @@ def _settings(run: Path, hub_path: str | None) -> RunConfig:
     return settings
 
 
-def _export_dreams(
+def _export_imagined(
     settings: RunConfig, config: ExportConfig, run: Path, root: Path, console: Console
 ) -> dict[str, Any]:
-    chosen = _picked(read_dreams(run / DREAMS), lambda dream: dream.success, config)
+    chosen = _picked(read_imagined(run / FOLDER), lambda episode: episode.success, config)
     if not chosen:
         raise InputError(
-            "path", str(run), f"no imagined rollout in its {DREAMS}/ of those asked for ({config.pick})"
+            "path", str(run), f"no imagined rollout in its {FOLDER}/ of those asked for ({config.pick})"
         )
     with appearing(root) as partial:
-        tally = write_dreams(chosen, partial, config.repo_id, settings.env.type, console)
+        tally = write_dataset(chosen, partial, config.repo_id, settings.env.type, console)
         _write_sidecar(config, run, settings, tally, partial)
     return tally
 

@@ -40,11 +40,11 @@ Files = dict[str, Path | bytes]
 """Name in the repository → a file, or its content."""
 FOLDER = "accerl_run"
 """Folder in which a policy or world model carries files of its run."""
-EVALUATION, TRIAL = "evaluation.json", "trial.json"
+EVALUATION, VALIDATION = "evaluation.json", "validation.json"
 KEPT = {
     POLICY: (RECIPE, SUMMARY, EVALUATION, "success_curve.png", "before_after.mp4"),
-    WORLD_MODEL: (RECIPE, TRIAL, "preview.mp4", "preview_online.mp4"),
-    SUCCESS_MODEL: (RECIPE, TRIAL),
+    WORLD_MODEL: (RECIPE, VALIDATION, "preview.mp4", "preview_online.mp4"),
+    SUCCESS_MODEL: (RECIPE, VALIDATION),
 }
 """Artifact type → files of its run that go with it."""
 MARK = "<!-- Written by accerl push, and anew each time. Delete this line to keep what you change. -->"
@@ -69,7 +69,7 @@ class Provenance:
     """Summary of a run that ended with this very policy."""
     evaluation: dict[str, Any] = field(default_factory=dict)
     """By ``accerl eval``, of this very policy."""
-    trial: dict[str, Any] = field(default_factory=dict)
+    validation: dict[str, Any] = field(default_factory=dict)
     """Validation of the world model."""
     files: Mapping[str, Path] = field(default_factory=dict)
     """Name in the repository → file that goes with the folder."""
@@ -102,7 +102,7 @@ def _known(folder: Path, artifact: str) -> tuple[dict[str, Any], dict[str, Path]
     is_last = number.isdigit() and int(number) == summary.get("updates")
     measured = own is not None or artifact != POLICY or is_last
     names = KEPT.get(artifact, ()) if measured else (RECIPE,)
-    known = {"recipe": _read_recipe(home / RECIPE), "trial": read_json(home / TRIAL)}
+    known = {"recipe": _read_recipe(home / RECIPE), "validation": read_json(home / VALIDATION)}
     if measured and artifact in (POLICY, RUN):
         known["summary"] = summary
     if own is not None:  # an evaluation is there only if one was given to an earlier push
@@ -117,7 +117,7 @@ def _run_of(folder: Path, artifact: str) -> Path | None:
     if artifact == POLICY and folder.name == PRETRAINED and folder.parents[1].name == CHECKPOINTS:
         home, sign = folder.parents[2], RECIPE
     elif artifact in (WORLD_MODEL, SUCCESS_MODEL):
-        home, sign = folder.parents[0 if artifact == WORLD_MODEL else 1], TRIAL
+        home, sign = folder.parents[0 if artifact == WORLD_MODEL else 1], VALIDATION
     else:
         return None
     return home if (home / sign).is_file() else None
@@ -142,7 +142,7 @@ def _read_evaluation(path: Path, policy: Path) -> dict[str, Any]:
 
 def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenance: Provenance) -> str:
     """README.md of a model repository; pictures and videos among `files` are shown."""
-    recipe, summary, trial = provenance.recipe, provenance.summary, provenance.trial
+    recipe, summary, validation = provenance.recipe, provenance.summary, provenance.validation
     config = read_json(folder / LAST / CONFIG if artifact == RUN else folder / CONFIG)
     env = recipe.get("env") or {}
     tags = ["accerl-lerobot", artifact.replace(" ", "-"), config.get("type"), env.get("type")]
@@ -174,8 +174,11 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenan
         type=config.get("type"),
         measurements=measurements,
         numbers={name: _plain(summary[key]) for name, key in NUMBERS.items() if summary.get(key) is not None},
-        trial=trial,
-        checks={n: (_plain(c.get("value")), c.get("holds")) for n, c in (trial.get("gates") or {}).items()},
+        validation=validation,
+        checks={
+            name: (_plain(check.get("value")), check.get("holds"))
+            for name, check in (validation.get("checks") or {}).items()
+        },
         pictures=[name for name in shown if name.endswith((".png", ".gif", ".svg", ".jpg"))],
         videos=[name for name in shown if name.endswith(".mp4")],
         commands=_commands(repo_id, artifact, config, recipe),

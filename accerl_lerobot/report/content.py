@@ -14,10 +14,10 @@ import yaml
 
 from accerl_lerobot.console import ABSENT, count, duration, number, percent, rate
 from accerl_lerobot.report.charts import COLOURS, Chart, Series, line, rates
-from accerl_lerobot.report.read import SUMMARY, TRIAL, Record, Run, column, newest
+from accerl_lerobot.report.read import SUMMARY, VALIDATION, Record, Run, column, newest
 from accerl_lerobot.report.recipe import apart, commands, differences, lag_bound, unreadable
 from accerl_lerobot.timeline.states import ROLES, STATES
-from accerl_lerobot.world_model.by_source import compared, every_source, source_rows
+from accerl_lerobot.world_model.validation.tables import dataset_rows, has_several, per_dataset
 
 RECENT_S = 120.0
 """A run that has written something since is taken to be still going."""
@@ -74,26 +74,22 @@ INFERENCE: tuple[Spec, ...] = (
 IMAGINATION: tuple[Spec, ...] = (
     ("Success, imagined and real", "Imagined success far above the real one misleads the policy.",
      {"imagination_success": "imagined", "imagination_success_real": "real",
-      "imagination_success_beside": "imagined, weighted as the real outcomes"}, SHARE),
+      "imagination_success_imagined": "imagined, weighted as the real outcomes"}, SHARE),
     ("Imagined share", "", {"replay_imagined_share": "of a batch"}, SHARE),
     ("Real episodes that the world model has learned from", "",
      {"imagination_learn_episodes": "episodes"}, {"bottom": 0}),
-    ("Skill of the world model", "At each held-out evaluation: 1 is perfect, 0 a copy of the last frame.",
-     {"imagination_gate_skill_changed_first": "after one chunk",
-      "imagination_gate_skill_changed_last": "at the horizon"}, {"top": 1}),
+    ("Skill of the world model", "At each validation: 1 is perfect, 0 a copy of the last frame.",
+     {"imagination_check_skill_changed_first": "after one chunk",
+      "imagination_check_skill_changed_last": "at the horizon"}, {"top": 1}),
 )  # fmt: skip
 BY_DEPTH: tuple[Spec, ...] = (
     ("Skill", "1 is perfect, 0 is a copy of the last frame.",
      {"skill_changed": "where pixels changed", "skill": "all pixels"}, {"top": 1}),
     ("Sensitivity to actions", "Growth of the error with wrong actions; 1: the model ignores them.",
-     {"sensitivity_shuffled": "another episode's", "sensitivity_zero": "none",
-      "sensitivity_opposite": "the opposite"}, {"unit": "times the error", "bottom": 0}),
+     {"sensitivity_shuffled": "another episode's", "sensitivity_zero": "none"},
+     {"unit": "times the error", "bottom": 0}),
     ("Error of the state", "",
      {"state_error": "imagined", "state_error_copy": "copy of the last state"}, {"bottom": 0}),
-    ("Taken for a success", "Share of imagined rollouts, by their actions; with its own: of failures.",
-     {"false_success_true": "its own", "false_success_shuffled": "another episode's",
-      "false_success_zero": "none", "false_success_opposite": "the opposite",
-      "false_success_failed": "a failed episode's"}, {"share": True, "bottom": 0}),
 )  # fmt: skip
 CHECKS = {
     "skill_changed_first": ("skill_first", "better than a copy of the last frame, where pixels changed"),
@@ -102,7 +98,7 @@ CHECKS = {
     "sensitivity_low": ("sensitivity", "how much worse it gets with another episode's actions"),
     "auroc": ("auroc", "tells episodes that succeed from those that fail, lower end of the interval"),
     "false_success": ("false_success", "failed episodes that are imagined as successes"),
-    "false_success_still": ("false_success", "rollouts imagined without actions, taken for successes"),
+    "false_success_idle": ("false_success", "rollouts imagined without actions, taken for successes"),
     "recall": ("recall", "successes that are imagined as such"),
 }
 """Check of a world model → the recipe's field with its threshold, and its meaning."""
@@ -201,7 +197,7 @@ def status(run: Run, now: float) -> str:
 def warnings(run: Run, bound: int | None, now: float) -> Iterator[str]:
     """Caveats of a run's numbers: one plain sentence each, none if all is well."""
     if run.result is None:
-        file, age = SUMMARY if run.verb == "train" else TRIAL, now - run.written
+        file, age = SUMMARY if run.verb == "train" else VALIDATION, now - run.written
         at = datetime.datetime.fromtimestamp(run.written).strftime("%d %B %Y, %H:%M")
         if age < RECENT_S:
             yield f"The run is still going: there is no {file} yet. This page shows it {at}."
@@ -227,12 +223,12 @@ def warnings(run: Run, bound: int | None, now: float) -> Iterator[str]:
     if run.section("policy").get("precision", "fp32") == "fp32" and mismatch > MISMATCH:
         yield f"Acting and learning disagreed by up to {mismatch:.2g} nats at equal weights, beyond rounding."
     if run.section("imagination").get("share"):
-        rollouts = newest(run.rollout, "imagination_dreams")
-        means = [percent(newest(run.rollout, f"imagination_success_{of}")) for of in ("beside", "real")]
+        rollouts = newest(run.rollout, "imagination_rollouts")
+        means = [percent(newest(run.rollout, f"imagination_success_{of}")) for of in ("imagined", "real")]
         if rollouts and newest(run.rollout, "imagination_on") == 0:
             yield f"Imagination was switched off: {means[0]} success imagined, {means[1]} in reality."
         elif run.rollout and not rollouts and not newest(run.rollout, "imagination_promoted"):
-            yield "No rollout was imagined: no world model passed its held-out evaluation."
+            yield "No rollout was imagined: no world model passed validation."
 
 
 def shown(value: Any) -> str:
@@ -303,9 +299,9 @@ def evaluated(run: Run, name: str, colour: int) -> Series:
 def _imagination(run: Run) -> Section:
     """Imagined rollouts: how many, how true, and the checks that the world model had to pass."""
     title, settings, rollout = "Imagined rollouts", run.section("imagination"), run.rollout
-    if not settings.get("share") or newest(rollout, "imagination_dreams") is None:
+    if not settings.get("share") or newest(rollout, "imagination_rollouts") is None:
         return Section(title)
-    names = ("dreams", "decisions", "successes", "doubted", "promoted", "refused")
+    names = ("rollouts", "decisions", "successes", "uncertain", "promoted", "rejected")
     total, decisions, successes, uncertain, passed, failed = (
         int(newest(rollout, f"imagination_{name}") or 0) for name in names
     )
@@ -313,13 +309,13 @@ def _imagination(run: Run) -> Section:
     text += f"{percent(successes / total if total else None)} of them succeeded"
     text += f", and {uncertain:,} ended early because the model was too uncertain." if uncertain else "."
     if passed + failed:
-        text += f" The world model passed {passed} of {count(passed + failed, 'held-out evaluation')}."
+        text += f" The world model passed {passed} of {count(passed + failed, 'validation')}."
     real, imagined = (newest(rollout, f"replay_{kind}trained_decisions") or 0.0 for kind in ("", "imagined_"))
     if real + imagined:
         text += f" {percent(imagined / (real + imagined))} of the decisions learned from were imagined."
-    thresholds, checks = (settings.get("learn") or {}).get("trial") or {}, []
+    thresholds, checks = (settings.get("learn") or {}).get("validation") or {}, []
     for name, (threshold, _) in CHECKS.items():
-        value, bound = newest(rollout, f"imagination_gate_{name}"), thresholds.get(threshold)
+        value, bound = newest(rollout, f"imagination_check_{name}"), thresholds.get(threshold)
         if value is not None and bound is not None and threshold == "false_success":
             checks.append((name, value, f"at most {bound}", value <= bound))
         elif value is not None and bound is not None:
@@ -327,10 +323,10 @@ def _imagination(run: Run) -> Section:
     caption = "a recorded episode above, and what the world model imagined with the same actions below. The "
     caption += "frame at the end is green for a success and red for a failure."
     videos = [
-        (path, f"Held-out evaluation {path.stem.replace('_', ', ').lstrip('0')}: {caption}")
+        (path, f"Validation {path.stem.replace('_', ', ').lstrip('0')}: {caption}")
         for path in dict.fromkeys([*run.imagined_videos[:1], *run.imagined_videos[-1:]])
     ]
-    tables = _checks("The last held-out evaluation of the world model", checks)
+    tables = _checks("The last validation of the world model", checks)
     return Section(title, text, charts=_charts(rollout, IMAGINATION), tables=tables, videos=videos)
 
 
@@ -441,27 +437,27 @@ def _tiles(run: Run, bound: int | None) -> list[tuple[str, str, str]]:
 
 def _world_model_sections(run: Run) -> list[Section]:
     found = run.result or {}
-    depths, text, by_source = found.get("depths", []), "", Section("By source")
+    depths, text, by_dataset = found.get("depths", []), "", Section("By dataset")
     if found:
-        every = every_source(found)
-        text = count(sum(one["trials"] for one in every), "rollout")
+        every = per_dataset(found)
+        text = count(sum(one["windows"] for one in every), "window")
         if all(one.get("episodes") for one in every):
             text += f" on {count(sum(one['episodes'] for one in every), 'episode')} it had not learned from"
-        text += ", each imagined from a real frame on, with the actions really made, and with others."
-    if compared(found):
-        sources = {str(one.get("name")): one["depths"] for one in every}
-        rows = [(name, *(cell or ABSENT for cell in cells)) for name, cells in source_rows(every)]
-        table = ("The same on episodes of each source", ("", *sources), rows)
-        by_source = Section("By source", tables=[table], charts=_side_by_side(sources))
-    checks = [(k, g["value"], str(g.get("wanted")), g["holds"]) for k, g in found.get("gates", {}).items()]
+        text += ", each imagined from a real frame on, with the executed actions, and with others."
+    if has_several(found):
+        datasets = {str(one.get("name")): one["depths"] for one in every}
+        rows = [(name, *(cell or ABSENT for cell in cells)) for name, cells in dataset_rows(every)]
+        table = ("The same on episodes of each dataset", ("", *datasets), rows)
+        by_dataset = Section("By dataset", tables=[table], charts=_side_by_side(datasets))
+    checks = [(k, c["value"], str(c.get("wanted")), c["holds"]) for k, c in found.get("checks", {}).items()]
     by_depth = []
     for title, note, metrics, options in BY_DEPTH:
         series = [estimates(depths, key, label, i) for i, (key, label) in enumerate(metrics.items())]
         by_depth.append(Chart(title, note, DEPTH, series, **options))
     return [
-        Section("Held-out evaluation", text, tables=_checks("Checks it had to pass", checks)),
+        Section("Validation", text, tables=_checks("Checks it had to pass", checks)),
         Section("By depth", charts=by_depth),
-        by_source,
+        by_dataset,
         Section("Learning", charts=_loss_charts(run)),
     ]
 
@@ -479,12 +475,11 @@ def estimates(depths: Sequence[Record], key: str, name: str, colour: int) -> Ser
 
 
 def _side_by_side(depths: Mapping[str, Sequence[Record]]) -> list[Chart]:
-    """Estimates by depth of several models, or of one model on several sources."""
+    """Estimates by depth of several models, or of one model on several datasets."""
     charts = []
     for title, key in (
         ("Skill where pixels changed", "skill_changed"),
         ("Sensitivity to another episode's actions", "sensitivity_shuffled"),
-        ("AUROC of the chunk", "auroc_dreamt"),
     ):
         series = [estimates(rows, key, name, i) for i, (name, rows) in enumerate(depths.items())]
         charts.append(Chart(title, "", DEPTH, series))
@@ -511,11 +506,11 @@ def _verdict(run: Run) -> str:
     """The result of a world model in one sentence."""
     if run.result is None:
         steps = max((int(r.get("step", 0)) for r in run.records.get("world_model", [])), default=0)
-        return f"A world model after {count(steps, 'step')}, not evaluated yet"
-    failed = [name for name, gate in run.result["gates"].items() if not gate["holds"]]
+        return f"A world model after {count(steps, 'step')}, not validated yet"
+    failed = [name for name, check in run.result["checks"].items() if not check["holds"]]
     if failed:
-        return f"The world model failed its held-out evaluation: {', '.join(failed)}"
-    return f"The world model passed its held-out evaluation: all {len(run.result['gates'])} checks hold"
+        return f"The world model failed validation: {', '.join(failed)}"
+    return f"The world model passed validation: all {len(run.result['checks'])} checks hold"
 
 
 def _world_model_tiles(found: Record) -> list[tuple[str, str, str]]:
@@ -551,14 +546,14 @@ def _run_table(runs: Mapping[str, Run], now: float) -> Table:
 
 
 def _check_table(runs: Mapping[str, Run], now: float) -> Table:
-    every = {name: (run.result or {}).get("gates", {}) for name, run in runs.items()}
-    checks = list(dict.fromkeys(check for gates in every.values() for check in gates))
+    every = {name: (run.result or {}).get("checks", {}) for name, run in runs.items()}
+    checks = list(dict.fromkeys(name for found in every.values() for name in found))
     rows = []
-    for name, gates in every.items():
-        own = [gates.get(check, {"value": None, "holds": True}) for check in checks]
-        cells = (f"{number(gate['value'], 2)}{'' if gate['holds'] else ', fails'}" for gate in own)
+    for name, found in every.items():
+        own = [found.get(check, {"value": None, "holds": True}) for check in checks]
+        cells = (f"{number(check['value'], 2)}{'' if check['holds'] else ', fails'}" for check in own)
         rows.append((name, status(runs[name], now), *cells))
-    return "Checks of the held-out evaluation", ("run", "", *checks), rows
+    return "Checks of the validation", ("run", "", *checks), rows
 
 
 def _curves(runs: Mapping[str, Run]) -> list[Chart]:

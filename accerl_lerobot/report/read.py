@@ -21,13 +21,13 @@ from accerl_lerobot.checkpoint.safety import Origin, check_folder
 from accerl_lerobot.config.parsing import check_recipe_size, load_yaml
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.metrics import METRICS
-from accerl_lerobot.world_model.imagination_config import FILMS
+from accerl_lerobot.world_model.config import VIDEOS
 
 Record = dict[str, Any]
 Schema = dict[str, Any]
 """Required field → its type, or a dict or list of such; ``*`` stands for every field."""
 
-TRIAL = "trial.json"
+VALIDATION = "validation.json"
 COUNTERS = ("env_steps", "decisions", "episodes")
 """Counters of workers, which may restart at 0 when a run is resumed."""
 
@@ -37,26 +37,26 @@ SUMMARY_SCHEMA: Schema = {
     "ci95_before": [NUMBER, NUMBER], "env_steps": NUMBER, "wall_s": NUMBER, "seed": NUMBER, "tasks": [str],
     "episodes": NUMBER, "updates": NUMBER, "warm_start_s": NUMBER, "rl_s": NUMBER,
 }  # fmt: skip
-TRIAL_SCHEMA: Schema = {
+VALIDATION_SCHEMA: Schema = {
     "passed": bool,
-    "trials": NUMBER,
+    "windows": NUMBER,
     "episodes": NUMBER,
     "seconds": NUMBER,
-    "gates": {"*": {"value": (*NUMBER, type(None)), "wanted": object, "holds": bool}},
+    "checks": {"*": {"value": (*NUMBER, type(None)), "wanted": object, "holds": bool}},
     "depths": [{"depth": NUMBER}],
 }
-TRIAL_SCHEMA["sources"] = {"*": {"name": str, **TRIAL_SCHEMA}}
+VALIDATION_SCHEMA["datasets"] = {"*": {"name": str, **VALIDATION_SCHEMA}}
 RATE: Schema = {"success": NUMBER, "ci95": [NUMBER, NUMBER], "n": NUMBER}
 EVALUATION_SCHEMA: Schema = {**RATE, "env_steps": NUMBER, "steps_mean": NUMBER, "tasks": {"*": RATE}}
 OPTIONAL = (
-    "success_before", "ci95_before", "sources", "tasks", "episodes", "updates", "warm_start_s", "rl_s",
+    "success_before", "ci95_before", "datasets", "tasks", "episodes", "updates", "warm_start_s", "rl_s",
     "seconds",
 )  # fmt: skip
 """Fields that may be null or missing."""
 VERBS = {
     "train": {"algorithm", "trainer"},
     "world-model": {"world_model"},
-    "world-model-eval": {"path", "trial"},
+    "world-model-eval": {"path", "validation"},
 }
 """Verbs that write runs, and sections by which their config is recognised."""
 
@@ -73,7 +73,7 @@ class Run:
     records: dict[str, list[Record]]
     """Lines of metrics.jsonl by their kind, in order."""
     result: Record | None
-    """summary.json or trial.json; None: not finished."""
+    """summary.json or validation.json; None: not finished."""
     truncated: bool
     """True if the last line of metrics.jsonl is incomplete."""
     sessions: int
@@ -153,7 +153,7 @@ def read_run(path: Path) -> Run:
         raise InputError("runs", str(path), remedy)
     lines, truncated = _lines(path / METRICS)
     records, sessions = _continuous(lines)
-    result = (SUMMARY, SUMMARY_SCHEMA) if verb == "train" else (TRIAL, TRIAL_SCHEMA)
+    result = (SUMMARY, SUMMARY_SCHEMA) if verb == "train" else (VALIDATION, VALIDATION_SCHEMA)
     checkpoint = path / CHECKPOINTS / LAST / PRETRAINED
     return Run(
         path=path,
@@ -166,7 +166,7 @@ def read_run(path: Path) -> Run:
         sessions=sessions,
         written=max(file.stat().st_mtime for file in path.iterdir() if file.suffix != ".html"),
         videos=tuple(sorted(path.glob("*.mp4"))),
-        imagined_videos=tuple(sorted(path.glob(f"{FILMS}/[0-9]*.mp4"))),
+        imagined_videos=tuple(sorted(path.glob(f"{VIDEOS}/[0-9]*.mp4"))),
         checkpoint=checkpoint if checkpoint.is_dir() else None,
     )
 

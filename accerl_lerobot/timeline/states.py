@@ -13,7 +13,7 @@ STATES = (
 (COMPUTE, WAIT_IN, WAIT_OUT, TRANSPORT, WEIGHT_SYNC, CHECKPOINT, RECOVERY, TRAINING, EVALUATION) = range(
     len(STATES)
 )
-ROLES = ("driver", "local", "rollout", "dream", "inference", "replay", "trainer", "world learning")
+ROLES = ("driver", "local", "rollout", "imagination", "inference", "replay", "trainer", "world learning")
 """In the order in which they are shown."""
 TIMELINE = "timeline"
 """Name of the folder in a run's."""

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of a world model: its size, its objective, how it learns, and the gates that it must pass.
-
-Free of torch, as all configs are.
-"""
+"""Options of world models: network, training, validation, and imagination in a run. Free of torch."""
 
 from __future__ import annotations
 
@@ -13,17 +10,30 @@ from typing import Annotated, ClassVar, Literal
 import draccus
 
 from accerl_lerobot.checkpoint.safety import check_remote_code
-from accerl_lerobot.config.ranges import LearningRate, NonNegative, Positive, Range, Section, Share, Steps
+from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.config.ranges import (
+    Choice,
+    LearningRate,
+    NonNegative,
+    Positive,
+    Range,
+    Section,
+    Share,
+    Steps,
+)
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.replay.pacing import ReplayConfig
 
 Objective = Literal["refiner", "edm", "flow"]
 PIXELS = "pixels"
-"""The type of our own class of world models that learn."""
+"""The type of our own class of learned world models."""
+VIDEOS = "validation"
+"""Folder of a run with `OnlineLearnConfig.videos`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkConfig(Section, section="world_model.model.network"):
-    """How large it is."""
+    """Size of the network."""
 
     space_to_depth: Annotated[int, Range("[1, 64]")] = 4
     """Side of the pixel blocks that become channels; image height and width are multiples of it times 2 for
@@ -33,7 +43,7 @@ class NetworkConfig(Section, section="world_model.model.network"):
     blocks: Annotated[int, Range("[1, 1000]")] = 1
     """Residual blocks per level."""
     condition: Annotated[int, Range("[1, 65536]")] = 128
-    """Width of what the adaptive norms read."""
+    """Width of the conditioning vector that the adaptive norms read."""
     planes: Annotated[int, Range("[0, 65536]")] = 8
     """Channels of the action planes; 0: none."""
 
@@ -50,7 +60,7 @@ class NetworkConfig(Section, section="world_model.model.network"):
 
 @dataclass(frozen=True, kw_only=True)
 class LearnableModelConfig(Section, draccus.ChoiceRegistry, section="world_model.model"):
-    """A class of world models that learn; each is a `contract.LearnableWorldModel` and a config like this.
+    """Base config of a class of learned world models, which is a `contract.LearnableWorldModel`.
 
     Example:
         >>> @LearnableModelConfig.register_subclass("mine")
@@ -61,10 +71,10 @@ class LearnableModelConfig(Section, draccus.ChoiceRegistry, section="world_model
     """
 
     make: ClassVar[str]
-    """``module:name`` of the class, which is made of a `contract.WorldModelSpec` and this config."""
+    """``module:name`` of the class, which is built from a `contract.WorldModelSpec` and this config."""
 
     context: Annotated[int, Range("[1, 1000]")] = 2
-    """Frames it sees, the newest included, a chunk apart."""
+    """Frames the model sees, the newest included, a chunk apart."""
 
     @property
     def type(self) -> str:
@@ -77,16 +87,16 @@ class LearnableModelConfig(Section, draccus.ChoiceRegistry, section="world_model
         return 1
 
     def provides(self, state_dim: int) -> frozenset[str]:
-        """See `contract.WorldModelSpec`, of a world whose robot's state has so many dims, maybe 0."""
+        """Outputs of the model, see `contract.WorldModelSpec`; `state_dim` may be 0."""
         return frozenset({"pixels", "state"} if state_dim else {"pixels"})
 
 
 @LearnableModelConfig.register_subclass(PIXELS)
 @dataclass(frozen=True, kw_only=True)
 class PixelModelConfig(LearnableModelConfig):
-    """How it learns and dreams."""
+    """Our own world model of images and robot state."""
 
-    make = "accerl_lerobot.world_model.pixels:PixelWorldModel"
+    make = "accerl_lerobot.world_model.model.pixels:PixelWorldModel"
 
     objective: Objective = "refiner"
     """refiner: predict the change, then refine it. edm: denoise the frame, as DIAMOND does. flow: rectified
@@ -95,13 +105,13 @@ class PixelModelConfig(LearnableModelConfig):
     """Network passes per chunk. One pass of the refiner is regression."""
     context_noise: NonNegative = 0.02
     """Largest standard deviation of the noise on context and anchor in training, in units of [−1, 1].
-    What it dreams is never as clean as what it learns from."""
+    Imagined frames are never as clean as the training data."""
     refine_levels: tuple[Positive, Positive] = (0.2, 0.05)
     """Noise of the first and last refinement, in usual changes; those between are spaced evenly in log."""
     sigma_max: Annotated[float, Range("(0.002, inf)")] = 5.0
-    """Noise an edm dream starts from."""
+    """Noise that edm sampling starts from."""
     heads: Annotated[int, Range("[2, 1000]")] = 3
-    """Predictions of the robot's state, several so that they can disagree."""
+    """Size of the ensemble that predicts the robot's state; its disagreement is the uncertainty."""
     state_weight: NonNegative = 1.0
     """Weight of the state's loss beside the image's."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
@@ -115,41 +125,40 @@ class PixelModelConfig(LearnableModelConfig):
 
     @property
     def multiple(self) -> int:
-        """See the base class."""
         return self.network.multiple
 
     def provides(self, state_dim: int) -> frozenset[str]:
-        """See the base class. Where no heads of a state can disagree, it has no doubts."""
+        """Without a state there is no ensemble, so no uncertainty."""
         return super().provides(state_dim) | ({"uncertainty"} if state_dim else set())
 
 
 @dataclass(frozen=True, kw_only=True)
 class LearnConfig(Section, section="world_model.learn"):
-    """How a world model is trained."""
+    """Training of a world model."""
 
     steps: Annotated[int, Range("[1, 1000000000]")] = 1500
     """Gradient steps of the pre-training."""
     batch: Annotated[int, Range("[2, 65536]")] = 16
-    """Windows in each."""
+    """Windows per gradient step."""
     lr: LearningRate = 1e-3
-    """Peak; falls to a tenth by a cosine."""
+    """Peak learning rate; falls to a tenth by a cosine."""
     warmup: Steps = 50
-    """Steps in which it rises."""
+    """Steps in which the learning rate rises."""
     weight_decay: NonNegative = 1e-2
     grad_clip: Positive = 1.0
     """Largest gradient norm."""
     average: Annotated[float, Range("[0, 1)")] = 0.99
-    """How slowly the weights that serve follow those that are trained."""
+    """Decay of the exponential moving average of the weights, which is what is used and saved."""
     chunks: Annotated[int, Range("[1, 10000]")] = 2
-    """Length of a window. From its second chunk on, the model learns from its own dream."""
+    """Chunks per window. From its second chunk on, the model is trained on its own prediction as input."""
     anchors: Annotated[int, Range("[0, 10000]")] = 15
-    """The anchor lies up to so many chunks back, as far as dreams will go."""
+    """The anchor lies up to so many chunks back, as far as imagined rollouts will go."""
     validate_every: Steps = 250
-    """Gradient steps of the pre-training until the loss on held-out windows is taken again; 0: never. What is
-    learnt is the same with it and without it."""
+    """Gradient steps of the pre-training between losses on held-out windows; 0: never. Does not change what
+    is learned."""
 
     def lr_at(self, step: int) -> float:
-        """The learning rate of a step, counted from 0; beyond `steps` it stays at its end."""
+        """Learning rate of a step, counted from 0; constant beyond `steps`."""
         if step < self.warmup:
             return self.lr * (step + 1) / self.warmup
         done = min(1.0, (step - self.warmup) / max(1, self.steps - self.warmup))
@@ -158,64 +167,60 @@ class LearnConfig(Section, section="world_model.learn"):
 
 @dataclass(frozen=True, kw_only=True)
 class SuccessLearnConfig(Section, section="world_model.success"):
-    """How it is trained."""
+    """Training of the success model."""
 
     steps: Annotated[int, Range("[1, 1000000000]")] = 400
     """Gradient steps."""
     batch: Annotated[int, Range("[2, 65536]")] = 32
-    """Pairs of frames in each."""
+    """Pairs of frames per gradient step."""
     lr: LearningRate = 1e-3
     weight_decay: NonNegative = 1e-2
-    dreamt: Share = 0.5
-    """Share of pairs that are dreamt: real episodes, with the actions that were made in them."""
+    imagined: Share = 0.5
+    """Share of pairs from imagined replays of real episodes, with the actions that were executed in them."""
     depth: Annotated[int, Range("[1, 100000]")] = 15
-    """Chunks of such a dream at most."""
+    """Chunks of such a replay at most."""
     episodes: Annotated[int, Range("[2, 1000000]")] = 48
-    """Episodes that are dreamt at a time,"""
-    every: Annotated[int, Range("[1, 1000000]")] = 50
-    """and gradient steps until others are."""
+    """Episodes that are replayed at a time."""
+    refresh_every: Annotated[int, Range("[1, 1000000]")] = 50
+    """Gradient steps until other episodes are replayed."""
     validate_every: Steps = 50
-    """Gradient steps of the pre-training until it is tried on held-out pairs again; 0: never."""
+    """Gradient steps of the pre-training between losses on held-out pairs; 0: never."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrialConfig(Section, section="world_model.trial"):
-    """Gates of a trial, and its data."""
+class ValidationConfig(Section, section="world_model.validation"):
+    """Held-out validation: its data, and the checks that a world model has to pass."""
 
     depth: Annotated[int, Range("[1, 100000]")] = 6
-    """Chunks dreamt, the horizon it is judged for."""
-    every: Annotated[int, Range("[1, 1000000]")] = 10
-    """A trial begins every so many env steps of an episode."""
-    most: Annotated[int, Range("[1, 1000000]")] = 400
-    """Trials at most, drawn at random."""
-    whole: bool = True
-    """Outcomes are tried on episodes dreamt to their ends, from the beginning and from one later place each;
-    false: on dreams of `depth` chunks that begin anywhere."""
+    """Chunks predicted from each window, the horizon that frames are compared at."""
+    stride: Annotated[int, Range("[1, 1000000]")] = 10
+    """Env steps between two windows of an episode."""
+    max_windows: Annotated[int, Range("[1, 1000000]")] = 400
+    """Windows at most, drawn at random."""
     skill_first: float = 0.3
-    """Least skill on changed pixels after one chunk,"""
+    """The skill on changed pixels after one chunk must exceed this."""
     skill_last: float = 0.0
-    """and at the horizon, more than this; there on all pixels too, or what should not move does."""
+    """The skill after `depth` chunks must exceed this, on changed pixels and on all pixels."""
     sensitivity: float = 1.2
-    """Value that the lower end of the sensitivity's interval after one chunk must exceed."""
+    """The lower end of the sensitivity's interval after one chunk must exceed this."""
     auroc: float = 0.9
-    """Value that the lower end of the interval of the AUROC of dreams' outcomes must exceed."""
+    """The lower end of the interval of the AUROC of rollouts' outcomes must exceed this."""
     false_success: float = 0.25
-    """Largest share of dreams that may be taken for a success although they cannot be one: with the true
-    actions of episodes that failed, and with none."""
+    """Largest share of imagined rollouts that may be classified as successes although they cannot be: with
+    the executed actions of episodes that failed, and without any action."""
     false_positives: Annotated[float, Range("[0, 1)")] = 0.1
-    """The success model's threshold lets no larger share of failures be taken for a success in a
-    dream: failures that were held out, or in a run all of the policy's newest. Of all that do not, it is the
-    one that tells most successes from failures."""
+    """Largest share of failures above the success threshold when it is chosen. Of the thresholds that keep
+    to it, the one that best separates successes from failures is taken."""
     recall: float = 0.3
-    """Value that the share of successes that are dreamt, and taken, for such must exceed."""
+    """The share of successes whose imagined rollout is classified as one must exceed this."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class StandInConfig(Section, section="success"):
-    """A reward model of LeRobot that tells successes, see `stand_in.py`."""
+class ExternalRewardModelConfig(Section, section="success"):
+    """A LeRobot reward model that classifies successes, see `external_reward_model.py`."""
 
     path: str | None = None
-    """A folder, or an id on the Hub. None: the success model beside the world model."""
+    """A folder, or an id on the Hub. None: the success model saved with the world model."""
     revision: str | None = None
     """Hub revision."""
     trust_remote_code: bool = False
@@ -224,7 +229,7 @@ class StandInConfig(Section, section="success"):
     code_revision: str | None = None
     """Commit of that repository, 40 hexadecimal digits: the one whose code you have read. No other is run."""
     threshold: Share | None = None
-    """P above which a frame counts as a success. None: ``accerl world-model-eval`` sets it on the
+    """P above which a frame counts as a success. None: ``accerl world-model-eval`` chooses it on the
     episodes, a run refuses."""
     discover_packages_path: str | None = None
     """Package to import that registers the model's type with LeRobot, where that is not LeRobot's own."""
@@ -233,33 +238,28 @@ class StandInConfig(Section, section="success"):
         super().__post_init__()
         check_remote_code(self.trust_remote_code, self.code_revision, "success")
         if self.path is None and self.threshold is not None:
-            remedy = "it is of the model in success.path; the one beside the world model has its own"
+            remedy = "it belongs to the model in success.path; the one beside the world model has its own"
             raise InputError("success.threshold", self.threshold, remedy)
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorldModelConfig(Section, draccus.ChoiceRegistry, section="world_model"):
-    """A world model with its success model; `sizes.py` has those that can be named."""
+class WorldModelConfig(Section, section="world_model"):
+    """A world model and its success model. The default has 1.8 million weights and trains on two cores."""
 
     model: LearnableModelConfig = field(default_factory=PixelModelConfig)
     discover_packages_path: str | None = field(default=None, metadata={"registers": True})
     """Package to import that registers the type of `model`, where that is not one of ours."""
     learn: LearnConfig = field(default_factory=LearnConfig)
     success: SuccessLearnConfig = field(default_factory=SuccessLearnConfig)
-    trial: TrialConfig = field(default_factory=TrialConfig)
+    validation: ValidationConfig = field(default_factory=ValidationConfig)
     held_out: Annotated[float, Range("(0, 1)")] = 0.2
-    """Share of the episodes that it is judged on and does not learn from."""
+    """Share of the episodes held out for validation."""
     image_size: Annotated[int, Range("[2, 1024]")] = 64
-    """Height and width in pixels of the frames it dreams."""
+    """Height and width in pixels of the predicted frames."""
     chunk: Annotated[int, Range("[1, 10000]")] = 10
-    """Env steps it goes at a time: the actions a policy executes per decision."""
+    """Env steps per prediction: the actions a policy executes per decision."""
     shuffle_actions: bool = False
-    """Learn with the actions of other windows: a placebo, which must fail the trial."""
-
-    @property
-    def type(self) -> str:
-        """The registered name."""
-        return str(self.get_choice_name(self.__class__))
+    """Train with the actions of other windows: a placebo, which must fail validation."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -267,3 +267,205 @@ class WorldModelConfig(Section, draccus.ChoiceRegistry, section="world_model"):
         if self.image_size < multiple or self.image_size % multiple:
             remedy = f"use a multiple of {multiple}, or change world_model.model"
             raise InputError("world_model.image_size", self.image_size, remedy)
+
+
+# Imagination in a run.
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelKind:
+    """Properties of an entry of `MODELS` that are known before it is built."""
+
+    make: str
+    """``module:name`` of a function of a `contract.BuildInputs`."""
+    what: str
+    """For ``--help``, one sentence."""
+    needs_path: bool = True
+    """True if it is built from the world model in ``imagination.path``."""
+    learns: bool = False
+    """True if that world model can be trained on during a run."""
+    knows_success: bool = False
+    """True if it needs no success model, see `Prediction.success`."""
+    needs_history: bool = False
+    """True if it can start only where all actions since the reset are known, see `ActionHistory`."""
+    min_rollouts: int = 1
+    """Imagined rollouts that it must have at the same time, at least."""
+
+
+_REGISTRY = "accerl_lerobot.world_model.imagination.registry"
+MODELS = {
+    "learned": ModelKind(make=f"{_REGISTRY}:learned", what="the one in `path`.", learns=True),
+    "shuffled": ModelKind(
+        make=f"{_REGISTRY}:shuffled",
+        what="the learned one, given the actions of another imagined rollout.",
+        learns=True,
+        min_rollouts=2,
+    ),
+    "copy": ModelKind(make=f"{_REGISTRY}:copy", what="nothing ever moves."),
+    "oracle": ModelKind(
+        make=f"{_REGISTRY}:oracle",
+        what="a simulator, put where a rollout starts: the best there can be.",
+        needs_path=False,
+        knows_success=True,
+        needs_history=True,
+    ),
+}
+"""The world models that ``imagination.model`` can name. A new one is a class and an entry here."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnlineLearnConfig(Section, section="imagination.learn"):
+    """Training of the world model on the policy's episodes during a run."""
+
+    steps_per_episode: Annotated[float, Range("[0, 1000000]")] = 5.0
+    """Gradient steps of world model and success model each, per real episode; 0: both stay as they are.
+
+    A model that only saw demonstrations classifies a policy's failures as successes: on door-open 39 % of
+    them after four decisions, and 2 % after 100 steps on 64 episodes of that policy. So nothing is imagined
+    before it has passed validation on the policy's own episodes.
+    """
+    batch: Annotated[int, Range("[2, 65536]")] = 16
+    """Windows per gradient step."""
+    lr: LearningRate = 3e-4
+    """Constant after the first 50 steps."""
+    offline: Share = 0.5
+    """Share of windows from the pre-training data, where `dataset` and `online` name it."""
+    recent: Share = 0.7
+    """Share of the others from the newest quarter of episodes."""
+    failures: Share = 0.6
+    """Share of those from episodes that failed, as long as there are both kinds."""
+    held_out: Annotated[float, Range("(0, 1)")] = 0.2
+    """Share of real episodes held out for validation."""
+    validate_every: Annotated[int, Range("[1, 1000000]")] = 16
+    """Real episodes between two validations. Where real episodes are counted, no more are collected until
+    the validation is over. Once all are in, it is repeated after as many steps as so many would have
+    brought, `final_validations` times at most."""
+    final_validations: Annotated[int, Range("[1, 1000000]")] = 5
+    """Validations after the last real episode; a model that has not passed by then is never used."""
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    """Dataset of the pre-training: the model trains on the episodes it already knows, and is validated on
+    those that were held out. Of another dataset it trains on all episodes."""
+    online: DatasetConfig = field(default_factory=DatasetConfig)
+    """Episodes of an earlier policy from the pre-training, used in the same way."""
+    validation: ValidationConfig = field(
+        default_factory=lambda: ValidationConfig(
+            max_windows=120, depth=4, auroc=0.6, false_success=0.5, recall=0.3, false_positives=0.3
+        )
+    )
+    """Checks that a model must pass to be used. A dozen held-out episodes say little; beyond that, `guard`
+    watches."""
+    memory: Annotated[int, Range("[2, 1000000]")] = 400
+    """Real episodes kept for training."""
+    videos: Annotated[int, Range("[0, 1000000]")] = 1
+    """A video after every so many validations, in the run's folder ``validation``: the newest held-out
+    episode beside its prediction with the same actions. 0: none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GuardConfig(Section, section="imagination.guard"):
+    """The kill switch: nothing is imagined any more once imagined rollouts succeed much more often than
+    real episodes."""
+
+    max_gap: Positive = 0.5
+    """Largest difference of the success rates, imagined less real. Rollouts from resets are compared with
+    real episodes of the same time; where `start_at_reset_prob` is 0, rollouts are compared with the episodes
+    they start in. A world model that is promoted later gets another chance. With `start_at_reset_prob`,
+    nothing is compared any more once all real episodes have been played."""
+    window: Annotated[int, Range("[1, 1000000]")] = 100
+    """Imagined rollouts over which the gap is measured. When as many in a row end at once because the model
+    is too uncertain, nothing is imagined any more either."""
+    min_real_episodes: Annotated[int, Range("[1, 1000000]")] = 16
+    """Real episodes required before the gap is evaluated, with `start_at_reset_prob`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImaginationConfig(Section, section="imagination"):
+    """Learning from imagined rollouts."""
+
+    share: Annotated[float, Range("[0, 1)")] = 0.0
+    """Share of the decisions of a batch that are imagined; 0: none."""
+    model: Annotated[str, Choice(MODELS)] = field(default="learned", metadata={"choices": MODELS})
+    """World model. shuffled and copy are placebos: a gain that they give too is not the world model's."""
+    path: str | None = None
+    """The folder ``world_model`` that ``accerl world-model`` has written; oracle needs none, copy uses its
+    success model."""
+    discover_packages_path: str | None = None
+    """Package to import that registers the type of the world model in `path`, where that is not one of ours;
+    every machine of the cluster needs it."""
+    success: ExternalRewardModelConfig = field(default_factory=ExternalRewardModelConfig)
+    """A reward model used in place of the success model in `path`; neither it nor the world model is trained
+    in the run."""
+    threshold: Share | None = None
+    """P above which an imagined frame counts as a success; an oracle knows. None: the threshold saved with
+    the success model of `path`, which is chosen anew as that is trained on.
+
+    That one is chosen on rollouts with executed actions. A policy that sees imagined frames succeeds more
+    often: ``python -m benchmarks ranking`` says at which threshold it succeeds as often as in reality.
+    Validation uses it too, so a strict one needs a lower `learn.validation.recall`.
+    """
+    workers: Annotated[int, Range("[1, 1000]")] = 1
+    """Processes that imagine, each with a copy of the world model, its own random draws, and its part of
+    `rollouts`; they are assigned to inference replicas as rollout workers are, from the last one on."""
+    rollouts: Annotated[int, Range("[1, 100000]")] = 32
+    """Imagined rollouts at a time, over all workers; each worker steps its part as one batch."""
+    start_at_reset_prob: Share = 0.0
+    """Share of rollouts that start where an episode began; others may, too. The later one starts, the less
+    of it is imagined, and the truer is how it ends."""
+    start_at_high_td_prob: Share = 0.5
+    """Share of the others that start where the critic's TD error was large; the rest start anywhere."""
+    max_uncertainty: Positive = 2.0
+    """A rollout ends before a prediction with a higher uncertainty, where 1 is the 95th percentile on
+    training data."""
+    memory: Annotated[int, Range("[1, 10000000]")] = 4096
+    """Newest real decisions that rollouts start at."""
+    record: Annotated[int, Range("[0, 1000000]")] = 0
+    """Newest imagined rollouts kept on disk, in the run's folder ``imagined``, of which
+    ``accerl export --source=imagined`` makes a LeRobotDataset; 0: none. Images are stored as they are:
+    0.2 MB for 15 decisions seen by one camera of 64×64. Of several workers the first one's are kept."""
+    guard: GuardConfig = field(default_factory=GuardConfig)
+    replay: ReplayConfig = field(
+        default_factory=lambda: ReplayConfig(
+            capacity=2048, min_decisions=1, samples_per_insert=4.0, ahead=512
+        )
+    )
+    """Size and pace of the replay buffer of imagined segments."""
+    learn: OnlineLearnConfig = field(default_factory=OnlineLearnConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.workers > self.rollouts:
+            remedy = f"use at most imagination.rollouts, {self.rollouts}: each worker needs one"
+            raise InputError("imagination.workers", self.workers, remedy)
+        if self.rollouts < (least := self.kind.min_rollouts * self.workers):
+            remedy = f"use at least {least}, or fewer imagination.workers"
+            why = f"{remedy}: {self.model} needs {self.kind.min_rollouts} in each"
+            raise InputError("imagination.rollouts", self.rollouts, why)
+        if self.share and self.path is None and self.kind.needs_path:
+            remedy = "give the folder world_model that accerl world-model has written"
+            raise InputError("imagination.path", None, remedy)
+        if self.threshold is not None and self.success.path is not None:
+            remedy = "with an external reward model, use imagination.success.threshold alone"
+            raise InputError("imagination.threshold", self.threshold, remedy)
+        if self.share and self.success.path is not None:
+            self._check_external_reward_model()
+
+    def _check_external_reward_model(self) -> None:
+        if self.success.threshold is None:
+            remedy = "say what counts as a success; accerl world-model-eval --success.path=… finds it"
+            raise InputError("imagination.success.threshold", None, remedy)
+        if self.kind.knows_success:
+            remedy = f"leave it out: the {self.model} knows what has succeeded"
+            raise InputError("imagination.success.path", self.success.path, remedy)
+        if self.learns:
+            remedy = "use 0 with imagination.success.path: an external reward model is not trained"
+            raise InputError("imagination.learn.steps_per_episode", self.learn.steps_per_episode, remedy)
+
+    @property
+    def kind(self) -> ModelKind:
+        """Properties of `model`."""
+        return MODELS[self.model]
+
+    @property
+    def learns(self) -> bool:
+        """True if the world model is trained on during the run."""
+        return self.share > 0 and self.kind.learns and self.learn.steps_per_episode > 0

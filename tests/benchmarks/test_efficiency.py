@@ -46,7 +46,7 @@ def small(tmp_path: Path, checkpoint: Path, **options: Any) -> BenchEfficiencyCo
 def a_summary(success: float, explored: int = 4) -> dict[str, Any]:
     return {
         "success_after": success, "n_after": 10, "env_steps": 100, "updates": 4, "rl_s": 1.0,
-        "episodes_explored": explored, "imagination": {"dreams": 3.0},
+        "episodes_explored": explored, "imagination": {"rollouts": 3.0},
     }  # fmt: skip
 
 
@@ -68,7 +68,7 @@ def test_seeds_are_counted_together(result: dict[str, Any]):
     assert (first["arm"], first["budget"], first["successes"], first["n"]) == ("none", 4, 2, 20)
     assert (last["arm"], last["budget"], last["successes"], last["by_seed"]) == ("oracle", 8, 20, [1.0, 1.0])
     assert first["episodes_explored"] == 3.5 and result["starts"] == {"3": 0.2, "4": 0.4}
-    assert result["cells"][0]["imagination"] == {"dreams": 3.0}
+    assert result["cells"][0]["imagination"] == {"rollouts": 3.0}
     json.dumps(result)
 
 
@@ -175,7 +175,7 @@ def test_a_world_model_that_is_missing_is_found_before_anything_runs(tmp_path: P
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("arms", ("none", "dreams"), r"arms=\('none', 'dreams'\): use a list .*, each none, learned"),
+        ("arms", ("none", "rollouts"), r"arms=\('none', 'rollouts'\): use a list .*, each none, learned"),
         ("arms", (), "arms="),
         ("budgets", (4, 4), "budgets="),
         ("budgets", (0,), r"budgets=\(0,\): use a list .*, each a whole number from 1"),

@@ -210,7 +210,7 @@ def test_nothing_is_begun_where_something_is(tmp_path: Path):
         bench_faults(BenchFaultsConfig(output_dir=str(tmp_path)))
     new = str(tmp_path / "new")
     with pytest.raises(InputError, match="nothing is imagined in this recipe"):
-        bench_faults(BenchFaultsConfig(output_dir=new, targets=("dream",)))
+        bench_faults(BenchFaultsConfig(output_dir=new, targets=("imagination",)))
     recipe = str(Path(__file__).parents[2] / "recipes" / "quickstart.yaml")
     with pytest.raises(InputError, match="the trainer of this recipe is one process"):
         bench_faults(BenchFaultsConfig(output_dir=new, targets=("trainer rank",), recipe=recipe))

@@ -18,20 +18,19 @@ from torch import Tensor
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
-from accerl_lerobot.world_model import side_by_side
-from accerl_lerobot.world_model.agreement import agreement
 from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, WorldModelConfig
-from accerl_lerobot.world_model.contract import Context, Dream, History, State, WorldModel
-from accerl_lerobot.world_model.imagine import Dreamer
-from accerl_lerobot.world_model.offline import world_spec
-from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.side_by_side import dreamt, lived
-from accerl_lerobot.world_model.store import save_world_model
-from accerl_lerobot.world_model.success import new_success_model
+from accerl_lerobot.world_model.imagination.registry import ImaginationModels
+from accerl_lerobot.world_model.learning.learners import new_success_model
+from accerl_lerobot.world_model.learning.pretrain import world_spec
+from accerl_lerobot.world_model.model.contract import ActionHistory, Context, Prediction, State, WorldModel
+from accerl_lerobot.world_model.model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.model.store import save_world_model
+from benchmarks import paired_eval
 from benchmarks import ranking as bench
+from benchmarks.paired_eval import agreement, rollout_imagined, rollout_real
 from benchmarks.ranking import BenchRankingConfig
-from tests.test_imagining import ENV
-from tests.world_model.lived import SPEC, WORLD, K, decided
+from tests.test_imagination import ENV
+from tests.world_model.real_segments import SPEC, WORLD, K, decided
 
 STARTS = [("match", seed) for seed in range(23)]
 
@@ -60,34 +59,36 @@ class Knowing(WorldModel):
     spec = SPEC
 
     def begin(
-        self, context: Context, tasks: Sequence[str], histories: Sequence[History | None] | None = None
+        self, context: Context, tasks: Sequence[str], histories: Sequence[ActionHistory | None] | None = None
     ) -> State:
-        assert not context.told.any() and torch.equal(context.first, context.robot[:, -1])
+        assert not context.commanded_sum.any() and torch.equal(context.initial_state, context.robot[:, -1])
         return {"robot": context.robot[:, -1], "frames": context.frames[:, -1]}
 
-    def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Dream:
+    def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Prediction:
         assert len(set(seeds)) == len(actions)
         met = ((actions[:, 0] - state["robot"][:, :2]).abs() < WORLD.tolerance).all(1)
         frames = torch.zeros_like(state["frames"]) + (200 * met.byte())[:, None, None, None, None]
         unknown = torch.full((len(actions),), torch.nan)
-        return Dream(state=state, frames=frames, robot=state["robot"], uncertainty=unknown)
+        return Prediction(state=state, frames=frames, robot=state["robot"], uncertainty=unknown)
 
 
 @pytest.fixture
-def dreamer(monkeypatch: pytest.MonkeyPatch) -> Dreamer:
+def models(monkeypatch: pytest.MonkeyPatch) -> ImaginationModels:
     """With a success model that looks at how bright it is."""
-    monkeypatch.setattr(side_by_side, "probabilities", lambda _, before, after: after.max((1, 2, 3, 4)) / 200)
-    return Dreamer(Knowing(), SimpleNamespace(config=SimpleNamespace(threshold=0.5)))  # type: ignore[arg-type]
+    monkeypatch.setattr(paired_eval, "probabilities", lambda _, before, after: after.max((1, 2, 3, 4)) / 200)
+    return ImaginationModels(Knowing(), SimpleNamespace(config=SimpleNamespace(threshold=0.5)))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("aside", "rate"), [(0.0, (1, 1)), (0.4, (0.2, 0.9)), (9.0, (0, 0))])
-def test_a_policy_does_in_true_dreams_what_it_does(dreamer: Dreamer, aside: float, rate: tuple[float, float]):
+def test_a_policy_does_the_same_in_a_true_world_model(
+    models: ImaginationModels, aside: float, rate: tuple[float, float]
+):
     worlds = [make_world(replace(WORLD, hold=1)) for _ in range(4)]
     told: list[int] = []
     policy: Any = Aiming(aside)
-    real = lived(policy, worlds, STARTS, told.append)
+    real = rollout_real(policy, worlds, STARTS, told.append)
     assert told == list(range(1, len(STARTS) + 1)) and policy.most == 4
-    promised = dreamt(policy, dreamer, worlds[0], STARTS, batch=9)
+    promised = rollout_imagined(policy, models, worlds[0], STARTS, batch=9)
     assert np.array_equal(real, promised > 0.5) and policy.most == 9
     assert rate[0] <= real.mean() <= rate[1]
 
@@ -97,8 +98,8 @@ def result() -> dict[str, Any]:
         name: {"value": 0.5, "low": 0.1, "high": 0.9}
         for name in ("spearman", "pearson", "mmrv", "bias", "mcc")
     }
-    rows = [{"path": f"run{i}", "real": i, "dreamt": 2 * i, "n": 10} for i in range(3)]
-    even = {"threshold": 0.9, "dreamt": [0, 1, 2], "agreement": found}
+    rows = [{"path": f"run{i}", "real": i, "imagined": 2 * i, "n": 10} for i in range(3)]
+    even = {"threshold": 0.9, "imagined": [0, 1, 2], "agreement": found}
     return {"policies": rows, "threshold": 0.5, "agreement": found, "even": even}
 
 
@@ -122,17 +123,17 @@ def test_checkpoints_are_ranked(tmp_path: Path, tiny_checkpoint: Path):
     assert [row["path"] for row in found["policies"]] == list(policies)
     real = found["outcomes"]["real"]
     assert real[0] == real[1] == real[2] and len(real[0]) == 6, "three copies of one policy"
-    said = np.array(found["outcomes"]["said"])
-    assert [row["dreamt"] for row in found["policies"]] == (said > found["threshold"]).sum(1).tolist()
-    assert found["even"]["dreamt"] == (said > found["even"]["threshold"]).sum(1).tolist()
+    said = np.array(found["outcomes"]["score"])
+    assert [row["imagined"] for row in found["policies"]] == (said > found["threshold"]).sum(1).tolist()
+    assert found["even"]["imagined"] == (said > found["even"]["threshold"]).sum(1).tolist()
     assert json.loads((tmp_path / "out" / "ranking.json").read_text())["policies"] == found["policies"]
     assert (tmp_path / "out" / "ranking.png").is_file()
 
 
 def test_of_one_policy_there_is_a_threshold_and_no_rank():
     found = agreement(np.array([[True, False]]), np.array([[True, True]]))
-    rows = [{"path": "run", "real": 1, "dreamt": 2, "n": 2}]
-    even = {"threshold": 0.9, "dreamt": [1], "agreement": found}
+    rows = [{"path": "run", "real": 1, "imagined": 2, "n": 2}]
+    even = {"threshold": 0.9, "imagined": [1], "agreement": found}
     shown = bench.table({"policies": rows, "threshold": 0.5, "agreement": found, "even": even})
     assert shown.row_count == 1 and "Spearman nan" in str(shown.title)
 

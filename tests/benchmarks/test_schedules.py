@@ -166,7 +166,7 @@ def test_a_small_run_of_scaling(light_ray: None, tmp_path: Path):
 
 
 def test_a_recipe_that_a_schedule_cannot_have_is_refused(tmp_path: Path):
-    config = BenchThroughputConfig(recipe="recipes/dreams.yaml", policy_path=str(tmp_path))
+    config = BenchThroughputConfig(recipe="recipes/imagination.yaml", policy_path=str(tmp_path))
     with pytest.raises(InputError, match=r"launch\.schedule='overlap'"):
         bench_throughput(config)
 

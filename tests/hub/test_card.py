@@ -103,20 +103,21 @@ def test_of_a_policy_that_was_pulled_and_improved(tmp_path: Path):
     assert ModelCard(card_of(run, "run")).data.base_model == "bob/start"
 
 
-def test_a_trial_is_told_as_it_went(tmp_path: Path):
+def test_a_validation_is_reported(tmp_path: Path):
     write_json(tmp_path / "world_model" / "config.json", {"spec": {}, "model": {}})
-    gates = {
+    checks = {
         "auroc": {"value": 0.97123, "wanted": "above 0.9", "holds": True},
         "recall": {"value": 0.1, "holds": False},
     }
-    write_json(tmp_path / "trial.json", {"passed": False, "gates": gates})
+    write_json(tmp_path / "validation.json", {"passed": False, "checks": checks})
     text = card_of(tmp_path / "world_model", "world model")
-    assert "**It failed**" in text and "| auroc | 0.9712 | yes |" in text and "| recall | 0.1 | no |" in text
+    assert "**It failed validation**" in text and "| auroc | 0.9712 | yes |" in text
+    assert "| recall | 0.1 | no |" in text
 
 
 def test_a_world_model_of_another_class_says_where_that_is(tmp_path: Path):
     write_json(tmp_path / "world_model" / "config.json", {"spec": {}, "model": {"type": "mine"}})
-    write_json(tmp_path / "trial.json", {"passed": True, "gates": {}})
+    write_json(tmp_path / "validation.json", {"passed": True, "checks": {}})
     recipe, package = tmp_path / "config.yaml", "--discover_packages_path="
     recipe.write_text("world_model: {discover_packages_path: my.package}\n")
     assert f"--dataset.repo_id=USER/DATASET {package}my.package\n" in card_of(

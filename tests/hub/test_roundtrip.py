@@ -206,8 +206,13 @@ def test_a_dataset_is_one_that_lerobot_finds(hub: HubServer, tmp_path: Path):
 
 
 def test_world_models_and_success_models(hub: HubServer, tmp_path: Path):
-    from accerl_lerobot.world_model.store import Source, load_sources, load_world_model, save_world_model
-    from accerl_lerobot.world_model.success import new_success_model
+    from accerl_lerobot.world_model.learning.learners import new_success_model
+    from accerl_lerobot.world_model.model.store import (
+        Source,
+        load_sources,
+        load_world_model,
+        save_world_model,
+    )
     from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
     source = Source(repo_id="a/b", fingerprint="f", learnt=(0, 2), held_out=(1,))

@@ -19,7 +19,7 @@ from accerl_lerobot.engine.config import RunConfig, encode
 from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig
 from accerl_lerobot.evaluation.stats import wilson_interval
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.world_model.imagination_config import ImaginationConfig
+from accerl_lerobot.world_model.config import ImaginationConfig
 
 HOSTILE = "<script>document.title = 'owned'</script>\"'><img src=x onerror=\"document.title = 'owned'\">"
 """Hostile names of a task, or any other text of a run."""
@@ -137,12 +137,12 @@ def summary(config: RunConfig, evaluations: Sequence[dict[str, Any]], tasks: Seq
 def imagined(share: float = 0.5, on: float = 1.0) -> dict[str, Any]:
     """Numbers of the workers where something is imagined."""
     return {
-        "imagination_dreams": 100.0, "imagination_decisions": 700.0, "imagination_successes": 60.0,
-        "imagination_doubted": 3.0, "imagination_success": 0.6, "imagination_success_beside": 0.7,
+        "imagination_rollouts": 100.0, "imagination_decisions": 700.0, "imagination_successes": 60.0,
+        "imagination_uncertain": 3.0, "imagination_success": 0.6, "imagination_success_imagined": 0.7,
         "imagination_success_real": 0.4, "imagination_on": on, "imagination_promoted": 1.0,
-        "imagination_refused": 2.0, "imagination_learn_episodes": 30.0, "replay_imagined_share": share,
+        "imagination_rejected": 2.0, "imagination_learn_episodes": 30.0, "replay_imagined_share": share,
         "replay_trained_decisions": 100.0, "replay_imagined_trained_decisions": 300.0,
-        "imagination_gate_skill_changed_first": 0.7, "imagination_gate_false_success": 0.8,
+        "imagination_check_skill_changed_first": 0.7, "imagination_check_false_success": 0.8,
     }  # fmt: skip
 
 
@@ -152,7 +152,7 @@ def write_world_model(folder: Path, *, passed: bool = True, finished: bool = Tru
     recipe = replace(WorldModelRun(), dataset=DatasetConfig(repo_id="accerl/demos"))
     (folder / "config.yaml").write_text(yaml.safe_dump(encode(recipe), sort_keys=False))
     losses = [
-        {"kind": "world_model", "step": step, "image": 1 / step, "state": 0.1, "image_dreamt": 1.1 / step}
+        {"kind": "world_model", "step": step, "image": 1 / step, "state": 0.1, "image_imagined": 1.1 / step}
         for step in range(20, 420, 20)
     ]
     losses += [{"kind": "world_model_held_out", "step": step, "image": 2 / step} for step in (200, 400)]
@@ -160,24 +160,24 @@ def write_world_model(folder: Path, *, passed: bool = True, finished: bool = Tru
     if finished:
         depths = [
             {
-                "depth": depth, "trials": 50, "skill": {"value": 0.7, "low": 0.6, "high": 0.8},
+                "depth": depth, "windows": 50, "skill": {"value": 0.7, "low": 0.6, "high": 0.8},
                 "skill_changed": {"value": 0.8, "low": 0.7, "high": 0.9},
-                "state_error": 0.1, "state_error_copy": 0.2, "false_success_true": 0.1,
+                "state_error": 0.1, "state_error_copy": 0.2,
                 "sensitivity_shuffled": {"value": 2.0, "low": 1.5, "high": math.nan},
             }
             for depth in (1, 2, 3)
         ]  # fmt: skip
-        gates = {
+        checks = {
             "skill_last": {"value": 0.7, "wanted": "above 0.0", "holds": True},
             "recall": {"value": 0.1, "wanted": "above 0.3", "holds": passed},
         }
-        trial = {
-            "gates": gates,
+        result = {
+            "checks": checks,
             "passed": passed,
             "depths": depths,
-            "trials": 50,
+            "windows": 50,
             "episodes": 8,
             "seconds": 61.0,
         }
-        (folder / "trial.json").write_text(json.dumps(trial) + "\n")
+        (folder / "validation.json").write_text(json.dumps(result) + "\n")
     return folder

@@ -28,7 +28,7 @@ from accerl_lerobot.report.content import evaluated, exploring
 from accerl_lerobot.report.read import read_run
 from accerl_lerobot.report.recipe import commands
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.world_model.imagination_config import FILMS
+from accerl_lerobot.world_model.config import VIDEOS
 from tests.report.folders import (
     HOSTILE,
     imagined,
@@ -273,7 +273,7 @@ def test_a_run_that_died_before_its_first_record(tmp_path: Path) -> None:
 def test_imagined_rollouts(tmp_path: Path) -> None:
     text = page_of(write_run(tmp_path / "on", config=imagining(), rollout=imagined())).text
     assert "100 imagined rollouts of 700 decisions; 60 % of them succeeded, and 3 ended early" in text
-    assert "The world model passed 1 of 3 held-out evaluations." in text
+    assert "The world model passed 1 of 3 validations." in text
     assert "75 % of the decisions learned from were imagined" in text and "real 40 % → 40 %" in text
     assert "skill_changed_first 0.7 above 0.3 holds" in text
     assert "false_success 0.8 at most 0.5 fails" in text
@@ -284,13 +284,13 @@ def test_imagined_rollouts(tmp_path: Path) -> None:
 
 def test_videos_of_imagined_rollouts(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "run", config=imagining(), rollout=imagined())
-    (folder / FILMS).mkdir()
+    (folder / VIDEOS).mkdir()
     for name in ("0001_failed", "0002_failed", "0013_passed", ".0014_failed"):
-        (folder / FILMS / f"{name}.mp4").write_bytes(name.encode())
+        (folder / VIDEOS / f"{name}.mp4").write_bytes(name.encode())
     text = page_of(folder).text
-    assert "Held-out evaluation 1, failed: a recorded episode" in text
-    assert "evaluation 13, passed: " in text
-    assert "evaluation 2, failed" not in text and "evaluation 14" not in text
+    assert "Validation 1, failed: a recorded episode" in text
+    assert "Validation 13, passed: " in text
+    assert "Validation 2, failed" not in text and "Validation 14" not in text
     html = (folder / "report.html").read_text()
     for name, there in (("0001_failed", True), ("0002_failed", False), ("0013_passed", True)):
         assert (base64.b64encode(name.encode()).decode() in html) is there
@@ -298,33 +298,33 @@ def test_videos_of_imagined_rollouts(tmp_path: Path) -> None:
 
 def test_a_world_model(tmp_path: Path) -> None:
     text = page_of(write_world_model(tmp_path / "good")).text
-    assert "The world model passed its held-out evaluation: all 2 checks hold" in text
-    assert "50 rollouts on 8 episodes it had not learned from" in text
+    assert "The world model passed validation: all 2 checks hold" in text
+    assert "50 windows on 8 episodes it had not learned from" in text
     assert "where pixels changed 0.8 → 0.8" in text and "image 0.05 → 0.0025" in text
     assert "image, held out 0.01 → 0.005" in text and "state, held out" not in text
     failed = page_of(write_world_model(tmp_path / "bad", passed=False)).text
-    assert "The world model failed its held-out evaluation: recall" in failed
+    assert "The world model failed validation: recall" in failed
     assert "recall 0.1 above 0.3 fails" in failed
     begun = page_of(write_world_model(tmp_path / "begun", finished=False)).text
-    assert "A world model after 400 steps, not evaluated yet" in begun
-    assert "there is no trial.json yet" in begun
+    assert "A world model after 400 steps, not validated yet" in begun
+    assert "there is no validation.json yet" in begun
 
 
-def test_a_world_model_on_several_sources(tmp_path: Path) -> None:
+def test_a_world_model_on_several_datasets(tmp_path: Path) -> None:
     folder = write_world_model(tmp_path / "model")
-    found = json.loads((folder / "trial.json").read_text())
-    found |= {"name": "demos", "sources": {"online": {**found, "name": "online"}}}
-    (folder / "trial.json").write_text(json.dumps(found))
+    found = json.loads((folder / "validation.json").read_text())
+    found |= {"name": "demos", "datasets": {"online": {**found, "name": "online"}}}
+    (folder / "validation.json").write_text(json.dumps(found))
     text = page_of(folder).text
-    assert "100 rollouts on 16 episodes" in text and "demos online" in text and "online 0.8 → 0.8" in text
+    assert "100 windows on 16 episodes" in text and "demos online" in text and "online 0.8 → 0.8" in text
 
 
 def test_a_world_model_that_was_evaluated_again(tmp_path: Path) -> None:
     folder = write_world_model(tmp_path / "tried")
     (folder / "metrics.jsonl").unlink()
-    (folder / "config.yaml").write_text("path: model/world_model\ntrial: {depth: 9}\n")
+    (folder / "config.yaml").write_text("path: model/world_model\nvalidation: {depth: 9}\n")
     text = page_of(folder).text
-    assert "accerl world-model-eval · tried" in text and "trial.depth 9 6" in text
+    assert "accerl world-model-eval · tried" in text and "validation.depth 9 6" in text
     assert "There are no metrics" not in text  # it makes none
 
 

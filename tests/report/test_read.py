@@ -95,8 +95,8 @@ def test_damaged_files_are_named(tmp_path: Path, name: str, content: bytes, said
 def test_a_damaged_trial_is_named(tmp_path: Path) -> None:
     folder = write_world_model(tmp_path / "model")
     assert read_run(folder).verb == "world-model"
-    (folder / "trial.json").write_text('{"passed": true, "trials": 3, "gates": {"recall": 1}}')
-    with pytest.raises(InputError, match="no good gates"):
+    (folder / "validation.json").write_text('{"passed": true, "windows": 3, "checks": {"recall": 1}}')
+    with pytest.raises(InputError, match="no good checks"):
         read_run(folder)
 
 

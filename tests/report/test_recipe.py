@@ -76,8 +76,8 @@ def test_a_section_that_is_off_unless_given() -> None:
 
 
 def test_a_recipe_without_defaults_for_everything() -> None:
-    tree = {"path": "model/world_model", "seed": 0, "trial": {"depth": 9}}
+    tree = {"path": "model/world_model", "seed": 0, "validation": {"depth": 9}}
     assert differences(WorldModelEvalRun, tree) == [
         ("path", "model/world_model", None),
-        ("trial.depth", 9, 6),
+        ("validation.depth", 9, 6),
     ]

@@ -14,15 +14,15 @@ from torch import Tensor, nn
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import LearnableModelConfig
-from accerl_lerobot.world_model.contract import (
+from accerl_lerobot.world_model.data import Windows
+from accerl_lerobot.world_model.model.contract import (
+    ActionHistory,
     Context,
-    Dream,
-    History,
     LearnableWorldModel,
+    Prediction,
     State,
     WorldModelSpec,
 )
-from accerl_lerobot.world_model.episodes import Windows
 
 
 @LearnableModelConfig.register_subclass("linear")
@@ -59,17 +59,17 @@ class LinearWorldModel(LearnableWorldModel):
         self.scale.copy_(torch.from_numpy(moved.std(0)).clamp(min=1e-3))
 
     def begin(
-        self, context: Context, tasks: Sequence[str], histories: Sequence[History | None] | None = None
+        self, context: Context, tasks: Sequence[str], histories: Sequence[ActionHistory | None] | None = None
     ) -> State:
         """See the base class."""
         seen = {"frames": context.frames[:, -1], "robot": context.robot[:, -1]}
         return {name: tensor.to(self.scale.device) for name, tensor in seen.items()}
 
     @torch.no_grad()
-    def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Dream:
+    def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Prediction:
         """See the base class."""
         robot = state["robot"] + self._moved(actions)
-        return Dream(
+        return Prediction(
             state=state | {"robot": robot},
             frames=state["frames"],
             robot=robot,

@@ -1,35 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``accerl world-model-eval`` on several sources."""
+"""accerl world-model-eval on several datasets: thresholds and checks."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
 from accerl_lerobot import cli
+from accerl_lerobot.console import Console
 from accerl_lerobot.demos.dataset_files import open_metadata
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.engine.config import DatasetConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.world_model import evaluate
-from accerl_lerobot.world_model.by_source import source_rows
 from accerl_lerobot.world_model.config import (
     NetworkConfig,
     PixelModelConfig,
+    ValidationConfig,
     WorldModelConfig,
 )
-from accerl_lerobot.world_model.dataset import fingerprint
-from accerl_lerobot.world_model.offline import world_spec
-from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.store import Source, save_world_model
-from accerl_lerobot.world_model.success import new_success_model
+from accerl_lerobot.world_model.data import fingerprint
+from accerl_lerobot.world_model.learning.learners import new_success_model
+from accerl_lerobot.world_model.learning.pretrain import world_spec
+from accerl_lerobot.world_model.model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.model.store import Source, save_world_model
+from accerl_lerobot.world_model.validation import evaluate
+from accerl_lerobot.world_model.validation.evaluate import HELD_OUT, ONLINE, open_datasets, validate_datasets
+from accerl_lerobot.world_model.validation.tables import dataset_rows
 from tests.runs import replacing
-from tests.world_model.test_learn_device import moved
+from tests.world_model.test_pretrain import moved
 
 ENV = SimulatedConfig(max_steps=60, hold=25, image_size=16)
 CONFIG = WorldModelConfig(
@@ -63,11 +67,11 @@ def told(folders: tuple[Path, Path, Path], out: Path, *more: str) -> list[str]:
     demos, model, _ = folders
     return [
         "world-model-eval", f"--path={model}", "--dataset.repo_id=a/b", f"--dataset.root={demos}",
-        f"--output_dir={out}", "--trial.depth=2", *more,
+        f"--output_dir={out}", "--validation.depth=2", *more,
     ]  # fmt: skip
 
 
-def test_the_same_measures_on_every_source(
+def test_the_same_measures_on_every_dataset(
     folders: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     out = tmp_path / "out"
@@ -75,45 +79,45 @@ def test_the_same_measures_on_every_source(
     code = cli.main(told(folders, out, *more))
     stdout, stderr = capsys.readouterr()
     found = json.loads(stdout)
-    assert code == 1 and found == json.loads((out / "trial.json").read_text())
-    every = {found["name"]: found} | found["sources"]
+    assert code == 1 and found == json.loads((out / "validation.json").read_text())
+    every = {found["name"]: found} | found["datasets"]
     assert {name: one["tried"]["episodes"] for name, one in every.items()} == {
         "held out": 4, "online": 8,
     }  # fmt: skip
     for one in every.values():
-        assert set(one["gates"]) == set(found["gates"])
+        assert set(one["checks"]) == set(found["checks"])
         assert {"skill_changed", "sensitivity_shuffled"} < {*one["depths"][0]}
     assert {p.name for p in out.iterdir()} == {
-        "config.yaml", "trial.json", "preview.mp4", "preview_online.mp4",
+        "config.yaml", "validation.json", "preview.mp4", "preview_online.mp4",
     }  # fmt: skip
-    assert "By source" in stderr and "gates that hold" in stderr
+    assert "By dataset" in stderr and "checks that hold" in stderr
     assert cli.main(["report", str(out)]) == 0
     page = (out / "report.html").read_text()
-    assert "By source" in page and "that a policy lived through" in page
+    assert "By dataset" in page and "that a policy real_episode through" in page
 
 
-def test_what_dreams_and_what_judges_go_to_the_device(
+def test_both_models_go_to_the_device(
     folders: tuple[Path, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     asked, went = moved(monkeypatch)
     tried: list[list[str]] = []
-    real = evaluate.try_sources
+    real = evaluate.validate_datasets
 
-    def try_sources(*args: Any, **options: Any) -> Any:
+    def validate_datasets(*args: Any, **options: Any) -> Any:
         tried.append([kind for kind, device in went if device == torch.device("cpu", 0)])
         return real(*args, **options)
 
-    monkeypatch.setattr(evaluate, "try_sources", try_sources)
+    monkeypatch.setattr(evaluate, "validate_datasets", validate_datasets)
     cli.main(told(folders, tmp_path / "out", "--device=cuda:3"))
     assert asked == ["cuda:3"] and tried == [["PixelWorldModel", "SuccessPairsRewardModel"]]
     stands_in: list[Any] = []
 
-    def load_stand_in(*args: Any) -> Any:
+    def load_external_reward_model(*args: Any) -> Any:
         stands_in.append(args[3])
         raise InputError("success.path", "x", "enough")
 
-    monkeypatch.setattr(evaluate, "rehearse_stand_in", lambda *args: None)
-    monkeypatch.setattr(evaluate, "load_stand_in", load_stand_in)
+    monkeypatch.setattr(evaluate, "rehearse_external_reward_model", lambda *args: None)
+    monkeypatch.setattr(evaluate, "load_external_reward_model", load_external_reward_model)
     cli.main(told(folders, tmp_path / "again", "--success.path=x"))
     assert asked == ["cuda:3", "auto"] and stands_in == [torch.device("cpu", 0)]
 
@@ -124,7 +128,7 @@ def test_one_that_does_not_know_the_dataset_is_tried_on_all_of_it(
     arguments = [a.replace(str(folders[0]), str(folders[2])) for a in told(folders, tmp_path / "out")]
     cli.main(arguments)
     found = json.loads(capsys.readouterr().out)
-    assert found["name"] == "dataset" and found["tried"]["episodes"] == 8 and found["sources"] == {}
+    assert found["name"] == "dataset" and found["tried"]["episodes"] == 8 and found["datasets"] == {}
 
 
 @pytest.mark.parametrize(
@@ -145,13 +149,110 @@ def test_what_is_refused(
     assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
-def test_rows_of_sources_leave_out_what_none_of_them_has():
+def test_rows_of_datasets_leave_out_what_none_of_them_has():
     skill = {"value": 0.5, "low": 0.25, "high": 0.75}
-    one = {"gates": {"a": {"holds": True}, "b": {"holds": False}}, "depths": [{"skill_changed": skill}]}
-    empty = {"gates": {}, "depths": [], "tried": {"episodes": 3}}
-    assert source_rows([one, empty]) == [
+    one = {"checks": {"a": {"holds": True}, "b": {"holds": False}}, "depths": [{"skill_changed": skill}]}
+    empty = {"checks": {}, "depths": [], "tried": {"episodes": 3}}
+    assert dataset_rows([one, empty]) == [
         ("episodes", ["", "3"]),
-        ("gates that hold", ["1 of 2", "0 of 0"]),
+        ("checks that hold", ["1 of 2", "0 of 0"]),
         ("skill, changed pixels, first chunk", ["0.50 [0.25, 0.75]", ""]),
         ("last chunk", ["0.50 [0.25, 0.75]", ""]),
     ]
+
+
+SAVED, SET = 0.8, 0.6
+
+
+class Tried:
+    """In place of a trial: what each source was judged by, in order."""
+
+    def __init__(self) -> None:
+        self.judged: list[tuple[str, float, bool]] = []
+
+    def __call__(
+        self, model: Any, episodes: Any, config: Any, success: Any, seed: int, fresh: bool
+    ) -> dict[str, Any]:
+        self.judged.append((episodes, success.config.threshold, fresh))
+        if fresh:
+            success.config.threshold = SET
+        gate = {"value": 1.0, "wanted": "above 0", "holds": episodes != "fails"}
+        return {"checks": {"skill": gate}, "passed": gate["holds"], "threshold": success.config.threshold}
+
+
+@pytest.fixture
+def tried(monkeypatch: pytest.MonkeyPatch) -> Tried:
+    tried = Tried()
+    monkeypatch.setattr(evaluate, "validate", tried)
+    monkeypatch.setattr(evaluate, "preview_video", lambda path, *_: path.write_bytes(b"video"))
+    monkeypatch.setattr(evaluate, "count_episodes", lambda episodes: {"episodes": 1})
+    return tried
+
+
+def validated(tmp_path: Path, of: dict[str, Any], **options: Any) -> tuple[dict[str, Any], float]:
+    success: Any = SimpleNamespace(config=SimpleNamespace(threshold=SAVED))
+    found = validate_datasets(
+        None, of, ValidationConfig(), success, tmp_path, Console(), **options  # type: ignore[arg-type]
+    )  # fmt: skip
+    return found, success.config.threshold
+
+
+def test_what_is_set_on_a_policys_episodes_is_kept_and_classifies_the_others(tried: Tried, tmp_path: Path):
+    """They come first then, but in what is validated the first stays the first."""
+    of = {HELD_OUT: "demos", ONLINE: "policy's"}
+    found, threshold = validated(tmp_path, of, trained_on=of, fresh=ONLINE, keep_threshold=True)
+    assert threshold == SET
+    assert tried.judged == [
+        ("policy's", SAVED, True),
+        ("demos", SET, False),
+    ]
+    assert found["name"] == HELD_OUT and list(found["datasets"]) == [ONLINE]
+    assert {path.name for path in tmp_path.iterdir()} == {"preview.mp4", "preview_online.mp4"}
+
+
+def test_a_threshold_that_was_saved_is_only_set_anew_where_it_comes_from(tried: Tried, tmp_path: Path):
+    of = {HELD_OUT: "demos", ONLINE: "another policy's", "perturbed": "again"}
+    found, threshold = validated(tmp_path, of, trained_on=[HELD_OUT], fresh=HELD_OUT)
+    assert threshold == SAVED and found["threshold"] == SET
+    assert tried.judged == [
+        ("demos", SAVED, True),
+        ("another policy's", SAVED, False),
+        ("again", SAVED, False),
+    ]
+
+
+def test_checks_of_what_it_has_learned_from_count(tried: Tried, tmp_path: Path):
+    of = {HELD_OUT: "demos", ONLINE: "fails"}
+    found, _ = validated(tmp_path, of, trained_on=of)
+    assert not found["passed"] and {k: g["holds"] for k, g in found["checks"].items()} == {
+        "skill": True, "online.skill": False,
+    }  # fmt: skip
+    found, _ = validated(tmp_path, of, trained_on=[HELD_OUT])
+    assert found["passed"] and list(found["checks"]) == ["skill"]
+
+
+def test_a_dataset_is_known_by_the_order_of_its_episodes_too(tmp_path: Path):
+    env = SimulatedConfig(max_steps=60, hold=25, image_size=16)
+
+    def recorded(name: str, seed: int) -> DatasetConfig:
+        of = DemosConfig(
+            episodes=3, failure_share=0.5, processes=1, root=str(tmp_path / name), repo_id="a/b", seed=seed
+        )
+        return DatasetConfig(repo_id="a/b", root=str(record_demos(env, of)))
+
+    config = WorldModelConfig(image_size=16, model=PixelModelConfig(network=NetworkConfig(channels=(16, 24))))
+    spec = world_spec(config, env)
+    one, other = recorded("one", 0), recorded("other", 1)
+    opened = open_datasets({"dataset": one, "online": other}, spec)
+    assert [meta.total_episodes for meta in opened.values()] == [3, 3]
+    meta = opened["dataset"]
+    ends = {key: list(meta.episodes[key]) for key in ("dataset_from_index", "dataset_to_index")}
+    turned = SimpleNamespace(stats=meta.stats, fps=meta.fps, episodes=ends)
+    assert evaluate.fingerprint(turned) == evaluate.fingerprint(meta)
+    ends["dataset_to_index"][0] += 1
+    ends["dataset_from_index"][1] += 1
+    assert evaluate.fingerprint(turned) != evaluate.fingerprint(opened["dataset"])
+    with pytest.raises(InputError, match="^online.repo_id='a/b': it is the one in dataset; name another"):
+        open_datasets({"dataset": one, "online": one}, spec)
+    with pytest.raises(InputError, match="^online.root='nowhere': no meta/info.json there"):
+        open_datasets({"dataset": one, "online": DatasetConfig(repo_id="a/b", root="nowhere")}, spec)

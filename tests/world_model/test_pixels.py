@@ -11,12 +11,18 @@ import torch
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import LearnConfig, NetworkConfig, Objective, PixelModelConfig
-from accerl_lerobot.world_model.contract import Dream, WorldModelSpec
-from accerl_lerobot.world_model.episodes import Episode, Windows, cut, places
-from accerl_lerobot.world_model.judge import mean_error, sensitivity, shuffled, skill, squared_errors
-from accerl_lerobot.world_model.learn import Learner, pretrain
-from accerl_lerobot.world_model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.replayed import context_of
+from accerl_lerobot.world_model.data import Episode, Windows, cut_windows, window_starts
+from accerl_lerobot.world_model.learning.learners import Learner, train_from_scratch
+from accerl_lerobot.world_model.model.contract import Prediction, WorldModelSpec
+from accerl_lerobot.world_model.model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.validation.metrics import (
+    mean_error,
+    sensitivity,
+    shuffle_across_groups,
+    skill,
+    squared_errors,
+)
+from accerl_lerobot.world_model.validation.rollout_eval import context_of
 from tests.rounding import assert_close
 
 SIZE, K = 16, 2
@@ -69,22 +75,22 @@ def model(**options: object) -> PixelWorldModel:
 
 
 def windows(episodes: list[Episode], chunks: int = 3) -> Windows:
-    at = [p for p in places(episodes) if p.frame + K * chunks < len(episodes[p.episode].frames)]
-    return cut(episodes, at, chunk=K, context=2, chunks=chunks)
+    at = [p for p in window_starts(episodes) if p.frame + K * chunks < len(episodes[p.episode].frames)]
+    return cut_windows(episodes, at, chunk=K, context=2, chunks=chunks)
 
 
-def dream(
+def rollout(
     made: PixelWorldModel, of: Windows, actions: np.ndarray | None = None, seed: int = 0
-) -> list[Dream]:
-    """One dream after another, as many as the windows have chunks."""
+) -> list[Prediction]:
+    """One rollout after another, as many as the windows have chunks."""
     chosen = of.actions if actions is None else actions
     state = made.begin(context_of(of), of.task)
-    dreams = []
+    predictions = []
     for r in range(chosen.shape[1]):
         seeds = [1000 * seed + 10 * i + r for i in range(len(of))]
-        dreams.append(made.step(state, torch.from_numpy(chosen[:, r]), seeds))
-        state = dreams[-1].state
-    return dreams
+        predictions.append(made.step(state, torch.from_numpy(chosen[:, r]), seeds))
+        state = predictions[-1].state
+    return predictions
 
 
 def awake(made: PixelWorldModel) -> PixelWorldModel:
@@ -100,7 +106,7 @@ def awake(made: PixelWorldModel) -> PixelWorldModel:
 def test_a_new_refiner_is_a_copy_of_the_last_frame(steps: int):
     of = windows(dots(2))
     made = model(steps=steps)
-    for one in dream(made, of)[: 1 if steps > 1 else None]:
+    for one in rollout(made, of)[: 1 if steps > 1 else None]:
         # Refining adds noise that only a trained network takes away again.
         off = np.abs(one.frames.numpy().astype(int) - of.frames[:, 1])
         assert off.max() == 0 if steps == 1 else off.mean() < 30
@@ -110,24 +116,24 @@ def test_a_new_model_s_robot_stays_about_where_it_is():
     of = windows(dots(2))
     made = model()
     made.fit_statistics(of)
-    moved = dream(made, of)[0]
+    moved = rollout(made, of)[0]
     assert_close(moved.robot, of.state[:, 1] + made.motion_mean.numpy())
     assert moved.uncertainty.tolist() == [0.0] * len(of), "the heads still agree"
 
 
 @pytest.mark.parametrize("objective", ["refiner", "edm", "flow"])
 @pytest.mark.parametrize("steps", [1, 3])
-def test_a_dream_depends_on_its_row_and_seed_alone(objective: Objective, steps: int):
+def test_a_rollout_depends_on_its_row_and_seed_alone(objective: Objective, steps: int):
     of = windows(dots(2), chunks=2)
     made = awake(model(objective=objective, steps=steps))
-    together = dream(made, of)
-    assert torch.equal(together[1].frames, dream(made, of)[1].frames)
+    together = rollout(made, of)
+    assert torch.equal(together[1].frames, rollout(made, of)[1].frames)
     state = made.begin(context_of(of, slice(3, 4)), of.task[3:4])
     alone = made.step(state, torch.from_numpy(of.actions[3:4, 0]), [30])
     assert (alone.frames.int() - together[0].frames[3:4].int()).abs().max() <= 1, "rounding"
     assert_close(alone.robot, together[0].robot[3:4])
     random = objective != "refiner" or steps > 1
-    assert torch.equal(together[0].frames, dream(made, of, seed=1)[0].frames) is not random
+    assert torch.equal(together[0].frames, rollout(made, of, seed=1)[0].frames) is not random
 
 
 def test_a_state_is_not_changed_by_going_on_from_it():
@@ -142,7 +148,7 @@ def test_a_state_is_not_changed_by_going_on_from_it():
     assert torch.equal(first.state["anchor"], state["anchor"]), "the anchor stays"
 
 
-def test_a_picture_that_is_no_number_is_doubted(monkeypatch: pytest.MonkeyPatch):
+def test_a_picture_that_is_no_number_is_uncertain(monkeypatch: pytest.MonkeyPatch):
     of = windows(dots(1))
     made = awake(model())
     state, sample = made.begin(context_of(of), of.task), made._sample
@@ -199,7 +205,7 @@ def test_statistics_by_hand():
     assert float(made.change) == pytest.approx(np.sqrt(np.square(off / 127.5).mean()), rel=1e-4)
 
 
-def test_only_what_is_learnt_from_is_shown_with_noise():
+def test_only_what_is_learned_from_is_shown_with_noise():
     """One pass of the refiner is regression: beside the context's, no noise is in its loss."""
     of = windows(dots(3))
     clean, noisy, noisier = (awake(model(context_noise=level)) for level in (0.0, 0.05, 0.5))
@@ -213,7 +219,7 @@ def test_only_what_is_learnt_from_is_shown_with_noise():
     assert loss(noisy, 0) == loss(noisy, 0) != loss(noisy, 1)
     off = [abs(loss(made, 0) - loss(clean, 0)) for made in (noisy, noisier)]
     assert 0 < 3 * off[0] < off[1], "as much as was asked for"
-    for one, other in zip(dream(clean, of), dream(noisier, of), strict=True):
+    for one, other in zip(rollout(clean, of), rollout(noisier, of), strict=True):
         assert torch.equal(one.frames, other.frames) and torch.equal(one.robot, other.robot)
 
 
@@ -225,12 +231,12 @@ def test_the_loss_reaches_every_weight(objective: Objective, steps: int):
     loss, metrics = made.loss(of, torch.Generator().manual_seed(0))
     loss.backward()
     silent = [k for k, p in made.named_parameters() if p.grad is None or not p.grad.abs().max() > 0]
-    assert silent == [] and set(metrics) == {"image", "state", "image_dreamt"}
+    assert silent == [] and set(metrics) == {"image", "state", "image_imagined"}
 
 
 def trained(shuffle: bool = False, **options: object) -> Learner:
     config = LearnConfig(steps=250, batch=16, lr=2e-3, warmup=10, anchors=3)
-    return pretrain(model(**options), dots(60), config, seed=0, shuffle=shuffle)
+    return train_from_scratch(model(**options), dots(60), config, seed=0, shuffle=shuffle)
 
 
 @pytest.fixture(scope="module")
@@ -238,42 +244,42 @@ def learnt() -> Learner:
     return trained()
 
 
-def judged(learner: Learner, depth: int = 0) -> tuple[float, float]:
+def scores(learner: Learner, depth: int = 0) -> tuple[float, float]:
     """(skill, sensitivity) on dots that were not seen."""
     episodes = dots(12, seed=5)
     of = windows(episodes)
     wanted = of.frames[:, 2 + depth]
     with torch.no_grad():
-        true = squared_errors(dream(learner.serving, of)[depth].frames.numpy(), wanted)
-        rows = shuffled(len(of), range(len(of)), np.random.default_rng(0))
-        other = squared_errors(dream(learner.serving, of, of.actions[rows])[depth].frames.numpy(), wanted)
+        true = squared_errors(rollout(learner.serving, of)[depth].frames.numpy(), wanted)
+        rows = shuffle_across_groups(len(of), range(len(of)), np.random.default_rng(0))
+        other = squared_errors(rollout(learner.serving, of, of.actions[rows])[depth].frames.numpy(), wanted)
     copy = squared_errors(of.frames[:, 1], wanted)
     return skill(true, copy, of.episode).value, sensitivity(true, other, of.episode).low
 
 
 def test_it_learns_where_the_dot_goes(learnt: Learner):
-    assert judged(learnt)[0] > 0.5 and judged(learnt, depth=2)[0] > 0.3
-    assert judged(learnt)[1] > 2
+    assert scores(learnt)[0] > 0.5 and scores(learnt, depth=2)[0] > 0.3
+    assert scores(learnt)[1] > 2
 
 
 def test_it_learns_where_the_robot_goes(learnt: Learner):
     of = windows(dots(12, seed=5))
-    dreams = dream(learnt.serving, of)
+    predictions = rollout(learnt.serving, of)
     for depth, most in ((0, 0.5), (2, 1.0)):
-        assert np.abs(dreams[depth].robot.numpy() - of.state[:, depth + 2]).mean() < most
+        assert np.abs(predictions[depth].robot.numpy() - of.state[:, depth + 2]).mean() < most
     strange = of.actions + 20
-    assert dream(learnt.serving, of, strange)[0].uncertainty.mean() > 3 * dreams[0].uncertainty.mean()
+    assert rollout(learnt.serving, of, strange)[0].uncertainty.mean() > 3 * predictions[0].uncertainty.mean()
 
 
 def test_a_model_of_shuffled_actions_ignores_them():
-    _, low = judged(trained(shuffle=True))
+    _, low = scores(trained(shuffle=True))
     assert 0.8 < low < 1.1
 
 
 def test_a_model_that_diverges_is_an_error():
     episodes = dots(3)
     learner = Learner(model(), LearnConfig(), seed=0)
-    of = learner.draw(episodes, places(episodes))
+    of = learner.draw(episodes, window_starts(episodes))
     with pytest.raises(FloatingPointError, match="not finite at step 1"):
         learner.step(replace(of, state=of.state * np.nan))
 
@@ -281,7 +287,7 @@ def test_a_model_that_diverges_is_an_error():
 def test_the_same_seed_learns_the_same():
     config = LearnConfig(steps=3, batch=4, anchors=2)
     weights = [
-        pretrain(model(), dots(4), config, seed).serving.state_dict()["network.leave.2.weight"]
+        train_from_scratch(model(), dots(4), config, seed).serving.state_dict()["network.leave.2.weight"]
         for seed in (0, 0, 1)
     ]
     assert torch.equal(weights[0], weights[1]) and not torch.equal(weights[0], weights[2])

@@ -8,23 +8,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from accerl_lerobot.world_model import starts as starts_module
-from accerl_lerobot.world_model.frames import seen
-from accerl_lerobot.world_model.starts import StartPool
+from accerl_lerobot.world_model.config import ImaginationConfig
+from accerl_lerobot.world_model.data import model_arrays
+from accerl_lerobot.world_model.imagination import starts as starts_module
+from accerl_lerobot.world_model.imagination.starts import StartPool
+from accerl_lerobot.world_model.model.contract import WorldModelSpec
 from tests.rounding import assert_close
-from tests.world_model.lived import SPEC, K, lived
+from tests.world_model.real_segments import SPEC, K, real_episode
 
 
-def pool(**options: object) -> StartPool:
-    defaults = {"memory": 1000, "horizon": 2, "beginnings": 0.0, "keyframes": 0.0}
-    return StartPool(SPEC, **(defaults | options))  # type: ignore[arg-type]
+def pool(spec: WorldModelSpec = SPEC, **options: object) -> StartPool:
+    """Starts anywhere; an oracle's need their history."""
+    defaults = {"memory": 1000, "start_at_high_td_prob": 0.0}
+    return StartPool(spec, ImaginationConfig(**(defaults | options)))  # type: ignore[arg-type]
 
 
 def test_a_start_is_a_real_observation_with_what_led_there():
-    [segment] = lived(3)
+    [segment] = real_episode(3)
     held = pool()
     held.add(segment)
-    frames, robot = seen(segment.observations, SPEC)
+    frames, robot = model_arrays(segment.observations, SPEC)
     assert len(segment) == len(held) == 4
     for start in held.draw(50, np.random.default_rng(0)):
         t = start.origin.decision
@@ -33,31 +36,17 @@ def test_a_start_is_a_real_observation_with_what_led_there():
         assert np.array_equal(start.robot, robot[[max(0, t - 1), t]])
         assert np.array_equal(start.actions[0], segment.actions[t - 1] if t else np.zeros((K, 2)))
         assert start.history is not None and start.history[:2] == ("match", 3)
-        assert_close(start.told, segment.actions[:t].sum((0, 1)))
-        assert np.array_equal(start.first, robot[0])
+        assert_close(start.commanded_sum, segment.actions[:t].sum((0, 1)))
+        assert np.array_equal(start.initial_state, robot[0])
         assert np.array_equal(start.history.actions, segment.actions[:t].reshape(-1, 2))
 
 
-def test_whether_the_task_was_achieved_in_as_many_decisions():
-    [success] = lived(1, solve_at=2)
-    assert success.terminated and success.success and len(success) == 4
-    held = pool()
-    held.add(success)
-    found = {s.origin.decision: s.achieved for s in held.draw(100, np.random.default_rng(0))}
-    assert found == {0: False, 1: False, 2: True, 3: True}
-    [failure] = lived(1)
-    held = pool()
-    held.add(failure)
-    assert {s.achieved for s in held.draw(50, np.random.default_rng(0))} == {False}
-
-
 def test_where_a_segment_was_cut_the_outcome_or_the_history_is_not_known():
-    first, second = lived(5, length=2)
+    first, second = real_episode(5, length=2)
     assert len(first) == len(second) == 2
     held = pool()
     held.add(first)
-    found = {s.origin.decision: s.achieved for s in held.draw(100, np.random.default_rng(0))}
-    assert found == {0: False, 1: None}
+    assert {s.origin.decision for s in held.draw(100, np.random.default_rng(0))} == {0, 1}
     held.add(second)
     starts = {s.origin.decision: s for s in held.draw(200, np.random.default_rng(0))}
     # What the third decision's frame before showed is in a segment that may be gone.
@@ -65,68 +54,69 @@ def test_where_a_segment_was_cut_the_outcome_or_the_history_is_not_known():
     assert starts[3].history is None and starts[3].achieved is False
     assert np.array_equal(starts[3].actions[0], second.actions[0])
     told = first.actions.sum((0, 1)) + second.actions[0].sum(0)
-    assert_close(starts[3].told, told)  # since the episode began
-    assert np.array_equal(starts[3].first, first.observations["observation.state"][0])
+    assert_close(starts[3].commanded_sum, told)  # since the episode began
+    assert np.array_equal(starts[3].initial_state, first.observations["observation.state"][0])
     alone = pool()
     alone.add(second)
     [start] = alone.draw(1, np.random.default_rng(0))
-    assert_close(start.told, second.actions[0].sum(0))  # since it is known
-    assert np.array_equal(start.first, second.observations["observation.state"][0])
-    whole = pool(whole=True)
+    assert_close(start.commanded_sum, second.actions[0].sum(0))  # since it is known
+    assert np.array_equal(start.initial_state, second.observations["observation.state"][0])
+    whole = pool(model="oracle")
     for segment in (first, second):
         whole.add(segment)
     assert len(whole) == 2
 
 
 def test_what_led_to_a_segment_is_kept_over_several_and_when_a_pool_is_left(monkeypatch: pytest.MonkeyPatch):
-    parts, [whole] = lived(5, length=1), lived(5)
+    parts, [whole] = real_episode(5, length=1), real_episode(5)
     assert len(parts) == len(whole) == 4
-    one, other = replace(SPEC, context=1), lived(6, length=1)
-    held = StartPool(one, memory=1, horizon=None, beginnings=0.0, keyframes=0.0)
+    one, other = replace(SPEC, context=1), real_episode(6, length=1)
+    held = pool(one, memory=1)
     for t, part in enumerate(parts):
         held.add(part)
         [start] = held.draw(1, np.random.default_rng(0))
         assert start.origin.decision == t
-        assert_close(start.told, whole.actions[:t].sum((0, 1)))
-        assert np.array_equal(start.first, whole.observations["observation.state"][0])
-        again = StartPool(one, memory=1, horizon=None, beginnings=0.0, keyframes=0.0)
+        assert_close(start.commanded_sum, whole.actions[:t].sum((0, 1)))
+        assert np.array_equal(start.initial_state, whole.observations["observation.state"][0])
+        again = pool(one, memory=1)
         again.restore(held.state())
-        assert np.array_equal(again.draw(1, np.random.default_rng(0))[0].told, start.told)
+        assert np.array_equal(again.draw(1, np.random.default_rng(0))[0].commanded_sum, start.commanded_sum)
         held = again
     assert not held._leads, "the episode has ended"
-    monkeypatch.setattr(starts_module, "UNDER_WAY", 1)
+    monkeypatch.setattr(starts_module, "MAX_UNFINISHED", 1)
     held.add(parts[0])
     held.add(other[0])
     assert list(held._leads) == [("match", 6)]
     held.add(other[2])  # the one between was lost
     [start] = held.draw(1, np.random.default_rng(0))
-    assert not start.told.any() and start.origin.decision == 2
+    assert not start.commanded_sum.any() and start.origin.decision == 2
 
 
 def test_some_begin_where_episodes_began():
-    held = pool(beginnings=0.5, keyframes=0.0)
+    held = pool(start_at_reset_prob=0.5, start_at_high_td_prob=0.0)
     for seed in range(3):
-        held.add(lived(seed)[0])
-    held.add(lived(9, length=2)[1])  # a later part
+        held.add(real_episode(seed)[0])
+    held.add(real_episode(9, length=2)[1])  # a later part
     starts = held.draw(4000, np.random.default_rng(0))
     first = Counter(s.origin.seed for s in starts if not s.origin.decision)
     # Of 13 decisions that may be chosen, three are the first of an episode.
     assert set(first) == {0, 1, 2} and sum(first.values()) == pytest.approx(
         4000 * (0.5 + 0.5 * 3 / 13), abs=150
     )
-    only = pool(beginnings=1.0, keyframes=1.0)
+    only = pool(start_at_reset_prob=1.0, start_at_high_td_prob=1.0)
     for seed in range(3):
-        only.add(lived(seed)[0])
+        only.add(real_episode(seed)[0])
     assert {s.origin.decision for s in only.draw(100, np.random.default_rng(0))} == {0}
     assert not any(
-        s.told.any() or (s.first != s.robot[-1]).any() for s in only.draw(9, np.random.default_rng(0))
+        s.commanded_sum.any() or (s.initial_state != s.robot[-1]).any()
+        for s in only.draw(9, np.random.default_rng(0))
     )
 
 
 def test_to_the_end_it_is_how_the_episode_ended_that_counts():
-    first, second = lived(5, length=2)
-    [failure], [success] = lived(6), lived(7, solve_at=2)
-    held = pool(horizon=None)
+    first, second = real_episode(5, length=2)
+    [failure], [success] = real_episode(6), real_episode(7, solve_at=2)
+    held = pool()
     for segment in (first, failure, success):
         held.add(segment)
 
@@ -137,28 +127,28 @@ def test_to_the_end_it_is_how_the_episode_ended_that_counts():
     held.add(replace(second, success=True, terminated=True, truncated=False))
     assert found(held) == {(5, True), (6, False), (7, True)}
     # What is known of an episode goes when the last of it does.
-    short = pool(horizon=None, memory=1)
+    short = pool(memory=1)
     for segment in (first, second, failure):
         short.add(segment)
     assert found(short) == {(6, False)} and set(short._outcomes) == {("match", 6)}
 
 
-def test_keyframes_are_where_the_critic_was_surprised():
-    [segment] = lived(3)
+def test_high_td_starts_are_where_the_critic_was_surprised():
+    [segment] = real_episode(3)
     # V says 0, 0, 1, 1: it is surprised at the second decision, and at the end, after which comes nothing.
     segment = replace(
         segment, value=np.array([0, 0, 1, 1], np.float32), reward=np.zeros(4, np.float32), terminated=True,
         truncated=False,
     )  # fmt: skip
-    held = pool(keyframes=1.0)
+    held = pool(start_at_high_td_prob=1.0)
     held.add(segment)
     counts = Counter(s.origin.decision for s in held.draw(1000, np.random.default_rng(0)))
     assert set(counts) == {1, 3} and abs(counts[1] - 500) < 80
-    even = pool(keyframes=0.5)
+    even = pool(start_at_high_td_prob=0.5)
     even.add(segment)
     counts = Counter(s.origin.decision for s in even.draw(4000, np.random.default_rng(0)))
     assert counts[0] == pytest.approx(500, abs=90) and counts[1] == pytest.approx(1500, abs=140)
-    still = pool(keyframes=1.0)
+    still = pool(start_at_high_td_prob=1.0)
     still.add(replace(segment, value=np.zeros(4, np.float32)))
     assert len({s.origin.decision for s in still.draw(100, np.random.default_rng(0))}) == 4
 
@@ -166,7 +156,7 @@ def test_keyframes_are_where_the_critic_was_surprised():
 def test_the_newest_are_kept():
     held = pool(memory=9)
     for seed in range(6):
-        held.add(lived(seed)[0])
+        held.add(real_episode(seed)[0])
     assert 9 <= len(held) < 13
     assert {s.origin.seed for s in held.draw(300, np.random.default_rng(0))} == {3, 4, 5}
     with pytest.raises(ValueError, match="no real experience"):
@@ -174,9 +164,9 @@ def test_the_newest_are_kept():
 
 
 def test_pictures_have_the_model_s_size():
-    [segment] = lived(3)
-    frames, robot = seen(segment.observations, replace(SPEC, image_size=(8, 8), state_dim=0))
+    [segment] = real_episode(3)
+    frames, robot = model_arrays(segment.observations, replace(SPEC, image_size=(8, 8), state_dim=0))
     assert frames.shape == (5, 1, 8, 8, 3) and frames.dtype == np.uint8 and robot.shape == (5, 0)
-    full, _ = seen(segment.observations, SPEC)
+    full, _ = model_arrays(segment.observations, SPEC)
     assert abs(frames.astype(float).mean() - full.mean()) < 2
     assert full.shape == (5, 1, 16, 16, 3) and K == 4

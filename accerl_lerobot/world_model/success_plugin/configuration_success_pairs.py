@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Its configuration."""
+"""Configuration of the success model."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class SuccessPairsConfig(RewardModelConfig):
     success_reward: float = 0.5
     """A ``next.reward`` above it is a success; datasets of ``accerl demos`` give 1."""
     threshold: float = 0.5
-    """P above which a frame counts as a success where one has to decide, [0, 1]."""
+    """P above which a frame counts as a success, in [0, 1]."""
     alone: float = 0.25
-    """Share of pairs, in [0, 1], whose first frame is replaced by the second in training: what counts is what
-    that one shows, not how far they are apart."""
+    """Share of pairs, in [0, 1], whose first frame is replaced by the second in training, so that the second
+    frame is judged and not their distance."""
     noise: float = 0.03
     """Largest standard deviation of the noise on frames in training, where 1 is white; ≥ 0."""
     shift: int = 3
@@ -55,7 +55,7 @@ class SuccessPairsConfig(RewardModelConfig):
 
     @property
     def reward_delta_indices(self) -> list[int]:
-        """Every reward of it."""
+        """Every reward of the chunk."""
         return list(range(self.chunk))
 
     def get_optimizer_preset(self) -> OptimizerConfig:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network, its loss, and what LeRobot asks of a reward model.
+"""The network, its loss, and the interface of a LeRobot reward model.
 
-Cameras share their convolutions, and what they see is averaged, so a model serves any number of them.
+Cameras share their convolutions, and their features are averaged, so a model serves any number of them.
 
 Shapes: B batch, V cameras, C×H×W image.
 """
@@ -20,16 +20,11 @@ from accerl_lerobot.world_model.success_plugin.configuration_success_pairs impor
 
 IMAGES, REWARD, PAD = "observation.image", "next.reward", "_is_pad"
 GRID = 4
-"""Side of the map that is flattened: where something is matters."""
+"""Side of the feature map that is flattened."""
 
 
 class SuccessPairsRewardModel(PreTrainedRewardModel):
-    """P(the second of two frames shows the task achieved), and the episode's progress by then.
-
-    Args:
-        config: its size.
-        unused: LeRobot hands over a dataset's statistics, which it does not need.
-    """
+    """P(the second of two frames shows the task achieved), and the episode's progress by then."""
 
     config_class = SuccessPairsConfig
     name = "success_pairs"
@@ -56,7 +51,7 @@ class SuccessPairsRewardModel(PreTrainedRewardModel):
         return success, progress
 
     @torch.no_grad()
-    def said(self, before: Tensor, after: Tensor) -> Tensor:
+    def probability(self, before: Tensor, after: Tensor) -> Tensor:
         """P(success), (B,), of frames (B, V, 3, H, W) in [0, 1]."""
         return torch.sigmoid(self.logits(before, after)[0])
 
@@ -79,13 +74,13 @@ class SuccessPairsRewardModel(PreTrainedRewardModel):
         """
         if self.training:
             before, after = self._augmented(before, after, generator)
-        said, along = self.logits(before, after)
-        each = functional.binary_cross_entropy_with_logits(said, success, reduction="none")
+        logits, along = self.logits(before, after)
+        each = functional.binary_cross_entropy_with_logits(logits, success, reduction="none")
         total = each.new_zeros(())
         kinds = [kind for kind in (success > 0.5, success <= 0.5) if kind.any()]
         for kind in kinds:
             total = total + each[kind].mean() / len(kinds)
-        metrics = {"accuracy": float(((said > 0) == (success > 0.5)).float().mean())}
+        metrics = {"accuracy": float(((logits > 0) == (success > 0.5)).float().mean())}
         if progress is not None and bool((known := ~progress.isnan()).any()):
             error = (torch.sigmoid(along[known]) - progress[known]).square().mean()
             total, metrics = total + error, metrics | {"progress": error.item()}
@@ -103,7 +98,7 @@ class SuccessPairsRewardModel(PreTrainedRewardModel):
 
     @torch.no_grad()
     def compute_reward(self, batch: dict[str, Tensor]) -> Tensor:
-        """P(success), (B,), of the same batches, or of single frames, which are taken for both."""
+        """P(success), (B,), of the same batches, or of single frames, which stand for both."""
         success, _ = self.logits(*self._frames(batch))
         return torch.sigmoid(success)
 

@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Builds what imagines for a run, and the learner of its world model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from accerl_lerobot.engine.config import DatasetConfig, RunConfig, journal_folder
+from accerl_lerobot.engine.preflight import policy_to_be
+from accerl_lerobot.envs import make_world
+from accerl_lerobot.envs.base import WorldSpec
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import Segment
+from accerl_lerobot.policies.loading import load_lerobot_config
+from accerl_lerobot.world_model.config import VIDEOS, OnlineLearnConfig
+from accerl_lerobot.world_model.data import Episode, fingerprint, load_episodes
+from accerl_lerobot.world_model.imagination.guard import worker_config
+from accerl_lerobot.world_model.imagination.recorder import FOLDER, Recorder
+from accerl_lerobot.world_model.imagination.registry import (
+    ImaginationModels,
+    check_fit,
+    learned_part,
+    make_models,
+)
+from accerl_lerobot.world_model.imagination.rollouts import Imagination, RolloutSettings
+from accerl_lerobot.world_model.learning.online import OnlineLearner
+from accerl_lerobot.world_model.model.contract import WorldModelSpec
+from accerl_lerobot.world_model.model.store import OWN_RUN, Source, find_source, load_sources
+from accerl_lerobot.world_model.validation.evaluate import (
+    DATASET,
+    ONLINE,
+    check_disjoint,
+    name_section,
+    open_datasets,
+)
+from accerl_lerobot.world_model.validation.validate import ValidationVideos
+
+EARLIER = "earlier"
+"""`Episode.source` of the pre-training episodes."""
+
+
+def make_imagination(
+    config: RunConfig, name: str, on_segment: Callable[[Segment], object], index: int = 0
+) -> Imagination:
+    """Builds the imagination of a run, or of one of its workers.
+
+    Args:
+        config: of the run; its ``policy.path`` must be set.
+        name: prefix of the segments' keys.
+        on_segment: receives the imagined segments.
+        index: of `ImaginationConfig.workers`.
+
+    Raises:
+        InputError: the world model cannot be loaded, or does not fit environment and policy.
+    """
+    world = _world_spec(config)
+    models = load_models(config, world)
+    folder = journal_folder(config)
+    if config.imagination.record and folder is not None and index == 0:
+        pace = world.fps / models.model.spec.chunk
+        on_segment = _recorded(Recorder(folder / FOLDER, config.imagination.record, pace), on_segment)
+    run = RolloutSettings(
+        decision_cost=config.rollout.decision_cost,
+        time_limit_fails=config.rollout.time_limit == "fail",
+        seed=config.seed,
+        name=name,
+    )
+    sources = _sources(config, models.model.spec) if index == 0 else ()
+    part = worker_config(config.imagination, index)
+    return Imagination(models, world, part, run, on_segment, index=index, sources=sources)
+
+
+def _sources(config: RunConfig, spec: WorldModelSpec) -> list[Source]:
+    """Datasets that a world model is trained on in the run, beside the run's own episodes."""
+    if not config.imagination.learns:
+        return []
+    sources = list(load_sources(Path(str(config.imagination.path)), "imagination"))
+    sections = _dataset_sections(config.imagination.learn)
+    for section, meta in open_datasets(sections, spec).items():
+        if find_source(sources, known := fingerprint(meta)) is None:  # then it trains on all of it
+            every = tuple(range(meta.total_episodes))
+            name = sections[section].repo_id or ""
+            sources.append(Source(repo_id=name, fingerprint=known, learnt=every, held_out=()))
+    return [*sources, OWN_RUN]
+
+
+def _recorded(recorder: Recorder, on_segment: Callable[[Segment], object]) -> Callable[[Segment], object]:
+    def record(segment: Segment) -> None:
+        recorder.write(segment)
+        on_segment(segment)
+
+    return record
+
+
+def load_models(config: RunConfig, world: WorldSpec) -> ImaginationModels:
+    """Loads a run's world model; its ``policy.path`` must be set.
+
+    Raises:
+        InputError: see `make_imagination`.
+    """
+    policy = load_lerobot_config(config.policy)
+    executed = getattr(policy, "n_action_steps", 1)
+    return _models(config, world, executed, policy.n_obs_steps)
+
+
+def make_learner(config: RunConfig, models: ImaginationModels | None = None) -> OnlineLearner:
+    """Builds the learner of a run's world model, which starts at `models`; None: at the saved ones.
+
+    Raises:
+        InputError: a dataset of its pre-training cannot be read, does not fit, or is named twice.
+    """
+    learn = config.imagination.learn
+    world = _world_spec(config)
+    models = models or load_models(config, world)
+    model, success = learned_part(models.model), models.success
+    longest = _longest(world, model.spec.chunk)
+    assert success is not None  # as `check_imagination` has found
+    sources = load_sources(Path(str(config.imagination.path)), "imagination")
+    offline: list[Episode] = []
+    held_out: list[Episode] = []
+    sections = _dataset_sections(learn)
+    for section, meta in open_datasets(sections, model.spec).items():
+        with name_section(section):
+            # Not ``online``, even if a policy recorded them: in validation this run's own failures count.
+            episodes = load_episodes(sections[section], model.spec, EARLIER, both=False)
+            check_disjoint(sections[section], episodes, offline + held_out)
+        source = find_source(sources, fingerprint(meta))
+        offline += episodes if source is None else [episodes[i] for i in source.learnt]
+        held_out += [] if source is None else [episodes[i] for i in source.held_out]
+    return OnlineLearner(
+        model,
+        success,
+        learn,
+        replace(learn.validation, depth=min(learn.validation.depth, longest)),
+        offline=offline,
+        held_out=held_out,
+        longest=longest,
+        threshold=config.imagination.threshold,
+        seed=config.seed,
+        on_validation=_videos(config),
+    )
+
+
+def check_imagination(config: RunConfig) -> None:
+    """Refuses, before a run begins, what `make_imagination` would refuse in the middle of it.
+
+    Raises:
+        InputError: see there.
+    """
+    policy = policy_to_be(config)
+    executed = getattr(policy, "n_action_steps", 1)
+    models = _models(config, _world_spec(config), executed, policy.n_obs_steps, first=True)
+    if config.imagination.learns:
+        open_datasets(_dataset_sections(config.imagination.learn), models.model.spec)
+
+
+def _dataset_sections(learn: OnlineLearnConfig) -> dict[str, DatasetConfig]:
+    """The datasets that are named, by their config section."""
+    sections = {DATASET: learn.dataset, ONLINE: learn.online}
+    return {f"imagination.learn.{name}": of for name, of in sections.items() if of.repo_id is not None}
+
+
+def _videos(config: RunConfig) -> ValidationVideos | None:
+    """Videos into the run's folder, if that is known and they are wanted."""
+    folder, every = journal_folder(config), config.imagination.learn.videos
+    return None if folder is None or not every else ValidationVideos(folder / VIDEOS, every)
+
+
+def _longest(world: WorldSpec, chunk: int) -> int:
+    """Decisions of a rollout at most."""
+    return math.ceil(world.max_steps / chunk)
+
+
+def _world_spec(config: RunConfig) -> WorldSpec:
+    world = make_world(config.env)
+    try:
+        return world.spec
+    finally:
+        world.close()
+
+
+def _models(
+    config: RunConfig, world: WorldSpec, executed: int, history: int, *, first: bool = False
+) -> ImaginationModels:
+    """Loads and checks the models; `first`: see `make_models`."""
+    if (reward := getattr(config.env, "reward", "success")) != "success":
+        remedy = "use success with imagination.share: that is what imagined rollouts are rewarded for"
+        raise InputError("env.reward", reward, remedy)
+    if not getattr(config.env, "terminate_on_success", True):
+        remedy = "use true with imagination.share: imagined rollouts end with a success, real ones must too"
+        raise InputError("env.terminate_on_success", False, remedy)
+    models = make_models(config.imagination, config.env, world, executed, config.policy.device, first=first)
+    if config.imagination.learns and models.success is None:
+        remedy = "it has no success model to train on; use imagination.learn.steps_per_episode=0"
+        raise InputError("imagination.path", config.imagination.path, remedy)
+    check_fit(models.model.spec, world, executed, history, models.success is not None)
+    config.imagination.replay.check(
+        batch_decisions=config.trainer.batch_decisions,
+        segment_decisions=_longest(world, executed),
+        field="imagination.replay",
+    )
+    return models

@@ -1,0 +1,360 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training of a world model on the policy's episodes during a run.
+
+The loss is that of the pre-training. Batches are of real windows only: some from the pre-training data, the
+others from the policy's episodes, the newest and the failed ones more often, as demonstrations do not show
+how the policy fails. Some episodes are held out, and a model is used only once it has passed validation on
+them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from accerl_lerobot.experience import REAL, Segment
+from accerl_lerobot.world_model.config import (
+    LearnConfig,
+    OnlineLearnConfig,
+    SuccessLearnConfig,
+    ValidationConfig,
+)
+from accerl_lerobot.world_model.data import Episode, WindowStart, executed_actions, model_arrays
+from accerl_lerobot.world_model.learning.learners import Examples, Learner, SuccessLearner
+from accerl_lerobot.world_model.model.contract import LearnableWorldModel, WorldModelSpec
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+from accerl_lerobot.world_model.validation.rollout_eval import (
+    Scores,
+    choose_threshold,
+    concatenate,
+    score_episodes,
+)
+from accerl_lerobot.world_model.validation.validate import fit_uncertainty_scale, validate
+
+MAX_VALIDATION_S = 3600.0
+"""A validation in progress counts as progress of the run for so long, see `launch`."""
+ENDLESS = 10**9
+"""Steps of a learning rate that never falls."""
+_COUNTS = ("pending_steps", "promoted", "rejected", "result", "_ended", "_since", "_final_validations")
+
+OnValidation = Callable[[LearnableWorldModel, SuccessPairsRewardModel, Episode, int, bool], object]
+"""Receives both models, the newest held-out episode, the validation's number, and True if it passed."""
+
+
+def episode_from_segments(segments: Sequence[Segment], spec: WorldModelSpec) -> Episode:
+    """Joins the segments of a whole episode, in order; it has a frame per decision."""
+    arrays = [model_arrays(segment.observations, spec) for segment in segments]
+    # A segment's first observation is the last one of the segment before.
+    frames, robot = (
+        np.concatenate([part[i][:-1] for part in arrays[:-1]] + [arrays[-1][i]]) for i in range(2)
+    )
+    steps = np.concatenate([segment.steps for segment in segments])
+    actions = executed_actions(np.concatenate([segment.actions for segment in segments]), steps)
+    return Episode(
+        frames=frames,
+        times=np.concatenate([[0], np.cumsum(steps)]).astype(np.int64),
+        state=robot.astype(np.float32),
+        actions=actions,
+        success_at=len(actions) - 1 if segments[-1].success else -1,
+        task=segments[-1].task,
+        source="online",
+    )
+
+
+class UnfinishedEpisodes:
+    """Segments of episodes that are incomplete so far; the oldest of more than `most` are dropped, such as
+    those of a worker that died."""
+
+    def __init__(self, most: int = 1024) -> None:
+        self._most = most
+        self.parts: OrderedDict[tuple[str, int], dict[int, Segment]] = OrderedDict()
+
+    def add(self, segment: Segment) -> list[Segment] | None:
+        """The whole episode, in order, if it is complete with this segment."""
+        name = segment.origin[:2]
+        parts = self.parts.setdefault(name, {})
+        parts[segment.origin.decision] = segment
+        if len(self.parts) > self._most:
+            self.parts.popitem(last=False)
+        ordered = [parts[at] for at in sorted(parts)]
+        expected = 0
+        for part in ordered:
+            if part.origin.decision != expected:
+                return None
+            expected += len(part)
+        if not (ordered[-1].terminated or ordered[-1].truncated):
+            return None
+        self.parts.pop(name, None)
+        return ordered
+
+
+class Promotion(NamedTuple):
+    """A model that has passed validation, on the CPU."""
+
+    model: LearnableWorldModel
+    success: SuccessPairsRewardModel
+    version: int
+    """Gradient steps in the run."""
+    result: dict[str, Any]
+    """See `validate`."""
+
+
+class OnlineLearner:
+    """Trains as real segments come in.
+
+    Example:
+        >>> learner.add(segment)
+        >>> while learner.pending_steps >= 1:
+        ...     learner.step()
+        >>> if learner.validation_due(last=False) and (promotion := learner.promote(last=False)):
+        ...     imagination.swap(promotion)
+
+    Args:
+        model: start of the training; not changed.
+        success: the same.
+        config: of the training.
+        validation: what a model must pass.
+        offline: episodes of the pre-training.
+        held_out: episodes held out in the pre-training.
+        longest: chunks of a rollout at most.
+        threshold: of the success model; None: it is chosen on the policy's episodes.
+        seed: of everything random.
+        on_validation: see there.
+    """
+
+    def __init__(
+        self,
+        model: LearnableWorldModel,
+        success: SuccessPairsRewardModel,
+        config: OnlineLearnConfig,
+        validation: ValidationConfig,
+        *,
+        offline: Sequence[Episode] = (),
+        held_out: Sequence[Episode] = (),
+        longest: int = 15,
+        threshold: float | None = None,
+        seed: int = 0,
+        on_validation: OnValidation | None = None,
+    ) -> None:
+        self.config, self.validation, self._threshold = config, validation, threshold
+        self._on_validation = on_validation
+        self.pending_steps = 0.0
+        """Gradient steps that are due."""
+        self.promoted = self.rejected = 0
+        self._seed = seed
+        self.result: dict[str, Any] = {}
+        """Result of the last validation."""
+        learn = LearnConfig(steps=ENDLESS, batch=config.batch, lr=config.lr, anchors=longest)
+        self._learner = Learner(_trainable(model), learn, seed)
+        success_learn = SuccessLearnConfig(steps=ENDLESS, lr=config.lr, depth=longest)
+        self._success = SuccessLearner(_trainable(success), success_learn, seed)
+        self._offline, self._held_offline = list(offline), list(held_out)
+        self._learnt: deque[Episode] = deque(maxlen=config.memory)
+        self._held: deque[Episode] = deque(maxlen=max(1, round(config.memory * config.held_out)))
+        self._rng = np.random.default_rng((seed, 4))
+        self._unfinished = UnfinishedEpisodes()
+        self._examples: Examples | None = None
+        self._examples_stale = True
+        self._ended = self._since = self._final_validations = 0
+        self._unserved: dict[str, Any] = {}
+        """Counts before the validation whose outcome has not been served yet."""
+        self._validating: float | None = None
+        """Start of the validation in progress; read on another thread."""
+
+    @property
+    def version(self) -> int:
+        """Gradient steps made."""
+        return self._learner.count
+
+    def validation_due(self, last: bool) -> bool:
+        """True if the model is to be validated; `last`: no real episode will come any more."""
+        if not self.version or (last and self.pending_steps >= 1):
+            return False
+        if not last:
+            return self._since >= self.config.validate_every
+        left = self._final_validations < self.config.final_validations
+        return (self._since > 0 or not self.promoted) and left
+
+    def may_promote(self, last: bool) -> bool:
+        """True if another version may be promoted; see `validation_due`."""
+        return not last or self.pending_steps >= 1 or self.validation_due(last)
+
+    def add(self, segment: Segment) -> None:
+        """Takes a real segment; some of the episodes that it completes are held out.
+
+        Raises:
+            ValueError: it was imagined: a world model must not train on its own predictions.
+        """
+        if segment.source != REAL:
+            raise ValueError(f"a world model trains on real segments, and {segment.key} is {segment.source}")
+        parts = self._unfinished.add(segment)
+        if parts is None:
+            return
+        episode = episode_from_segments(parts, self._learner.model.spec)
+        if parts[-1].success and not parts[-1].terminated:
+            return  # the step of its success is unknown
+        share = self.config.held_out
+        before, self._ended = self._ended, self._ended + 1
+        held = int(self._ended * share) > int(before * share)
+        (self._held if held else self._learnt).append(episode)
+        self._examples, self._examples_stale = None, True
+        self._since += 1
+        # Bounded, where episodes come faster than it can train.
+        most = max(1.0, self.config.validate_every * self.config.steps_per_episode)
+        self.pending_steps = min(self.pending_steps + self.config.steps_per_episode, most)
+
+    def step(self) -> dict[str, float]:
+        """Makes one gradient step of either model, if there are episodes."""
+        self.pending_steps -= 1
+        if not self._learnt and not self._offline:
+            return {}
+        episodes = self._offline + list(self._learnt)
+        metrics = self._learner.step(self._learner.windows(episodes, self._draw()))
+        if self._examples is None and self._examples_stale:
+            self._examples_stale = False
+            with contextlib.suppress(ValueError):  # so far there may be only one kind of outcome
+                self._examples = Examples(episodes, self._learner.model.spec.chunk)
+        if self._examples is not None:
+            success = self._success.step(self._examples, self._learner.serving)
+            metrics |= {f"success_{k}": v for k, v in success.items()}
+        return metrics
+
+    def promote(self, last: bool) -> Promotion | None:
+        """Validates a copy of the present model; None if it fails, and the one before stays in use.
+
+        If it fails when `last`, more gradient steps become due all the same.
+        """
+        self._validating = time.monotonic()
+        try:
+            return self._promote(last)
+        finally:
+            self._validating = None
+
+    def mark_served(self) -> None:
+        """Notes that the last promoted model is in use."""
+        self._unserved = {}
+
+    def _promote(self, last: bool) -> Promotion | None:
+        self._unserved = {name: getattr(self, name) for name in _COUNTS}
+        self._since = 0
+        self._final_validations += last
+        held = [*self._held_offline, *self._held]
+        if not held:
+            self._unserved = {}
+            return None
+        model = copy.deepcopy(self._learner.serving)
+        success = copy.deepcopy(self._success.model).eval().requires_grad_(False)
+        known = [*self._offline, *self._learnt][-100:]
+        fit_uncertainty_scale(model, known, self.validation, self._seed)
+        # A dozen held-out episodes are too few to choose a threshold. It is chosen on training episodes,
+        # validated on the others, and chosen again on both for use.
+        learnt = self._scores(model, success, list(self._learnt)[-self.validation.max_windows :])
+        self._set_threshold(success, learnt)
+        result = self.result = validate(model, held, self.validation, success, self._seed)
+        if self._on_validation is not None:
+            number = self.promoted + self.rejected + 1
+            self._on_validation(model, success, held[-1], number, result["passed"])
+        if not result["passed"]:
+            self.rejected += 1
+            if last and self._final_validations < self.config.final_validations:
+                self.pending_steps += self.config.validate_every * self.config.steps_per_episode
+            self._unserved = {}
+            return None
+        self.promoted += 1
+        self._set_threshold(success, learnt + self._scores(model, success, list(self._held)))
+        return Promotion(model.cpu(), success.cpu(), self.version, result)
+
+    def _scores(
+        self, model: LearnableWorldModel, success: SuccessPairsRewardModel, episodes: list[Episode]
+    ) -> list[Scores]:
+        if not episodes or self._threshold is not None:
+            return []
+        return [score_episodes(model, success, episodes, self.validation, self._seed)]
+
+    def _set_threshold(self, success: SuccessPairsRewardModel, parts: list[Scores]) -> None:
+        """Chooses it on the policy's own episodes; without a failure among them it stays."""
+        if self._threshold is not None:
+            success.config.threshold = self._threshold
+        elif parts:
+            scores = concatenate(*parts)
+            chosen = choose_threshold(scores, np.ones(len(scores.achieved), bool), self.validation)
+            success.config.threshold = chosen or success.config.threshold
+
+    def state(self) -> dict[str, Any]:
+        """Copies all that `restore` needs; see `snapshot`.
+
+        A validation that is in progress, or whose outcome has not been served, will be repeated.
+        """
+        unfinished = {name: dict(parts) for name, parts in self._unfinished.parts.items()}
+        return (
+            {name: getattr(self, name) for name in _COUNTS}
+            | self._unserved
+            | {
+                "learner": self._learner.state(),
+                "success": self._success.state(),
+                "learnt": list(self._learnt),
+                "held": list(self._held),
+                "rng": copy.deepcopy(self._rng),
+                "unfinished": unfinished,
+            }
+        )
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continues from a `state`."""
+        for name in _COUNTS:
+            setattr(self, name, state[name])
+        self._learner.restore(state["learner"])
+        self._success.restore(state["success"])
+        self._learnt.extend(state["learnt"])
+        self._held.extend(state["held"])
+        self._rng = state["rng"]
+        self._unfinished.parts.update(state["unfinished"])
+
+    def metrics(self) -> dict[str, float]:
+        """Counts of training and validations, and the checks of the last one."""
+        started = self._validating
+        seconds = 0.0 if started is None else min(MAX_VALIDATION_S, time.monotonic() - started)
+        return {
+            "learn_steps": float(self.version),
+            "learn_episodes": float(len(self._learnt)),
+            "promoted": float(self.promoted),
+            "rejected": float(self.rejected),
+            "validation_s": seconds,
+        } | {f"check_{name}": float(check["value"]) for name, check in self.result.get("checks", {}).items()}
+
+    def _draw(self) -> list[WindowStart]:
+        """Draws a batch from the pre-training episodes, which have the first indices, and the policy's."""
+        count, known = self.config.batch, len(self._offline)
+        share = self.config.offline if self._learnt else 1.0
+        offline = round(share * count) if known else 0
+        chosen = self._rng.integers(known, size=offline).tolist() if offline else []
+        if count > offline:
+            weights = episode_weights([e.success for e in self._learnt], self.config)
+            chosen += (known + self._rng.choice(len(weights), size=count - offline, p=weights)).tolist()
+        episodes = self._offline + list(self._learnt)
+        return [WindowStart(e, int(self._rng.integers(len(episodes[e].frames) - 1))) for e in chosen]
+
+
+def episode_weights(successes: Sequence[bool], config: OnlineLearnConfig) -> np.ndarray:
+    """Probability of drawing each of the policy's episodes, oldest first."""
+    count = len(successes)
+    newest = np.arange(count) >= count - max(1, count // 4)
+    weights = np.where(newest, config.recent / newest.sum(), 0.0)
+    old = ~newest
+    weights[old] += (1 - config.recent) / max(1, old.sum())
+    failed = ~np.asarray(successes, bool)
+    if failed.any() and not failed.all():
+        for which, share in ((failed, config.failures), (~failed, 1 - config.failures)):
+            weights[which] *= share / weights[which].sum() if weights[which].sum() else 0.0
+    total = weights.sum()
+    return np.asarray(weights / total if total else np.full(count, 1 / count))
+
+
+def _trainable(model: Any) -> Any:
+    return copy.deepcopy(model).requires_grad_(True)

@@ -1,0 +1,274 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Validation of a world model on held-out episodes, and videos of it.
+
+From each window some chunks are predicted with the executed actions, with another episode's, and with none. A
+model must be better than a copy of the last frame where something moves, and worse with wrong actions; and
+whole imagined rollouts must end as the real episodes did, see `rollout_eval.py`.
+
+Predictions are of whole chunks. Where an episode ended within one, its last action is held.
+
+Depths are counted in chunks, from 1. Shapes: M windows, D depths; see `data.py` for the others.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from accerl_lerobot.evaluation.pictures import captioned, write_video
+from accerl_lerobot.world_model.config import ValidationConfig
+from accerl_lerobot.world_model.data import (
+    Episode,
+    Windows,
+    WindowStart,
+    cut_windows,
+    hold_last_action,
+    longest_rollout,
+)
+from accerl_lerobot.world_model.model.contract import LearnableWorldModel, WorldModel
+from accerl_lerobot.world_model.model.external_reward_model import SuccessModel, probabilities
+from accerl_lerobot.world_model.validation import metrics
+from accerl_lerobot.world_model.validation.rollout_eval import (
+    Predictions,
+    choose_threshold,
+    outcome_metrics,
+    predict,
+    replay,
+    score_episodes,
+    spaced_frames,
+    subsample,
+)
+
+ARMS = ("true", "shuffled", "zero")
+"""Actions that are predicted with: the executed ones, another episode's, none."""
+PREVIEW_ROWS = 4
+SCALE = 3
+"""Enlargement of videos."""
+FPS = 4
+"""Chunks per second of video."""
+
+
+def validation_windows(
+    episodes: Sequence[Episode], model: WorldModel, config: ValidationConfig, seed: int
+) -> Windows:
+    """Windows of D chunks every `stride` env steps; chunks beyond an episode's end are not valid, but filled
+    up with its last action."""
+    starts = [
+        WindowStart(e, f)
+        for e, episode in enumerate(episodes)
+        for f in spaced_frames(episode.times, config.stride)
+    ]
+    at = subsample(episodes, starts, config.max_windows, np.random.default_rng(seed))
+    spec = model.spec
+    windows = cut_windows(episodes, at, chunk=spec.chunk, context=spec.context, chunks=config.depth)
+    return replace(windows, actions=hold_last_action(windows.actions, windows.steps))
+
+
+def arm_actions(windows: Windows, arm: str, rng: np.random.Generator) -> np.ndarray:
+    """(M, D, K, A), the actions of one of `ARMS`."""
+    actions = windows.actions
+    if arm == "shuffled":
+        return actions[metrics.shuffle_across_groups(len(windows), windows.episode.tolist(), rng)]
+    return {"true": actions, "zero": np.zeros_like(actions)}[arm]
+
+
+def fit_uncertainty_scale(
+    model: LearnableWorldModel, episodes: Sequence[Episode], config: ValidationConfig, seed: int
+) -> None:
+    """Scales the uncertainty so that 1 is the 95th percentile after one whole chunk of these episodes."""
+    windows = validation_windows(episodes, model, config, seed + 1)
+    uncertainty = predict(model, windows, windows.actions[:, :1]).uncertainty[:, 0]
+    uncertainty = uncertainty[windows.steps[:, 0] == model.spec.chunk]
+    usual = float(np.quantile(uncertainty, 0.95)) if len(uncertainty) else math.nan
+    if math.isfinite(usual):  # a model without a state has no uncertainty
+        model.uncertainty_scale.mul_(max(usual, 1e-6))
+
+
+def validate(
+    model: WorldModel,
+    episodes: Sequence[Episode],
+    config: ValidationConfig,
+    success: SuccessModel | None = None,
+    seed: int = 0,
+    fresh: bool = False,
+) -> dict[str, Any]:
+    """Validates a model.
+
+    Args:
+        model: in eval mode.
+        episodes: not trained on.
+        config: data and checks.
+        success: None: outcomes are not checked.
+        seed: of windows and shuffles.
+        fresh: the success model is new: its threshold is chosen on these episodes.
+
+    Returns:
+        ``depths``: a row per depth with estimates of skill and sensitivity, and errors of pixels and state;
+        with a success model its ``threshold``, and ``outcomes``, see `outcome_metrics`; ``checks``: each with
+        its value and whether it holds; ``passed``; numbers of ``windows`` and ``episodes``.
+    """
+    rng = np.random.default_rng((seed, 1))
+    ended: dict[str, Any] = {}
+    if success is not None:
+        scores = score_episodes(model, success, episodes, config, seed)
+        own = np.array([episodes[e].source == "online" for e in scores.episode])
+        if fresh:
+            success.config.threshold = choose_threshold(scores, own, config) or 0.5
+        threshold = success.config.threshold
+        ended["outcomes"] = outcome_metrics(scores, own, config, None if fresh else threshold)
+        ended["threshold"] = threshold
+    windows = validation_windows(episodes, model, config, seed)
+    arms = {arm: predict(model, windows, arm_actions(windows, arm, rng)) for arm in ARMS}
+    context = model.spec.context
+    newest = windows.frames[:, context - 1]
+    rows = []
+    # A chunk cut short by the episode's end is not the one that was predicted, nor are those after it.
+    whole = np.cumprod(windows.steps == model.spec.chunk, axis=1).astype(bool)
+    for d in range(config.depth):
+        fits = whole[:, d]
+        row: dict[str, Any] = {"depth": d + 1, "windows": int(fits.sum())}
+        if fits.sum() >= 2:
+            row |= _frame_metrics(arms, newest[fits], windows.frames[fits, context + d], fits, d, windows)
+            robots = arms["true"].robot[fits, d]
+            if robots.shape[1]:
+                real = windows.state[fits, context + d]
+                row["state_error"] = float(np.abs(robots - real).mean())
+                row["state_error_copy"] = float(np.abs(windows.state[fits, context - 1] - real).mean())
+            row["uncertainty"] = float(arms["true"].uncertainty[fits, d].mean())
+        rows.append(row)
+    checks = _checks(rows, config, ended.get("outcomes"))
+    return ended | {
+        "windows": len(windows),
+        "episodes": len(np.unique(windows.episode)),
+        "depths": rows,
+        "checks": checks,
+        "passed": all(check["holds"] for check in checks.values()),
+    }
+
+
+def _frame_metrics(
+    arms: dict[str, Predictions],
+    newest: np.ndarray,
+    real: np.ndarray,
+    fits: np.ndarray,
+    d: int,
+    windows: Windows,
+) -> dict[str, Any]:
+    groups, moved = windows.episode[fits], metrics.changed(newest, real)
+    errors = {arm: metrics.squared_errors(of.frames[fits, d], real) for arm, of in arms.items()}
+    copy = metrics.squared_errors(newest, real)
+    where_moved = metrics.squared_errors(arms["true"].frames[fits, d], real, moved)
+    copy_where_moved = metrics.squared_errors(newest, real, moved)
+    return {
+        "mse": metrics.mean_error(errors["true"]),
+        "mse_copy": metrics.mean_error(copy),
+        "psnr": float(10 * np.log10(255**2 / max(metrics.mean_error(errors["true"]), 1e-9))),
+        "skill": metrics.skill(errors["true"], copy, groups)._asdict(),
+        "skill_changed": metrics.skill(where_moved, copy_where_moved, groups)._asdict(),
+        **{
+            f"sensitivity_{arm}": metrics.sensitivity(errors["true"], errors[arm], groups)._asdict()
+            for arm in ARMS[1:]
+        },
+    }
+
+
+def _checks(
+    rows: list[dict[str, Any]], config: ValidationConfig, outcomes: dict[str, Any] | None
+) -> dict[str, dict[str, Any]]:
+    first, last = rows[0], rows[-1]
+
+    def at(row: dict[str, Any], key: str, part: str = "value") -> float:
+        return float(row[key][part]) if key in row else float("nan")
+
+    bounds = {
+        "skill_changed_first": (at(first, "skill_changed"), "above", config.skill_first),
+        "skill_changed_last": (at(last, "skill_changed"), "above", config.skill_last),
+        "skill_last": (at(last, "skill"), "above", config.skill_last),
+        "sensitivity_low": (at(first, "sensitivity_shuffled", "low"), "above", config.sensitivity),
+    }
+    if outcomes is not None:
+        bounds["auroc"] = (float(outcomes["auroc"]["low"]), "above", config.auroc)
+        for name in ("false_success", "false_success_idle"):
+            bounds[name] = (outcomes[name], "at most", config.false_success)
+        bounds["recall"] = (outcomes["recall"], "above", config.recall)
+    # NaN passes nothing.
+    return {
+        name: {
+            "value": value,
+            "wanted": f"{how} {bound}",
+            "holds": bool(value > bound if how == "above" else value <= bound),
+        }
+        for name, (value, how, bound) in bounds.items()
+    }
+
+
+# Videos.
+
+
+def preview_video(
+    path: Path, model: WorldModel, episodes: Sequence[Episode], config: ValidationConfig, seed: int
+) -> None:
+    """Real frames, predicted ones, and those predicted with another episode's actions, one row each."""
+    windows = validation_windows(episodes, model, config, seed)
+    rng = np.random.default_rng((seed, 3))
+    rows = sorted(rng.choice(len(windows), min(PREVIEW_ROWS, len(windows)), replace=False).tolist())
+    chosen, context = windows.rows(rows), model.spec.context
+    lines = [chosen.frames[:, context - 1 :]]
+    for arm in ("true", "shuffled"):
+        frames = predict(model, chosen, arm_actions(windows, arm, rng)[rows]).frames
+        lines.append(np.concatenate([chosen.frames[:, context - 1 : context], frames], 1))
+    write_video(path, [[list(_enlarge(clip)) for clip in line] for line in lines], fps=FPS)
+
+
+def comparison_video(
+    path: Path, model: WorldModel, success: SuccessModel | None, episode: Episode, scale: int = SCALE
+) -> None:
+    """An episode above its replay in the model, from beginning to end; the file appears when it is complete.
+
+    The frame at the end has the colour of the outcome: green for a success, red for a failure. The replay
+    counts as a success if any chunk does; without a success model none does.
+    """
+    depth = longest_rollout([episode], model.spec.chunk)
+    replayed = replay(model, [episode], [WindowStart(0, 0)], depth)
+    count = int(replayed.executed.sum())
+    imagined = np.concatenate([replayed.newest, replayed.predictions.frames[0, :count]])
+    real = replayed.windows.frames[0, model.spec.context - 1 :][: count + 1]
+    achieved = success is not None and bool(
+        (probabilities(success, imagined[:-1], imagined[1:]) > success.config.threshold).any()
+    )
+    rows = [
+        [captioned(list(_enlarge(frames, scale)), name, outcome)]
+        for frames, name, outcome in ((real, "real", episode.success), (imagined, "imagined", achieved))
+    ]
+    part = path.with_name(f".{path.name}")
+    write_video(part, rows, fps=FPS)
+    os.replace(part, path)
+
+
+class ValidationVideos:
+    """A comparison video after every so many validations of a run; the folder is made with the first."""
+
+    def __init__(self, folder: Path, every: int) -> None:
+        self.folder, self.every = folder, every
+
+    def __call__(
+        self, model: WorldModel, success: SuccessModel, episode: Episode, number: int, passed: bool
+    ) -> None:
+        """Called after the validation of this number, counted from 1, with a held-out episode."""
+        if (number - 1) % self.every:
+            return
+        self.folder.mkdir(exist_ok=True)
+        name = f"{number:04d}_{'passed' if passed else 'failed'}.mp4"
+        comparison_video(self.folder / name, model, success, episode)
+
+
+def _enlarge(frames: np.ndarray, scale: int = SCALE) -> np.ndarray:
+    """(D, V, H, W, 3) as (D, scale·H, V·scale·W, 3): cameras beside each other."""
+    cameras = np.concatenate(list(frames.transpose(1, 0, 2, 3, 4)), axis=2)
+    return cameras.repeat(scale, 1).repeat(scale, 2)

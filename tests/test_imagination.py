@@ -1,0 +1,395 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs in which the policy learns from rollouts too, through either engine."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from accerl_lerobot import cli
+from accerl_lerobot.checkpoint import snapshot
+from accerl_lerobot.checkpoint.layout import TRAINING_STATE
+from accerl_lerobot.console import Console
+from accerl_lerobot.demos.dataset_files import open_metadata
+from accerl_lerobot.engine.config import DatasetConfig, RunConfig
+from accerl_lerobot.engine.contract import Progress
+from accerl_lerobot.engine.imagination_workers import ImaginationWorker, WorldLearningWorker
+from accerl_lerobot.engine.local import LocalEngine
+from accerl_lerobot.engine.run import train
+from accerl_lerobot.envs import SimulatedConfig, make_world
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import IMAGINED, REAL, Segment
+from accerl_lerobot.policies.features import check_features, dataset_features, env_features
+from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.timeline.read import shares
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.world_model.config import (
+    GuardConfig,
+    ImaginationConfig,
+    NetworkConfig,
+    OnlineLearnConfig,
+    PixelModelConfig,
+    ValidationConfig,
+    WorldModelConfig,
+)
+from accerl_lerobot.world_model.imagination.recorder import FOLDER, read_imagined, write_dataset
+from accerl_lerobot.world_model.learning.learners import new_success_model
+from accerl_lerobot.world_model.learning.pretrain import world_spec
+from accerl_lerobot.world_model.model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.model.store import save_world_model
+from tests.runs import drive, polls, tiny_run
+
+# About half of all episodes succeed when it is acted at random.
+ENV = SimulatedConfig(max_steps=16, hold=8, tolerance=0.45)
+LOOSE = ValidationConfig(
+    skill_first=-1e9,
+    skill_last=-1e9,
+    sensitivity=0.0,
+    auroc=-1.0,
+    false_success=1.0,
+    recall=-1.0,
+    stride=4,
+    max_windows=40,
+)
+IMAGINED_REPLAY = ReplayConfig(capacity=64, min_decisions=1, ahead=16, samples_per_insert=1.0)
+
+
+@pytest.fixture(scope="module")
+def world_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A new one, which has learnt nothing."""
+    torch.manual_seed(0)
+    config = PixelModelConfig(network=NetworkConfig(channels=(8, 8), condition=8, planes=2))
+    spec = world_spec(WorldModelConfig(chunk=4, image_size=32, model=config), ENV)
+    folder = tmp_path_factory.mktemp("world") / "world_model"
+    save_world_model(folder, PixelWorldModel(spec, config), new_success_model(4))
+    return folder
+
+
+def imagining(
+    checkpoint: Path, *, episodes: int = 6, sections: dict[str, Any] | None = None, **config: Any
+) -> RunConfig:
+    watched = {k: config.pop(k) for k in ("window", "min_real_episodes", "max_gap") if k in config}
+    guard = GuardConfig(**({"window": 10_000} | watched))
+    fields: dict[str, Any] = {"share": 0.5, "rollouts": 4, "replay": IMAGINED_REPLAY, "guard": guard}
+    return tiny_run(
+        checkpoint,
+        env=ENV,
+        imagination=ImaginationConfig(**(fields | config)),
+        rollout=RolloutConfig(worlds=4, segment_length=4, episodes=episodes, time_limit="fail"),
+        trainer=TrainerConfig(updates=12, batch_decisions=16, warmup_updates=2, value_warmup_updates=2),
+        **(sections or {}),
+    )
+
+
+def run_locally(config: RunConfig) -> tuple[list[Progress], list[list[Segment]], LocalEngine]:
+    """A run in one process: what was reported, the batches that were learnt from, and the engine."""
+    engine = LocalEngine(config, ("match",))
+    batches: list[list[Segment]] = []
+    step = engine._update.step
+    engine._update.step = lambda segments: batches.append(segments) or step(segments)  # type: ignore
+    engine.train()
+    history = drive(engine)
+    engine.close()
+    return history, batches, engine
+
+
+def decisions(segments: list[Segment], source: str) -> int:
+    return sum(len(s) for s in segments if s.source == source)
+
+
+def test_half_of_what_is_learned_from_is_imagined(tiny_checkpoint: Path):
+    history, batches, _ = run_locally(imagining(tiny_checkpoint, model="oracle", episodes=0))
+    assert len(batches) == 12
+    for batch in batches:
+        assert 8 <= decisions(batch, REAL) < 8 + 4 and 8 <= decisions(batch, IMAGINED) < 8 + 4
+        for segment in batch:
+            imagined = segment.source == IMAGINED
+            assert segment.key.startswith("imagination." if imagined else "local.")
+            assert (segment.world_version is not None) is imagined
+    assert history[-1].imagination["rollouts"] > 20 and history[-1].imagination["on"] == 1
+
+
+def test_when_the_real_episodes_have_been_played_imagination_goes_on(tiny_checkpoint: Path):
+    history, batches, engine = run_locally(imagining(tiny_checkpoint, model="oracle"))
+    explored = [e for p in history for e in p.episodes if e.plan.explore]
+    assert len(explored) == 6 and history[-1].rollout["episodes"] == 6
+    real = [decisions(b, REAL) for b in batches]
+    assert len(batches) == 12 and real[-1] == 0 and real[0] >= 8
+    assert all(len(b) and decisions(b, REAL) + decisions(b, IMAGINED) >= 16 for b in batches)
+    books = history[-1].replay
+    assert books["trained_decisions"] == sum(real)
+    assert books["imagined_trained_decisions"] == sum(decisions(b, IMAGINED) for b in batches)
+    assert real and sum(real) <= 2 * books["inserted_decisions"], "as often as samples_per_insert says"
+    assert engine._replay.real_ended
+
+
+def test_without_imagination_a_run_ends_when_its_episodes_are_used_up(tiny_checkpoint: Path):
+    config = imagining(tiny_checkpoint, share=0.0)
+    history, batches, _ = run_locally(config)
+    assert history[-1].done and 0 < len(batches) < 12
+    books = history[-1].replay
+    assert books["available_decisions"] < 16 and history[-1].imagination == {}
+
+
+def test_two_runs_are_equal_to_the_last_bit(tiny_checkpoint: Path, world_model: Path):
+    learn = OnlineLearnConfig(
+        steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE, batch=4
+    )
+    config = imagining(tiny_checkpoint, path=str(world_model), learn=learn, episodes=24)
+    runs = [run_locally(config) for _ in range(2)]
+    one, other = ([u for p in history for u in p.updates] for history, _, _ in runs)
+    assert len(one) == 12 and one == other
+    ends = [history[-1].imagination for history, _, _ in runs]
+    assert ends[0] == pytest.approx(ends[1], rel=0, abs=0, nan_ok=True)
+    for key, tensor in runs[0][2]._adapter.export_trainable().items():
+        np.testing.assert_array_equal(tensor, runs[1][2]._adapter.export_trainable()[key])
+
+
+@pytest.mark.parametrize(
+    ("model", "left_at"), [("learned", 0.1), ("learned", 0.6), ("shuffled", 0.8), ("oracle", 0.6)]
+)
+def test_a_run_that_was_left_goes_on_as_if_it_had_not(
+    model: str, left_at: float, tiny_checkpoint: Path, world_model: Path, tmp_path: Path
+):
+    """Rollouts, world model and success model included."""
+    learn = OnlineLearnConfig(
+        steps_per_episode=1.0, validate_every=8, held_out=0.5, validation=LOOSE, batch=4
+    )
+    chosen: dict[str, Any] = {
+        "model": model,
+        "start_at_reset_prob": 0.5,
+        "window": 4,
+        "max_gap": 2.0,
+    }
+    chosen["min_real_episodes"] = 2
+    if model != "oracle":
+        chosen |= {"path": str(world_model), "learn": learn}
+    config = imagining(tiny_checkpoint, episodes=24, **chosen)
+
+    def told(history: list[Progress]) -> list[Any]:
+        return [[u for p in history for u in p.updates], history[-1].rollout, history[-1].replay]
+
+    whole, _, expected = run_locally(config)
+    first = LocalEngine(config, ("match",))
+    first.train()
+    before = [first.poll() for _ in range(round(left_at * len(whole)))]
+    first.save(tmp_path)
+    first.close()
+    again = LocalEngine(config, ("match",), state=tmp_path / "training_state")
+    again.train()
+    after = drive(again)
+    again.close()
+    assert len(whole) == len(before) + len(after) and len(after) > 1 and whole[-1].imagination["rollouts"] > 8
+    assert told(before + after) == told(whole)
+    ends = [history[-1].imagination for history in (whole, after)]
+    assert ends[0] == pytest.approx(ends[1], rel=0, abs=0, nan_ok=True)
+    for key, tensor in expected._adapter.export_trainable().items():
+        np.testing.assert_array_equal(tensor, again._adapter.export_trainable()[key])
+    promoted = before[-1].imagination.get("promoted", 0) > 0
+    assert (tmp_path / "world_model" / "model.safetensors").is_file() is promoted
+
+
+def test_rollouts_of_a_model_that_is_trained_are_compared(tiny_checkpoint: Path, world_model: Path):
+    learn = OnlineLearnConfig(
+        steps_per_episode=1.0, validate_every=8, held_out=0.5, validation=LOOSE, batch=4
+    )
+    config = imagining(
+        tiny_checkpoint, path=str(world_model), learn=learn, episodes=24, start_at_reset_prob=0.5,
+        window=4, min_real_episodes=2, max_gap=2.0,
+    )  # fmt: skip
+    history, batches, engine = run_locally(config)
+    imagined = [s for batch in batches for s in batch if s.source == IMAGINED]
+    assert len(batches) == 12 and imagined
+    # A rollout starts anywhere in the sixteen env steps, and goes on to their end or a success.
+    assert {s.origin.decision + len(s) for s in imagined if not s.success} == {4}
+    assert {s.origin.decision for s in imagined} > {0}
+    assert all(s.terminated for s in imagined)
+    last = history[-1].imagination
+    assert last["promoted"] >= 1 and last["success_real"] == last["success_real"], "not NaN"
+    assert engine._world_learner is not None and engine._world_learner.validation.depth == 4
+
+
+def test_nothing_is_imagined_before_the_model_has_passed(tiny_checkpoint: Path, world_model: Path):
+    learn = OnlineLearnConfig(
+        steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE, batch=4
+    )
+    history, batches, _ = run_locally(
+        imagining(tiny_checkpoint, path=str(world_model), learn=learn, episodes=24)
+    )
+    imagined = [p.imagination["rollouts"] for p in history]
+    passed = [p.imagination["promoted"] for p in history]
+    first = next(i for i, n in enumerate(passed) if n)
+    assert imagined[first - 1] == 0 < imagined[-1]
+    versions = {s.world_version for b in batches for s in b if s.source == IMAGINED}
+    assert versions and 0 not in versions, "the one it began with never imagined"
+    strict = replace(learn, validation=replace(LOOSE, sensitivity=1e9), final_validations=2)
+    history, batches, _ = run_locally(imagining(tiny_checkpoint, path=str(world_model), learn=strict))
+    assert history[-1].imagination["rejected"] >= 2 and history[-1].imagination["rollouts"] == 0
+    assert 0 < len(batches) < 12 and not any(decisions(b, IMAGINED) for b in batches)
+
+
+def test_nothing_moves_in_rollouts_of_a_copy(tiny_checkpoint: Path, world_model: Path):
+    _, batches, _ = run_locally(imagining(tiny_checkpoint, model="copy", path=str(world_model)))
+    imagined = [s for b in batches for s in b if s.source == IMAGINED]
+    assert imagined
+    for segment in imagined:
+        frames = segment.observations["observation.images.front"]
+        assert all(np.array_equal(f, frames[0]) for f in frames)
+
+
+def test_it_runs_asynchronously_with_two_workers(tiny_checkpoint: Path, world_model: Path, tmp_path: Path):
+    from accerl_lerobot.engine.launch import RayEngine
+
+    learn = OnlineLearnConfig(
+        steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE, batch=4
+    )
+    config = imagining(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12, record=3, workers=2)
+    config = replace(config, rollout=replace(config.rollout, workers=2))
+    engine = RayEngine(replace(config, output_dir=str(tmp_path)), ("match",))
+    try:
+        pids = engine.pids()
+        assert {"imagination 0", "imagination 1", "world learning"} < set(pids)
+        engine.train()
+        history: list[Progress] = []
+        for progress in polls(engine):
+            history.append(progress)
+            if progress.imagination.get("rollouts", 0) > 0:
+                os.kill(pids["inference"], signal.SIGKILL)  # rollouts find the next one, too
+                history += drive(engine)
+                break
+        engine.save(tmp_path / "saved")
+    finally:
+        engine.close()
+    last = history[-1]
+    assert last.inference["restarts"] == 1.0
+    assert last.version == 12 == len([u for p in history for u in p.updates])
+    assert sum(e.plan.explore for p in history for e in p.episodes) == 12
+    assert last.imagination["promoted"] >= 1 and last.imagination["rollouts"] > 0
+    assert last.imagination["learn_episodes"] >= 5
+    assert last.replay["imagined_trained_decisions"] > 0 < last.replay["trained_decisions"]
+    assert last.replay["inserted_segments"] >= 12
+    explained = (Path(__file__).parents[1] / "docs" / "metrics.md").read_text()
+    for name in last.imagination:
+        assert f"`imagination_{name}`" in explained or name.startswith("check_"), name
+    films = sorted(p.name for p in (tmp_path / "validation").iterdir())
+    tried = int(last.imagination["promoted"] + last.imagination["rejected"])
+    assert films[0].startswith("0001_") and tried - 1 <= len(films) <= tried + 1
+    spent = shares(tmp_path)
+    assert {"recovery", "compute", "transport", "wait_in"} <= spent["imagination"].keys()
+    assert len(list((tmp_path / "timeline").glob("imagination*"))) == 2
+    saved = [
+        snapshot.load(tmp_path / "saved" / TRAINING_STATE / name)["imagination"]
+        for name in ("imagination", "imagination1")
+    ]
+    assert [len(s["rows"]) for s in saved] == [2, 2] and len({s["version"] for s in saved}) == 1
+    assert sum(s["counters"].decisions for s in saved) >= last.imagination["decisions"]
+    assert all(s["counters"].rollouts for s in saved) and saved[0]["rng"].random() != saved[1]["rng"].random()
+    assert {"recovery", "compute", "transport", "wait_in"} <= spent["world learning"].keys()
+    kept = list(read_imagined(tmp_path / FOLDER))
+    assert len(kept) == 3 and kept[-1].number > 3, "the newest"
+    assert all(rollout.observations.keys() == kept[0].observations.keys() for rollout in kept)
+    assert all(rollout.decisions_per_s == 80 / 4 and 1 <= len(rollout) <= 4 for rollout in kept)
+    write_dataset(kept, tmp_path / "set", "some/rollouts", "simulated", Console())
+    made = dataset_features(open_metadata(DatasetConfig(repo_id="some/rollouts", root=str(tmp_path / "set"))))
+    with pytest.raises(InputError, match=r"its action is \(8,\), but \(2,\) in the environment"):
+        check_features(made, env_features(make_world(ENV).spec), {}, "dataset.repo_id", "some/rollouts")
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "what"),
+    [
+        (ImaginationWorker, "_imagining", "imagination step"),
+        (WorldLearningWorker, "_learning", "step of learning"),
+    ],
+)
+def test_one_that_hangs_is_found_when_it_is_saved(kind: type, name: str, what: str, tmp_path: Path):
+    """And not after the minutes that large files may take; `benchmarks.faults` does it to a whole run."""
+    worker, held = object.__new__(kind), threading.Lock()
+    worker._limit, worker._promoted = 1.0, "something that nobody takes over"
+    setattr(worker, name, held)
+    message = f"an? {what} has not ended for \\d s or more; raise launch.stall_s"
+    with held, pytest.raises(TimeoutError, match=message):
+        worker.save(tmp_path)
+    assert not held.locked()
+
+
+def test_asynchronously_a_run_ends_when_its_episodes_are_used_up(tiny_checkpoint: Path):
+    from accerl_lerobot.engine.launch import RayEngine
+
+    config = imagining(tiny_checkpoint, share=0.0, episodes=7)
+    engine = RayEngine(replace(config, rollout=replace(config.rollout, workers=2)), ("match",))
+    try:
+        engine.train()
+        history = drive(engine)
+    finally:
+        engine.close()
+    assert 0 < history[-1].version < 12
+    assert sum(e.plan.explore for p in history for e in p.episodes) == 7
+
+
+def test_what_does_not_fit_is_refused_before_the_run_begins(
+    tiny_checkpoint: Path, world_model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    def told(*options: str) -> str:
+        arguments = [
+            "train", "--env.type=simulated", f"--policy.path={tiny_checkpoint}", "--imagination.share=0.5",
+            f"--output_dir={tmp_path / 'out'}", *options,
+        ]  # fmt: skip
+        assert cli.main(arguments) == 2
+        return capsys.readouterr().err
+
+    assert "imagination.path=None: give the folder world_model" in told()
+    assert "imagination.path='nowhere': config.json: is missing" in told("--imagination.path=nowhere")
+    paid = told(f"--imagination.path={world_model}", "--env.reward=dense")
+    assert "env.reward='dense': use success with imagination.share" in paid
+    looks = told(f"--imagination.path={world_model}", "--env.image_size=32", "--policy.n_action_steps=2")
+    assert "executes 2 actions per decision; train one with world_model.chunk=2" in looks
+    passed_by = told(f"--imagination.path={world_model}", "--env.terminate_on_success=false")
+    assert "env.terminate_on_success=False" in passed_by
+    assert not (tmp_path / "out" / "checkpoints").exists()
+
+
+def test_what_a_run_learns_its_world_model_from_is_real(tiny_checkpoint: Path, world_model: Path):
+    learn = OnlineLearnConfig(
+        steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE, batch=4
+    )
+    config = imagining(tiny_checkpoint, path=str(world_model), learn=learn, episodes=24)
+    engine = LocalEngine(config, ("match",))
+    assert engine._world_learner is not None
+    added, taken = engine._world_learner.add, []
+    engine._world_learner.add = lambda segment: taken.append(segment) or added(segment)  # type: ignore
+    engine.train()
+    history = drive(engine)
+    engine.close()
+    assert {s.source for s in taken} == {REAL} and history[-1].imagination["decisions"] > 0
+
+
+def test_sections_that_do_not_go_together(tiny_checkpoint: Path):
+    with pytest.raises(InputError, match=r"^rollout\.group_size=2: leave it out with imagination\.share"):
+        groups = RolloutConfig(worlds=4, segment_length=4, group_size=2)
+        tiny_run(
+            tiny_checkpoint, env=ENV, imagination=ImaginationConfig(share=0.5, model="oracle"), rollout=groups
+        )
+    with pytest.raises(InputError, match=r"^imagination\.replay\.ahead=4: use at least one batch, 16"):
+        imagining(tiny_checkpoint, model="oracle", replay=replace(IMAGINED_REPLAY, ahead=4))
+    with pytest.raises(InputError, match=r"^rollout\.episodes=7: use a multiple of rollout.group_size, 4"):
+        RolloutConfig(group_size=4, episodes=7)
+
+
+def test_the_summary_says_what_was_imagined(tiny_checkpoint: Path, tmp_path: Path):
+    from accerl_lerobot.console import Console
+
+    config = imagining(tiny_checkpoint, model="oracle")
+    config = replace(config, launch=replace(config.launch, engine="local"))
+    summary = train(config, tmp_path, Console())
+    assert summary["episodes_explored"] == 6 and summary["imagination"]["decisions"] > 0
+    assert summary["updates"] == 12

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Real experience of the simulated world, played at random."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from accerl_lerobot.envs import SimulatedConfig, World, make_world
+from accerl_lerobot.experience import Decision, Origin, Segment
+from accerl_lerobot.rollout.segments import SegmentBuilder
+from accerl_lerobot.world_model.model.contract import WorldModelSpec
+
+K = 4
+WORLD = SimulatedConfig(max_steps=16, image_size=16, hold=6, tolerance=0.2)
+SPEC = WorldModelSpec(
+    cameras=("observation.images.front",),
+    image_size=(16, 16),
+    state_dim=4,
+    action_dim=2,
+    chunk=K,
+    context=2,
+    fps=80,
+    provides=frozenset({"pixels", "state"}),
+)
+
+
+def decided(chunk: np.ndarray, value: float = 0.0, version: int = 0) -> Decision:
+    return Decision(
+        chunk=chunk.astype(np.float32),
+        latent={"x": chunk.ravel().astype(np.float32)},
+        log_prob=np.zeros(1, np.float32),
+        value=value,
+        version=version,
+    )
+
+
+def real_episode(
+    seed: int, *, world: World | None = None, length: int = 8, solve_at: int = 99, **config: Any
+) -> list[Segment]:
+    """An episode of random chunks, which are right from decision `solve_at` on."""
+    world = world or make_world(SimulatedConfig(**{**vars(WORLD), **config}))
+    rng = np.random.default_rng(seed)
+    builder = SegmentBuilder(world.reset(seed, "match"), length, Origin("match", seed, 0))
+    segments: list[Segment] = []
+    for t in range(99):
+        chunk = rng.uniform(-0.2, 0.2, (K, 2)).astype(np.float32)
+        if t >= solve_at:
+            chunk = np.repeat(world.solution[None], K, 0)  # type: ignore[attr-defined]
+        result = world.step_chunk(chunk)
+        reward = float(result.rewards.sum()) - 0.01
+        builder.add(decided(chunk, value=0.1 * t), chunk, reward, result.steps, result.observation)
+        if result.done or builder.full:
+            key = f"{seed}.{len(segments)}"
+            segments.append(builder.cut(key, result.terminated, result.truncated, result.success))
+        if result.done:
+            break
+    return segments

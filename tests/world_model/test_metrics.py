@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The judge's arithmetic, against slow sums and numbers by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.world_model.validation.metrics import (
+    auroc,
+    auroc_estimate,
+    bootstrap,
+    changed,
+    mean_error,
+    sensitivity,
+    shuffle_across_groups,
+    skill,
+    squared_errors,
+    threshold_at,
+)
+
+
+def frames(*values: int) -> np.ndarray:
+    """One camera, 1×2 pixels, of one colour each."""
+    return np.stack([np.full((1, 1, 2, 3), v, np.uint8) for v in values])
+
+
+def test_changed_pixels():
+    before, after = frames(10, 10, 200), frames(26, 27, 10)
+    after[0, 0, 0, 0] = 27 - 27 + 10
+    assert changed(before, after)[:, 0, 0].tolist() == [[False, False], [True, True], [True, True]]
+    before[0, 0, 0, 0, 2], after[0, 0, 0, 0] = 100, (10, 10, 80)
+    assert changed(before, after)[0, 0, 0].tolist() == [True, False], "one colour is enough"
+
+
+def test_errors_are_sums_over_counted_pixels():
+    rng = np.random.default_rng(0)
+    a, b = (rng.integers(0, 256, (3, 2, 4, 5, 3), dtype=np.uint8) for _ in range(2))
+    mask = rng.random((3, 2, 4, 5)) < 0.3
+    sums = squared_errors(a, b, mask)
+    for m in range(3):
+        errors = [
+            np.mean([(int(x) - int(y)) ** 2 for x, y in zip(a[m, v, i, j], b[m, v, i, j], strict=True)])
+            for v, i, j in zip(*np.nonzero(mask[m]), strict=True)
+        ]
+        assert sums[m].tolist() == pytest.approx([sum(errors), len(errors)])
+    assert mean_error(sums) == pytest.approx(sums[:, 0].sum() / mask.sum())
+    assert mean_error(squared_errors(a, b)) == pytest.approx(((a.astype(float) - b) ** 2).mean())
+
+
+def test_skill_and_sensitivity_by_hand():
+    wanted, of = frames(100, 100), np.arange(2)
+    model, copy = squared_errors(frames(98, 96), wanted), squared_errors(frames(90, 110), wanted)
+    assert skill(model, copy, of).value == pytest.approx(1 - 10 / 100)
+    assert sensitivity(model, copy, of).value == pytest.approx(100 / 10)
+    assert skill(copy, copy, of)[:] == pytest.approx((0, 0, 0))
+    assert sensitivity(copy, copy, of)[:] == pytest.approx((1, 1, 1))
+    exact = squared_errors(wanted, wanted)
+    assert sensitivity(exact, copy, of) == (np.inf,) * 3 and sensitivity(exact, exact, of) == (1, 1, 1)
+
+
+def test_the_interval_narrows_with_windows_and_holds_the_value():
+    rng = np.random.default_rng(0)
+
+    def of(count: int) -> tuple[float, float, float]:
+        wanted = rng.integers(60, 200, (count, 1, 4, 4, 3)).astype(np.uint8)
+        off = rng.integers(-4, 5, wanted.shape) * rng.integers(1, 5, (count, 1, 1, 1, 1))
+        near = (wanted + off).astype(np.uint8)
+        far = (wanted + rng.integers(-20, 21, wanted.shape)).astype(np.uint8)
+        return skill(squared_errors(near, wanted), squared_errors(far, wanted), np.arange(count))
+
+    few, many = of(10), of(1000)
+    for value, low, high in (few, many):
+        assert low <= value <= high
+    assert many[2] - many[1] < 0.3 * (few[2] - few[1])
+
+
+def test_windows_of_one_episode_are_drawn_together():
+    """A hundred copies of ten rows say no more than the ten do."""
+    rng = np.random.default_rng(0)
+    values = rng.standard_normal(10)
+    ten = bootstrap(np.arange(10), lambda rows: float(values[rows].mean()))
+    copies, groups = np.tile(values, 100), np.tile(np.arange(10), 100)
+    grouped = bootstrap(groups, lambda rows: float(copies[rows].mean()))
+    assert grouped == pytest.approx(ten)
+    alone = bootstrap(np.arange(1000), lambda rows: float(copies[rows].mean()))
+    assert alone.high - alone.low < 0.2 * (ten.high - ten.low)
+
+
+def test_a_statistic_that_is_not_always_there():
+    labels = np.array([True] + [False] * 9)
+    estimate = auroc_estimate(np.arange(10.0), labels, np.arange(10))
+    assert estimate.value == 0.0 and estimate.low == 0.0 <= estimate.high
+    assert all(np.isnan(auroc_estimate(np.arange(3.0), np.zeros(3, bool), np.arange(3))))
+
+
+def test_auroc_is_the_share_of_pairs_in_order():
+    rng = np.random.default_rng(0)
+    scores, labels = rng.integers(0, 6, 40).astype(float), rng.random(40) < 0.4
+    pairs = [(a > b) + 0.5 * (a == b) for a in scores[labels] for b in scores[~labels]]
+    assert auroc(scores, labels) == pytest.approx(np.mean(pairs))
+    assert auroc(np.array([1.0, 2, 3, 4]), np.array([False, False, True, True])) == 1.0
+    assert np.isnan(auroc(np.ones(3), np.ones(3, bool)))
+
+
+@pytest.mark.parametrize(("share", "accepted"), [(0.0, 0), (0.1, 1), (0.25, 2), (0.5, 5)])
+def test_a_threshold_lets_at_most_so_many_failures_pass(share: float, accepted: int):
+    scores = np.array([0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99])
+    labels = np.array([False] * 10 + [True] * 2)
+    at = threshold_at(scores[~labels], share)
+    assert (scores[~labels] >= at).sum() == accepted
+    assert (scores[~labels] >= np.nextafter(at, -np.inf)).sum() > share * 10, "no lower one would do"
+
+
+def test_a_threshold_without_failures():
+    with pytest.raises(ValueError, match="no failures"):
+        threshold_at(np.ones(0), 0.02)
+
+
+def test_shuffled_actions_are_another_episode_s():
+    groups = [i // 4 for i in range(20)]
+    chosen = shuffle_across_groups(20, groups, np.random.default_rng(0))
+    assert all(groups[i] != groups[j] for i, j in enumerate(chosen))
+    alone = shuffle_across_groups(5, [0] * 5, np.random.default_rng(0))
+    assert all(i != j for i, j in enumerate(alone))

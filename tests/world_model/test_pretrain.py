@@ -1,0 +1,455 @@
+# SPDX-License-Identifier: Apache-2.0
+"""accerl world-model from a dataset to its validation, saved and loaded again."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from accerl_lerobot import cli, console
+from accerl_lerobot.checkpoint import isolation
+from accerl_lerobot.cli.configs import WorldModelEvalRun, WorldModelRun
+from accerl_lerobot.demos.record import DemosConfig, record_demos
+from accerl_lerobot.engine.config import DatasetConfig, RunConfig, parse
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model.config import WorldModelConfig
+from accerl_lerobot.world_model.learning import learners, pretrain
+from accerl_lerobot.world_model.learning.learners import new_success_model
+from accerl_lerobot.world_model.model.store import (
+    load_sources,
+    load_world_model,
+    rehearse_world_model,
+    save_world_model,
+)
+from accerl_lerobot.world_model.validation import evaluate
+from tests.runs import replacing
+from tests.world_model.test_pixels import awake, dots, model, rollout, windows
+
+
+def recorded(root: Path, episodes: int, seed: int) -> Path:
+    env = SimulatedConfig(max_steps=60, hold=25, image_size=16)
+    of = DemosConfig(
+        episodes=episodes, failure_share=0.5, processes=1, root=str(root), repo_id="a/b", seed=seed
+    )
+    return record_demos(env, of)
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recorded(tmp_path_factory.mktemp("demos") / "dataset", 8, 0)
+
+
+@pytest.fixture(scope="module")
+def rollouts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recorded(tmp_path_factory.mktemp("rollouts") / "dataset", 6, 1)
+
+
+@pytest.fixture(scope="module")
+def overlapping(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recorded(tmp_path_factory.mktemp("overlapping") / "dataset", 6, 0)
+
+
+def arguments(demos: Path, output_dir: Path) -> list[str]:
+    return [
+        "world-model", "--env.type=simulated", "--env.image_size=16", "--dataset.repo_id=a/b",
+        f"--dataset.root={demos}", f"--output_dir={output_dir}", "--device=cpu",
+        "--world_model.image_size=16", "--world_model.chunk=5", "--world_model.learn.steps=25",
+        "--world_model.success.steps=10", "--world_model.validation.depth=2",
+        "--world_model.model.network.channels=16,24",
+    ]  # fmt: skip
+
+
+def test_from_a_dataset_to_a_validation(demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = tmp_path / "out"
+    code = cli.main(arguments(demos, out))
+    stdout, stderr = capsys.readouterr()
+    found = json.loads(stdout)
+    assert code == (0 if found["passed"] else 1) and found == json.loads(
+        (out / "validation.json").read_text()
+    )
+    assert {p.name for p in out.iterdir()} == {
+        "config.yaml", "world_model", "validation.json", "preview.mp4", "metrics.jsonl",
+    }  # fmt: skip
+    assert found["learnt"]["episodes"] + found["held_out"]["episodes"] == 8
+    assert [row["depth"] for row in found["depths"]] == [1, 2] and found["seconds"] > 0
+    assert set(found["checks"]) == {
+        "skill_changed_first",
+        "skill_changed_last",
+        "skill_last",
+        "sensitivity_low",
+        "auroc",
+        "false_success",
+        "false_success_idle",
+        "recall",
+    }
+    assert found["threshold"] >= 0.5 and found["outcomes"]["rollouts"] > 2
+    kinds = [json.loads(line)["kind"] for line in (out / "metrics.jsonl").read_text().splitlines()]
+    assert kinds == ["world_model"]
+    assert " windows: " in stderr and stderr.count(" wanted") == 8 and "preview.mp4" in stderr
+    world, success = load_world_model(out / "world_model")
+    assert success is not None and success.config.chunk == world.spec.chunk == 5
+    assert success.config.threshold == pytest.approx(found["threshold"])
+    assert world.spec.cameras == ("observation.images.front",) and float(world.uncertainty_scale) != 1
+    assert (out / "preview.mp4").stat().st_size > 1000
+
+
+def test_a_saved_one_is_tried_on_another_dataset(
+    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    cli.main(arguments(demos, tmp_path / "out"))
+    capsys.readouterr()
+    path = tmp_path / "out" / "world_model"
+    told = [f"--path={path}", "--dataset.repo_id=a/b", f"--dataset.root={demos}", "--validation.depth=2"]
+    code = cli.main(["world-model-eval", *told, f"--output_dir={tmp_path / 'again'}"])
+    found = json.loads(capsys.readouterr().out)
+    assert code == (0 if found["passed"] else 1)
+    (source,) = load_sources(path)
+    assert sorted(source.learnt + source.held_out) == list(range(8))
+    assert found["tried"]["episodes"] == len(source.held_out) < 8, "it has learnt from the others"
+    save_world_model(tmp_path / "unknown", load_world_model(path)[0])
+    told[0] = f"--path={tmp_path / 'unknown'}"
+    capsys.readouterr()  # LeRobot prints
+    cli.main(["world-model-eval", *told, f"--output_dir={tmp_path / 'all'}"])
+    assert json.loads(capsys.readouterr().out)["tried"]["episodes"] == 8
+    assert {p.name for p in (tmp_path / "again").iterdir()} == {
+        "config.yaml",
+        "validation.json",
+        "preview.mp4",
+    }
+    assert cli.main(["world-model-eval", "--path=nowhere", f"--output_dir={tmp_path / 'third'}"]) == 2
+    assert "path='nowhere': config.json: is missing" in capsys.readouterr().err
+    assert cli.main(["world-model-eval"]) == 2
+    assert "path=None: name the folder world_model" in capsys.readouterr().err
+
+
+def test_what_is_refused_leaves_no_folder(demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = tmp_path / "out"
+    assert cli.main([*arguments(demos, out), "--env.state_dim=6"]) == 2
+    assert "observation.state has shape (4,), the world's has (6,)" in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        (
+            "--world_model.validation.depth=20",
+            "world_model.validation.depth=20: held-out episodes have at most",
+        ),
+        (
+            "--world_model.success.weight_decay=-1",
+            "world_model.success.weight_decay=-1.0: use a number",
+        ),
+        (
+            "--world_model.model.state_weight=-1",
+            "world_model.model.state_weight=-1.0: use a number",
+        ),
+        ("--world_model.image_size=13", "world_model.image_size=13: use a multiple of 8"),
+        ("--seed=-1", "seed=-1: use a whole number from 0"),
+        ("--env.task=mirror", "env.task='mirror': an episode's task is"),
+    ],
+)
+def test_what_is_refused_before_anything_is_learnt(
+    option: str, message: str, demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert cli.main(replacing(arguments(demos, tmp_path / "out"), option)) == 2
+    assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_one_success_is_not_enough_to_learn_from_and_be_classified_on():
+    config = WorldModelConfig()
+    failures = dots(4, steps=80)
+    success = [replace(failures[0], success_at=79)]
+    with pytest.raises(InputError, match="at least two successes and two failures"):
+        pretrain._check_held_out(DatasetConfig(), success + failures[:2], failures[2:], config)
+    pretrain._check_held_out(DatasetConfig(), success + failures[:2], success + failures[2:], config)
+
+
+def test_the_validation_is_on_episodes_that_were_not_learned_from(
+    demos: Path, rollouts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    seen: dict[str, list[bytes]] = {}
+
+    def spy(name: str, place: int, real: Any) -> Any:
+        def called(*args: Any, **options: Any) -> Any:
+            of = getattr(args[place], "episodes", args[place])
+            seen.setdefault(name, []).extend(e.frames.tobytes() for e in of)
+            return real(*args, **options)
+
+        return called
+
+    monkeypatch.setattr(pretrain, "train_from_scratch", spy("learnt", 1, pretrain.train_from_scratch))
+    monkeypatch.setattr(evaluate, "validate", spy("tried", 1, evaluate.validate))
+    monkeypatch.setattr(pretrain.SuccessLearner, "step", spy("success", 1, pretrain.SuccessLearner.step))
+    monkeypatch.setattr(learners.HeldOutLoss, "__init__", spy("looked at", 1, learners.HeldOutLoss.__init__))
+    monkeypatch.setattr(
+        pretrain, "held_out_success_metrics", spy("pairs", 1, pretrain.held_out_success_metrics)
+    )
+    more = ["--online.repo_id=a/b", f"--online.root={rollouts}", "--world_model.success.validate_every=5"]
+    cli.main([*arguments(demos, tmp_path / "out"), *more])
+    assert set(seen["learnt"]) == set(seen["success"]) and len(set(seen["learnt"] + seen["tried"])) == 14
+    assert not set(seen["learnt"]) & set(seen["tried"])
+    assert set(seen["looked at"]) == set(seen["pairs"]) == set(seen["tried"])
+
+
+def test_held_out_losses_are_told_and_change_nothing(
+    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(console, "PLAIN_EVERY_S", -1.0)
+    logged: dict[str, list[dict[str, Any]]] = {}
+    for name, world, success in (("with", 10, 4), ("without", 0, 0)):
+        every = [
+            f"--world_model.{of}.validate_every={n}" for of, n in (("learn", world), ("success", success))
+        ]
+        cli.main([*arguments(demos, tmp_path / name), *every])
+        lines = (tmp_path / name / "metrics.jsonl").read_text().splitlines()
+        logged[name] = [json.loads(line) for line in lines]
+    err = capsys.readouterr().err
+    assert re.search(r"world model 10/25 \(40%\) · \S+ left · image \S+ state \S+\n", err)
+    assert re.search(
+        r"world model 11/25 \(44%\) · \S+ left · image \S+ state \S+, held out image \S+ state \S+\n", err
+    )
+    assert re.search(r"success model 3/10 \(30%\) · \S+ left · loss \S+\n", err)
+    assert re.search(r"success model 4/10 \(40%\) · \S+ left · loss \S+, held out \S+\n", err)
+    steps = [(record["kind"], record["step"]) for record in logged["with"]]
+    assert steps == [
+        ("world_model_held_out", 10), ("world_model", 20), ("world_model_held_out", 20),
+        ("success_model_held_out", 4), ("success_model_held_out", 8),
+    ]  # fmt: skip
+    assert logged["without"] == [logged["with"][1]]
+    text = (Path(__file__).parents[2] / "docs" / "metrics.md").read_text()
+    explained = text.split("## `accerl world-model`")[1].split("\n## ")[0]
+    for record in logged["with"]:
+        assert all(f"`{name}`" in explained for name in record), record
+        assert all(value >= 0 for name, value in record.items() if name != "kind")
+    for file in ("model.safetensors", "success_model/model.safetensors"):
+        one, other = ((tmp_path / name / "world_model" / file).read_bytes() for name in ("with", "without"))
+        assert one == other
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_a_placebo_is_learned_where_one_is_asked_for(
+    shuffled: bool, demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    class Spy(learners.Learner):
+        def draw(self, *args: Any) -> Any:
+            raise InterruptedError(self._shuffle)
+
+    monkeypatch.setattr(learners, "Learner", Spy)
+    told = [*arguments(demos, tmp_path / "out")[1:], f"--world_model.shuffle_actions={shuffled}"]
+    config = parse(WorldModelRun, told, recipe_class=RunConfig)
+    with pytest.raises(InterruptedError, match=str(shuffled)):
+        pretrain.pretrain(config, tmp_path, console.Console())
+
+
+def test_both_networks_learn_on_the_device_and_are_saved_for_any(
+    demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    asked, went = moved(monkeypatch)
+    learnt: list[str] = []
+
+    def on(name: str, real: Any) -> Any:
+        def called(*args: Any, **options: Any) -> Any:
+            learnt.extend([name, *(kind for kind, device in went if device == torch.device("cpu", 0))])
+            return real(*args, **options)
+
+        return called
+
+    monkeypatch.setattr(pretrain, "train_from_scratch", on("pretrain", pretrain.train_from_scratch))
+    monkeypatch.setattr(pretrain, "SuccessLearner", on("success", pretrain.SuccessLearner))
+    cli.main(replacing(arguments(demos, tmp_path / "out"), "--device=cuda:3"))
+    assert asked == ["cuda:3"]
+    models = ["PixelWorldModel", "SuccessPairsRewardModel"]
+    assert learnt == ["pretrain", models[0], "success", *models], "before the optimisers are made"
+    saved = json.loads((tmp_path / "out" / "world_model" / "success_model" / "config.json").read_text())
+    assert saved["device"] == "cpu"
+
+
+def test_a_policys_episodes_are_learned_from_beside_demonstrations(
+    demos: Path, rollouts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    theirs = ["--online.repo_id=a/rollouts", f"--online.root={rollouts}"]
+    out = tmp_path / "out"
+    code = cli.main([*arguments(demos, out), *theirs])
+    stdout, stderr = capsys.readouterr()
+    found = json.loads(stdout)
+    both = load_sources(out / "world_model")
+    assert [source.repo_id for source in both] == ["a/b", "a/rollouts"]
+    assert [sorted(s.learnt + s.held_out) for s in both] == [list(range(8)), list(range(6))]
+    assert found["learnt"]["episodes"] == sum(len(source.learnt) for source in both)
+    assert found["held_out"]["episodes"] == sum(len(source.held_out) for source in both)
+    online = found["datasets"]["online"]
+    own = {name: gate for name, gate in found["checks"].items() if "." not in name}
+    assert found["checks"] == own | {f"online.{name}": gate for name, gate in online["checks"].items()}
+    assert found["passed"] is all(gate["holds"] for gate in found["checks"].values()) is (code == 0)
+    assert (out / "preview_online.mp4").stat().st_size > 1000
+    world, success = load_world_model(out / "world_model")
+    assert success is not None and success.config.threshold == found["threshold"] == online["threshold"]
+    assert world.spec.tasks == ("match",)
+    assert (
+        "By dataset" in stderr and f" of {len(own)} │" in stderr and stderr.count(" wanted") == 2 * len(own)
+    )
+    told = [f"--path={out / 'world_model'}", "--dataset.repo_id=a/b", f"--dataset.root={demos}", *theirs]
+    capsys.readouterr()  # LeRobot prints
+    cli.main(["world-model-eval", *told, "--validation.depth=2", f"--output_dir={tmp_path / 'again'}"])
+    stdout, stderr = capsys.readouterr()
+    again = json.loads(stdout)
+    tried = [one["tried"]["episodes"] for one in (again, again["datasets"]["online"])]
+    assert tried == [len(source.held_out) for source in both] and set(again["checks"]) == set(found["checks"])
+    assert f"trained on a/rollouts (online): evaluated on its {tried[1]} held-out" in stderr
+    assert (
+        cli.main(["report", str(out)]) == 0
+        and "episodes that a policy real_episode through" in (out / "report.html").read_text()
+    )
+
+
+@pytest.mark.parametrize(
+    ("of", "message"),
+    [
+        ("demos", "online.repo_id='a/b': it is the one in dataset; name another"),
+        ("overlapping", "online.repo_id='a/b': 6 of its episodes are in the other dataset, too"),
+        ("nowhere", "online.root='nowhere': no meta/info.json there"),
+    ],
+)
+def test_a_policys_episodes_that_are_refused(
+    of: str, message: str, request: pytest.FixtureRequest, demos: Path, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+):  # fmt: skip
+    root = of if of == "nowhere" else request.getfixturevalue(of)
+    theirs = ["--online.repo_id=a/b", f"--online.root={root}"]
+    assert cli.main([*arguments(demos, tmp_path / "out"), *theirs]) == 2
+    assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_a_saved_model_predicts_the_same(tmp_path: Path):
+    of = windows(dots(2))
+    made = awake(model())
+    made.fit_statistics(of)
+    success = new_success_model(2).eval()
+    save_world_model(tmp_path / "w", made, success)
+    again, loaded = load_world_model(tmp_path / "w")
+    assert again.spec == made.spec and again.config == made.config and loaded is not None
+    for one, other in zip(rollout(made, of), rollout(again, of), strict=True):
+        assert torch.equal(one.frames, other.frames) and torch.equal(one.robot, other.robot)
+    pair = torch.rand(1, 1, 3, 16, 16)
+    assert torch.equal(success.logits(pair, pair)[0], loaded.logits(pair, pair)[0])
+    assert not any(p.requires_grad for p in again.parameters())
+    save_world_model(tmp_path / "alone", made)
+    assert load_world_model(tmp_path / "alone")[1] is None
+
+
+@pytest.mark.parametrize(
+    ("harm", "why"),
+    [
+        ("nowhere", "config.json: is missing"),
+        ("config", "config.json: spec: not one of accerl world-model"),
+        ("weights", "model.safetensors: not safetensors"),
+        ("size", "not a world model of accerl world-model"),
+        ("tasks", "config.json: spec.tasks: names of at most 200 printable characters are wanted"),
+        ("camera", "config.json: spec.cameras: the name '../x' cannot be part of a path"),
+        ("nan", "model.safetensors: uncertainty_scale holds NaN or infinity; train it again"),
+    ],
+)
+def test_what_cannot_be_loaded(tmp_path: Path, harm: str, why: str):
+    folder = tmp_path / "w"
+    save_world_model(folder, model())
+    if harm == "nowhere":
+        folder = tmp_path / "nowhere"
+    if harm == "config":
+        (folder / "config.json").write_text("{}")
+    if harm in ("tasks", "camera"):
+        content = json.loads((folder / "config.json").read_text())
+        content["spec"] |= {"tasks": ["match", "\x1b[2J"]} if harm == "tasks" else {"cameras": ["../x"]}
+        (folder / "config.json").write_text(json.dumps(content))
+    if harm == "weights":
+        (folder / "model.safetensors").write_bytes(b"\x00" * 64)
+    if harm == "nan":
+        tensors = load_file(folder / "model.safetensors")
+        save_file(
+            tensors | {"uncertainty_scale": tensors["uncertainty_scale"] * float("nan")},
+            folder / "model.safetensors",
+        )
+    if harm == "size":
+        content = json.loads((folder / "config.json").read_text())
+        content["spec"]["action_dim"] = 7
+        (folder / "config.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=f"^path=.*{why}"):
+        load_world_model(folder)
+
+
+@pytest.mark.parametrize(
+    ("where", "name", "value"),
+    [
+        ("spec", "context", 10**9),
+        ("spec", "image_size", [2**20, 2**20]),
+        ("network", "blocks", 10**9),
+        ("network", "channels", [10**6, 10**6]),
+        ("model", "steps", 10**9),
+    ],
+)
+def test_what_nobody_could_load_is_found_in_a_child_process(
+    tmp_path: Path, where: str, name: str, value: object, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(isolation, "CPU_S", 3)
+    save_world_model(tmp_path / "w", model(), new_success_model(2).eval())
+    rehearse_world_model(tmp_path / "w")
+    file = tmp_path / "w" / "config.json"
+    content = json.loads(file.read_text())
+    part = {"spec": content["spec"], "model": content["model"], "network": content["model"]["network"]}
+    part[where][name] = value
+    file.write_text(json.dumps(content))
+    with pytest.raises(InputError) as caught:
+        rehearse_world_model(tmp_path / "w")
+    assert str(caught.value).startswith("path=") and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("held_out", 0.0), ("held_out", 1.0), ("chunk", 0), ("image_size", 60), ("image_size", 4)],
+)
+def test_bad_values_name_their_field(name: str, value: float):
+    with pytest.raises(InputError, match=f"^world_model.{name}="):
+        WorldModelConfig(**{name: value})
+
+
+def moved(monkeypatch: pytest.MonkeyPatch) -> tuple[list[str], list[tuple[str, Any]]]:
+    """Devices that are asked for, and which networks go where; the CPU stands in for all of them."""
+    asked: list[str] = []
+    went: list[tuple[str, Any]] = []
+    real = torch.nn.Module.to
+
+    def resolve(name: str, field: str) -> torch.device:
+        asked.append(name)
+        return torch.device("cpu", 0)
+
+    def to(self: torch.nn.Module, *args: Any, **options: Any) -> torch.nn.Module:
+        went.append((type(self).__name__, args[0]))
+        return real(self, *args, **options)
+
+    for module in (pretrain, evaluate):
+        monkeypatch.setattr(module, "resolve_device", resolve)
+    monkeypatch.setattr(torch.nn.Module, "to", to)
+    return asked, went
+
+
+def test_a_device_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert WorldModelRun().device == WorldModelEvalRun(path="x").device == "auto"
+    for name, why in (("tpu", "use auto, cpu, cuda"), ("cuda", "no CUDA device here; use cpu or auto")):
+        if name == "cuda" and torch.cuda.is_available():
+            continue
+        # The dataset is not there either, and is not looked for.
+        nowhere = ["--dataset.repo_id=a/b", "--dataset.root=nowhere"]
+        told = [*nowhere, f"--output_dir={tmp_path / 'out'}", f"--device={name}"]
+        assert cli.main(["world-model", "--env.type=simulated", *told]) == 2
+        assert f"accerl: device='{name}': {why}" in capsys.readouterr().err
+        assert cli.main(["world-model-eval", "--path=nowhere", *told]) == 2
+        assert f"accerl: device='{name}': {why}" in capsys.readouterr().err
+        assert not (tmp_path / "out").exists()

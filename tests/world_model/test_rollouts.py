@@ -1,0 +1,399 @@
+# SPDX-License-Identifier: Apache-2.0
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from accerl_lerobot.envs import make_world
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import IMAGINED, REAL, Decision, Request, Segment
+from accerl_lerobot.world_model.config import GuardConfig, ImaginationConfig, OnlineLearnConfig
+from accerl_lerobot.world_model.imagination import rollouts
+from accerl_lerobot.world_model.imagination.registry import (
+    ImaginationModels,
+    OracleModel,
+    ShuffledModel,
+    check_fit,
+)
+from accerl_lerobot.world_model.imagination.rollouts import Imagination, RolloutSettings
+from accerl_lerobot.world_model.learning.online import Promotion
+from accerl_lerobot.world_model.model.contract import ActionHistory, Context, Prediction, State, WorldModel
+from tests.world_model.real_segments import SPEC, WORLD, K, decided, real_episode
+
+WORLD_SPEC = make_world(WORLD).spec
+ENDLESS, SHORT = (replace(WORLD_SPEC, max_steps=steps) for steps in (400, 2 * K))
+CAMERA = "observation.images.front"
+
+
+class Counting(WorldModel):
+    """Frames grow brighter by 40 a chunk, as far as the actions say; doubtful where told so."""
+
+    spec = SPEC
+
+    def __init__(self, uncertainty: float = float("nan")) -> None:
+        self.uncertainty = uncertainty
+        self.seeds: list[list[int]] = []
+
+    def to(self, device: object) -> Counting:
+        return self
+
+    def begin(
+        self, context: Context, tasks: Sequence[str], histories: Sequence[ActionHistory | None] | None = None
+    ) -> State:
+        return {"frames": torch.zeros_like(context.frames[:, -1]), "robot": context.robot[:, -1]}
+
+    def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Prediction:
+        self.seeds.append(list(seeds))
+        brighter = (40 * actions[:, 0, 0]).round().byte()[:, None, None, None, None]
+        frames = state["frames"] + brighter
+        robot = state["robot"] + 1
+        doubt = torch.full((len(actions),), self.uncertainty)
+        doubt[1:] = torch.nan
+        return Prediction(
+            state={"frames": frames, "robot": robot}, frames=frames, robot=robot, uncertainty=doubt
+        )
+
+
+def brightness(success: object, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    return after.max((1, 2, 3, 4)) / 200
+
+
+class Bright(torch.nn.Module):
+    """Stands where a success model does; from 0.55, three chunks of full action, it is a success."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.out, self.config = torch.nn.Linear(1, 1), SimpleNamespace(threshold=0.55)
+
+
+@pytest.fixture
+def bright(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A success model that looks at how bright it is."""
+    monkeypatch.setattr(rollouts, "probabilities", brightness)
+    return Bright()
+
+
+def imagination(
+    model: WorldModel, success: Any = None, *, fails: bool = True, world: Any = WORLD_SPEC, **config: Any
+) -> tuple[Imagination, list[Segment]]:
+    kind = "oracle" if isinstance(model, OracleModel) else "learned"
+    fields: dict[str, Any] = {
+        "share": 0.5, "path": "x", "rollouts": 4, "start_at_reset_prob": 0.0, "model": kind,
+        "learn": OnlineLearnConfig(steps_per_episode=0),
+    }  # fmt: skip
+    made: list[Segment] = []
+    settings = RolloutSettings(decision_cost=0.01, time_limit_fails=fails, seed=0, name="imagination")
+    models = ImaginationModels(model, success)
+    batch = Imagination(models, world, ImaginationConfig(**(fields | config)), settings, made.append)
+    return batch, made
+
+
+def promotion(model: Any, success: Any, version: int) -> Promotion:
+    return Promotion(model, success, version, {})
+
+
+def act(requests: Sequence[Request], size: float = 1.0) -> list[Decision]:
+    return [decided(np.full((K, 2), size), value=7.0, version=5) for _ in requests]
+
+
+def play(batch: Imagination, rounds: int, size: float = 1.0) -> None:
+    for _ in range(rounds):
+        batch.advance(act(batch.requests(), size))
+
+
+def test_a_rollout_is_a_segment_like_any_other(bright: Any):
+    batch, made = imagination(Counting(), bright, world=ENDLESS)
+    [real] = real_episode(3)
+    assert batch.requests() == [], "nothing to begin from"
+    batch.remember(real)
+    batch.version = 9
+    play(batch, 3)
+    assert len(made) == 4 and len({s.key for s in made}) == 4
+    for segment in made:
+        t = segment.origin.decision
+        assert (segment.source, segment.world_version) == (IMAGINED, 9) and segment.origin[:2] == ("match", 3)
+        assert segment.task == real.task and real.source == REAL
+        assert np.array_equal(segment.observations[CAMERA][0], real.observations[CAMERA][t])
+        state = real.observations["observation.state"][t]
+        assert np.allclose(segment.observations["observation.state"][0], state)
+        assert np.allclose(segment.observations["observation.state"][1], state + 1)
+        assert (segment.observations[CAMERA][1] == 40).all()
+        assert set(segment.version.tolist()) == {5} and set(segment.steps.tolist()) == {K}
+        assert np.array_equal(segment.actions, np.ones((len(segment), K, 2)))
+
+
+def test_a_success_ends_a_rollout_and_nothing_follows_it(bright: Any):
+    batch, made = imagination(Counting(), bright, rollouts=1, world=ENDLESS)
+    batch.remember(real_episode(3)[0])
+    play(batch, 4)
+    assert len(made) == 1 and len(made[0]) == 3
+    assert made[0].terminated and made[0].success and not made[0].truncated
+    assert made[0].reward == pytest.approx([-0.01, -0.01, 0.99])
+    assert batch.counters.successes == 1 and batch.metrics()["rollouts"] == 1
+
+
+@pytest.mark.parametrize("fails", [True, False])
+def test_a_rollout_ends_at_the_time_limit(bright: Any, fails: bool):
+    batch, made = imagination(Counting(), bright, fails=fails, rollouts=16)
+    batch.remember(real_episode(3)[0])  # 4 decisions of 4 steps are all there is time for
+    play(batch, 4, size=0.5)
+    assert {s.origin.decision: len(s) for s in made} == {0: 4, 1: 3, 2: 2, 3: 1}
+    for segment in made:
+        assert (segment.terminated, segment.truncated) == (fails, not fails) and not segment.success
+
+
+def test_what_is_too_uncertain_is_not_kept(bright: Any):
+    model = Counting(uncertainty=1.9)
+    batch, made = imagination(model, bright, rollouts=2, max_uncertainty=2.0, world=ENDLESS)
+    batch.remember(real_episode(3)[0])
+    play(batch, 1, 0.1)
+    model.uncertainty = 2.1
+    play(batch, 1, 0.1)
+    doubted = [s for s in made if len(s) == 1 and not s.terminated and not s.truncated]
+    assert batch.counters.uncertain == 1 and len(doubted) == 1, "what came before stays"
+    play(batch, 1, 0.1)  # the first decision of a new rollout is doubted at once
+    assert batch.counters.uncertain == 2 and batch.counters.rollouts == len(made) + 1
+
+
+def test_what_is_no_number_ends_a_rollout_and_is_not_kept(bright: Any):
+    """A model that diverges says NaN of the robot, which nothing is larger than."""
+    model = Counting()
+    batch, made = imagination(model, bright, rollouts=2, world=ENDLESS)
+    batch.remember(real_episode(3)[0])
+    play(batch, 1, 0.1)
+    assert batch._state is not None
+    batch._state["robot"] = batch._state["robot"] + torch.tensor([[0.0], [torch.nan]])
+    play(batch, 1, 0.1)
+    assert batch.counters.uncertain == 1 and [len(s) for s in made] == [1]
+    assert np.isfinite(made[0].observations["observation.state"]).all()
+    play(batch, 4, 0.1)
+    assert batch.counters.uncertain == 1, "its row has begun anew"
+
+
+def test_ended_rollouts_start_anew_beside_the_others():
+    oracle = OracleModel(SPEC, lambda: make_world(WORLD), 8)
+    batch, made = imagination(oracle, rollouts=8)
+    for seed in range(3):
+        batch.remember(real_episode(seed, solve_at=2)[0])
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        requests = batch.requests()
+        assert len(requests) == 8 == len({r.noise_seed for r in requests}) and all(
+            r.explore for r in requests
+        )
+        batch.advance([decided(chunk) for chunk in rng.uniform(-1.2, 1.2, (8, K, 2))])
+    assert len(made) > 20 and {len(s) for s in made} >= {1, 2, 3}
+    for segment in made:
+        # The very same actions after the very same beginning, in the real world.
+        world = make_world(WORLD)
+        start = segment.origin
+        [real] = real_episode(start.seed, solve_at=2)
+        world.reset(start.seed, "match")
+        for t in range(start.decision):
+            world.step_chunk(real.actions[t])
+        assert (np.abs(segment.actions) <= 1).all()
+        for t, actions in enumerate(segment.actions):
+            result = world.step_chunk(actions)
+            assert np.array_equal(segment.observations[CAMERA][t + 1], result.observation[CAMERA])
+            state = segment.observations["observation.state"][t + 1]
+            assert np.array_equal(state, result.observation["observation.state"])
+            assert segment.reward[t] == pytest.approx(float(result.success) - 0.01)
+        assert segment.success is result.success
+
+
+def test_rollouts_that_succeed_too_often_are_switched_off_until_a_promotion(bright: Any):
+    batch, _ = imagination(
+        Counting(),
+        bright,
+        rollouts=4,
+        guard=GuardConfig(window=4, min_real_episodes=4, max_gap=0.5),
+        start_at_high_td_prob=0.0,
+        world=ENDLESS,
+    )
+    for seed in range(8):
+        batch.remember(real_episode(seed)[0])  # failures, all of them
+    rounds = 0
+    while batch.requests():
+        play(batch, 1)
+        rounds += 1
+        assert rounds < 50
+    assert batch.switch.tripped and batch.metrics()["on"] == 0 and batch.metrics()["success"] > 0.5
+    batch.swap(promotion(Counting(), bright, 12))
+    assert len(batch.requests()) == 4 and batch.version == 12 and batch.metrics()["on"] == 1
+
+
+def test_rollouts_from_resets_are_compared_with_real_episodes(bright: Any):
+    batch, made = imagination(
+        Counting(),
+        bright,
+        rollouts=4,
+        guard=GuardConfig(window=4, min_real_episodes=3, max_gap=0.5),
+        start_at_reset_prob=1.0,
+        world=ENDLESS,
+    )
+    for seed in range(4):
+        batch.remember(real_episode(seed)[0])
+    play(batch, 3)
+    assert {(s.origin.decision, len(s), s.success, s.terminated) for s in made} == {(0, 3, True, True)}
+    for seed in range(3):
+        assert batch.requests(), "what happened before anything was imagined does not count"
+        batch.remember(real_episode(seed)[0])
+    assert batch.switch.shares == (1.0, 0.0) and not batch.on and not batch.requests()
+    batch.swap(promotion(Counting(), bright, 12))
+    assert batch.requests()
+
+
+@pytest.mark.parametrize("fails", [True, False])
+def test_a_rollout_from_a_reset_lasts_to_the_time_limit(bright: Any, fails: bool):
+    batch, made = imagination(Counting(), bright, start_at_reset_prob=1.0, fails=fails)
+    batch.remember(real_episode(3)[0])
+    play(batch, 4, size=0.0)
+    assert {(len(s), s.terminated, s.truncated, s.success) for s in made} == {(4, fails, not fails, False)}
+
+
+def test_a_model_that_is_trained_is_used_once_it_has_passed(bright: Any):
+    batch, _ = imagination(Counting(), bright, learn=OnlineLearnConfig(steps_per_episode=1))
+    batch.remember(real_episode(3)[0])
+    assert batch.requests() == [] and not batch.on
+    batch.swap(promotion(Counting(), bright, 3))
+    assert batch.on and len(batch.requests()) == 4
+
+
+def test_unfinished_rollouts_are_dropped_when_a_model_is_promoted(bright: Any):
+    batch, made = imagination(Counting(), bright, start_at_reset_prob=1.0, world=SHORT)
+    batch.remember(real_episode(3)[0])
+    play(batch, 1, 0.1)
+    batch.swap(promotion(Counting(), bright, 12))
+    play(batch, 1, 0.1)
+    assert not made, "the second decision was the first of new batch"
+    play(batch, 1, 0.1)
+    assert {s.world_version for s in made} == {12} and all(len(s) == 2 for s in made)
+
+
+def test_a_model_that_is_uncertain_of_everything_is_switched_off(bright: Any):
+    model = Counting(uncertainty=9.0)
+    batch, made = imagination(
+        model, bright, rollouts=1, max_uncertainty=2.0, guard=GuardConfig(window=5), world=ENDLESS
+    )
+    batch.remember(real_episode(3)[0])
+    play(batch, 5)
+    assert batch.requests() == [] and not batch.on and not made and batch.counters.uncertain == 5
+    batch.swap(promotion(Counting(), bright, 12))
+    assert batch.on and batch.requests()
+
+
+def test_an_episode_that_fails_ends_its_rollout(bright: Any, monkeypatch: pytest.MonkeyPatch):
+    step = Counting.step
+
+    def broken(self: Any, state: State, actions: Tensor, seeds: Sequence[int]) -> Prediction:
+        return replace(step(self, state, actions, seeds), done=torch.tensor([True, False]))
+
+    monkeypatch.setattr(Counting, "step", broken)
+    batch, made = imagination(Counting(), bright, rollouts=2, world=ENDLESS)
+    batch.remember(real_episode(3)[0])
+    play(batch, 1, 0.1)
+    assert len(made) == 1 and made[0].terminated and not made[0].success
+
+
+def test_a_placebo_stays_one_when_its_model_is_promoted(bright: Any):
+    batch, _ = imagination(ShuffledModel(Counting()), bright)
+    promoted = Counting()
+    batch.swap(promotion(promoted, bright, 3))
+    assert isinstance(batch.models[0], ShuffledModel) and batch.models[0].model is promoted
+
+
+def test_pictures_have_the_world_s_size(bright: Any):
+    world = replace(WORLD_SPEC, images={CAMERA: (32, 24, 3)})
+    batch, _ = imagination(Counting(), bright, world=world)
+    batch.remember(real_episode(3)[0])
+    [*requests] = batch.requests()
+    assert {np.asarray(r.observation[CAMERA]).shape for r in requests} == {(32, 24, 3)}
+
+
+@pytest.mark.parametrize(
+    ("change", "executed", "history", "judged", "message"),
+    [
+        ({"cameras": ("observation.images.wrist",)}, K, 1, True, "front.*model observation.images.wrist"),
+        ({"state_dim": 7}, K, 1, True, "=7: is the world model's state_dim, and the world's is 4"),
+        ({"action_dim": 7}, K, 1, True, "action_dim"),
+        ({"fps": 30}, K, 1, True, "imagination.path=30: is the world model's fps"),
+        ({}, 5, 1, True, "executes 5 actions per decision; train one with world_model.chunk=5"),
+        ({}, K, 2, True, "policy.n_obs_steps=2: the policy looks back"),
+        ({}, K, 1, False, "no success model beside the world model"),
+        ({"provides": frozenset({"pixels"})}, K, 1, True, "'state': the policy reads it"),
+    ],
+)  # fmt: skip
+def test_a_world_model_of_something_else_is_refused(
+    change: dict[str, Any], executed: int, history: int, judged: bool, message: str
+):
+    check_fit(SPEC, WORLD_SPEC, K, 1, True)
+    with pytest.raises(InputError, match=message):
+        check_fit(replace(SPEC, **change), WORLD_SPEC, executed, history, judged)
+
+
+def test_a_world_model_of_another_task_is_refused():
+    known = (*WORLD_SPEC.tasks, "another")
+    check_fit(replace(SPEC, tasks=known), WORLD_SPEC, K, 1, True)
+    message = f"^env.task='unheard of': the world model is of {', '.join(known)}; name these, or"
+    with pytest.raises(InputError, match=message):
+        tasks = (*WORLD_SPEC.tasks, "unheard of")
+        check_fit(replace(SPEC, tasks=known), replace(WORLD_SPEC, tasks=tasks), K, 1, True)
+
+
+@pytest.mark.parametrize(
+    ("known", "played", "fits"),
+    [
+        ("suite/3", "suite", True), ("suite", "suite/3", True), ("suite/3", "suite/3", True),
+        ("suite/3", "suite/4", False), ("suite/3", "suit", False), ("suit/3", "suite", False),
+    ],
+)  # fmt: skip
+def test_a_task_that_is_played_alone_bears_the_name_of_its_suite(known: str, played: str, fits: bool):
+    spec, world = replace(SPEC, tasks=(known,)), replace(WORLD_SPEC, tasks=(played,))
+    with contextlib.nullcontext() if fits else pytest.raises(InputError, match="^env.task="):
+        check_fit(spec, world, K, 1, True)
+
+
+def test_one_that_tells_successes_needs_no_success_model():
+    check_fit(replace(SPEC, provides=SPEC.provides | {"success"}), WORLD_SPEC, K, 1, False)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("share", 1.0), ("share", -0.1), ("model", "magic"), ("rollouts", 0),
+        ("memory", 0), ("max_uncertainty", 0.0), ("start_at_high_td_prob", 1.1),
+    ],
+)  # fmt: skip
+def test_bad_values_name_their_field(name: str, value: object):
+    with pytest.raises(InputError, match=f"^imagination.{name}="):
+        ImaginationConfig(**{"path": "x", name: value})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("steps_per_episode", -1.0), ("batch", 1), ("validate_every", 0), ("memory", 1), ("offline", 1.1),
+        ("recent", -0.1), ("failures", 2.0), ("held_out", 0.0), ("lr", 0.0),
+    ],
+)  # fmt: skip
+def test_bad_values_of_learning_name_their_field(name: str, value: float):
+    with pytest.raises(InputError, match=f"^imagination.learn.{name}="):
+        OnlineLearnConfig(**{name: value})  # type: ignore[arg-type]
+
+
+def test_what_does_not_go_together():
+    with pytest.raises(InputError, match="^imagination.path=None"):
+        ImaginationConfig(share=0.5)
+    ImaginationConfig(share=0.5, model="oracle")
+    assert ImaginationConfig(share=0.5, path="x").learns
+    assert not ImaginationConfig(share=0.5, path="x", model="copy").learns
+    assert not ImaginationConfig(path="x").learns

@@ -1,0 +1,332 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A class of world models that is not ours: learnt, saved, tried, imagined with and learnt on in a run.
+
+Each test begins where nobody has heard of it: who forgets to import its package fails.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from accerl_lerobot import cli, console
+from accerl_lerobot.cli.configs import WorldModelEvalRun, WorldModelRun
+from accerl_lerobot.config.parsing import encode
+from accerl_lerobot.engine.config import parse
+from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model.config import (
+    ImaginationConfig,
+    LearnableModelConfig,
+    LearnConfig,
+    OnlineLearnConfig,
+    PixelModelConfig,
+    WorldModelConfig,
+)
+from accerl_lerobot.world_model.imagination.registry import make_models
+from accerl_lerobot.world_model.learning.learners import Learner, new_success_model
+from accerl_lerobot.world_model.learning.pretrain import world_spec
+from accerl_lerobot.world_model.model.contract import LearnableWorldModel, learnable_class, new_learnable
+from accerl_lerobot.world_model.model.store import load_world_model, save_world_model
+from benchmarks.ranking import BenchRankingConfig
+from tests.runs import drive, replacing
+from tests.test_imagination import LOOSE, decisions, imagining, run_locally
+from tests.world_model.test_pixels import SPEC, dots, windows
+from tests.world_model.test_pretrain import arguments, recorded
+
+PACKAGE = "tests.world_model.linear_world"
+NAMED = [f"--world_model.discover_packages_path={PACKAGE}", "--world_model.model.type=linear"]
+ENV = SimulatedConfig(max_steps=16, hold=8)
+
+
+def forgotten() -> None:
+    LearnableModelConfig.get_known_choices().pop("linear", None)
+    sys.modules.pop(PACKAGE, None)
+
+
+@pytest.fixture(autouse=True)
+def unheard_of() -> Iterator[None]:
+    forgotten()
+    yield
+    forgotten()
+
+
+def linear(**fields: Any) -> LearnableModelConfig:
+    config: LearnableModelConfig = importlib.import_module(PACKAGE).LinearModelConfig(**fields)
+    return config
+
+
+def saved(folder: Path, **fields: Any) -> Path:
+    torch.manual_seed(0)
+    config = linear(**fields)
+    spec = world_spec(WorldModelConfig(chunk=4, image_size=32, model=config), ENV)
+    save_world_model(folder, new_learnable(spec, config), new_success_model(4))
+    forgotten()
+    return folder
+
+
+def name_of(model: object) -> str:
+    return type(model).__name__
+
+
+def test_it_is_learned_and_tried_by_naming_its_package(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(console, "PLAIN_EVERY_S", -1.0)
+    demos, out = recorded(tmp_path / "dataset", 24, 0), tmp_path / "out"
+    ours = "--world_model.model.network.channels=16,24"
+    told = [a for a in arguments(demos, out) if a != ours]
+    told = replacing(told, *NAMED, "--world_model.learn.steps=300")
+    cli.main([*told, "--world_model.learn.lr=0.03", "--world_model.learn.validate_every=100"])
+    stdout, stderr = capsys.readouterr()
+    found = json.loads(stdout)
+    assert "world model 300/300 (100%) · motion 0." in stderr
+    losses = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    held = [row["motion"] for row in losses if row["kind"] == "world_model_held_out"]
+    assert len(held) == 3 and 0 < held[-1] < 0.5, (
+        "in usual motions; of one that knows nothing it is 1 or more"
+    )
+    forgotten()
+    model, success = load_world_model(out / "world_model", PACKAGE)
+    assert name_of(model) == "LinearWorldModel" and success is not None and model.config.context == 1
+    assert (
+        model.spec.provides == {"pixels", "state"}
+        and float(model.uncertainty_scale) == 1.0
+        and not model.training
+    )
+    capsys.readouterr()  # LeRobot prints
+    path, trial = f"--path={out / 'world_model'}", "--validation.depth=2"
+    dataset = ["--dataset.repo_id=a/b", f"--dataset.root={demos}", f"--output_dir={tmp_path / 'again'}"]
+    forgotten()
+    assert cli.main(["world-model-eval", path, *dataset, trial]) == 2
+    assert "or name its package: discover_packages_path" in capsys.readouterr().err
+    cli.main(["world-model-eval", path, *dataset, trial, f"--discover_packages_path={PACKAGE}"])
+    again = json.loads(capsys.readouterr().out)
+    (first, _), (same, _) = found["depths"], again["depths"]
+    assert first["state_error"] == pytest.approx(same["state_error"])
+    assert not found["passed"], "its pictures never change"
+    forgotten()
+    assert cli.main(["report", str(out), f"--output={tmp_path / 'page.html'}"]) == 0
+    assert "motion, held out" in (tmp_path / "page.html").read_text()
+    assert PACKAGE not in sys.modules, "who reads a recipe runs nothing that it names"
+
+
+def test_its_fields_are_fields_of_the_command_line():
+    run = parse(WorldModelRun, [*NAMED, "--world_model.model.gain=2", "--world_model.image_size=18"])
+    assert run.world_model.model == linear(gain=2.0)
+    with pytest.raises(InputError, match=r"^world_model.model.gain=0\.?0?: use a positive number"):
+        parse(WorldModelRun, [*NAMED, "--world_model.model.gain=0"])
+    with pytest.raises(InputError, match="^world_model.model.context=0: use a whole number from 1"):
+        linear(context=0)
+    with pytest.raises(InputError, match="^world_model.model.heads=3: no such field; world_model.model has"):
+        parse(WorldModelRun, [*NAMED, "--world_model.model.heads=3"])
+
+
+def test_a_recipe_of_one_class_is_gone_on_with_as_another(tmp_path: Path):
+    recipe = tmp_path / "config.yaml"
+    recipe.write_text(json.dumps(encode(parse(WorldModelRun, ["--world_model.model.steps=3"]))))
+    other = parse(WorldModelRun, [f"--config_path={recipe}", *NAMED, "--world_model.model.context=3"])
+    assert other.world_model.model == linear(context=3)
+    written = encode(other)
+    recipe.write_text(json.dumps(written))
+    forgotten()
+    with pytest.raises(InputError, match=f"add --{NAMED[0][2:]}$"):
+        parse(WorldModelRun, [f"--config_path={recipe}"])
+    assert PACKAGE not in sys.modules
+    again = parse(WorldModelRun, [f"--config_path={recipe}", NAMED[0]])
+    assert encode(again) == written and again.world_model.model == linear(context=3)
+    ours = parse(WorldModelRun, [f"--config_path={recipe}", NAMED[0], "--world_model.model.type=pixels"])
+    assert ours.world_model.model == PixelModelConfig(context=3)
+
+
+def test_ours_are_one_type_of_several():
+    assert parse(WorldModelRun, ["--world_model.model.steps=2"]).world_model.model == PixelModelConfig(
+        steps=2
+    )
+    for value, said in (("spiral", "'spiral'"), ("[linear]", r"\['linear'\]"), ("{a: 1}", "{'a': 1}")):
+        with pytest.raises(InputError, match=rf"^world_model.model.type={said}: .*pixels"):
+            parse(WorldModelRun, [f"--world_model.model.type={value}"])
+
+
+@pytest.mark.parametrize(
+    ("source", "why"),
+    [
+        (None, "cannot be imported .ModuleNotFoundError: "),
+        ("def", "cannot be imported .SyntaxError: "),
+        ("raise RuntimeError('no weather today')", "cannot be imported .RuntimeError: no weather today"),
+        ("raise SystemExit(0)", "cannot be imported .SystemExit: 0"),
+    ],
+)
+def test_packages_that_cannot_be_imported(
+    source: str | None, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.syspath_prepend(tmp_path)
+    if source is not None:
+        (tmp_path / "a_model_of_mine.py").write_text(source)
+    with pytest.raises(InputError, match=f"^world_model.discover_packages_path='a_model_of_mine': {why}"):
+        parse(WorldModelRun, ["--world_model.discover_packages_path=a_model_of_mine"])
+    with pytest.raises(InputError, match=f"^imagination.discover_packages_path='a_model_of_mine': {why}"):
+        load_world_model(tmp_path / "w", "a_model_of_mine", section="imagination")
+
+
+@pytest.mark.parametrize("name", ["", ".", ".x", "a..b", "3", "a/b", "a-b"])
+def test_names_that_no_package_has(name: str):
+    with pytest.raises(InputError, match="^world_model.discover_packages_path=.*: use the name of a package"):
+        parse(WorldModelRun, [f"--world_model.discover_packages_path={name}"])
+
+
+def test_whoever_does_not_name_its_package_is_told_to(tmp_path: Path):
+    path = str(saved(tmp_path / "w"))
+    config = ImaginationConfig(share=0.5, path=path)
+    wanted = "config.json: model.type: 'linear'; use one of pixels, or name its package: "
+    with pytest.raises(InputError, match=f"^imagination.path=.*{wanted}imagination.discover_packages_path$"):
+        make_models(config, ENV, None, 4, "cpu")  # type: ignore[arg-type]  # only an oracle asks
+    with pytest.raises(InputError, match=f"^path=.*{wanted}discover_packages_path$"):
+        load_world_model(tmp_path / "w")
+    for reader, more in ((WorldModelEvalRun, []), (BenchRankingConfig, ["--policies=a"])):
+        options = [f"--path={path}", f"--discover_packages_path={PACKAGE}", *more]
+        assert parse(reader, options).discover_packages_path == PACKAGE and PACKAGE not in sys.modules
+
+
+def test_what_its_file_says_is_its_configs_to_refuse(tmp_path: Path):
+    file = saved(tmp_path / "w") / "config.json"
+    good = json.loads(file.read_text())
+    assert good["model"] == {"type": "linear", "context": 1, "gain": 1.0}
+    for model, why in (
+        ({"gain": -1.0}, "use a positive number"),
+        ({"gain": "much"}, "not a world model of accerl world-model"),
+        ({"type": ["linear"]}, "use one of"),
+        ({"type": None}, "config.json: model.type: it has none, as earlier versions wrote; train it again"),
+    ):
+        file.write_text(json.dumps(good | {"model": good["model"] | model}))
+        with pytest.raises(InputError, match=f"^path=.*{why}"):
+            load_world_model(tmp_path / "w", PACKAGE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BareConfig(LearnableModelConfig):
+    """Says nothing of its class."""
+
+
+@pytest.mark.parametrize(
+    ("make", "why"),
+    [
+        (None, "its config's make is '', which cannot be imported"),
+        (f"{__name__}:Nothing", "cannot be imported .module .* has no attribute 'Nothing'"),
+        (".mine:Model", "cannot be imported .*; use module:name"),
+        ("no.such:Model", "cannot be imported .No module named 'no'"),
+        (
+            "accerl_lerobot.world_model.imagination.registry:CopyModel",
+            "CopyModel is no subclass of LearnableWorldModel",
+        ),
+        (
+            "accerl_lerobot.world_model.model.contract:LearnableWorldModel",
+            "lacks begin, fit_statistics, loss, step",
+        ),
+    ],
+)
+def test_classes_that_are_none(
+    make: str | None, why: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Any
+):
+    monkeypatch.setitem(LearnableModelConfig.get_known_choices(), "bare", BareConfig)
+    if make is not None:
+        monkeypatch.setattr(BareConfig, "make", make, raising=False)
+    with pytest.raises(InputError, match=f"^world_model.model.type='bare': .*{why}"):
+        learnable_class(BareConfig())
+    told = ["--dataset.repo_id=a/b", f"--dataset.root={tmp_path / 'none'}", "--env.type=simulated"]
+    assert (
+        cli.main(["world-model", *told, "--world_model.model.type=bare", f"--output_dir={tmp_path / 'o'}"])
+        == 2
+    )
+    assert "world_model.model.type='bare'" in capsys.readouterr().err and not (tmp_path / "o").exists()
+
+
+def test_it_goes_on_learning_in_a_run_and_is_saved_when_promoted(tiny_checkpoint: Path, tmp_path: Path):
+    learn = OnlineLearnConfig(
+        steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE, batch=4
+    )
+    path = str(saved(tmp_path / "w", gain=3.0))
+    config = imagining(tiny_checkpoint, path=path, discover_packages_path=PACKAGE, learn=learn, episodes=24)
+    history, batches, engine = run_locally(config)
+    imagined = [s for batch in batches for s in batch if decisions([s], "imagined")]
+    assert history[-1].imagination["promoted"] >= 1 and imagined
+    assert all(s.world_version for s in imagined), "the one it began with never imagined"
+    assert engine._imagination is not None
+    engine._imagination.save_promoted(tmp_path / "promoted")
+    before, after = (load_world_model(tmp_path / name)[0] for name in ("w", "promoted"))
+    assert name_of(after) == "LinearWorldModel" and after.config == linear(gain=3.0)
+    moved = after.get_parameter("motion.weight") - before.get_parameter("motion.weight")
+    assert float(moved.abs().max()) > 0
+
+
+def test_in_processes_of_their_own_they_find_it_too(tiny_checkpoint: Path, tmp_path: Path):
+    from accerl_lerobot.engine.launch import RayEngine
+
+    learn = OnlineLearnConfig(
+        steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE, batch=4
+    )
+    named = {"path": str(saved(tmp_path / "w")), "discover_packages_path": PACKAGE}
+    config = imagining(tiny_checkpoint, learn=learn, episodes=24, **named)
+    engine = RayEngine(replace(config, output_dir=str(tmp_path / "run")), ("match",))
+    try:
+        engine.train()
+        last = drive(engine)[-1]
+    finally:
+        engine.close()
+    assert last.version == 12 and last.imagination["promoted"] >= 1 and last.imagination["rollouts"] > 0
+
+
+class Moody(LearnableWorldModel):
+    """Behaves otherwise in training, counts in a buffer, has a layer twice, and views."""
+
+    def __init__(self, spec: Any, config: Any) -> None:
+        super().__init__(spec, config)
+        self.norm, self.drop = nn.BatchNorm1d(spec.action_dim), nn.Dropout()
+        self.first = nn.Linear(spec.action_dim, spec.action_dim)
+        self.again = self.first
+        self.register_buffer("mask", torch.ones(8, 8).tril()[:4])
+        self.part = nn.Parameter(torch.randn(64)[:4])
+
+    def fit_statistics(self, windows: Any) -> None:
+        """It has none."""
+
+    def begin(self, context: Any, tasks: Any, histories: Any = None) -> Any:
+        """See the base class."""
+        return {}
+
+    def step(self, state: Any, actions: Any, seeds: Any) -> Any:
+        """See the base class."""
+        raise NotImplementedError
+
+    def loss(self, windows: Any, generator: torch.Generator) -> Any:
+        """How far what it makes of the first actions is from nothing."""
+        made = self.drop(self.norm(self.again(torch.from_numpy(windows.actions[:, 0, 0]))))
+        loss = (made + 1).square().mean() + self.part.square().mean()
+        return loss, {"made": loss.item()}
+
+
+def test_it_is_tried_and_saved_as_it_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Not in training; with what it has counted; and with layers that it has twice, and views."""
+    monkeypatch.setitem(LearnableModelConfig.get_known_choices(), "bare", BareConfig)
+    monkeypatch.setattr(BareConfig, "make", f"{__name__}:Moody", raising=False)
+    learner = Learner(new_learnable(SPEC, BareConfig()).eval(), LearnConfig(), seed=0)
+    assert learner.model.training and not learner.serving.training
+    for _ in range(3):
+        learner.step(windows(dots(4)))
+    counted, served = (m.get_submodule("norm").state_dict() for m in (learner.model, learner.serving))
+    assert int(served["num_batches_tracked"]) == 3
+    assert torch.equal(counted["running_var"], served["running_var"])
+    save_world_model(tmp_path / "w", learner.serving)
+    again, _ = load_world_model(tmp_path / "w")
+    assert not any(module.training for module in again.modules())
+    for name, value in learner.serving.state_dict().items():
+        assert torch.equal(value, again.state_dict()[name]), name

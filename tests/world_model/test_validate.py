@@ -1,0 +1,276 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Validation: models whose quality is known must get the numbers they deserve; and videos of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import imageio.v2 as imageio
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.evaluation.pictures import GAP
+from accerl_lerobot.world_model.config import SuccessLearnConfig, ValidationConfig
+from accerl_lerobot.world_model.data import Episode
+from accerl_lerobot.world_model.learning.learners import Examples, SuccessLearner, new_success_model
+from accerl_lerobot.world_model.model.contract import ActionHistory, Context, Prediction, State, WorldModel
+from accerl_lerobot.world_model.validation.rollout_eval import match_cut_lengths, predict
+from accerl_lerobot.world_model.validation.validate import (
+    SCALE,
+    ValidationVideos,
+    arm_actions,
+    comparison_video,
+    validate,
+    validation_windows,
+)
+from tests.world_model.test_pixels import SIZE, SPEC, K, dots
+
+CONFIG = ValidationConfig(depth=3, stride=2)
+
+
+class Deterministic(WorldModel):
+    """The dot's own world: exact, or not listening, or standing still."""
+
+    def __init__(self, kind: str) -> None:
+        self.spec, self.kind = SPEC, kind
+        self.calls: list[int] = []
+
+    def begin(
+        self, context: Context, tasks: Sequence[str], histories: Sequence[ActionHistory | None] | None = None
+    ) -> State:
+        assert len(tasks) == len(context.frames)
+        return {"frames": context.frames[:, -1], "robot": context.robot[:, -1]}
+
+    def step(self, state: State, actions: Tensor, seeds: Sequence[int]) -> Prediction:
+        assert len(set(seeds)) == len(actions)
+        self.calls.append(len(actions))
+        if self.kind == "copy":
+            moved, frames = state["robot"], state["frames"]
+        else:
+            made = 2 * actions if self.kind == "exact" else torch.full_like(actions, 0.4)
+            at = state["robot"]
+            for k in range(K):
+                at = (at + made[:, k]).clamp(0, SIZE - 4)
+            moved, frames = at, torch.stack([drawn(x) for x in at])
+        doubt = torch.zeros(len(actions))
+        return Prediction(
+            state={"frames": frames, "robot": moved}, frames=frames, robot=moved, uncertainty=doubt
+        )
+
+
+def drawn(at: Tensor) -> Tensor:
+    frame = torch.full((1, SIZE, SIZE, 3), 60, dtype=torch.uint8)
+    y, x = (int(v) for v in at.round())
+    frame[:, y : y + 4, x : x + 4] = 220
+    return frame
+
+
+def with_successes(episodes: list[Episode]) -> list[Episode]:
+    """An episode ends when the dot reaches the right; the picture shows it by then."""
+    made = []
+    for episode in episodes:
+        there = np.flatnonzero(episode.state[:, 1] > SIZE / 2)
+        if not len(there):
+            made.append(episode)
+        if not len(there) or there[0] < 2:
+            continue
+        t = int(there[0]) + 1
+        made.append(
+            replace(
+                episode,
+                frames=episode.frames[:t],
+                times=episode.times[:t],
+                state=episode.state[:t],
+                actions=episode.actions[:t],
+                success_at=t - 1,
+            )  # fmt: skip
+        )
+    return made
+
+
+def test_the_exact_world_passes():
+    found = validate(Deterministic("exact"), dots(12, seed=3), CONFIG)
+    assert found["passed"] and found["windows"] == 12 * 6
+    for depth, row in enumerate(found["depths"]):
+        assert row["depth"] == depth + 1 and row["windows"] == 12 * (5 - depth)
+        assert row["skill_changed"]["value"] > 0.99 and row["state_error"] < 1e-4 < row["state_error_copy"]
+        assert row["sensitivity_shuffled"]["low"] > 10 and row["psnr"] > 40
+        assert row["sensitivity_zero"]["value"] > 10
+    assert set(found["checks"]) == {
+        "skill_changed_first", "skill_changed_last", "skill_last", "sensitivity_low",
+    }  # fmt: skip
+    assert found["episodes"] == 12
+
+
+def test_a_copy_of_the_last_frame_fails():
+    found = validate(Deterministic("copy"), dots(12, seed=3), CONFIG)
+    assert not found["passed"] and not any(gate["holds"] for gate in found["checks"].values())
+    assert [row["skill"]["value"] for row in found["depths"]] == [0, 0, 0]
+    assert found["depths"][0]["sensitivity_shuffled"]["value"] == 1
+
+
+def test_a_world_that_does_not_listen_fails_by_its_sensitivity():
+    gates = validate(Deterministic("deaf"), dots(12, seed=3), CONFIG)["checks"]
+    assert gates["sensitivity_low"] == {"value": 1.0, "wanted": "above 1.2", "holds": False}
+
+
+def test_validations_are_the_same_for_the_same_seed_and_batched():
+    episodes = dots(30, seed=3)
+    model = Deterministic("exact")
+    windows = validation_windows(episodes, model, replace(CONFIG, max_windows=100), seed=1)
+    assert len(windows) == 100 and len(np.unique(windows.episode)) > 20
+    again = validation_windows(episodes, model, replace(CONFIG, max_windows=100), seed=1)
+    assert np.array_equal(windows.frames, again.frames)
+    other = validation_windows(episodes, model, replace(CONFIG, max_windows=100), seed=2)
+    assert not np.array_equal(windows.frames, other.frames)
+    rollouts = predict(model, windows, windows.actions)
+    assert model.calls == [64] * 3 + [36] * 3
+    assert rollouts.frames.shape == (100, 3, 1, SIZE, SIZE, 3) and rollouts.uncertainty.shape == (100, 3)
+
+
+def test_wrong_actions_are_wrong():
+    windows = validation_windows(dots(6, seed=3), Deterministic("exact"), CONFIG, seed=0)
+    rng = np.random.default_rng(0)
+    assert arm_actions(windows, "true", rng) is windows.actions
+    assert not arm_actions(windows, "zero", rng).any()
+    shuffled = arm_actions(windows, "shuffled", rng)
+    for i in range(len(windows)):
+        from_ = [j for j in range(len(windows)) if np.array_equal(shuffled[i], windows.actions[j])]
+        assert from_ and all(windows.episode[j] != windows.episode[i] for j in from_)
+
+
+def test_the_success_model_is_classified_on_what_was_imagined():
+    learn, held = with_successes(dots(120, seed=1)), with_successes(dots(120, seed=2))
+    assert sum(e.success for e in held) > 10
+    torch.manual_seed(0)
+    success = new_success_model(K)
+    learner = SuccessLearner(success, SuccessLearnConfig(steps=1, batch=32, lr=2e-3, imagined=0.3), seed=0)
+    world = Deterministic("exact")
+    examples = Examples(learn, K)
+    for _ in range(120):
+        metrics = learner.step(examples, world)
+    assert set(metrics) == {"loss", "accuracy", "progress"}
+    success.eval()
+    config = replace(CONFIG, stride=1, max_windows=5000, auroc=0.7, false_success=0.3)
+    exact = validate(world, held, config, success, fresh=True)
+    assert exact["passed"] and exact["checks"]["auroc"]["value"] > 0.7
+    assert exact["threshold"] == success.config.threshold >= 0.5
+    still = validate(Deterministic("copy"), held, config, success)
+    assert still["outcomes"]["auroc_real"] == exact["outcomes"]["auroc_real"] > 0.85
+    assert still["outcomes"]["auroc"]["value"] < exact["outcomes"]["auroc"]["value"] - 0.1, "nothing moved"
+
+
+def test_what_is_taken_for_a_success_depends_on_the_threshold():
+    episodes = with_successes(dots(40, seed=1))
+    success = new_success_model(K).eval()
+    shares = []
+    for success.config.threshold in (0.0, 1.0):
+        found = validate(Deterministic("exact"), episodes, CONFIG, success)
+        shares.append(found["checks"]["false_success_idle"]["value"])
+        assert found["checks"]["false_success"]["holds"] is (shares[-1] == 0)
+        assert found["threshold"] == success.config.threshold, "it is not fresh"
+    assert shares == [1, 0]
+
+
+def test_success_learning_needs_both_kinds():
+    with pytest.raises(ValueError, match="0 frames show a success"):
+        Examples(dots(3), K)
+
+
+def test_half_of_what_is_drawn_are_successes():
+    episodes, rng = with_successes(dots(20, seed=1)), np.random.default_rng(0)
+    examples = Examples(episodes, K)
+    at = examples.chunks(11, rng)
+    hits = [
+        episodes[p.episode].success_at - K < p.frame <= episodes[p.episode].success_at
+        and episodes[p.episode].success
+        for p in at
+    ]
+    assert hits == [True] * 5 + [False] * 6
+    before, after, success, progress = examples.sample(11, rng)
+    assert success.tolist() == hits and before.shape == after.shape == (11, 1, SIZE, SIZE, 3)
+    assert (progress[:5] == 1).all() and not (progress[5:] == 1).any()
+
+
+def test_pairs_that_were_seen_are_as_far_apart_in_successes_as_in_failures():
+    """How far the dot's picture has moved tells nothing, when pairs are drawn alike."""
+    times = np.arange(60)
+    episode = replace(
+        dots(1, steps=60)[0],
+        frames=np.broadcast_to(times[:, None, None, None, None], (60, 1, 2, 2, 3)).astype(np.uint8),
+        times=times, state=np.zeros((60, 2), np.float32), success_at=59,
+    )  # fmt: skip
+    before, after, success, _ = Examples([episode], K).sample(4000, np.random.default_rng(0))
+    apart = (after.astype(int) - before)[:, 0, 0, 0, 0]
+    assert set(apart.tolist()) == set(range(K + 1))
+    assert apart[success].mean() == pytest.approx(apart[~success].mean(), abs=0.1)
+
+
+def test_failures_are_cut_short_as_successes_are():
+    rng = np.random.default_rng(0)
+    steps = np.array([[2, 5], [3, 5]] + [[5, 5]] * 500 + [[1, 5]])
+    success = np.zeros(steps.shape, bool)
+    success[:2, 0] = True
+    cut = match_cut_lengths(steps, success, rng)
+    assert cut[:2].tolist() == steps[:2].tolist() and cut[-1, 0] == 1, "never more than was executed"
+    assert set(cut[2:-1, 0].tolist()) == {2, 3} and 2.4 < cut[2:-1, 0].mean() < 2.6
+    assert (cut[:, 1] == 5).all(), "nothing to compare with"
+
+
+@pytest.mark.parametrize("name", ["depth", "stride", "max_windows"])
+def test_bad_values_name_their_field(name: str):
+    with pytest.raises(InputError, match=f"^world_model.validation.{name}=0"):
+        ValidationConfig(**{name: 0})
+
+
+LARGE = SCALE * SIZE
+
+
+def video(path: Path) -> np.ndarray:
+    return np.stack(imageio.mimread(path))
+
+
+def halves(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    frames = video(path)
+    assert frames.shape[1:] == (2 * LARGE + GAP, LARGE, 3)
+    return frames[:, :LARGE], frames[:, LARGE + GAP :]
+
+
+@pytest.mark.parametrize("kind", ["exact", "copy"])
+def test_above_is_what_happened_and_below_what_was_imagined(kind: str, tmp_path: Path):
+    episode = dots(1, steps=13, seed=5)[0]
+    comparison_video(tmp_path / "film.mp4", Deterministic(kind), None, episode, scale=SCALE)
+    above, below = halves(tmp_path / "film.mp4")
+    shown = episode.frames[::K, 0].repeat(SCALE, 1).repeat(SCALE, 2).astype(int)
+    assert len(above) > len(shown) == 7
+    for t, expected in enumerate(shown):
+        mask = slice(16, None)  # below the name
+        assert np.abs(above[t][mask] - expected[mask]).mean() < 12
+        imagined = expected if kind == "exact" else shown[0]
+        assert np.abs(below[t][mask] - imagined[mask]).mean() < 12
+    assert [p.name for p in tmp_path.iterdir()] == ["film.mp4"]
+
+
+def test_the_colour_of_the_end_tells_how_it_went(tmp_path: Path):
+    success = new_success_model(K).eval()
+    failure = dots(1, seed=3)[0]
+    achieved = next(e for e in with_successes(dots(20, seed=1)) if e.success)
+    colours = []
+    for episode in (failure, achieved):
+        for success.config.threshold in (0.0, 1.0):
+            comparison_video(tmp_path / "film.mp4", Deterministic("exact"), success, episode)
+            borders = [part[-1][-2, 4:-4].mean(0) for part in halves(tmp_path / "film.mp4")]
+            colours.append(["green" if b[1] > b[0] else "red" for b in borders])
+    assert colours == [["red", "green"], ["red", "red"], ["green", "green"], ["green", "red"]]
+
+
+def test_every_so_many_validations_are_videoed(tmp_path: Path):
+    films = ValidationVideos(tmp_path / "rollouts", every=3)
+    for number in range(1, 6):
+        films(Deterministic("exact"), new_success_model(K).eval(), dots(1)[0], number, number == 4)
+    assert sorted(p.name for p in films.folder.iterdir()) == ["0001_failed.mp4", "0004_passed.mp4"]
