@@ -77,10 +77,10 @@ def show_timelines(config: TimelineConfig) -> dict[str, Any]:
     Raises:
         InputError: a run has no timeline, the window is not within one, or the picture has no place.
     """
+    picture = None if config.output is None else expanded(config.output, "output")
     timelines = [read_timeline(Path(name).expanduser()) for name in config.runs]
-    picture = timelines[0].run / PICTURE if len(timelines) == 1 else Path(PICTURE)
-    if config.output is not None:
-        picture = expanded(config.output, "output")
+    if picture is None:
+        picture = timelines[0].run / PICTURE if len(timelines) == 1 else Path(PICTURE)
     _check_output(picture)
     windows = [choose_window(timeline, config.start_s, config.seconds) for timeline in timelines]
     part = picture.with_name(f".{picture.stem}.part.png")
