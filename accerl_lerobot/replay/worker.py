@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The replay process: the door between collecting and learning.
 
-consumes    segments from rollout workers and from dreams
+consumes    segments from rollout workers and from imagination
 produces    batches of segments for the trainer
 waits for   the pace: `insert` until rollouts are not too far ahead, `sample` for enough that is new;
             and, where they take turns, each for the other
@@ -34,11 +34,11 @@ from accerl_lerobot.transport.contract import stopped
 from accerl_lerobot.transport.shared_memory import Address, serve_on_loop
 
 IN_TRANSIT = 1024
-"""Newest real segments that are kept for those who dream, who ask for them several times a second."""
+"""Newest real segments that are kept for the workers that imagine, which ask several times a second."""
 
 
 class News(NamedTuple):
-    """Answer to workers that dream."""
+    """Answer to workers that imagine."""
 
     segments: list[Segment]
     """Real ones that have come since."""
@@ -61,7 +61,7 @@ class ReplayWorker:
         state: the ``training_state`` to go on from; None: begin.
         directory: of the run, for the journal; None: none is kept.
         timeline: folder of the timeline; None: none is kept.
-        dreamers: how many dream.
+        imaginers: number of workers that imagine.
     """
 
     def __init__(
@@ -73,14 +73,14 @@ class ReplayWorker:
         state: Path | None = None,
         directory: Path | None = None,
         timeline: Path | None = None,
-        dreamers: int = 1,
+        imaginers: int = 1,
     ) -> None:
         self._clock = open_clock(timeline, "replay")
         journal = None if directory is None else Journal(directory / EPISODES)
         self._replay = MixedReplay(config, imagined or ReplayConfig(), 0.0, patient, journal)
-        # Nothing is imagined until a dreamer says so.
+        # Nothing is imagined until one of them says so.
         self._replay.awaited = imagined is not None
-        self._mixes = [(0.0, imagined is not None)] * dreamers
+        self._mixes = [(0.0, imagined is not None)] * imaginers
         """Last report of each of them: the share, and the chance of more later on."""
         self._real: deque[Segment] = deque(maxlen=IN_TRANSIT if imagined else 0)
         self._real_count = 0
@@ -96,7 +96,7 @@ class ReplayWorker:
             saved = snapshot.load(state / "replay")
             self._replay.restore(saved["replay"])
             self._rng = saved["rng"]
-            # Those who dream were saved before, and may not have been told of the last ones.
+            # The workers that imagine were saved before, and may not have been told of the last ones.
             self._real.extend(self._replay.real.segments)
             self._real_count = saved["real_count"]
         self._clock.enter(WAIT_IN)
@@ -194,7 +194,7 @@ class ReplayWorker:
         return News(segments, self._real_count, self._replay.real_ended, self._closed)
 
     async def mix(self, share: float, awaited: bool, who: int = 0) -> None:
-        """See `MixedReplay.mix`; imagined is what any of those who dream imagines."""
+        """See `MixedReplay.mix`; imagined is what any of the workers imagines."""
         async with self._changed:
             self._mixes[who] = (share, awaited)
             shares, hopes = zip(*self._mixes, strict=True)

@@ -63,7 +63,7 @@ def test_once_all_real_episodes_are_in_they_are_used_up_and_dreams_go_on():
     assert drawn(replay, 8) == {REAL: 4, IMAGINED: 4}
     assert drawn(replay, 8) == {REAL: 4, IMAGINED: 4}, "twice, as samples_per_insert says"
     assert drawn(replay, 8) == {REAL: 0, IMAGINED: 8}
-    assert not replay.may_sample(8) and not replay.exhausted(8), "dreams will come"
+    assert not replay.may_sample(8) and not replay.exhausted(8), "imagined rollouts will come"
 
 
 def test_where_real_episodes_are_counted_they_are_kept_for_when_there_are_dreams():
@@ -100,15 +100,15 @@ def test_it_is_exhausted_when_nothing_will_come():
     for _ in range(2):
         assert not replay.exhausted(12) and drawn(replay, 12) == {REAL: 12, IMAGINED: 0}
     assert replay.exhausted(12) and drawn(replay, 12) == {REAL: 0, IMAGINED: 0}
-    dreaming = mixed()
-    dreaming.end_real()
-    assert not dreaming.exhausted(8)
-    dreaming.mix(0.0, awaited=True)  # the world model is being learnt
-    assert not dreaming.exhausted(8)
-    dreaming.mix(0.0, awaited=False)  # the kill switch
-    assert dreaming.exhausted(8)
-    dreaming.mix(0.5, awaited=True)
-    assert not dreaming.exhausted(8)
+    imagining = mixed()
+    imagining.end_real()
+    assert not imagining.exhausted(8)
+    imagining.mix(0.0, awaited=True)  # the world model is being learnt
+    assert not imagining.exhausted(8)
+    imagining.mix(0.0, awaited=False)  # the kill switch
+    assert imagining.exhausted(8)
+    imagining.mix(0.5, awaited=True)
+    assert not imagining.exhausted(8)
 
 
 def test_what_is_too_old_for_one_part_costs_the_other_nothing():

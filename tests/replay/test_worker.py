@@ -173,7 +173,7 @@ def test_news_is_real_experience_alone():
 
 def test_imagined_is_what_any_of_several_who_dream_imagines():
     async def main() -> None:
-        worker = ReplayWorker(CONFIG, seed=0, imagined=CONFIG, dreamers=2)
+        worker = ReplayWorker(CONFIG, seed=0, imagined=CONFIG, imaginers=2)
         mixed = worker._replay
         assert (mixed.share, mixed.awaited) == (0.0, True)
         await worker.mix(0.0, False, 0)  # the other has not said anything yet
