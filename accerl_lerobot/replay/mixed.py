@@ -7,8 +7,8 @@ give. Two things end that:
 * the real episodes that were paid for have all been collected (`end_real`): from then on a batch takes what
   draws they have left, and imagined ones for the rest;
 * nothing is imagined, yet or any more (`share` is 0): a batch is real. But where real episodes are counted,
-  they are not used up while a world model is learnt that is to imagine from them: as long as there is room for
-  more of them, they are let in and there is no batch.
+  they are not used up while a world model is learnt that is to imagine from them: as long as there is room
+  for more of them, they are let in and there is no batch.
 
 When neither can give, and neither ever will, the replay is *exhausted*.
 """
