@@ -231,9 +231,11 @@ class ChunkCriticUpdate(OffPolicyUpdate):
     def _descend(self, name: str, loss: Tensor, clip: float = 1.0) -> float:
         """A step of one optimiser, left out where it is not finite; the gradient's norm."""
         optimizer = self.optimizers[name]
-        optimizer.zero_grad()
-        loss.backward()
-        norm = float(torch.nn.utils.clip_grad_norm_(optimizer.param_groups[0]["params"], clip))
+        parameters = optimizer.param_groups[0]["params"]
+        # Of these alone: the teacher's loss runs through the critic, whose gradients nobody needs then.
+        for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters), strict=True):
+            parameter.grad = gradient
+        norm = float(torch.nn.utils.clip_grad_norm_(parameters, clip))
         if math.isfinite(float(loss.detach()) + norm):
             optimizer.step()
         return norm
