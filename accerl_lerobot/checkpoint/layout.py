@@ -4,7 +4,7 @@
     checkpoints/NNNNNN/
       pretrained_model/     what stock LeRobot loads
       training_state/       what a run needs to go on, see `snapshot`; `training_step.json` is LeRobot's
-      world_model/          what dreams, where it has learnt on
+      world_model/          the world model in use, where one was promoted in the run
       config.yaml           the run's
       manifest.json         size and SHA-256 of all of these
     checkpoints/last        the newest
