@@ -4,7 +4,7 @@
     checkpoints/NNNNNN/
       pretrained_model/     loaded by stock LeRobot
       training_state/       needed to resume, see `snapshot`; `training_step.json` is LeRobot's
-      world_model/          the world model, where it is trained in the run
+      world_model/          the world model in use, where one was promoted in the run
       config.yaml           the run's config
       manifest.json         size and SHA-256 of all of these
     checkpoints/last        the newest

@@ -93,7 +93,7 @@ def test_the_same_measures_on_every_dataset(
     assert "By dataset" in stderr and "checks that hold" in stderr
     assert cli.main(["report", str(out)]) == 0
     page = (out / "report.html").read_text()
-    assert "By dataset" in page and "that a policy real_episode through" in page
+    assert "By dataset" in page and "that a policy collected" in page
 
 
 def test_both_models_go_to_the_device(

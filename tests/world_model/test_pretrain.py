@@ -307,7 +307,7 @@ def test_a_policys_episodes_are_learned_from_beside_demonstrations(
     assert f"trained on a/rollouts (online): evaluated on its {tried[1]} held-out" in stderr
     assert (
         cli.main(["report", str(out)]) == 0
-        and "episodes that a policy real_episode through" in (out / "report.html").read_text()
+        and "episodes that a policy collected" in (out / "report.html").read_text()
     )
 
 
