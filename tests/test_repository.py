@@ -168,6 +168,13 @@ def test_only_shells_import_ray() -> None:
         assert not distributed or path.name in DISTRIBUTED, path
 
 
+def test_a_config_is_read_before_ray_is_imported() -> None:
+    """Ray reads its environment when it is imported, and `ray_session.prepare` comes after the config."""
+    code = "import sys, accerl_lerobot.engine.run, accerl_lerobot.cli.verbs; sys.exit('ray' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 def test_collecting_and_storing_stay_free_of_torch_and_lerobot() -> None:
     code = (
         "import importlib, sys\n"

@@ -34,7 +34,7 @@ from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.timeline import COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.contract import PendingRequest, Server, stopped
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
-from accerl_lerobot.weights.factory import monotonic_clock
+from accerl_lerobot.weights.publisher import monotonic_clock
 from accerl_lerobot.weights.shared_memory import Received, SharedMemoryReader
 
 LOOK_S = 1.0

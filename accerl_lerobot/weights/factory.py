@@ -16,7 +16,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.transport.endpoint import FIELD, Transport
 from accerl_lerobot.transport.memfd import available
 from accerl_lerobot.weights.buffer import WeightBuffer
-from accerl_lerobot.weights.publisher import FLUSH_S, Publisher
+from accerl_lerobot.weights.publisher import FLUSH_S, Publisher, wall_clock
 from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
 
 logger = logging.getLogger(__name__)
@@ -105,16 +105,6 @@ def _connect(publisher: SharedMemoryPublisher, readers: Sequence[Any]) -> list[b
         return [bool(ray.get(answer, timeout=CONNECT_S)) for answer in answers]
     except GetTimeoutError as error:
         raise TimeoutError(f"a reader has not answered `open_weights` within {CONNECT_S:g} s") from error
-
-
-def wall_clock(moment: float) -> float:
-    """A moment of `time.monotonic` on the clock that machines share as well as theirs are set."""
-    return time.time() - (time.monotonic() - moment)
-
-
-def monotonic_clock(moment: float) -> float:
-    """The inverse of `wall_clock`, on the machine that calls it; never in the future."""
-    return time.monotonic() - max(0.0, time.time() - moment)
 
 
 @dataclass(eq=False)

@@ -199,3 +199,13 @@ class PublishDelay:
     def restore(self, state: list[tuple[int, Tensors]]) -> None:
         """Resume from `state`."""
         self._waiting.extend(state)
+
+
+def wall_clock(moment: float) -> float:
+    """A moment of `time.monotonic` on the clock that machines share as well as theirs are set."""
+    return time.time() - (time.monotonic() - moment)
+
+
+def monotonic_clock(moment: float) -> float:
+    """The inverse of `wall_clock`, on the machine that calls it; never in the future."""
+    return time.monotonic() - max(0.0, time.time() - moment)

@@ -12,7 +12,8 @@ import ray as real_ray
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.weights import factory
-from accerl_lerobot.weights.factory import RayPublisher, make_publisher, monotonic_clock, wall_clock
+from accerl_lerobot.weights.factory import RayPublisher, make_publisher
+from accerl_lerobot.weights.publisher import monotonic_clock, wall_clock
 from accerl_lerobot.weights.shared_memory import Received, SharedMemoryPublisher, SharedMemoryReader
 from tests.local_ray import Handle, Local
 from tests.weights.contract import filled, values_of
