@@ -308,6 +308,9 @@ def _check_off_policy(config: RunConfig, spec: WorldSpec, policy: Any) -> None:
         raise InputError(
             "policy.sampler.type", sampler.type, f"algorithm.type={config.algorithm.type}: {remedy}"
         )
+    if getattr(policy, "use_relative_actions", False):
+        remedy = f"algorithm.type={config.algorithm.type} keeps actions without the state they refer to"
+        raise InputError("policy.use_relative_actions", True, f"{remedy}; use another algorithm.type")
     decisions = math.ceil(spec.max_steps / getattr(policy, "n_action_steps", 1))
     if config.rollout.segment_length < decisions:
         remedy = f"algorithm.type={config.algorithm.type} looks at whole episodes; use at least {decisions}"

@@ -30,6 +30,8 @@ from accerl_lerobot.policies.value_head import ValueHead
 OBS_STATE = "observation.state"
 IMAGES = "observation.image"
 """How images' names begin: ``observation.images.<camera>``, or LeRobot's name for a lone camera."""
+CONSTANT = 1e-6
+"""Environment units in one normalised unit, below which an action counts as constant."""
 SELF_CHECK_TOLERANCE = 1e-5
 """Largest difference, in normalised action units, between our sampler and LeRobot's; fp32 noise is 1e-6."""
 
@@ -179,10 +181,15 @@ class Processing:
         return self.postprocessor(chunk)
 
     def normalise(self, chunk: Tensor) -> Tensor:
-        """(B, K, A) from environment to normalised units; every normalisation that LeRobot has is affine."""
+        """(B, K, A) from environment to normalised units; every normalisation that LeRobot has is affine.
+
+        An action that is constant in the policy's dataset has no scale; it is 0.
+        """
         ends = torch.stack([torch.zeros_like(chunk[0]), torch.ones_like(chunk[0])])
         zero, one = self.unnormalise(ends.to(self.device)).to(chunk)
-        return (chunk - zero) / (one - zero)
+        scale = one - zero
+        varies = scale.abs() > CONSTANT
+        return torch.where(varies, (chunk - zero) / torch.where(varies, scale, 1), 0)
 
 
 def example_requests(policy_config: Any, rename_map: dict[str, str]) -> list[Request]:

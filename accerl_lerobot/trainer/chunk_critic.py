@@ -27,7 +27,7 @@ from accerl_lerobot.algorithms import ChunkCriticConfig
 from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
-from accerl_lerobot.policies.family import Encoded
+from accerl_lerobot.policies.family import Encoded, pooled
 from accerl_lerobot.policies.teacher import Ensemble, Teacher
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.off_policy import OffPolicyUpdate, mean
@@ -103,14 +103,15 @@ class ChunkCriticUpdate(OffPolicyUpdate):
 
     def learn(self, new: int) -> dict[str, float]:
         """See the base class."""
-        if self.version < self.config.value_warmup_updates:
+        won = np.flatnonzero(self.memory["success"])
+        # Without a success there is nothing to learn: the teacher would follow the critic's noise.
+        if self.version < self.config.value_warmup_updates or not len(won):
             return {}
         self._scale_states()
         if not self.teacher.ready:
             self._begin()
         returns = self.memory["return"]
         bounds = float(returns.min()), float(returns.max())
-        won = np.flatnonzero(self.memory["success"])
         metrics = mean(
             self._critic_step(bounds) for _ in self.steps("critic", self.algorithm.critic_steps, new)
         )
@@ -133,7 +134,7 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         weight = self.algorithm.perception
         if not weight:
             return {}
-        features = (encoded.features * encoded.mask[..., None]).float().mean(1)
+        features = pooled(encoded.features, encoded.mask)
         state = self.teacher.scaled(self.tensor("state", rows))
         return {"perception_loss": weight * (self.reader(features) - state).square().mean()}
 
@@ -161,8 +162,9 @@ class ChunkCriticUpdate(OffPolicyUpdate):
     @torch.no_grad()
     def _scale_states(self) -> None:
         states = self.memory["state"]
-        self.teacher.mean.copy_(torch.from_numpy(states.mean(0)))
-        self.teacher.std.copy_(torch.from_numpy(states.std(0).clip(1e-3)))
+        # In float64, or the rounding of a long sum would look like a spread.
+        self.teacher.mean.copy_(torch.from_numpy(states.mean(0, dtype=np.float64)))
+        self.teacher.std.copy_(torch.from_numpy(states.std(0, dtype=np.float64).clip(1e-3)))
 
     def _begin(self) -> None:
         """The teacher learns to do what was done so far."""
@@ -215,13 +217,11 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         state = self.tensor("state", self._draw())
         q = self.critic(self.teacher.scaled(state), self.teacher(state))
         loss = -self._pessimistic(q).mean() / q.detach().abs().mean().clamp(min=SMALLEST_SCALE)
-        metrics = {"teacher_value": q.mean(), "disagreement": q.std(0).mean()}
-        if len(won):
-            rows = won[torch.randint(len(won), (BATCH,)).numpy()]
-            gap = self.teacher(self.tensor("state", rows)) - self.tensor("chunk", rows)
-            metrics["distance"] = gap.square().mean() / DISTANCE**2
-            loss = loss + self.algorithm.imitation * metrics["distance"]
-        self._descend("teacher", loss)
+        rows = won[torch.randint(len(won), (BATCH,)).numpy()]
+        gap = self.teacher(self.tensor("state", rows)) - self.tensor("chunk", rows)
+        distance = gap.square().mean() / DISTANCE**2
+        self._descend("teacher", loss + self.algorithm.imitation * distance)
+        metrics = {"teacher_value": q.mean(), "disagreement": q.std(0).mean(), "distance": distance}
         return {name: float(value.detach()) for name, value in metrics.items()}
 
     def _pessimistic(self, q: Tensor) -> Tensor:
@@ -238,6 +238,8 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         norm = float(torch.nn.utils.clip_grad_norm_(parameters, clip))
         if math.isfinite(float(loss.detach()) + norm):
             optimizer.step()
+        else:
+            self.skip(f"a step of the {name}", float(loss.detach()), norm)
         return norm
 
 

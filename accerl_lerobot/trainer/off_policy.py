@@ -161,17 +161,22 @@ class OffPolicyUpdate:
             self.optimizer.step()
             self._skipped_in_a_row = 0
         else:
-            self._skip(float(loss.detach()), norm)
+            self.skip("a step of the policy", float(loss.detach()), norm)
         metrics |= {"policy_loss": loss}
         return {name: float(value.detach()) for name, value in metrics.items()} | {"grad_norm": norm}
 
-    def _skip(self, loss: float, norm: float) -> None:
+    def skip(self, step: str, loss: float, norm: float) -> None:
+        """Counts a step that was left out because its loss or gradient is not finite.
+
+        Raises:
+            NonFiniteError: ``trainer.max_nonfinite`` of them since the policy's last step.
+        """
         self.skipped += 1
         self._skipped_in_a_row += 1
         if self._skipped_in_a_row >= self.config.max_nonfinite:
             raise NonFiniteError(
-                f"{self._skipped_in_a_row} steps in a row had a non-finite loss or gradient (the last one: "
-                f"loss {loss:g}, gradient norm {norm:g}); lower trainer.lr"
+                f"{self._skipped_in_a_row} steps in a row had a non-finite loss or gradient (the last one, "
+                f"{step}: loss {loss:g}, gradient norm {norm:g}); lower trainer.lr or trainer.value_lr"
             )
 
 

@@ -217,6 +217,22 @@ def test_actions_are_normalised_as_they_are_unnormalised(tiny_checkpoint: Path):
     torch.testing.assert_close(processing.normalise(processing.unnormalise(chunk)), chunk)
 
 
+def test_a_constant_action_is_normalised_to_0(tiny_checkpoint: Path):
+    processing = load_adapter(PolicyConfig(path=str(tiny_checkpoint), device="cpu")).processing
+    processing.postprocessor = lambda chunk: chunk * torch.tensor([0.5, 0.0]) + torch.tensor([1.0, 3.0])
+    chunk = torch.tensor([[[2.0, 3.0], [1.0, 4.0]]])
+    assert processing.normalise(chunk).tolist() == [[[2.0, 0.0], [0.0, 0.0]]]
+
+
+def test_nothing_is_learnt_before_the_first_success(tiny_checkpoint: Path):
+    update = learner(tiny_checkpoint, ChunkCriticConfig(policy_steps=1.0))
+    before = update.adapter.export_trainable()
+    assert "imitation_loss" not in update.step([episode([0.0, 0.0])])
+    after = update.adapter.export_trainable()
+    assert all(np.array_equal(before[name], after[name]) for name in before)
+    assert "imitation_loss" in update.step([episode([0.0, 1.0])])
+
+
 def test_imitation_is_flow_matching():
     """For the field that leads straight to the chunk the loss is 0; for one that is off by 1 it is 1."""
     shape = FlowShape(num_steps=3, chunk_size=4, executed=3, padded_dim=5, action_dim=2)
