@@ -44,7 +44,7 @@ class BenchSoakConfig(Section):
     """How long, how often, and what."""
 
     recipe: str | None = None
-    """See ``bench faults``."""
+    """See ``python -m benchmarks faults``."""
     output_dir: str = "outputs/soak"
     """Folder of the run and of soak.json and .md; must not exist."""
     minutes: Positive = 8.0
@@ -52,11 +52,11 @@ class BenchSoakConfig(Section):
     block_s: Annotated[float, Range("[20, inf)")] = 60.0
     """Seconds of a block; in every other one there is one fault. At least 20."""
     targets: tuple[str, ...] = ("rollout", "inference", "replay", "trainer")
-    """See ``bench faults``; not of the run's own process, which is not gone on with by itself."""
+    """See ``python -m benchmarks faults``; not of the run's own process, which does not resume by itself."""
     faults: tuple[str, ...] = ("kill", "exception", "exit")
-    """See ``bench faults``."""
+    """See ``python -m benchmarks faults``."""
     stall_s: Annotated[float, Range("[5, inf)")] = 10.0
-    """See ``bench faults``."""
+    """See ``python -m benchmarks faults``."""
     seed: Seed = 0
     """Seed of faults, places and moments."""
 
@@ -78,7 +78,7 @@ class BenchSoakConfig(Section):
 
     @property
     def of(self) -> BenchFaultsConfig:
-        """The same of ``bench faults``."""
+        """The same of ``python -m benchmarks faults``."""
         return BenchFaultsConfig(
             recipe=self.recipe, targets=self.targets, faults=self.faults, stall_s=self.stall_s, seed=self.seed
         )

@@ -110,7 +110,7 @@ class ReplayWorker:
         return serve_on_loop(self.insert).address
 
     async def run(self) -> None:
-        """Lasts until `close`; that it ends earlier is how the conductor learns of this process's death.
+        """Lasts until `close`; that it ends earlier is how the engine learns of this process's death.
 
         Raises:
             Exception: what has gone wrong while something was stored or drawn.

@@ -76,9 +76,9 @@ class RolloutConfig(Section, section="rollout"):
     replay has something to give, which is little unless more is imagined, and then ends.
     """
     max_restarts: Annotated[int, Range("[0, 1000000]")] = 3
-    """How often each worker is started again after it died or hung; once more ends the run with its error.
+    """Restarts of each worker after a crash or hang; one more restarts all workers from the last checkpoint.
 
-    Not reset by progress: a world that keeps crashing is to be mended.
+    Not reset by progress: an environment that keeps crashing needs fixing.
     """
 
     def __post_init__(self) -> None:
