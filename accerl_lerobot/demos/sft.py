@@ -25,7 +25,6 @@ from accerl_lerobot.config.dataset import DatasetConfig
 from accerl_lerobot.config.ranges import LearningRate, Range, Section, Steps, Threads
 from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
 from accerl_lerobot.errors import InputError, check_absent
-from accerl_lerobot.policies.guard import fetched_checkpoint
 from accerl_lerobot.policies.registry import discovery, register_policies
 
 logger = logging.getLogger(__name__)
@@ -151,6 +150,8 @@ def run_sft(
     """
     check_absent(output_dir)
     if config.init_path is not None:
+        from accerl_lerobot.policies.guard import fetched_checkpoint  # imports torch
+
         config = replace(config, init_path=str(fetched_checkpoint(config.init_path, None, "sft.init_path")))
     output_dir.parent.mkdir(parents=True, exist_ok=True)
     if config.init_path is None and config.backbone is not None:
