@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Progress
 from accerl_lerobot.engine.local import LocalEngine
+from accerl_lerobot.engine.run import make_engine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.config import evaluation_plans
@@ -85,10 +87,12 @@ def test_a_run_that_was_left_goes_on_as_if_it_had_not(
     case: str, left_at: int, tiny_checkpoint: Path, tmp_path: Path
 ):
     config = config_of(tiny_checkpoint, case)
+    config = replace(config, launch=replace(config.launch, engine="local"))
     tasks = ("match", "mirror") if case.startswith("tasks") else ("match",)
 
     def begin() -> LocalEngine:
-        engine = LocalEngine(config, tasks)
+        engine = make_engine(config, tasks, history=1)
+        assert isinstance(engine, LocalEngine)
         engine.plan(evaluation_plans(tasks, 9, "during"))  # some of them are under way when it is left
         engine.train()
         return engine
@@ -101,7 +105,8 @@ def test_a_run_that_was_left_goes_on_as_if_it_had_not(
     assert saved == (before[-1].version, [])
     between = drive(first)
     first.close()
-    again = LocalEngine(config, tasks, state=tmp_path / TRAINING_STATE)
+    again = make_engine(config, tasks, history=1, state=tmp_path / TRAINING_STATE)
+    assert isinstance(again, LocalEngine)
     again.train()
     after = drive(again)
     assert told(before + between) == told(expected), "saving changes nothing"

@@ -311,12 +311,12 @@ def test_a_thread_that_hangs_outside_of_a_world_shows_in_the_report(stage, monke
     release = threading.Event()
     hangs = iter([True])
 
-    def reach(point: str) -> bool:
+    def fault_point(point: str) -> bool:
         if point == "rollout.send" and next(hangs, False):
             release.wait(HANGS_S)
         return False
 
-    monkeypatch.setattr(module, "reach", reach)
+    monkeypatch.setattr(module, "fault_point", fault_point)
     one = stage(lambda segments: True)
     one.until(lambda: one.order(True).stuck_s > 0.4)
     assert one.order(True).in_world_s == 0
@@ -327,7 +327,7 @@ def test_a_thread_that_hangs_outside_of_a_world_shows_in_the_report(stage, monke
 def test_what_is_not_finite_is_sent_where_it_is_ordered(stage, monkeypatch: pytest.MonkeyPatch):
     """Replay refuses and counts it."""
     visits = iter([True])
-    monkeypatch.setattr(module, "reach", lambda point: point == "rollout.send" and next(visits, False))
+    monkeypatch.setattr(module, "fault_point", lambda point: point == "rollout.send" and next(visits, False))
     inserted: list[Segment] = []
     one = stage(lambda segments: inserted.extend(segments) or True)
     one.until(lambda: len(inserted) >= 4)

@@ -96,12 +96,12 @@ def test_what_is_promoted_says_what_it_has_learned_from(
     config = run(
         tiny_checkpoint, tmp_path / "model", OnlineLearnConfig(dataset=demos, online=rollouts), [source]
     )
-    rollouts = make_imagination(config, "rollout", lambda segment: None)
-    model, success = rollouts.models
+    imagination = make_imagination(config, "rollout", lambda segment: None)
+    model, success = imagination.models
     assert isinstance(model, PixelWorldModel) and isinstance(success, SuccessPairsRewardModel)
-    rollouts.swap(Promotion(model, success, 7, {}))
-    success.config.device = "cuda:3"  # as where it rollouts; who goes on may have none
-    rollouts.save_promoted(tmp_path / "promoted")
+    imagination.swap(Promotion(model, success, 7, {}))
+    success.config.device = "cuda:3"  # as where it imagines; a machine that resumes may have none
+    imagination.save_promoted(tmp_path / "promoted")
     saved = json.loads((tmp_path / "promoted" / "success_model" / "config.json").read_text())
     assert saved["device"] == "cpu" and success.config.device == "cuda:3"
     assert load_sources(tmp_path / "promoted") == (source, known(rollouts, (0, 1, 2, 3), ()), OWN_RUN)
