@@ -96,20 +96,13 @@ class Memory:
         }
         columns |= seen
         for name, values in columns.items():
-            self.write(name, rows, values, self.total + t)
+            self._write(name, rows, values, self.total + t)
         self.total += t
         return rows
 
-    def write(self, name: str, rows: np.ndarray, values: np.ndarray, total: int | None = None) -> None:
-        """Sets rows of a column, which is made if it is new.
-
-        Args:
-            name: of the column.
-            rows: (B,).
-            values: (B, ...).
-            total: rows that there are then; None: as many as now.
-        """
-        size = min(self.total if total is None else total, self.capacity)
+    def _write(self, name: str, rows: np.ndarray, values: np.ndarray, total: int) -> None:
+        """Sets rows (B,) of a column, made if new, to values (B, ...); `total` rows are there then."""
+        size = min(total, self.capacity)
         column = self._columns.get(name)
         if column is None or len(column) < size:
             room = FIRST
