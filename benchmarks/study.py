@@ -22,7 +22,7 @@ import yaml
 from rich.table import Table
 
 from accerl_lerobot.bench.tables import as_table
-from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY
+from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, DEMOS, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.config.ranges import Range, Section, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, encode, parse
@@ -236,6 +236,12 @@ class Study:
         if self.starts[cell.seed].policy.path is None:
             checkpoint = self.start(cell.seed) / CHECKPOINTS / LAST / PRETRAINED
             chosen += ["--sft.steps=0", f"--policy.path={checkpoint}"]
+            if self.starts[cell.seed].dataset.repo_id is None:
+                root = self.start(cell.seed) / DEMOS
+                chosen += [
+                    f"--dataset.repo_id={self.starts[cell.seed].demos.repo_id}",
+                    f"--dataset.root={root}",
+                ]
         return self._parse(cell.seed, chosen, self.folder(cell))
 
     def _parse(self, seed: int, chosen: list[str], folder: Path) -> RunConfig:

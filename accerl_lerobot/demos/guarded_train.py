@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stock ``lerobot-train`` that runs no code from outside, unpickles nothing, and checks its dataset's files.
 
-Same arguments, same result. π0-FAST's action tokeniser, whose newest code LeRobot would fetch and run, is
+Same arguments, same result, but that a new policy of images reads no ``observation.environment_state``, which
+a real robot does not have. π0-FAST's action tokeniser, whose newest code LeRobot would fetch and run, is
 read by `policies.fast` instead. ``--code_revision=COMMIT`` has code from the Hub run, of this commit only.
 
 ``--cache_items=true`` keeps the dataset's items in memory: LeRobot 0.6.1 decodes every image of an action
@@ -23,6 +24,7 @@ from torch.utils.data import Dataset
 from accerl_lerobot.checkpoint.safety import Origin
 from accerl_lerobot.demos.dataset_files import checked
 from accerl_lerobot.demos.sft import CACHE, CODE_REVISION, REFUSED
+from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.policies.guard import guarded, input_error
 
 MAX_BYTES = 4 * 1024**3
@@ -59,6 +61,19 @@ def item_bytes(meta: Any) -> int:
     return sum(4 * math.prod(meta.features[key]["shape"]) for key in meta.camera_keys)
 
 
+def _without_simulator(stock: Any) -> Any:
+    """LeRobot's function that makes the datasets, which then offer no simulator's state beside images."""
+
+    def make(cfg: Any) -> tuple[Any, Any]:
+        made: tuple[Any, Any] = stock(cfg)
+        for dataset in made:
+            if dataset is not None and dataset.meta.camera_keys:
+                dataset.meta.features.pop(ENVIRONMENT_STATE, None)
+        return made
+
+    return make
+
+
 def _cached(stock: Any) -> Any:
     """LeRobot's function that makes the datasets, with a `CachedDataset` where that is possible."""
 
@@ -84,6 +99,7 @@ def main() -> None:
 
     code, root, name = given(CODE_REVISION), given("--dataset.root="), given("--dataset.repo_id=")
     origin = Origin("dataset.repo_id", name) if root is None else Origin("dataset.root", root)
+    lerobot_train.make_train_eval_datasets = _without_simulator(lerobot_train.make_train_eval_datasets)
     if CACHE in sys.argv:
         lerobot_train.make_train_eval_datasets = _cached(lerobot_train.make_train_eval_datasets)
     sys.argv[1:] = [a for a in sys.argv[1:] if a != CACHE and not a.startswith(CODE_REVISION)]

@@ -122,7 +122,8 @@ def _write(env_config: EnvConfig, config: DemosConfig, spec: WorldSpec, root: Pa
     ):
         # The first episodes are already being simulated while LeRobot is imported.
         episodes = in_order(pool, _record_one, range(config.episodes), ahead=2 * config.processes)
-        with new_dataset(root, config.repo_id, spec.fps, env_config.type, features(spec)) as dataset:
+        table = features(spec, env_config.state_size)
+        with new_dataset(root, config.repo_id, spec.fps, env_config.type, table) as dataset:
             bar = progress.add_task("recording", total=config.episodes)
             for episode, discarded in episodes:
                 for frame in frames(episode):
@@ -138,13 +139,20 @@ def _write(env_config: EnvConfig, config: DemosConfig, spec: WorldSpec, root: Pa
     return tally
 
 
-def features(spec: WorldSpec) -> dict[str, dict[str, Any]]:
-    """LeRobot's feature table for a world; reward, done and success under LeRobot's own names."""
+def features(spec: WorldSpec, environment_state: int) -> dict[str, dict[str, Any]]:
+    """LeRobot's feature table for a world; reward, done and success under LeRobot's own names.
+
+    Args:
+        spec: of the world.
+        environment_state: numbers of its ``observation.environment_state``; 0: it offers none.
+    """
     table: dict[str, dict[str, Any]] = {
         key: {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
         for key, shape in spec.images.items()
     }
     vectors = {"observation.state": ("state", spec.state_dim), "action": ("action", spec.action_dim)}
+    if environment_state:
+        vectors[ENVIRONMENT_STATE] = ("environment_state", environment_state)
     for key, (name, size) in vectors.items():
         table[key] = {"dtype": "float32", "shape": (size,), "names": [f"{name}_{i}" for i in range(size)]}
     table["next.reward"] = {"dtype": "float32", "shape": (1,), "names": None}
@@ -154,14 +162,10 @@ def features(spec: WorldSpec) -> dict[str, dict[str, Any]]:
 
 
 def frames(episode: Episode) -> Iterator[dict[str, Any]]:
-    """The rows of `episode` as ``LeRobotDataset.add_frame`` takes them.
-
-    Without the environment state, which LeRobot would make an input of any policy trained on them.
-    """
-    seen = {key: rows for key, rows in episode.observations.items() if key != ENVIRONMENT_STATE}
+    """The rows of `episode` as ``LeRobotDataset.add_frame`` takes them."""
     for t in range(len(episode)):
         yield {
-            **{key: rows[t] for key, rows in seen.items()},
+            **{key: rows[t] for key, rows in episode.observations.items()},
             "action": episode.actions[t],
             "next.reward": episode.rewards[t : t + 1],
             "next.done": np.array([episode.done and t == len(episode) - 1]),

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from accerl_lerobot.algorithms import ChunkCriticConfig
+from accerl_lerobot.algorithms import ChunkCriticConfig, OffPolicyConfig
 from accerl_lerobot.checkpoint.layout import (
     AWAY,
     CHECKPOINTS,
@@ -39,6 +39,7 @@ from accerl_lerobot.checkpoint.layout import (
     newest_whole,
     write_atomically,
 )
+from accerl_lerobot.config.dataset import DatasetConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import ray_session
 from accerl_lerobot.engine.config import RunConfig, encode, timeline_folder
@@ -93,6 +94,10 @@ def make_engine(
 
         size, algorithm = history * config.env.state_size, config.algorithm
         load = WithTeacher(loader(load), size, algorithm.teacher_episodes, algorithm.teacher_noise)
+    if isinstance(config.algorithm, OffPolicyConfig) and (dataset := demonstrations_of(config)) is not None:
+        from accerl_lerobot.trainer.demonstrations import WithDemonstrations
+
+        load = WithDemonstrations(loader(load), dataset)
     if config.launch.engine == "local":
         from accerl_lerobot.engine.local import LocalEngine
 
@@ -101,6 +106,16 @@ def make_engine(
     from accerl_lerobot.engine.launch import RayEngine
 
     return RayEngine(config, tasks, history, state, load, session)
+
+
+def demonstrations_of(config: RunConfig) -> DatasetConfig | None:
+    """The dataset that the run was given, or has recorded; None without one."""
+    if config.dataset.repo_id is not None:
+        return config.dataset
+    own = None if config.output_dir is None else Path(config.output_dir).absolute() / DEMOS
+    if own is None or not own.is_dir():
+        return None
+    return replace(config.dataset, repo_id=config.demos.repo_id, root=str(own))
 
 
 def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfig:

@@ -166,7 +166,9 @@ def _write(
     spec = world.spec
     world.close()
     tally = {"episodes": 0, "frames": 0, "successes": 0, "unlike": 0}
-    table = features(spec) | {VERSION: {"dtype": "int64", "shape": (1,), "names": None}}
+    table = features(spec, settings.env.state_size) | {
+        VERSION: {"dtype": "int64", "shape": (1,), "names": None}
+    }
     cost = settings.rollout.decision_cost
     starts: list[Start] = []
     with (

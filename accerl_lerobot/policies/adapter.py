@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -26,6 +26,9 @@ from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Encoded, Family, Model
 from accerl_lerobot.policies.teacher import PREFIX, Teacher
 from accerl_lerobot.policies.value_head import ValueHead
+
+if TYPE_CHECKING:
+    from accerl_lerobot.config.dataset import DatasetConfig
 
 OBS_STATE = "observation.state"
 IMAGES = "observation.image"
@@ -237,6 +240,8 @@ class LeRobotAdapter(PolicyAdapter):
         self.policy.eval()
         self.teacher: Teacher | None = None
         """Acts in its place in part of the exploring episodes; given by `teacher.WithTeacher`."""
+        self.demonstrations: DatasetConfig | None = None
+        """What off-policy learning remembers from the start; given by `demonstrations.WithDemonstrations`."""
 
     def encode(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Encoded:
         """Reads raw observations, each (B, ...), and B instructions, for the family; differentiable."""

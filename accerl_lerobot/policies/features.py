@@ -57,6 +57,8 @@ def dataset_features(meta: Any) -> Features:
     from lerobot.utils.feature_utils import dataset_to_policy_features
 
     shapes = _shapes(dataset_to_policy_features(meta.features))
+    if meta.camera_keys:
+        shapes.pop(ENV_STATE, None)  # see `demos.guarded_train`
     return Features(shapes=shapes, fps=meta.fps, tasks=tuple(map(str, meta.tasks.index)))
 
 

@@ -46,7 +46,7 @@ READER_LR = 1e-3
 LAST = 50
 """Exploring episodes that ``teacher_success`` and ``policy_success`` are of."""
 FIRST_STEPS = 2000
-"""Steps in which the teacher learns what was done before it may act."""
+"""Steps in which the teacher learns what was done before it may act; the critic makes half as many."""
 MARGIN = 0.05
 """Share of the explored range of actions that the teacher may go beyond it."""
 SMALLEST_SCALE = 0.02
@@ -109,9 +109,8 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             return {}
         self._scale_states()
         if not self.teacher.ready:
-            self._begin()
-        returns = self.memory["return"]
-        bounds = float(returns.min()), float(returns.max())
+            self._begin(won)
+        bounds = self._bounds()
         metrics = mean(
             self._critic_step(bounds) for _ in self.steps("critic", self.algorithm.critic_steps, new)
         )
@@ -166,18 +165,27 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         self.teacher.mean.copy_(torch.from_numpy(states.mean(0, dtype=np.float64)))
         self.teacher.std.copy_(torch.from_numpy(states.std(0, dtype=np.float64).clip(1e-3)))
 
-    def _begin(self) -> None:
-        """The teacher learns to do what was done so far."""
+    def _bounds(self) -> tuple[float, float]:
+        """Smallest and largest return seen."""
+        returns = self.memory["return"]
+        return float(returns.min()), float(returns.max())
+
+    def _begin(self, won: np.ndarray) -> None:
+        """The teacher learns to do what succeeded so far, or all that was done if that is little."""
         chunks = self.memory["chunk"]
         low, high = (torch.from_numpy(end) for end in (chunks.min((0, 1)), chunks.max((0, 1))))
         margin = MARGIN * (high - low) + MARGIN
         with torch.no_grad():
             self.teacher.low.copy_(low - margin)
             self.teacher.high.copy_(high + margin)
+        known = won if len(won) >= BATCH else np.arange(len(self.memory))
         for _ in range(FIRST_STEPS):
-            rows = self._draw()
+            rows = known[torch.randint(len(known), (BATCH,)).numpy()]
             loss = (self.teacher(self.tensor("state", rows)) - self.tensor("chunk", rows)).square().mean()
             self._descend("teacher", loss)
+        # Or the teacher would at once climb a critic that knows nothing.
+        for _ in range(FIRST_STEPS // 2):
+            self._critic_step(self._bounds())
         with torch.no_grad():
             self.teacher.ready.fill_(1)
 

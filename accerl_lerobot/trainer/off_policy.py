@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Updates from a memory of all episodes: the loop that off-policy algorithms share, and self-imitation.
 
-new episodes → memory → gradient steps of the policy, so many for each new decision
+demonstrations, then new episodes → memory → gradient steps of the policy, so many for each new decision
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.teacher import PREFIX
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.demonstrations import demonstrations
 from accerl_lerobot.trainer.frozen_policies import CRITIC
 from accerl_lerobot.trainer.memory import Memory
 from accerl_lerobot.trainer.nonfinite import NonFiniteError
@@ -71,10 +72,12 @@ class OffPolicyUpdate:
             InputError: a segment is not a whole episode.
             NonFiniteError: see `update.Update.step`.
         """
+        if not self.memory.total and self.adapter.demonstrations is not None:
+            for demonstration in demonstrations(self.adapter.demonstrations, segments[0]):
+                self._remember(demonstration)
         for segment in segments:
             if not segment.truncated:  # the simulator diverged: nothing follows, and nothing failed
-                executed = self.adapter.processing.normalise(torch.from_numpy(segment.actions))
-                self.memory.add(segment, executed.numpy())
+                self._remember(segment)
         metrics = {"decisions": float(sum(map(len, segments))), "memory_decisions": float(len(self.memory))}
         rewards = np.concatenate([segment.reward for segment in segments])
         metrics |= {"reward_mean": float(rewards.mean())}
@@ -141,6 +144,10 @@ class OffPolicyUpdate:
         if self.version >= start and len(rows := self.imitable()):
             metrics |= mean(self._policy_step(rows) for _ in self.steps("policy", self.policy_steps, new))
         return metrics
+
+    def _remember(self, segment: Segment) -> None:
+        executed = self.adapter.processing.normalise(torch.from_numpy(segment.actions))
+        self.memory.add(segment, executed.numpy())
 
     def tensor(self, name: str, rows: np.ndarray) -> Tensor:
         """Rows of a column, where the policy lives."""

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Demonstrations in an off-policy learner's memory, against the dataset's frames."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from accerl_lerobot.algorithms import ChunkCriticConfig
+from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.demos.record import DemosConfig, record_demos
+from accerl_lerobot.demos.sft import SFTConfig, run_sft
+from accerl_lerobot.envs import SimulatedConfig, make_world
+from accerl_lerobot.experience import ENVIRONMENT_STATE, Origin, Segment
+from accerl_lerobot.policies.config import PolicyConfig
+from accerl_lerobot.policies.loading import load_adapter
+from accerl_lerobot.policies.teacher import WithTeacher
+from accerl_lerobot.trainer import demonstrations as module
+from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.demonstrations import WithDemonstrations, demonstrations
+
+ENV = SimulatedConfig(max_steps=16, environment_state=True)
+K = 4
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> DatasetConfig:
+    """Three successes and a failure."""
+    root = tmp_path_factory.mktemp("demos") / "dataset"
+    config = DemosConfig(episodes=4, failure_share=0.25, processes=1, repo_id="a/b", root=str(root))
+    record_demos(ENV, config)
+    return DatasetConfig(repo_id="a/b", root=str(root))
+
+
+@pytest.fixture
+def like() -> Segment:
+    """An explored episode of one decision."""
+    world = make_world(ENV)
+    observation = world.reset(3, world.spec.tasks[0])
+    seen = {name: np.stack([value] * 2) for name, value in observation.items() if name != "task"}
+    return Segment(
+        observations=seen,
+        task=str(observation["task"]),
+        latent={},
+        log_prob=np.zeros((1, 1), np.float32),
+        value=np.zeros(1, np.float32),
+        actions=np.zeros((1, K, world.spec.action_dim), np.float32),
+        reward=np.zeros(1, np.float32),
+        version=np.zeros(1, np.int64),
+        steps=np.array([K]),
+        terminated=True,
+        truncated=False,
+        success=False,
+        key="explored",
+        origin=Origin("match", 0, 0),
+        episode={"return": 0.0},
+    )
+
+
+def test_decisions_are_the_frames_from_every_step_on(dataset: DatasetConfig, like: Segment):
+    data = LeRobotDataset("a/b", root=dataset.root)
+    ends = list(zip(data.meta.episodes["dataset_from_index"], data.meta.episodes["dataset_to_index"], strict=True))
+    episodes = [[data[i] for i in range(first, last)] for first, last in ends]
+    read = list(demonstrations(dataset, like))
+    expected = [(e, phase) for e in range(4) for phase in range(min(K, len(episodes[e])))]
+    assert len(read) == len(expected)
+    for segment, (e, phase) in zip(read, expected, strict=True):
+        frames = episodes[e]
+        won = any(bool(frame["next.success"]) for frame in frames)
+        assert segment.success is won and segment.reward.sum() == won == segment.reward[-1]
+        for t in range(len(segment)):
+            at = phase + K * t
+            for name in ("observation.state", ENVIRONMENT_STATE):
+                np.testing.assert_array_equal(segment.observations[name][t], frames[at][name].numpy())
+            image = next(name for name in segment.observations if "images" in name)
+            pixels = (255 * frames[at][image]).round().byte().permute(1, 2, 0).numpy()
+            np.testing.assert_array_equal(segment.observations[image][t], pixels)
+            for k in range(K):
+                last = min(at + k, len(frames) - 1)  # what was not executed repeats the last
+                np.testing.assert_array_equal(segment.actions[t, k], frames[last]["action"].numpy())
+            assert segment.steps[t] == min(K, len(frames) - at)
+    assert {segment.success for segment in read} == {True, False}
+
+
+def test_of_a_long_dataset_only_a_part_is_read(
+    dataset: DatasetConfig, like: Segment, monkeypatch: pytest.MonkeyPatch
+):
+    frames = LeRobotDataset("a/b", root=dataset.root).meta.total_frames
+    monkeypatch.setattr(module, "ROWS", frames // K // 2)
+    read = list(demonstrations(dataset, like))
+    assert len(read) == 2 and sum(map(len, read)) <= frames // K // 2 + 2
+
+
+def test_a_dataset_of_something_else_is_left_out(
+    dataset: DatasetConfig, like: Segment, caplog: pytest.LogCaptureFixture
+):
+    like = replace(like, actions=np.zeros((1, K, 7), np.float32))
+    with caplog.at_level(logging.WARNING):
+        assert not list(demonstrations(dataset, like))
+    assert "does not join the memory: the dataset's action has shape" in caplog.text
+
+
+def test_the_memory_begins_with_them_and_is_restored_without(
+    dataset: DatasetConfig, like: Segment, tiny_checkpoint: Path
+):
+    load = WithDemonstrations(WithTeacher(load_adapter, ENV.state_size, share=0.5, noise=0.1), dataset)
+    adapter = load(PolicyConfig(path=str(tiny_checkpoint), device="cpu"))
+    config = TrainerConfig(value_warmup_updates=100)
+    update = ChunkCriticUpdate(adapter, ChunkCriticConfig(), config)
+    rows = sum(map(len, demonstrations(dataset, like)))
+    assert update.step([like])["memory_decisions"] == rows + 1
+    assert update.memory["success"][:-1].any() and not update.memory["success"][-1]
+    again = ChunkCriticUpdate(adapter, ChunkCriticConfig(), config)
+    again.restore(update.state())
+    assert again.step([like])["memory_decisions"] == rows + 2
+
+
+def test_a_policy_of_images_does_not_read_the_simulators_state(dataset: DatasetConfig, tmp_path: Path):
+    policy = {"type": "act", "chunk_size": K, "n_action_steps": K, "dim_model": 8, "n_heads": 1}
+    small = {"n_encoder_layers": 1, "n_vae_encoder_layers": 1, "dim_feedforward": 8, "latent_dim": 2}
+    weights = {"pretrained_backbone_weights": None}
+    config = SFTConfig(steps=1, batch_size=2, policy=policy | small | weights)
+    path = run_sft(config, dataset, tmp_path / "sft", seed=0)
+    inputs = json.loads((path / "config.json").read_text())["input_features"]
+    assert "observation.state" in inputs and ENVIRONMENT_STATE not in inputs
