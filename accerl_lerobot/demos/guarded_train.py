@@ -62,7 +62,7 @@ def item_bytes(meta: Any) -> int:
 
 
 def _without_simulator(stock: Any) -> Any:
-    """LeRobot's function that makes the datasets, without a simulator's state beside the images to train on."""
+    """LeRobot's function that makes datasets, without a simulator's state beside the images to train on."""
 
     def make(cfg: Any) -> tuple[Any, Any]:
         train, evaluation = stock(cfg)
