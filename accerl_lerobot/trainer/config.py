@@ -26,8 +26,8 @@ class TrainerConfig(Section, section="trainer"):
     batch_decisions: Annotated[int, Range("[1, 1000000]")] = 128
     """Decisions of one update; whole segments are drawn until there are at least as many."""
     micro_batch: Annotated[int, Range("[1, 1000000]")] = 1024
-    """Decisions per backward pass of a rank; smaller saves memory, and costs one more forward pass for the
-    values."""
+    """Decisions per backward pass of a rank; smaller saves memory, and costs algorithms with a likelihood
+    ratio one more forward pass for the values."""
     lr: Annotated[float, Range("[0, 1)")] = 3e-5
     """Peak learning rate of the policy; 0 freezes it."""
     value_lr: Annotated[float, Range("[0, 1)")] = 1e-3

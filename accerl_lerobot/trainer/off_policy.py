@@ -27,6 +27,7 @@ from accerl_lerobot.trainer.demonstrations import demonstrations
 from accerl_lerobot.trainer.frozen_policies import CRITIC
 from accerl_lerobot.trainer.memory import Memory
 from accerl_lerobot.trainer.nonfinite import NonFiniteError
+from accerl_lerobot.trainer.sharding import arrange
 
 POLICY_BATCH = 128
 """Rows of one step of the policy."""
@@ -51,6 +52,7 @@ class OffPolicyUpdate:
         if not adapter.family.imitates:
             remedy = "needs a policy that explores by flow or gaussian; use gipo"
             raise InputError("algorithm.type", algorithm.type, remedy)
+        arrange(adapter, config)
         self.adapter, self.config = adapter, config
         self.policy_steps = algorithm.policy_steps
         self.memory = Memory(algorithm.memory, algorithm.gamma, self.n_step)
@@ -156,21 +158,25 @@ class OffPolicyUpdate:
     def _policy_step(self, imitable: np.ndarray) -> dict[str, float]:
         """One gradient step on rows drawn from `imitable`."""
         rows = imitable[torch.randint(len(imitable), (POLICY_BATCH,)).numpy()]
-        with self.adapter.autocast():
-            encoded = self.adapter.encode(*self.memory.observations(rows))
-            imitation = self.adapter.family.imitation_loss(encoded, self.target(rows)).float().mean()
-        metrics = {"imitation_loss": imitation} | self.auxiliary(rows, encoded)
-        loss = torch.stack(list(metrics.values())).sum()
+        metrics: dict[str, float] = {}
         self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        for part in np.array_split(rows, math.ceil(len(rows) / self.config.micro_batch)):
+            with self.adapter.autocast():
+                encoded = self.adapter.encode(*self.memory.observations(part))
+                imitation = self.adapter.family.imitation_loss(encoded, self.target(part)).float().mean()
+            losses = {"imitation_loss": imitation} | self.auxiliary(part, encoded)
+            losses = {name: len(part) / len(rows) * value for name, value in losses.items()}
+            torch.stack(list(losses.values())).sum().backward()
+            for name, value in losses.items():
+                metrics[name] = metrics.get(name, 0.0) + float(value.detach())
+        loss = sum(metrics.values())
         norm = float(torch.nn.utils.clip_grad_norm_(self._policy, self.config.grad_clip))
-        if math.isfinite(float(loss.detach()) + norm):
+        if math.isfinite(loss + norm):
             self.optimizer.step()
             self._skipped_in_a_row = 0
         else:
-            self.skip("a step of the policy", float(loss.detach()), norm)
-        metrics |= {"policy_loss": loss}
-        return {name: float(value.detach()) for name, value in metrics.items()} | {"grad_norm": norm}
+            self.skip("a step of the policy", loss, norm)
+        return metrics | {"policy_loss": loss, "grad_norm": norm}
 
     def skip(self, step: str, loss: float, norm: float) -> None:
         """Counts a step that was left out because its loss or gradient is not finite.

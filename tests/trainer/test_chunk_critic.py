@@ -354,6 +354,24 @@ def test_a_step_imitates_successes_only(tiny_checkpoint: Path):
     assert low < loss < high
 
 
+@pytest.mark.parametrize("options", [{"micro_batch": 50}, {"activation_checkpointing": True}], ids=str)
+def test_less_memory_gives_the_same_step(tiny_checkpoint: Path, options: dict[str, Any]):
+    def step(**options: Any) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+        torch.manual_seed(0)
+        adapter = load_adapter(PolicyConfig(path=str(tiny_checkpoint), device="cpu"))
+        adapter.family.imitation_loss = lambda encoded, chunk: encoded.features.square().mean((1, 2))
+        config = TrainerConfig(warmup_updates=0, value_warmup_updates=0, lr=1e-3, **options)
+        update = OffPolicyUpdate(adapter, SelfImitationConfig(policy_steps=0.25), config)
+        segments = [episode([0.0, 0.0, 0.0, 1.0])]
+        segments[0].observations["observation.state"][:, 0] = np.arange(5)
+        return update.step(segments), adapter.export_trainable()
+
+    (metrics, weights), (other, others) = step(), step(**options)
+    assert other == pytest.approx(metrics, rel=1e-5)
+    for name, tensor in weights.items():
+        np.testing.assert_allclose(others[name], tensor, rtol=1e-4, atol=1e-6)
+
+
 def test_the_critic_computes_in_fp32_beside_a_policy_in_bf16(
     tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ):
