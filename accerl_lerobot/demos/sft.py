@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -17,22 +19,27 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from accerl_lerobot.checkpoint.layout import displaced, relocate
 from accerl_lerobot.checkpoint.safety import Origin, check_remote_code, read_json
 from accerl_lerobot.config.dataset import DatasetConfig
-from accerl_lerobot.config.ranges import LearningRate, Range, Section, Steps, Threads
+from accerl_lerobot.config.ranges import LearningRate, Range, Section, Share, Steps, Threads
 from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
 from accerl_lerobot.errors import InputError, check_absent
+from accerl_lerobot.experience import SUCCESS
 from accerl_lerobot.policies.registry import discovery, register_policies
 
 logger = logging.getLogger(__name__)
 
 CODE_REVISION, CACHE = "--code_revision=", "--cache_items=true"
 """Our arguments of the trainer."""
+HELD_OUT = re.compile(r"\bstep (\d+): eval_loss=(\S+)")
+"""LeRobot's report of a loss on held-out episodes."""
 REFUSED = "accerl refuses: "
 """Begins the last line of a trainer that met something it must not use; JSON follows."""
+CHECKPOINTS = 10
+"""Checkpoints of which the best on held-out episodes is used."""
 LOG_EVERY = 25
 """Optimiser steps between two lines of progress."""
 NO_SFT = {
@@ -53,6 +60,11 @@ class SFTConfig(Section, section="sft"):
     """Peak learning rate; LeRobot's preset warms up and decays it over `steps`, if the policy type's does."""
     warmup_steps: Steps = 20
     """Without effect on a policy type whose preset has no warm-up, such as act."""
+    pick: Literal["all", "successes", "failures"] = "all"
+    """Episodes that are imitated, by their ``next.success``; the others stay in the dataset."""
+    held_out: Share = 0.0
+    """Share of each task's episodes that is not trained on: the checkpoint, one of ten, that predicts these
+    actions best is used; 0: all are trained on, and the last checkpoint is used."""
     cache: bool = True
     """Keep the dataset's items in memory, see `guarded_train`; not above 4 GiB nor with image transforms."""
     num_workers: Annotated[int, Range("[0, 256]")] = 0
@@ -81,9 +93,14 @@ class SFTConfig(Section, section="sft"):
 
 
 def sft_command(
-    config: SFTConfig, dataset: DatasetConfig, output_dir: Path, seed: int, device: str
+    config: SFTConfig,
+    dataset: DatasetConfig,
+    output_dir: Path,
+    seed: int,
+    device: str,
+    episodes: Sequence[int] | None = None,
 ) -> list[str]:
-    """The ``lerobot-train`` command line of this warm start."""
+    """The ``lerobot-train`` command line of this warm start; `episodes`: see `picked`."""
     policy: dict[str, Any]
     if config.init_path is not None:
         stored = read_json(Path(config.init_path) / "config.json", Origin("sft.init_path", config.init_path))
@@ -109,13 +126,18 @@ def sft_command(
     command += discovery(kind)
     named = {"repo_id": dataset.repo_id, "root": dataset.root, "revision": dataset.revision}
     command += [f"--dataset.{key}={value}" for key, value in named.items() if value]
+    command += [f"--dataset.episodes={json.dumps(episodes)}"] if episodes is not None else []
+    every = config.steps
+    if config.held_out:
+        every = math.ceil(config.steps / CHECKPOINTS)
+        command += [f"--dataset.eval_split={config.held_out}", f"--eval_steps={every}"]
     command += [
         f"--output_dir={output_dir}",
         f"--steps={config.steps}",
         f"--batch_size={config.batch_size}",
         f"--num_workers={config.num_workers}",
         f"--seed={seed}",
-        f"--save_freq={config.steps}",
+        f"--save_freq={every}",
         f"--log_freq={LOG_EVERY}",
         "--env_eval_freq=0",
         "--wandb.enable=false",
@@ -157,7 +179,7 @@ def run_sft(
     if config.init_path is None and config.backbone is not None:
         write_backbone(output_dir.parent / "backbone", config.backbone, texts)
     config = _with_backbone_in_place(config, output_dir.parent / "init")
-    command = sft_command(config, dataset, output_dir, seed, device)
+    command = sft_command(config, dataset, output_dir, seed, device, picked(dataset, config.pick))
     logger.info("%s", shlex.join(command))
     # Whoever holds Ray's token can run code in its workers; a trainer has no business there.
     environment = {k: v for k, v in os.environ.items() if not k.startswith("RAY_AUTH")} | {
@@ -193,7 +215,42 @@ def run_sft(
             raise InputError(*json.loads(last.removeprefix(REFUSED)))
         tail = "".join(log.read_text().splitlines(keepends=True)[-15:])
         raise RuntimeError(f"lerobot-train ended with exit code {code}; the end of {log}:\n{tail}")
-    return output_dir / "checkpoints" / "last" / "pretrained_model"
+    return _best(log.read_text(), output_dir / "checkpoints") / "pretrained_model"
+
+
+def picked(dataset: DatasetConfig, pick: str) -> list[int] | None:
+    """Indices of the episodes that ``sft.pick`` names; None: all.
+
+    Raises:
+        InputError: there is no such episode, or they are not labelled.
+    """
+    if pick == "all":
+        return None
+    from accerl_lerobot.demos.dataset_files import checked, open_metadata, origin_of
+
+    meta = open_metadata(dataset)
+    if SUCCESS not in meta.features:
+        raise InputError("sft.pick", pick, f"the dataset's episodes are not labelled by {SUCCESS}; use all")
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    with checked(origin_of(dataset)):
+        data = LeRobotDataset(meta.repo_id, root=meta.root, revision=meta.revision, video_backend="pyav")
+        columns = data.hf_dataset.with_format("numpy", columns=["episode_index", SUCCESS])[:]
+    succeeded = set(columns["episode_index"][columns[SUCCESS]].tolist())
+    wanted = [i for i in range(meta.total_episodes) if (i in succeeded) is (pick == "successes")]
+    if not wanted:
+        raise InputError("sft.pick", pick, f"none of the dataset's {meta.total_episodes} episodes; use all")
+    return wanted
+
+
+def _best(log: str, checkpoints: Path) -> Path:
+    """The checkpoint with the lowest loss on held-out episodes, the last one where none were held out."""
+    losses = {int(step): float(loss) for step, loss in HELD_OUT.findall(log)}
+    if not losses:
+        return checkpoints / "last"
+    best = min(losses, key=losses.__getitem__)
+    logger.info("loss on held-out episodes: %s; step %d is used", losses, best)
+    return next(path for path in checkpoints.iterdir() if path.name.isdecimal() and int(path.name) == best)
 
 
 def _with_backbone_in_place(config: SFTConfig, copy: Path) -> SFTConfig:

@@ -12,14 +12,13 @@ from typing import Any
 import numpy as np
 
 from accerl_lerobot.config.dataset import DatasetConfig
-from accerl_lerobot.experience import Origin, Segment
+from accerl_lerobot.experience import SUCCESS, Origin, Segment
 from accerl_lerobot.policies.config import Load, PolicyConfig
 
 logger = logging.getLogger(__name__)
 
 ROWS = 5000
 """Decisions that are read at most; of short datasets, those that begin at every env step."""
-SUCCESS = "next.success"
 
 
 @dataclass(frozen=True)

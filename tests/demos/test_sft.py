@@ -9,6 +9,7 @@ import pickle
 import shutil
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +21,9 @@ import torch
 from accerl_lerobot.config.dataset import DatasetConfig
 from accerl_lerobot.demos import guarded_train, sft
 from accerl_lerobot.demos.backbone import BackboneConfig
-from accerl_lerobot.demos.sft import SFTConfig, run_sft, sft_command
+from accerl_lerobot.demos.record import DemosConfig, record_demos
+from accerl_lerobot.demos.sft import SFTConfig, picked, run_sft, sft_command
+from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from tests.policies.tiny import adapter_at
 from tests.rounding import assert_close
@@ -157,6 +160,34 @@ def test_what_cannot_be_cached_is_read_the_stock_way(
     monkeypatch.setattr(sys, "argv", ["lerobot-train", "--cache_items=true"])
     guarded_train.main()
     assert isinstance(got[0], guarded_train.CachedDataset) == expected and got[1] == "evaluation"
+
+
+def test_the_checkpoint_that_is_best_on_held_out_episodes_is_used(tmp_path: Path):
+    path = run_sft(replace(TINY, steps=4, held_out=0.3), LOCAL, tmp_path / "sft", seed=0)
+    lines = [line for line in (tmp_path / "sft.log").read_text().splitlines() if "eval_loss=" in line]
+    losses = [float(line.rpartition("eval_loss=")[2]) for line in lines]
+    assert len(losses) == 4
+    assert path == tmp_path / "sft/checkpoints" / f"{1 + int(np.argmin(losses)):06d}" / "pretrained_model"
+
+
+class TestPick:
+    @pytest.fixture(scope="class")
+    def dataset(self, tmp_path_factory: pytest.TempPathFactory) -> DatasetConfig:
+        """Every second episode fails."""
+        root = str(tmp_path_factory.mktemp("demos") / "dataset")
+        config = DemosConfig(episodes=4, failure_share=0.5, processes=1, repo_id="a/b", root=root)
+        record_demos(SimulatedConfig(max_steps=16), config)
+        return DatasetConfig(repo_id="a/b", root=root)
+
+    def test_episodes_by_their_label(self, dataset: DatasetConfig, tmp_path: Path):
+        assert picked(dataset, "all") is None
+        assert picked(dataset, "successes") == [0, 2] and picked(dataset, "failures") == [1, 3]
+        command = sft_command(TINY, dataset, tmp_path, 0, "cpu", [0, 2])
+        assert "--dataset.episodes=[0, 2]" in command
+
+    def test_none_of_them(self):
+        with pytest.raises(InputError, match="sft.pick='failures': none of the dataset's"):
+            picked(LOCAL, "failures")
 
 
 def test_two_steps_of_lerobot_s_trainer_give_a_checkpoint(tmp_path: Path):
