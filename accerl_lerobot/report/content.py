@@ -413,6 +413,7 @@ def _headline(run: Run) -> str:
 
 def _tiles(run: Run, bound: int | None) -> list[tuple[str, str, str]]:
     result, algorithm = run.result or {}, run.section("algorithm")
+    advantage = algorithm.get("advantage")
     mean = float(np.nanmean(column(run.train, "lag_mean"))) if run.train else None
     largest = float(np.nanmax(column(run.train, "lag_max"))) if run.train else None
     parts = {"warm start": result.get("warm_start_s") or 0.0, "RL": result.get("rl_s") or 0.0}
@@ -430,7 +431,7 @@ def _tiles(run: Run, bound: int | None) -> list[tuple[str, str, str]]:
         ("wall time", duration(run.wall_s), spent),
         ("updates", updates, f"of {run.section('trainer').get('updates')}"),
         ("lag", number(mean, 2), f"largest {number(largest)}, bound {number(bound)}"),
-        ("algorithm", str(algorithm.get("type")).upper(), f"advantage {algorithm.get('advantage')}"),
+        ("algorithm", str(algorithm.get("type")).upper(), f"advantage {advantage}" if advantage else ""),
         ("seed", str(run.config.get("seed")), ""),
     ]
 
