@@ -130,6 +130,7 @@ def test_a_random_policy_learns_the_task(tiny_checkpoint: Path):
     assert np.mean(rewards[-10:]) > np.mean(rewards[:10]) + 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algorithm", "form"),
     [
@@ -218,6 +219,7 @@ def test_tasks_that_fail_are_explored_more(tiny_checkpoint: Path):
     assert len(late) > 30 and late.count("match") > 3 * late.count("mirror") > 0
 
 
+@pytest.mark.slow
 def test_without_learning_success_stays_where_it_was(tiny_checkpoint: Path):
     """The control of the test above: at rate 0 the same run changes nothing, to the last episode."""
     frozen = TrainerConfig(updates=4, batch_decisions=128, lr=0.0, value_lr=1e-3)

@@ -272,6 +272,7 @@ TIMES = 30
 """Factor on the shares of `tests.hostile`: about 24,000 files, of which about 140 are loaded."""
 
 
+@pytest.mark.slow
 def test_many_changed_files(tmp_path: Path):
     """Each is good or refused in a line: no other error, no file, no hang, no memory beyond a limit."""
     command = [sys.executable, "-m", "tests.hostile", "0", str(tmp_path), str(TIMES)]

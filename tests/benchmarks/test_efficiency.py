@@ -129,6 +129,7 @@ def test_cells_differ_in_what_is_imagined_and_in_the_real_episodes(tmp_path: Pat
     assert learned.replay.samples_per_insert == pytest.approx(drawn / 2, abs=1)
 
 
+@pytest.mark.slow
 def test_a_study_is_run(tmp_path: Path, tiny_checkpoint: Path):
     config = small(tmp_path, tiny_checkpoint, arms=("none",), budgets=(8,), seeds=(3,))
     (cell,) = bench.bench_efficiency(config)["cells"]

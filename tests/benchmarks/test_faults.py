@@ -217,6 +217,7 @@ def test_nothing_is_begun_where_something_is(tmp_path: Path):
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.slow
 def test_a_run_of_time_survives_what_is_done_to_it(tmp_path: Path):
     """Everything real: a run, Ray, a rollout worker that raises where it was told to, and its successor."""
     root = tmp_path / "faults"
@@ -236,6 +237,7 @@ def test_a_run_of_time_survives_what_is_done_to_it(tmp_path: Path):
     assert written["hits"] == result["hits"] and (root / "faults.png").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_a_service_comes_back_long_after_the_run_was_taken_back(tmp_path: Path):
     """Where it begins again is still there, whatever has been saved since."""
     light = tmp_path / "light.yaml"

@@ -88,6 +88,7 @@ def test_the_picture_is_drawn(result: dict[str, Any], tmp_path: Path):
     assert (tmp_path / "lag.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_a_study_is_run_and_goes_on_where_it_was_stopped(
     tmp_path: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ):

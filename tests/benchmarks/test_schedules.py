@@ -123,6 +123,7 @@ def test_requests_are_counted_whole():
     assert blocks._observations({"batches": 11.0, "batch_size_mean": mean}) == 15
 
 
+@pytest.mark.slow
 def test_a_small_run_of_everything(light_ray: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     small = {"worlds": 2, "latency_ms": 5.0, "update_ms": 20.0, "image_size": 16, "decide_ms": 1.0}
     trace = tmp_path / "drawers.txt"
@@ -171,6 +172,7 @@ def test_a_recipe_that_a_schedule_cannot_have_is_refused(tmp_path: Path):
         bench_throughput(config)
 
 
+@pytest.mark.slow
 def test_a_recipe_is_measured_under_two_schedules(tiny_checkpoint: Path, tmp_path: Path):
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text(

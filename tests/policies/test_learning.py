@@ -169,6 +169,7 @@ def test_every_type_but_smolvla_has_a_run():
     assert set(RUNS) == set(POLICIES) - {"smolvla"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)
 def test_a_random_policy_gets_better(name: str, tmp_path: Path):
     run = RUNS[name]

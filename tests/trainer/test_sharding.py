@@ -92,6 +92,7 @@ def assert_same_metrics(found: list[dict[str, float]], expected: list[dict[str, 
 # ---- with other processes
 
 
+@pytest.mark.slow
 def test_ranks_make_the_updates_of_one(made: Any, alone: dict[str, dict[str, Any]]):
     name, results = made
     before = sharded.cases()[name].adapter().export_trainable()
@@ -102,6 +103,7 @@ def test_ranks_make_the_updates_of_one(made: Any, alone: dict[str, dict[str, Any
         assert_same(result, expected, name)
 
 
+@pytest.mark.slow
 def test_ranks_know_the_same_to_the_last_bit(made: Any):
     """So that none of them skips an update that another makes."""
     first, *others = made[1]
@@ -113,6 +115,7 @@ def test_ranks_know_the_same_to_the_last_bit(made: Any):
             np.testing.assert_array_equal(tensor, other["weights"][key])
 
 
+@pytest.mark.slow
 def test_ranks_go_on_from_the_checkpoint_of_one(made: Any, alone: dict[str, dict[str, Any]]):
     name, results = made
     expected = alone[name]
@@ -123,6 +126,7 @@ def test_ranks_go_on_from_the_checkpoint_of_one(made: Any, alone: dict[str, dict
         assert_same(resumed, expected | {"metrics": expected["metrics"][half:]}, name)
 
 
+@pytest.mark.slow
 def test_one_goes_on_from_the_checkpoint_of_ranks(made: Any, alone: dict[str, dict[str, Any]]):
     name, results = made
     case, expected = sharded.cases()[name], alone[name]
@@ -133,6 +137,7 @@ def test_one_goes_on_from_the_checkpoint_of_ranks(made: Any, alone: dict[str, di
     assert_same(resumed, expected | {"metrics": expected["metrics"][half:]}, name)
 
 
+@pytest.mark.slow
 def test_the_cases_meet_what_they_are_for(alone: dict[str, dict[str, Any]]):
     assert alone["broken"]["metrics"][-1]["skipped"] == 2
     assert any("logprob/mismatch_mean" in metrics for metrics in alone["whole"]["metrics"])
