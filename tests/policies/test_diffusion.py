@@ -102,16 +102,6 @@ def test_not_exploring_is_lerobot_s_sampler_to_the_bit(
     assert np.abs(noisy - chunks).max() > 1e-2
 
 
-def test_lerobot_s_sampler_wants_what_its_processors_do_not_give(adapter: LeRobotAdapter):
-    batch = adapter.processing.prepare(*stack_observations(ask(2)))
-    with pytest.raises(AssertionError):
-        adapter.policy.predict_action_chunk(batch)
-    assert adapter.decide(ask(2), 0)[0].chunk.shape == (3, 2)
-    # Its queues would have answered the second question with the first one's observation.
-    adapter.policy.select_action(batch)
-    assert adapter.self_check(*stack_observations(ask(3))) == 0.0
-
-
 @pytest.mark.parametrize(
     ("fields", "config"),
     [
@@ -133,7 +123,7 @@ def test_other_weights_give_the_oracle_s_ratio(tmp_path: Path, fields: dict, con
     assert np.abs(change).max() > 0.05, "the weights must have moved the policy"
 
 
-# ---- what an importance weight is for, on a network in which every entry acts on every other
+# ---- importance weights, on a network in which every entry acts on every other
 
 SHAPE = DiffusionShape(horizon=3, executed=1, action_dim=1)
 SAMPLES = 100_000
@@ -201,16 +191,6 @@ def test_weighted_samples_of_mu_are_samples_of_pi(scheduler: str):
     assert deviation(old, new) > WRONG, "the weights must matter, or the test shows nothing"
     assert deviation(ratio, torch.ones(2)) < EXACT
     assert deviation(product, new) < EXACT
-
-
-@pytest.mark.parametrize("scheduler", ["DDPM", "DDIM"])
-def test_rows_that_are_not_executed_feed_back(scheduler: str, monkeypatch: pytest.MonkeyPatch):
-    config = DiffusionSamplerConfig(std_min=0.3)
-    executed = torch.tensor([[True], [False], [False]])
-    monkeypatch.setattr(diffusion, "_mask", lambda k, shape, schedule, device: executed)
-    ratio, product = weighted(scheduler, config)
-    assert deviation(ratio, torch.ones(2)) < EXACT, "E[ρ] = 1 does not catch it"
-    assert deviation(product, payoff(act(PI, scheduler, config, 12)[0])) > WRONG
 
 
 @pytest.mark.parametrize("scheduler", ["DDPM", "DDIM"])

@@ -15,10 +15,8 @@ from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
 from accerl_lerobot.policies.config import (
     FlowSamplerConfig,
     NoiseSpaceSamplerConfig,
-    PolicyConfig,
     TuningConfig,
 )
-from accerl_lerobot.policies.saving import save_pretrained
 from tests.policies.cases import CASES
 from tests.policies.tiny import adapter_at, perturb, requests, stored
 from tests.rounding import assert_close
@@ -104,16 +102,6 @@ def test_steering_moves_the_action_and_the_frozen_policy_stays(steered: LeRobotA
     last = np.stack([d.chunk for d in steered.decide(asked, 0)])[:, :, 0].mean()
     assert last > first + 0.1
     assert all(torch.equal(v, before[k]) for k, v in steered.policy.state_dict().items())
-
-
-def test_stock_lerobot_loads_the_frozen_policy(steered: LeRobotAdapter, path: Path, tmp_path: Path):
-    from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
-
-    perturb(steered, 0.5)
-    config = PolicyConfig(path=str(path), device="cpu", sampler=steered.family.sampler)
-    save_pretrained(steered, tmp_path / "saved", config)
-    stock, original = SmolVLAPolicy.from_pretrained(tmp_path / "saved"), SmolVLAPolicy.from_pretrained(path)
-    assert all(torch.equal(v, original.state_dict()[k]) for k, v in stock.state_dict().items())
 
 
 def test_entropy_of_the_noise_is_minus_its_expected_log_density(steered: LeRobotAdapter):
