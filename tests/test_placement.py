@@ -207,8 +207,6 @@ def test_a_rollout_worker_whose_node_has_left_goes_to_one_that_is_there():
 @pytest.mark.parametrize(
     ("role", "fields", "match"),
     [
-        ("trainer", {"gpus": 1.5}, r"trainer\.gpus=1\.5: use a number from 0 to 1"),
-        ("rollout", {"cpus": -1.0}, r"rollout\.cpus=-1\.0: use a number of at least 0"),
         ("rollout", {"gpus": 0.5}, r"rollout\.gpus=0\.5: rollout workers have no network"),
         ("imagination", {"nodes": " "}, r"imagination\.nodes=' ': name a node"),
     ],

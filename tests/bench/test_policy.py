@@ -11,7 +11,6 @@ import pytest
 from accerl_lerobot.bench import policy as bench
 from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.demos import backbone
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import TuningConfig
 
 
@@ -60,11 +59,3 @@ def test_the_published_backbone_has_the_published_size(tmp_path: Path) -> None:
     backbone.write_backbone(tmp_path / "b", backbone.SMOLVLM2_500M)
     text = json.loads((tmp_path / "b" / "config.json").read_text())["text_config"]
     assert (text["hidden_size"], text["intermediate_size"], text["vocab_size"]) == (960, 2560, 49280)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("type", "act"), ("batch", 0), ("cameras", 0), ("repeats", 0), ("precision", "fp8")]
-)
-def test_bad_values_name_their_field(name: str, value: object) -> None:
-    with pytest.raises(InputError, match=rf"^{name}={value!r}: use"):
-        BenchPolicyConfig(**{name: value})

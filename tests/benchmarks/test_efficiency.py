@@ -171,19 +171,3 @@ def test_a_world_model_that_is_missing_is_found_before_anything_runs(tmp_path: P
     with pytest.raises(InputError, match="imagination.path='nowhere'"):
         bench.bench_efficiency(small(tmp_path, tiny_checkpoint, arms=("none", "learned")))
     assert not (tmp_path / "study").exists()
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("arms", ("none", "rollouts"), r"arms=\('none', 'rollouts'\): use a list .*, each none, learned"),
-        ("arms", (), "arms="),
-        ("budgets", (4, 4), "budgets="),
-        ("budgets", (0,), r"budgets=\(0,\): use a list .*, each a whole number from 1"),
-        ("decisions", 0, "decisions=0"),
-        ("seeds", (), "seeds="),
-    ],
-)
-def test_bad_values_name_their_field(name: str, value: object, message: str):
-    with pytest.raises(InputError, match=message):
-        BenchEfficiencyConfig(**{name: value})

@@ -159,12 +159,8 @@ def test_one_nan_ends_the_episode_and_the_next_is_healthy():
 @pytest.mark.parametrize(
     ("values", "field"),
     [
-        ({"task": "other"}, "env.task"),
         ({"state_dim": 3}, "env.state_dim"),
         ({"hold": 41}, "env.hold"),
-        ({"tolerance": 0.0}, "env.tolerance"),
-        ({"step_ms": -1.0}, "env.step_ms"),
-        ({"latency": "normal"}, "env.latency"),
         ({"latency": "trace"}, "env.latency_trace"),
         ({"latency_trace": "trace.txt"}, "env.latency_trace"),
         ({"latency": "trace", "latency_trace": "trace.txt", "step_ms": 1.0}, "env.step_ms"),

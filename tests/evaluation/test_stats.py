@@ -11,8 +11,7 @@ import random
 import pytest
 from rich.console import Console
 
-from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.config import EvaluationConfig, evaluation_plans
+from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.evaluation.stats import Rate, mean_interval, summarise, table, wilson_interval
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seeds import DEMO_SEEDS, EVAL_SEEDS, TRAIN_SEEDS
@@ -196,12 +195,3 @@ class TestPlans:
         assert not any(p.explore for p in plans)
         assert [p.film for p in plans] == [True, True, False, False]
         assert [p.index for p in plans] == [0, 1, 2, 3] and {p.group for p in plans} == {"x"}
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [("episodes", 0), ("episodes_during", 0), ("video_size", 0), ("video_every", 0), ("videos", -1)],
-)
-def test_ranges(field: str, value: int) -> None:
-    with pytest.raises(InputError, match=f"evaluation.{field}={value}"):
-        EvaluationConfig(**{field: value})

@@ -290,20 +290,6 @@ def test_refusals(path: Path, tmp_path: Path, changes: dict, options: dict, sent
         load_adapter(PolicyConfig(path=str(copied), device="cpu", **options))
 
 
-@pytest.mark.parametrize(
-    ("values", "field"),
-    [
-        ({"std_min": 0.0}, "std_min"),
-        ({"std_min": 1.1}, "std_min"),
-        ({"last_steps": 0}, "last_steps"),
-        ({"scheduler": "PNDM"}, "scheduler"),
-    ],
-)
-def test_bad_values_name_their_field(values: dict, field: str):
-    with pytest.raises(InputError, match=f"^policy.sampler.{field}="):
-        DiffusionSamplerConfig(**values)
-
-
 # ---- a policy that looks back, LeRobot's default, in a world
 
 OBSERVED = 2

@@ -12,7 +12,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies import flow
 from accerl_lerobot.policies.config import FlowSamplerConfig
 from accerl_lerobot.policies.family import Encoded
@@ -343,22 +342,3 @@ def test_entropy_of_a_learned_std_by_hand(stochastic: str, entries: int):
     small, large = (flow.entropy(latent, SHAPE, config, head(config, s)(encoded)) for s in (0.0, 1.0))
     assert_close(small, torch.full((4,), entries * (math.log(0.2) + 0.5 * math.log(2 * math.pi * math.e))))
     assert (large > small).all() and small.requires_grad
-
-
-@pytest.mark.parametrize(
-    ("values", "field"),
-    [
-        ({"stochastic": "first"}, "policy.sampler.stochastic='first'"),
-        ({"noise": "none"}, "policy.sampler.noise='none'"),
-        ({"noise_level": 0.0}, "policy.sampler.noise_level=0.0"),
-        ({"noise_level": math.nan}, "policy.sampler.noise_level=nan"),
-        ({"noise_level": 2.5}, "policy.sampler.noise_level=2.5"),
-        ({"noise": "learned", "noise_level": 0.05}, "policy.sampler.noise_min=0.08"),
-        ({"noise": "learned", "noise_level": 0.5}, "policy.sampler.noise_max=0.4"),
-        ({"noise": "learned", "noise_min": 0.0}, "policy.sampler.noise_min=0.0"),
-        ({"noise": "learned", "noise_max": 3.0}, "policy.sampler.noise_max=3.0"),
-    ],
-)
-def test_bad_options_name_their_field(values: dict, field: str):
-    with pytest.raises(InputError, match=f"^{field}: use"):
-        FlowSamplerConfig(**values)

@@ -161,12 +161,6 @@ def test_options_under_which_its_density_would_be_another(
     torch.set_float32_matmul_precision(precision)
 
 
-@pytest.mark.parametrize("values", [{"num_steps": 0}, {"n_action_steps": 0}, {"n_action_steps": -1}])
-def test_sizes_below_one_are_refused_when_parsed(values: dict):
-    with pytest.raises(InputError, match=f"^policy.{next(iter(values))}=.*use a whole number from 1"):
-        PolicyConfig(**values)
-
-
 def test_devices(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert resolve_device("auto") == resolve_device("cpu") == torch.device("cpu")

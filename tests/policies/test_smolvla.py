@@ -114,21 +114,6 @@ def test_entropy_of_the_noise_is_minus_its_expected_log_density(steered: LeRobot
     assert abs(sampled.mean() - float(entropy)) < 4 * sampled.std() / np.sqrt(len(many))
 
 
-@pytest.mark.parametrize(
-    ("values", "field"),
-    [
-        ({"std": 0.0}, "std"),
-        ({"std_min": 1.0}, "std_min"),
-        ({"std_max": 1.0}, "std_max"),
-        ({"bound": 0.0}, "bound"),
-        ({"hidden": 0}, "hidden"),
-    ],
-)
-def test_bad_options_name_their_field(values: dict[str, float], field: str):
-    with pytest.raises(InputError, match=rf"^policy\.sampler\.{field}="):
-        NoiseSpaceSamplerConfig(**values)
-
-
 @pytest.mark.parametrize("mode", ["expert", "lora"])
 def test_tuning_a_frozen_policy_is_refused(path: Path, mode: str):
     with pytest.raises(InputError, match=rf"^policy\.tuning\.mode='{mode}': this sampler leaves the whole"):

@@ -13,10 +13,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies import tokens as tk
-from accerl_lerobot.policies.config import SamplerConfig, TokenSamplerConfig
+from accerl_lerobot.policies.config import TokenSamplerConfig
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.tokens import TokenContext, TokenFamily, TokenModel
 from tests.rounding import assert_close
@@ -348,10 +347,3 @@ def test_nan_logits_are_visible_in_the_log_prob_and_break_nothing():
     model = Parallel()
     action = family(model).act(encoded(model, torch.full((2, WIDTH), torch.nan)), requests(2))
     assert torch.isnan(action.log_prob).all() and (action.latent["tokens"] < VOCABULARY).all()
-
-
-@pytest.mark.parametrize("temperature", [0.0, -1.0, 10.1, math.nan, math.inf])
-def test_bad_temperatures_are_refused(temperature: float):
-    with pytest.raises(InputError, match=r"^policy\.sampler\.temperature="):
-        TokenSamplerConfig(temperature=temperature)
-    assert SamplerConfig.get_choice_class("tokens") is TokenSamplerConfig

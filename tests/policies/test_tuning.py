@@ -131,16 +131,6 @@ def test_targets_that_do_not_suit_the_policy(
         tuned(written(name), mode="lora", targets=targets)
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "why"),
-    [("mode", "qlora", "use"), ("rank", 0, "use"), ("alpha", 0, "use"), ("targets", "(", "not a regular")],
-)
-def test_bad_options_name_their_field_before_anything_is_loaded(name: str, value: object, why: str):
-    with pytest.raises(InputError) as caught:
-        TuningConfig(**{name: value})
-    assert str(caught.value).startswith(f"policy.tuning.{name}={value!r}: {why}")
-
-
 def test_only_what_is_trained_travels_and_is_copied_once(path: Path):
     trainer, reader, asked = tuned(path, mode="lora", rank=2), tuned(path, mode="lora", rank=2), requests(4)
     views, parameters = trainer.view_trainable(), trainer.trainable()

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.envs import SimulatedConfig, make_world
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
 from tests.rollout.worlds import CHUNK, Recorder, ScriptedWorld, evaluate, explore
@@ -208,20 +207,3 @@ def test_closing_closes_the_worlds():
     worlds = [ScriptedWorld(), ScriptedWorld()]
     Recorder(worlds, [], CONFIG).runner.close()
     assert all(world.closed for world in worlds)
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "remedy"),
-    [
-        ("group_size", 1, "groups of one have no comparison"),
-        ("group_size", -1, "use a whole number from 0 to 256"),
-        ("group_size", 257, "use a whole number from 0 to 256"),
-        ("group_advantage", "gae", "use grpo, rloo or grpo_no_std"),
-        ("group_filter", "success", "use outcome, return or none"),
-        ("task_sampling", "random", "use uniform or failures"),
-        ("task_window", 0, "use a whole number from 1"),
-    ],
-)
-def test_impossible_groups_and_tasks_are_refused(field, value, remedy):
-    with pytest.raises(InputError, match=f"rollout.{field}=.*{remedy}"):
-        RolloutConfig(**{field: value})

@@ -303,25 +303,3 @@ def test_the_weights_that_serve_follow_those_that_learn(learnt: Learner):
 def test_sizes_that_do_not_fit():
     with pytest.raises(InputError, match=r"world_model.image_size=\(18, 16\): use .* multiples of 4, or"):
         PixelWorldModel(replace(SPEC, image_size=(18, 16)), PixelModelConfig(network=NETWORK))
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("objective", "vae"), ("steps", 0), ("context", 0), ("heads", 1), ("context_noise", -1.0),
-        ("refine_levels", (0.05, 0.2)), ("sigma_max", 0.001),
-    ],
-)  # fmt: skip
-def test_bad_values_name_their_field(name: str, value: object):
-    with pytest.raises(InputError, match=f"^world_model.model.{name}="):
-        PixelModelConfig(**{name: value})
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("steps", 0), ("batch", 1), ("chunks", 0), ("warmup", -1), ("anchors", -1), ("lr", 0.0), ("lr", 1.0),
-     ("grad_clip", 0.0), ("average", 1.0), ("validate_every", -1)],
-)  # fmt: skip
-def test_bad_learning_names_its_field(name: str, value: object):
-    with pytest.raises(InputError, match=f"^world_model.learn.{name}="):
-        LearnConfig(**{name: value})

@@ -411,15 +411,6 @@ def test_what_nobody_could_load_is_found_in_a_child_process(
     assert str(caught.value).startswith("path=") and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("held_out", 0.0), ("held_out", 1.0), ("chunk", 0), ("image_size", 60), ("image_size", 4)],
-)
-def test_bad_values_name_their_field(name: str, value: float):
-    with pytest.raises(InputError, match=f"^world_model.{name}="):
-        WorldModelConfig(**{name: value})
-
-
 def moved(monkeypatch: pytest.MonkeyPatch) -> tuple[list[str], list[tuple[str, Any]]]:
     """Devices that are asked for, and which networks go where; the CPU stands in for all of them."""
     asked: list[str] = []

@@ -366,30 +366,6 @@ def test_one_that_tells_successes_needs_no_success_model():
     check_fit(replace(SPEC, provides=SPEC.provides | {"success"}), WORLD_SPEC, K, 1, False)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("share", 1.0), ("share", -0.1), ("model", "magic"), ("rollouts", 0),
-        ("memory", 0), ("max_uncertainty", 0.0), ("start_at_high_td_prob", 1.1),
-    ],
-)  # fmt: skip
-def test_bad_values_name_their_field(name: str, value: object):
-    with pytest.raises(InputError, match=f"^imagination.{name}="):
-        ImaginationConfig(**{"path": "x", name: value})  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("steps_per_episode", -1.0), ("batch", 1), ("validate_every", 0), ("memory", 1), ("offline", 1.1),
-        ("recent", -0.1), ("failures", 2.0), ("held_out", 0.0), ("lr", 0.0),
-    ],
-)  # fmt: skip
-def test_bad_values_of_learning_name_their_field(name: str, value: float):
-    with pytest.raises(InputError, match=f"^imagination.learn.{name}="):
-        OnlineLearnConfig(**{name: value})  # type: ignore[arg-type]
-
-
 def test_what_does_not_go_together():
     with pytest.raises(InputError, match="^imagination.path=None"):
         ImaginationConfig(share=0.5)
