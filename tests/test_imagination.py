@@ -240,15 +240,6 @@ def test_nothing_is_imagined_before_the_model_has_passed(tiny_checkpoint: Path, 
     assert 0 < len(batches) < 12 and not any(decisions(b, IMAGINED) for b in batches)
 
 
-def test_nothing_moves_in_rollouts_of_a_copy(tiny_checkpoint: Path, world_model: Path):
-    _, batches, _ = run_locally(imagining(tiny_checkpoint, model="copy", path=str(world_model)))
-    imagined = [s for b in batches for s in b if s.source == IMAGINED]
-    assert imagined
-    for segment in imagined:
-        frames = segment.observations["observation.images.front"]
-        assert all(np.array_equal(f, frames[0]) for f in frames)
-
-
 @pytest.mark.slow
 def test_it_runs_asynchronously_with_two_workers(tiny_checkpoint: Path, world_model: Path, tmp_path: Path):
     from accerl_lerobot.engine.launch import RayEngine

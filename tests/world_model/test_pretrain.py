@@ -130,13 +130,6 @@ def test_a_saved_one_is_tried_on_another_dataset(
     assert "path=None: name the folder world_model" in capsys.readouterr().err
 
 
-def test_what_is_refused_leaves_no_folder(demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    out = tmp_path / "out"
-    assert cli.main([*arguments(demos, out), "--env.state_dim=6"]) == 2
-    assert "observation.state has shape (4,), the world's has (6,)" in capsys.readouterr().err
-    assert not out.exists()
-
-
 @pytest.mark.parametrize(
     ("option", "message"),
     [
@@ -144,16 +137,7 @@ def test_what_is_refused_leaves_no_folder(demos: Path, tmp_path: Path, capsys: p
             "--world_model.validation.depth=20",
             "world_model.validation.depth=20: held-out episodes have at most",
         ),
-        (
-            "--world_model.success.weight_decay=-1",
-            "world_model.success.weight_decay=-1.0: use a number",
-        ),
-        (
-            "--world_model.model.state_weight=-1",
-            "world_model.model.state_weight=-1.0: use a number",
-        ),
-        ("--world_model.image_size=13", "world_model.image_size=13: use a multiple of 8"),
-        ("--seed=-1", "seed=-1: use a whole number from 0"),
+        ("--env.state_dim=6", "observation.state has shape (4,), the world's has (6,)"),
         ("--env.task=mirror", "env.task='mirror': an episode's task is"),
     ],
 )
@@ -388,10 +372,8 @@ def test_what_cannot_be_loaded(tmp_path: Path, harm: str, why: str):
 @pytest.mark.parametrize(
     ("where", "name", "value"),
     [
-        ("spec", "context", 10**9),
         ("spec", "image_size", [2**20, 2**20]),
         ("network", "blocks", 10**9),
-        ("network", "channels", [10**6, 10**6]),
         ("model", "steps", 10**9),
     ],
 )
