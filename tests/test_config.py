@@ -152,10 +152,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--policy.device=foo"], "policy.device='foo': use auto, cpu, cuda or cuda:0"),
     (["--launch.engine=slurm"], "launch.engine='slurm': use ray or local"),
     (["--rollout.group_size=1"], "rollout.group_size=1: groups of one have no comparison; use 0"),
-    (
-        ["--trainer.hold_back=50"],
-        "replay.max_lag=50: use more than trainer.hold_back, 50, or all is",
-    ),
+    (["--trainer.hold_back=50"], "replay.max_lag=50: use more than trainer.hold_back, 50, or all is"),
     (["--algorithm.advantage=group"], "algorithm.advantage='group': add --rollout.group_size=8, say"),
     (["--replay.ahead=3"], "replay.ahead=3: use at least one batch, 128, or both sides wait for each other"),
     (["--dataset.root=x"], "dataset.repo_id=None: name the dataset in dataset.root"),
@@ -174,10 +171,7 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--policy.push_to_hub=false"], "policy.push_to_hub=False: the name is LeRobot's; a run pushes nothing"),
     (["--algorithm.type=grpo"], "algorithm.type='grpo': use ppo or gipo with --algorithm.advantage=group"),
     (["--env.type=vlabench"], "env.type='vlabench': for LeRobot's vlabench use env.type=lerobot --env.name="),
-    (
-        ["--path=x"],
-        "path='x': not a field of this command, but of accerl world-model-eval",
-    ),
+    (["--path=x"], "path='x': not a field of this command, but of accerl world-model-eval"),
     (["--seed=1", "--seed=2"], "seed=2: it is set to 1 already; give it once"),
     (["--seed=0x_"], "seed='0x_': use a whole number"),
     (["--job_name=" + "x" * 5000], "job_name='xxx"),

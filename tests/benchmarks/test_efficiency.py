@@ -153,9 +153,7 @@ def test_what_is_real_beside_the_cells_is_counted(tmp_path: Path, tiny_checkpoin
     learn = replace(base.imagination.learn, dataset=learnt)
     # A recipe that makes its own policy, and says what its world model has learnt from.
     base = replace(
-        base,
-        policy=replace(base.policy, path=None),
-        imagination=replace(base.imagination, learn=learn),
+        base, policy=replace(base.policy, path=None), imagination=replace(base.imagination, learn=learn)
     )
     assert bench.beside(Study(config, cells(config, base)), base) == {
         "demonstrations": {"episodes": 3, "env_steps": (sizes["start-seed3"] + sizes["start-seed4"]) / 2},

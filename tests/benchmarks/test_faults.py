@@ -192,10 +192,7 @@ def test_the_table_says_all_of_it():
         ({"targets": ("everyone",)}, r"targets=\('everyone',\): use some of rollout, inference"),
         ({"targets": ()}, "use some of"),
         ({"faults": ("kill", "kill")}, "none twice"),
-        (
-            {"targets": ("everything",), "faults": ("nan", "torn")},
-            "none of them can befall everything",
-        ),
+        ({"targets": ("everything",), "faults": ("nan", "torn")}, "none of them can befall everything"),
     ],
 )
 def test_what_cannot_be_done_is_refused(options: dict[str, Any], message: str):

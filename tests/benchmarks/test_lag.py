@@ -54,10 +54,7 @@ def a_summary(success: float, *, env_steps: int = 100, lag: float = 1.0) -> dict
 @pytest.fixture
 def result(tmp_path: Path, tiny_checkpoint: Path) -> dict[str, Any]:
     config = small(tmp_path, tiny_checkpoint)
-    success = {
-        "gipo": {0: (0.9, 1.0), 2: (0.5, 0.6)},
-        "ppo": {0: (0.8, 0.7), 2: (0.0, 0.1)},
-    }
+    success = {"gipo": {0: (0.9, 1.0), 2: (0.5, 0.6)}, "ppo": {0: (0.8, 0.7), 2: (0.0, 0.1)}}
     runs = []
     for cell in cells(config):
         seed, lag = cell.seed, cell.of["lag"]

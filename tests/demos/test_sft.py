@@ -311,8 +311,7 @@ def test_the_command_line(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("kind", "schedule"),
-    [("act", set()), ("diffusion", {"--policy.scheduler_warmup_steps=20"})],
+    ("kind", "schedule"), [("act", set()), ("diffusion", {"--policy.scheduler_warmup_steps=20"})]
 )
 def test_a_preset_gets_only_what_it_has(tmp_path: Path, kind: str, schedule: set[str]):
     start = SFTConfig(steps=9, policy={"type": kind})

@@ -18,11 +18,7 @@ from torch import Tensor
 
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.adapter import LeRobotAdapter, Processing, stack_observations
-from accerl_lerobot.policies.config import (
-    PolicyConfig,
-    SamplerConfig,
-    ValueHeadConfig,
-)
+from accerl_lerobot.policies.config import PolicyConfig, SamplerConfig, ValueHeadConfig
 from accerl_lerobot.policies.registry import POLICIES
 from accerl_lerobot.policies.saving import save_pretrained
 from tests.policies.cases import CASES, VARIANTS, Case

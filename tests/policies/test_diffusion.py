@@ -271,11 +271,7 @@ def test_a_saved_checkpoint_is_stock_lerobot_s(path: Path, tmp_path: Path):
             {"sampler": DiffusionSamplerConfig(last_steps=5)},
             "policy.sampler.last_steps=5: use at most 4, the policy's denoising steps",
         ),
-        (
-            {},
-            {"n_action_steps": 9},
-            "policy.n_action_steps=9: use 1 to 8, the chunk the policy predicts",
-        ),
+        ({}, {"n_action_steps": 9}, "policy.n_action_steps=9: use 1 to 8, the chunk the policy predicts"),
         (
             {"n_obs_steps": 2},
             {"n_action_steps": 8},

@@ -12,11 +12,7 @@ import torch
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
-from accerl_lerobot.policies.config import (
-    FlowSamplerConfig,
-    NoiseSpaceSamplerConfig,
-    TuningConfig,
-)
+from accerl_lerobot.policies.config import FlowSamplerConfig, NoiseSpaceSamplerConfig, TuningConfig
 from tests.policies.cases import CASES
 from tests.policies.tiny import adapter_at, perturb, requests, stored
 from tests.rounding import assert_close

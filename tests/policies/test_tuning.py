@@ -54,9 +54,7 @@ def policy_names(adapter: LeRobotAdapter) -> set[str]:
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_low_rank_adapters_start_as_the_policy_itself_and_are_saved_merged(
-    written,
-    name: str,
-    tmp_path: Path,
+    written, name: str, tmp_path: Path
 ):
     path, asked = written(name), CASES[name].requests(8)
     tuning = TuningConfig(mode="lora", rank=2, alpha=16, targets=TARGETS[name])

@@ -184,10 +184,7 @@ def test_what_is_set_on_a_policys_episodes_is_kept_and_classifies_the_others(tri
     of = {HELD_OUT: "demos", ONLINE: "policy's"}
     found, threshold = validated(tmp_path, of, trained_on=of, fresh=ONLINE, keep_threshold=True)
     assert threshold == SET
-    assert tried.judged == [
-        ("policy's", SAVED, True),
-        ("demos", SET, False),
-    ]
+    assert tried.judged == [("policy's", SAVED, True), ("demos", SET, False)]
     assert found["name"] == HELD_OUT and list(found["datasets"]) == [ONLINE]
     assert {path.name for path in tmp_path.iterdir()} == {"preview.mp4", "preview_online.mp4"}
 

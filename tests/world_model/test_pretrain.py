@@ -371,11 +371,7 @@ def test_what_cannot_be_loaded(tmp_path: Path, harm: str, why: str):
 
 @pytest.mark.parametrize(
     ("where", "name", "value"),
-    [
-        ("spec", "image_size", [2**20, 2**20]),
-        ("network", "blocks", 10**9),
-        ("model", "steps", 10**9),
-    ],
+    [("spec", "image_size", [2**20, 2**20]), ("network", "blocks", 10**9), ("model", "steps", 10**9)],
 )
 def test_what_nobody_could_load_is_found_in_a_child_process(
     tmp_path: Path, where: str, name: str, value: object, monkeypatch: pytest.MonkeyPatch
