@@ -40,6 +40,7 @@ def test_all_arms_at_all_sizes(light_ray: None, tmp_path: Path):
         bench_weights(config)
 
 
+@pytest.mark.slow
 def test_readers_apart_are_on_a_node_of_their_own(light_ray: None, tmp_path: Path):
     """In a process of its own, as this one has a Ray of one node."""
     with pytest.raises(InputError, match="^apart=True: Ray has been started already"):

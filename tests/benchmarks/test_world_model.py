@@ -7,7 +7,7 @@ import json
 import pytest
 
 from benchmarks.__main__ import main
-from benchmarks.world_model import BenchWorldModelConfig, bench_world_model, table
+from benchmarks.world_model import table
 
 
 def test_it_measures(capsys: pytest.CaptureFixture[str]) -> None:
@@ -22,8 +22,3 @@ def test_it_measures(capsys: pytest.CaptureFixture[str]) -> None:
     assert result["parameters"]["world"] > 1000 < result["parameters"]["success"]
     assert list(result["memory_gb"]) == ["predicted", "learnt"]
     assert [*table(result).columns[0].cells][:2] == ["predict (1)", "predict (3)"]
-
-
-def test_a_robot_without_a_state() -> None:
-    small = BenchWorldModelConfig(batches=(2,), repeats=1, device="cpu", state_dim=0)
-    assert bench_world_model(small)["seconds"]["predict"]["2"]["median"] > 0
