@@ -209,6 +209,7 @@ def test_two_steps_of_lerobot_s_trainer_give_a_checkpoint(tmp_path: Path):
     assert_close(batch["observation.state"], expected)  # the dataset's normalisation
 
 
+@pytest.mark.slow
 def test_act_is_trained_as_well(tmp_path: Path):
     small = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "n_encoder_layers": 1, "latent_dim": 4}
     policy = {
