@@ -156,20 +156,6 @@ def test_a_random_policy_learns_the_task_from_groups_and_without_a_critic(
     assert history[-1].rollout["groups_kept"] >= 100 * 128 / 2 / (8 * 2)
 
 
-def grouped(checkpoint: Path, **rooms: Any) -> RunConfig:
-    rollout = RolloutConfig(
-        worlds=4, segment_length=3, group_size=4, group_filter="none", task_sampling="failures"
-    )
-    algorithm = GIPOConfig(advantage="group")
-    return tiny_run(checkpoint, **{"rollout": rollout, "algorithm": algorithm, **rooms})
-
-
-def test_two_runs_with_groups_are_equal_to_the_last_bit(tiny_checkpoint: Path):
-    runs = [train(grouped(tiny_checkpoint))[0] for _ in range(2)]
-    assert updates(runs[0]) == updates(runs[1]) and runs[0][-1].rollout == runs[1][-1].rollout
-    assert runs[0][-1].rollout["groups_kept"] > 0
-
-
 @pytest.mark.slow
 def test_without_learning_success_stays_where_it_was(tiny_checkpoint: Path):
     """The control of the test above: at rate 0 the same run changes nothing, to the last episode."""

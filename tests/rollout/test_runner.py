@@ -87,13 +87,6 @@ def test_episode_totals_come_with_the_last_segment_only():
     assert result.versions == (7, 7) and recorder.runner.counters.episodes == 1
 
 
-def test_totals_do_not_leak_into_the_next_episode():
-    recorder = Recorder([ScriptedWorld(steps=4)], [explore(1), explore(2)], CONFIG)
-    recorder.play()
-    assert [r.steps for r in recorder.results] == [4, 4]
-    assert [s.episode["return"] for s in recorder.segments] == [4.0, 4.0]
-
-
 def test_results_name_the_oldest_and_the_newest_weights():
     recorder = Recorder([ScriptedWorld(steps=6)], [explore()], CONFIG)
     request = recorder.runner.start(0)
