@@ -30,7 +30,6 @@ from accerl_lerobot.world_model.model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.model.store import Source, save_world_model
 from accerl_lerobot.world_model.validation import evaluate
 from accerl_lerobot.world_model.validation.evaluate import HELD_OUT, ONLINE, open_datasets, validate_datasets
-from accerl_lerobot.world_model.validation.tables import dataset_rows
 from tests.runs import replacing
 from tests.world_model.test_pretrain import moved, recorded
 
@@ -129,18 +128,6 @@ def test_what_is_refused(
 ):
     assert cli.main(replacing(told(folders, tmp_path / "out"), option)) == 2
     assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
-
-
-def test_rows_of_datasets_leave_out_what_none_of_them_has():
-    skill = {"value": 0.5, "low": 0.25, "high": 0.75}
-    one = {"checks": {"a": {"holds": True}, "b": {"holds": False}}, "depths": [{"skill_changed": skill}]}
-    empty = {"checks": {}, "depths": [], "tried": {"episodes": 3}}
-    assert dataset_rows([one, empty]) == [
-        ("episodes", ["", "3"]),
-        ("checks that hold", ["1 of 2", "0 of 0"]),
-        ("skill, changed pixels, first chunk", ["0.50 [0.25, 0.75]", ""]),
-        ("last chunk", ["0.50 [0.25, 0.75]", ""]),
-    ]
 
 
 SAVED, SET = 0.8, 0.6

@@ -100,11 +100,6 @@ def test_other_sizes(config: NetworkConfig):
     assert image.shape == (2, 3, side, side) and torch.isfinite(image).all()
 
 
-def test_a_world_without_a_state():
-    made = awake(network(state=0))
-    assert torch.isfinite(made(**(inputs() | {"state": None}))).all()
-
-
 def test_attention_is_softmax_attention():
     torch.manual_seed(0)
     layer = Attention(6)

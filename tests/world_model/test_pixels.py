@@ -112,15 +112,6 @@ def test_a_new_refiner_is_a_copy_of_the_last_frame(steps: int):
         assert off.max() == 0 if steps == 1 else off.mean() < 30
 
 
-def test_a_new_model_s_robot_stays_about_where_it_is():
-    of = windows(dots(2))
-    made = model()
-    made.fit_statistics(of)
-    moved = rollout(made, of)[0]
-    assert_close(moved.robot, of.state[:, 1] + made.motion_mean.numpy())
-    assert moved.uncertainty.tolist() == [0.0] * len(of), "the heads still agree"
-
-
 @pytest.mark.parametrize("objective", ["refiner", "edm", "flow"])
 @pytest.mark.parametrize("steps", [1, 3])
 def test_a_rollout_depends_on_its_row_and_seed_alone(objective: Objective, steps: int):
