@@ -185,41 +185,6 @@ def test_on_policy_all_are_the_plain_policy_gradient(config: AlgorithmConfig, le
     torch.testing.assert_close(gradient(inputs, compute_loss(inputs, config).loss), expected)
 
 
-def test_a_wide_sigma_is_importance_sampling_without_clip() -> None:
-    inputs = make_inputs(spread=1.0)
-    plain = -((inputs.log_prob_new - inputs.log_prob_old).exp() * inputs.advantage[:, None]).mean()
-    for sigma in (1e6, math.inf):
-        loss = gipo_loss(inputs, GIPOConfig(sigma=sigma, kl_coef=0.0, value_coef=0.0)).loss
-        assert loss.item() == pytest.approx(plain.item(), rel=1e-9)
-
-
-def test_gipo_bounds_what_one_sample_can_do() -> None:
-    """ω·ρ ≤ exp(σ²/2), reached at log ρ = σ²; far samples fade on both sides."""
-    config = GIPOConfig(sigma=0.8, kl_coef=0.0)
-    pull = [-gipo_loss(one(x, 1.0), config).loss.item() for x in np.linspace(-6, 6, 241)]
-    assert max(pull) <= math.exp(0.32) + 1e-12
-    assert -gipo_loss(one(0.64, 1.0), config).loss.item() == pytest.approx(math.exp(0.32))
-    assert pull[0] < 1e-9 and pull[-1] < 1e-9
-
-
-def test_levels_differ_off_policy_and_agree_for_one_factor() -> None:
-    off = make_inputs(factors=3)
-    single = make_inputs(factors=1)
-    for config in (GIPOConfig, PPOConfig):
-        action, chunk = config(level="action"), config(level="chunk")
-        assert compute_loss(off, action).loss.item() != pytest.approx(compute_loss(off, chunk).loss.item())
-        assert torch.equal(compute_loss(single, action).loss, compute_loss(single, chunk).loss)
-
-
-def test_chunk_level_sees_only_the_product() -> None:
-    inputs = make_inputs(factors=2, spread=0.0)
-    shift = torch.tensor([[0.3, -0.3]], dtype=torch.float64)
-    moved = make_inputs(factors=2, spread=0.0, log_prob_new=(inputs.log_prob_new + shift).detach())
-    chunk, action = GIPOConfig(level="chunk"), GIPOConfig(level="action")
-    assert compute_loss(moved, chunk).loss.item() == pytest.approx(compute_loss(inputs, chunk).loss.item())
-    assert compute_loss(moved, action).loss.item() != pytest.approx(compute_loss(inputs, action).loss.item())
-
-
 @each_config
 def test_only_the_value_term_moves_the_critic(config: AlgorithmConfig) -> None:
     inputs = make_inputs()
