@@ -378,19 +378,6 @@ def test_a_backbone_that_is_gone_is_named(tmp_path: Path):
     refused(origin, rf"policy.path=.*{PRETRAINED}-backbone, which is gone; put a copy into {BACKBONE}/")
 
 
-def test_the_backbone_s_own_weights_are_not_copied(written: Any, tmp_path: Path):
-    config = PolicyConfig(path=str(written("smolvla")), device="cpu")
-    adapter = load_adapter(config)
-    backbone = Path(shutil.copytree(adapter.policy.config.vlm_model_name, tmp_path / "backbone"))
-    (backbone / "model.safetensors").write_bytes(b"large")
-    adapter.policy.config.vlm_model_name = str(backbone)
-    save_pretrained(adapter, tmp_path / "saved", config)
-    assert (tmp_path / "saved" / BACKBONE / "tokenizer.json").is_file()
-    assert not (tmp_path / "saved" / BACKBONE / "model.safetensors").exists()
-    config_file = json.loads((tmp_path / "saved" / "config.json").read_text())
-    assert config_file["vlm_model_name"] == str(tmp_path / "saved" / BACKBONE)
-
-
 def test_a_checkpoint_on_the_hub_is_loaded_whole(
     written: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -217,15 +217,6 @@ def test_sequences_are_as_frequent_as_their_probability(kind: Any, temperature: 
     assert squares < freedom + 5 * math.sqrt(2 * freedom), "χ²"
 
 
-def test_positions_are_drawn_independently():
-    # One uniform number for all positions would give each its right marginal distribution.
-    model, count = Parallel(), 4000
-    model.out = torch.zeros_like(model.out)
-    action = family(model).act(encoded(model, observations(1).expand(count, -1)), requests(count))
-    correlation = np.corrcoef(action.latent["tokens"].numpy().T)
-    assert np.abs(correlation[np.triu_indices(LENGTH, 1)]).max() < 0.08
-
-
 def test_nothing_after_the_terminator_counts():
     model, count = Recurrent(), 60
     tokens_family, read = family(model, 2.0), encoded(model, observations(count))
