@@ -264,6 +264,7 @@ def skills(frames: np.ndarray, wanted: np.ndarray, newest: np.ndarray, of: Windo
     ]
 
 
+@pytest.mark.slow
 def test_either_camera_is_predicted_in_its_place(learnt: PixelWorldModel):
     of = windows(seen_twice(dots(12, seed=5), 6)[0])
     frames, wanted = rollout(learnt, of)[0].frames.numpy(), of.frames[:, 2]

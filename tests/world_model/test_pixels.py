@@ -262,6 +262,7 @@ def test_it_learns_where_the_robot_goes(learnt: Learner):
     assert rollout(learnt.serving, of, strange)[0].uncertainty.mean() > 3 * predictions[0].uncertainty.mean()
 
 
+@pytest.mark.slow
 def test_a_model_of_shuffled_actions_ignores_them():
     _, low = scores(trained(shuffle=True))
     assert 0.8 < low < 1.1

@@ -101,6 +101,7 @@ def test_from_a_dataset_to_a_validation(demos: Path, tmp_path: Path, capsys: pyt
     assert (out / "preview.mp4").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_a_saved_one_is_tried_on_another_dataset(
     demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -157,6 +158,7 @@ def test_one_success_is_not_enough_to_learn_from_and_be_classified_on():
     pretrain._check_held_out(DatasetConfig(), success + failures[:2], success + failures[2:], config)
 
 
+@pytest.mark.slow
 def test_the_validation_is_on_episodes_that_were_not_learned_from(
     demos: Path, rollouts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -184,6 +186,7 @@ def test_the_validation_is_on_episodes_that_were_not_learned_from(
     assert set(seen["looked at"]) == set(seen["pairs"]) == set(seen["tried"])
 
 
+@pytest.mark.slow
 def test_held_out_losses_are_told_and_change_nothing(
     demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
@@ -234,6 +237,7 @@ def test_a_placebo_is_learned_where_one_is_asked_for(
         pretrain.pretrain(config, tmp_path, console.Console())
 
 
+@pytest.mark.slow
 def test_both_networks_learn_on_the_device_and_are_saved_for_any(
     demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -257,6 +261,7 @@ def test_both_networks_learn_on_the_device_and_are_saved_for_any(
     assert saved["device"] == "cpu"
 
 
+@pytest.mark.slow
 def test_a_policys_episodes_are_learned_from_beside_demonstrations(
     demos: Path, rollouts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -260,6 +260,7 @@ def test_it_goes_on_learning_in_a_run_and_is_saved_when_promoted(tiny_checkpoint
     assert float(moved.abs().max()) > 0
 
 
+@pytest.mark.slow
 def test_in_processes_of_their_own_they_find_it_too(tiny_checkpoint: Path, tmp_path: Path):
     from accerl_lerobot.engine.launch import RayEngine
 
