@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 #
 # make quickstart   install what is missing, run recipes/quickstart.yaml
-# make test         install what is missing, run the tests
+# make test         install what is missing, run the tests but for the slow ones
+# make test-all     install what is missing, run all tests, as .ci/run does
 # ARGS adds arguments: make quickstart ARGS="--seed=1", make test ARGS="tests/replay -x -n 0"
 
 SHELL := /bin/bash
@@ -16,11 +17,12 @@ endef
 export LIST_INSTALLED
 
 .DEFAULT_GOAL := help
-.PHONY: help setup quickstart test check audit lint format-check types format
+.PHONY: help setup quickstart test test-all check audit lint format-check types format
 
 help:
 	@echo "make quickstart  demonstrations, SFT, asynchronous RL and evaluation on one MetaWorld task"
-	@echo "make test        the tests"
+	@echo "make test        the tests but for the slow ones: a few minutes"
+	@echo "make test-all    all tests, as continuous integration runs them"
 	@echo "make check       lint, formatting and types"
 	@echo "make audit       known vulnerabilities of what is installed; asks the Python package index"
 	@echo "make format      rewrite the code as 'make check' wants it"
@@ -41,6 +43,9 @@ quickstart: setup
 	@echo "TensorBoard: .venv/bin/tensorboard --logdir $(RUN)/tensorboard"
 
 test: setup
+	.venv/bin/python -m pytest -n 2 --dist loadfile -m "not slow" $(ARGS)
+
+test-all: setup
 	.venv/bin/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 check: lint format-check types

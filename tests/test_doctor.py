@@ -52,12 +52,9 @@ def test_this_machine(capsys: pytest.CaptureFixture[str]) -> None:
 class TestRecipe:
     """`accerl doctor recipe.yaml`."""
 
-    @pytest.mark.parametrize("form", ["{}", "--config_path={}", "--config_path {}"])
-    def test_writes_what_it_resolves_to(
-        self, form: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_writes_what_it_resolves_to(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         file = tmp_path / "resolved.yaml"
-        arguments = [*form.format(QUICKSTART).split(), "--trainer.lr=1e-5", f"--resolved={file}"]
+        arguments = [str(QUICKSTART), "--trainer.lr=1e-5", f"--resolved={file}"]
         assert cli.main(["doctor", *arguments]) == 0
         found = capsys.readouterr().out
         assert found.count("\n") <= 60 and "warn" not in found
@@ -244,14 +241,6 @@ class TestResources:
         assert lag.text == f"at most {by_hand + 2} updates with 64 decisions under way"
         local = self.recipe(replay=replay, rollout=rollout, trainer=trainer, launch={"engine": "local"})
         assert checks(local)["lag"].text.startswith(f"at most {by_hand} updates")
-
-    def test_groups_are_under_way_for_longer(self) -> None:
-        """Two episodes of ⌈150 / 10⌉ decisions in each of 2 · 4 worlds; of 150 where the chunk is unknown."""
-        rollout = {"workers": 2, "worlds": 4, "segment_length": 8, "group_size": 4}
-        rooms: dict[str, Any] = {"rollout": rollout, "env": {"max_steps": 150}}
-        known = self.recipe(**rooms, policy={"n_action_steps": 10})
-        assert "with 240 decisions under way" in checks(known)["lag"].text
-        assert "with 2400 decisions under way" in checks(self.recipe(**rooms))["lag"].text
 
     def test_a_pace_that_would_waste_is_warned_about(self) -> None:
         lag = checks(self.recipe(replay={"max_lag": 3}))["lag"]

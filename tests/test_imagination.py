@@ -154,6 +154,7 @@ def test_two_runs_are_equal_to_the_last_bit(tiny_checkpoint: Path, world_model: 
         np.testing.assert_array_equal(tensor, runs[1][2]._adapter.export_trainable()[key])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "left_at"), [("learned", 0.1), ("learned", 0.6), ("shuffled", 0.8), ("oracle", 0.6)]
 )
@@ -164,12 +165,7 @@ def test_a_run_that_was_left_goes_on_as_if_it_had_not(
     learn = OnlineLearnConfig(
         steps_per_episode=1.0, validate_every=8, held_out=0.5, validation=LOOSE, batch=4
     )
-    chosen: dict[str, Any] = {
-        "model": model,
-        "start_at_reset_prob": 0.5,
-        "window": 4,
-        "max_gap": 2.0,
-    }
+    chosen: dict[str, Any] = {"model": model, "start_at_reset_prob": 0.5, "window": 4, "max_gap": 2.0}
     chosen["min_real_episodes"] = 2
     if model != "oracle":
         chosen |= {"path": str(world_model), "learn": learn}
@@ -198,6 +194,7 @@ def test_a_run_that_was_left_goes_on_as_if_it_had_not(
     assert (tmp_path / "world_model" / "model.safetensors").is_file() is promoted
 
 
+@pytest.mark.slow
 def test_rollouts_of_a_model_that_is_trained_are_compared(tiny_checkpoint: Path, world_model: Path):
     learn = OnlineLearnConfig(
         steps_per_episode=1.0, validate_every=8, held_out=0.5, validation=LOOSE, batch=4
@@ -218,6 +215,7 @@ def test_rollouts_of_a_model_that_is_trained_are_compared(tiny_checkpoint: Path,
     assert engine._world_learner is not None and engine._world_learner.validation.depth == 4
 
 
+@pytest.mark.slow
 def test_nothing_is_imagined_before_the_model_has_passed(tiny_checkpoint: Path, world_model: Path):
     learn = OnlineLearnConfig(
         steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE, batch=4
@@ -237,15 +235,7 @@ def test_nothing_is_imagined_before_the_model_has_passed(tiny_checkpoint: Path, 
     assert 0 < len(batches) < 12 and not any(decisions(b, IMAGINED) for b in batches)
 
 
-def test_nothing_moves_in_rollouts_of_a_copy(tiny_checkpoint: Path, world_model: Path):
-    _, batches, _ = run_locally(imagining(tiny_checkpoint, model="copy", path=str(world_model)))
-    imagined = [s for b in batches for s in b if s.source == IMAGINED]
-    assert imagined
-    for segment in imagined:
-        frames = segment.observations["observation.images.front"]
-        assert all(np.array_equal(f, frames[0]) for f in frames)
-
-
+@pytest.mark.slow
 def test_it_runs_asynchronously_with_two_workers(tiny_checkpoint: Path, world_model: Path, tmp_path: Path):
     from accerl_lerobot.engine.launch import RayEngine
 
@@ -322,6 +312,7 @@ def test_one_that_hangs_is_found_when_it_is_saved(kind: type, name: str, what: s
     assert not held.locked()
 
 
+@pytest.mark.slow
 def test_asynchronously_a_run_ends_when_its_episodes_are_used_up(tiny_checkpoint: Path):
     from accerl_lerobot.engine.launch import RayEngine
 
@@ -358,6 +349,7 @@ def test_what_does_not_fit_is_refused_before_the_run_begins(
     assert not (tmp_path / "out" / "checkpoints").exists()
 
 
+@pytest.mark.slow
 def test_what_a_run_learns_its_world_model_from_is_real(tiny_checkpoint: Path, world_model: Path):
     learn = OnlineLearnConfig(
         steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE, batch=4

@@ -118,6 +118,7 @@ def test_a_run_ends_by_itself_and_closing_leaves_no_process(engine):
     assert [name for name, pid in pids.items() if not gone(pid)] == []
 
 
+@pytest.mark.slow
 def test_both_transports_play_the_same_episodes(engine):
     """Every decision of an evaluation is drawn from its request's seed, so one that differs shows."""
     played = []
@@ -153,6 +154,7 @@ def test_what_cannot_be_done_is_refused_and_an_exception_in_the_trainer_ends_the
     assert "the optimiser fell over" in text and "light_workers.py" in text
 
 
+@pytest.mark.slow
 def test_a_worker_that_does_not_start_is_an_error_and_the_others_are_ended(engine, monkeypatch):
     closed: list[RayEngine] = []
     close = RayEngine.close
@@ -208,6 +210,7 @@ def test_a_rollout_worker_that_is_killed_is_replaced_and_a_replay_that_is_killed
     assert until_failure(one).startswith("replay worker failed for good:")
 
 
+@pytest.mark.slow
 def test_a_rollout_worker_that_hangs_is_replaced_and_a_replay_that_hangs_ends_the_run(engine):
     one = engine(env=HARD, rollout=TWO, trainer=ENDLESS, launch=LaunchConfig(stall_s=7.0))
     lose_a_rollout_worker(one, signal.SIGSTOP)
@@ -218,6 +221,7 @@ def test_a_rollout_worker_that_hangs_is_replaced_and_a_replay_that_hangs_ends_th
     assert not alive(pid), "one that was stopped does not hear that it is to go"
 
 
+@pytest.mark.slow
 def test_a_rollout_worker_that_fails_to_report_is_replaced(engine, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(rollout_worker, "RolloutWorker", FalteringRollout)
     one = engine(rollout=TWO, trainer=ENDLESS)
@@ -288,13 +292,14 @@ def hit(one: RayEngine, number: signal.Signals) -> Callable[[str], None]:
     return lambda name: os.kill(one.pids()[name], number)
 
 
-@pytest.mark.parametrize("transport", ["ray", "shared_memory"])
+@pytest.mark.parametrize("transport", [pytest.param("ray", marks=pytest.mark.slow), "shared_memory"])
 def test_an_inference_that_is_killed_is_replaced_alone(engine, transport: Transport):
     launched = LaunchConfig(stall_s=120.0, transport=transport)
     one = engine(env=HARD, rollout=TWO, trainer=ENDLESS, launch=launched)
     lose_inference(one, hit(one, signal.SIGKILL))
 
 
+@pytest.mark.slow
 def test_while_one_of_two_hangs_the_other_goes_on(engine):
     one = engine(
         env=HARD, rollout=TWO, trainer=ENDLESS, launch=LaunchConfig(stall_s=7.0),
@@ -304,6 +309,7 @@ def test_while_one_of_two_hangs_the_other_goes_on(engine):
     assert away[-1].rollout["decisions"] > away[0].rollout["decisions"]
 
 
+@pytest.mark.slow
 def test_an_exception_in_the_inference_service_is_survived_as_often_as_it_may_be_and_then_its_own(engine):
     one = engine(env=HARD, rollout=TWO, trainer=ENDLESS, inference=InferenceConfig(max_restarts=1))
     lose_inference(one, lambda name: ray.get(next(one._inference.workers()).actor.fail.remote()))
@@ -332,6 +338,7 @@ class NoRoom(LightInference):
         raise MemoryError("no room for the policy")
 
 
+@pytest.mark.slow
 def test_an_inference_that_does_not_start_again_ends_the_run(engine, monkeypatch):
     one = engine(trainer=ENDLESS, inference=InferenceConfig(max_restarts=2))
     until_training(one)
@@ -342,6 +349,7 @@ def test_an_inference_that_does_not_start_again_ends_the_run(engine, monkeypatch
     assert "no room for the policy" in text
 
 
+@pytest.mark.slow
 def test_an_inference_is_replaced_before_there_are_weights_and_after_the_last_ones(engine):
     one = engine(rollout=TWO)
     one.plan(evaluation_plans(("match",), 4, "before"))
@@ -355,6 +363,7 @@ def test_an_inference_is_replaced_before_there_are_weights_and_after_the_last_on
     assert one.poll().inference["restarts"] == 2.0
 
 
+@pytest.mark.slow
 def test_a_worker_that_does_not_find_inference_is_replaced(engine, monkeypatch):
     monkeypatch.setattr(replicas, "AWAY_S", 1.0)
     one = engine(env=HARD, rollout=TWO, trainer=ENDLESS)
@@ -370,6 +379,7 @@ def test_a_worker_that_does_not_find_inference_is_replaced(engine, monkeypatch):
     assert restarts == 1.0 and one.pids()["rollout 1"] != before
 
 
+@pytest.mark.slow
 def test_a_world_that_does_not_return_is_no_reason_to_wait_for_ever(engine):
     endless = SimulatedConfig(max_steps=16, step_ms=1e6)
     one = engine(
@@ -380,6 +390,7 @@ def test_a_world_that_does_not_return_is_no_reason_to_wait_for_ever(engine):
     assert text.startswith("rollout 0 worker failed for good:") and "its world has not returned for" in text
 
 
+@pytest.mark.slow
 def test_a_run_in_which_nothing_moves_ends(engine):
     one = engine(launch=LaunchConfig(stall_s=5.0), trainer=ENDLESS)
     until_training(one)

@@ -27,6 +27,8 @@ from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.runs import collect, polls, tiny_run
 
+pytestmark = pytest.mark.slow
+
 UPDATES = 40
 WORLDS = 4
 SIZE = 3

@@ -9,7 +9,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 
+
+@pytest.mark.slow
 def test_two_nodes():
     """See `two_nodes`; in a process of its own, since this one may have a Ray already."""
     clean = {k: v for k, v in os.environ.items() if not k.startswith("RAY_")}

@@ -28,6 +28,8 @@ from accerl_lerobot.trainer.config import TrainerConfig
 from tests.runs import collect, drive, polls, tiny_run
 from tests.test_ray_session import LOOPBACK, listening
 
+pytestmark = pytest.mark.slow
+
 UPDATES = 12
 TWO = TrainerConfig(
     updates=1000, batch_decisions=16, warmup_updates=0, value_warmup_updates=1, probe_every=3,

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
-from tests.runs import collect, drive, polls, tiny_run
+from tests.runs import collect, drive, tiny_run
 
 
 def train(config: RunConfig) -> tuple[list[Progress], dict[str, np.ndarray]]:
@@ -130,6 +129,7 @@ def test_a_random_policy_learns_the_task(tiny_checkpoint: Path):
     assert np.mean(rewards[-10:]) > np.mean(rewards[:10]) + 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("algorithm", "form"),
     [
@@ -156,68 +156,7 @@ def test_a_random_policy_learns_the_task_from_groups_and_without_a_critic(
     assert history[-1].rollout["groups_kept"] >= 100 * 128 / 2 / (8 * 2)
 
 
-def grouped(checkpoint: Path, **rooms: Any) -> RunConfig:
-    rollout = RolloutConfig(
-        worlds=4, segment_length=3, group_size=4, group_filter="none", task_sampling="failures"
-    )
-    algorithm = GIPOConfig(advantage="group")
-    return tiny_run(checkpoint, **{"rollout": rollout, "algorithm": algorithm, **rooms})
-
-
-def test_two_runs_with_groups_are_equal_to_the_last_bit(tiny_checkpoint: Path):
-    runs = [train(grouped(tiny_checkpoint))[0] for _ in range(2)]
-    assert updates(runs[0]) == updates(runs[1]) and runs[0][-1].rollout == runs[1][-1].rollout
-    assert runs[0][-1].rollout["groups_kept"] > 0
-
-
-def test_a_group_that_comes_at_once_waits_at_the_door(tiny_checkpoint: Path):
-    """16 segments of 2 decisions; the door shuts at 32 decisions that are still to be learnt from."""
-    rollout = RolloutConfig(worlds=8, segment_length=2, group_size=8, group_filter="none")
-    replay = ReplayConfig(capacity=96, min_decisions=16, ahead=32)
-    env = SimulatedConfig(max_steps=16, tolerance=0.01)
-    trainer = TrainerConfig(updates=12, batch_decisions=24)
-    config = grouped(tiny_checkpoint, rollout=rollout, replay=replay, env=env, trainer=trainer)
-    engine = LocalEngine(config, ("match",))
-    engine.train()
-    waiting, available = [], []
-    for progress in polls(engine):
-        waiting.append(len(engine._outbox))
-        available.append(engine._replay.real.pace.available)
-        if progress.done:
-            break
-    engine.close()
-    assert max(waiting) > 4 and max(available) <= 32 + 2 - 1
-    assert progress.rollout["groups_kept"] >= 8
-
-
-def test_groups_that_are_unfinished_when_training_ends_are_dropped(tiny_checkpoint: Path):
-    engine = LocalEngine(grouped(tiny_checkpoint), ("match",))
-    engine.train()
-    drive(engine)
-    success(engine, 8)
-    assert engine.poll().rollout["groups_dropped"] >= 1
-    assert engine._plans.groups is not None and engine._plans.groups.open == 0
-    engine.close()
-
-
-def test_tasks_that_fail_are_explored_more(tiny_checkpoint: Path):
-    """As if one of two tasks always failed and the other never did."""
-    config = tiny_run(
-        tiny_checkpoint,
-        env=SimulatedConfig(task="match,mirror", max_steps=8, tolerance=0.02),
-        rollout=RolloutConfig(worlds=8, segment_length=2, task_sampling="failures", task_window=20),
-        trainer=TrainerConfig(updates=20, batch_decisions=16, lr=0.0),
-    )
-    engine = LocalEngine(config, ("match", "mirror"))
-    report = engine._plans.report
-    engine._plans.report = lambda r: report(replace(r, success=r.plan.task == "mirror"))  # type: ignore[method-assign]
-    engine.train()
-    tasks = [e.plan.task for p in drive(engine) for e in p.episodes]
-    engine.close()
-    late = tasks[len(tasks) // 2 :]
-    assert len(late) > 30 and late.count("match") > 3 * late.count("mirror") > 0
-
-
+@pytest.mark.slow
 def test_without_learning_success_stays_where_it_was(tiny_checkpoint: Path):
     """The control of the test above: at rate 0 the same run changes nothing, to the last episode."""
     frozen = TrainerConfig(updates=4, batch_decisions=128, lr=0.0, value_lr=1e-3)

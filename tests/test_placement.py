@@ -204,18 +204,9 @@ def test_a_rollout_worker_whose_node_has_left_goes_to_one_that_is_there():
         plan.moved("rollout 1", frozenset())  # a worker's loss may be noticed before its node's
 
 
-@pytest.mark.parametrize(
-    ("role", "fields", "match"),
-    [
-        ("trainer", {"gpus": 1.5}, r"trainer\.gpus=1\.5: use a number from 0 to 1"),
-        ("rollout", {"cpus": -1.0}, r"rollout\.cpus=-1\.0: use a number of at least 0"),
-        ("rollout", {"gpus": 0.5}, r"rollout\.gpus=0\.5: rollout workers have no network"),
-        ("imagination", {"nodes": " "}, r"imagination\.nodes=' ': name a node"),
-    ],
-)
-def test_values_that_mean_nothing_are_refused(role: str, fields: dict[str, Any], match: str):
-    with pytest.raises(InputError, match=rf"launch\.placement\.{match}"):
-        decode(RunConfig, {"launch": {"placement": {role: fields}}})
+def test_rollout_workers_take_no_gpu():
+    with pytest.raises(InputError, match=r"rollout\.gpus=0\.5: rollout workers have no network"):
+        decode(RunConfig, {"launch": {"placement": {"rollout": {"gpus": 0.5}}}})
 
 
 @pytest.mark.parametrize(
@@ -223,7 +214,6 @@ def test_values_that_mean_nothing_are_refused(role: str, fields: dict[str, Any],
     [
         ({"address": "here"}, r"launch\.address='here': use HOST:PORT"),
         ({"address": "here:0"}, r"launch\.address='here:0': use HOST:PORT"),
-        ({"address": ":6379"}, r"launch\.address=':6379': use HOST:PORT"),
         (
             {"address": "auto", "engine": "local"},
             r"launch\.address='auto': launch\.engine=local is one process",

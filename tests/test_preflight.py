@@ -55,10 +55,8 @@ def test_an_environment_offers_what_a_policy_of_it_needs():
             "observation.images.front; choose env.camera accordingly, or map names with policy.rename_map",
         ),
         ({FRONT: (3, 64, 64)}, {}, "its observation.images.front is (3, 64, 64), but (3, 32, 32) in the env"),
-        ({FRONT: (1, 32, 32)}, {}, "its observation.images.front is (1, 32, 32), but (3, 32, 32) in the env"),
         ({STATE: (6,)}, {}, "policy.path='x': its observation.state is (6,), but (4,) in the environment"),
         ({"action": (7,)}, {}, "its action is (7,), but (2,) in the environment"),
-        ({"observation.environment_state": (6,)}, {}, "no observation.environment_state in the environment"),
         (
             {},
             {"observation.images.frnt": FRONT},
@@ -142,7 +140,6 @@ def test_a_smolvla_of_another_size_fits(tiny_checkpoint: Path):
             "dataset.repo_id='accerl/metaworld_tiny': no episode of",
         ),
         ([*TINY, *TINY_ENV, "--env.image_size=128"], "is (3, 64, 64), but (3, 128, 128) in the environment"),
-        ([*TINY, *TINY_ENV, "--env.camera=topview"], "no observation.images.corner2 in the environment"),
         (
             [*TINY, *TINY_ENV, "--sft.policy={type: diffusion, crop_shape: [84, 84]}"],
             "LeRobot says: `crop_shape` should fit within the image shapes",
@@ -181,7 +178,6 @@ NO_GPU = "no CUDA device here; use cpu or auto"
     ("arguments", "line"),
     [
         ([*QUICK, "--policy.device=cuda"], f"policy.device='cuda': {NO_GPU}"),
-        ([*QUICK, "--policy.device=cuda:99"], f"policy.device='cuda:99': {NO_GPU}"),
         (["sft", *TINY, "--sft.steps=1", "--device=cuda"], f"device='cuda': {NO_GPU}"),
         (["bench", "policy", "--device=cuda"], f"device='cuda': {NO_GPU}"),
         (
@@ -221,7 +217,6 @@ def test_what_the_machine_lacks(
     [
         (["--env.type=metaworld"], "metaworld", "env.type='metaworld': {}'accerl-lerobot[metaworld]'"),
         (["--env.type=lerobot", "--env.name=pusht"], "gym_pusht", "env.name='pusht': {}'lerobot[pusht]'"),
-        (["--env.type=lerobot", "--env.name=libero"], "libero", "env.name='libero': {}'lerobot[libero]'"),
     ],
 )
 def test_a_simulator_that_is_not_installed(

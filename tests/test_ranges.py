@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every number in every config has a declared range, and construction enforces it."""
+"""Every number and choice in every config has declared values, and construction enforces them.
+
+Tests of single configs add nothing to this; rules between several fields are in one table, `RULES`.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,31 @@ import pytest
 from accerl_lerobot.cli.verbs import CONFIGS
 from accerl_lerobot.config.parsing import choices_of, section_of
 from accerl_lerobot.config.ranges import Choice, Device, Positive, Range, Section, Share, check, hints_of
+from accerl_lerobot.demos.backbone import BackboneConfig
+from accerl_lerobot.demos.record import DemosConfig
+from accerl_lerobot.demos.sft import SFTConfig
+from accerl_lerobot.engine.config import RoleConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.hub.artifact_types import PullConfig
+from accerl_lerobot.policies.config import (
+    FlowSamplerConfig,
+    GaussianSamplerConfig,
+    NoiseSpaceSamplerConfig,
+    TuningConfig,
+)
+from accerl_lerobot.replay import ReplayConfig
+from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.timeline.show import TimelineConfig
+from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, WorldModelConfig
+from benchmarks.__main__ import CONFIGS as BENCHMARKS
+from benchmarks.async_vs_sync import BenchAsyncVsSyncConfig
+from benchmarks.batching import BenchBatchingConfig
+from benchmarks.efficiency import BenchEfficiencyConfig
+from benchmarks.lag import BenchLagConfig
+from benchmarks.machinery import MachineryConfig
+from benchmarks.replay import BenchReplayConfig
+from benchmarks.scaling import BenchScalingConfig
+from benchmarks.transport import BenchTransportConfig
 
 
 def sections(cls: type[Any]) -> Iterator[type[Any]]:
@@ -26,7 +53,7 @@ def sections(cls: type[Any]) -> Iterator[type[Any]]:
                 yield from sections(kind)
 
 
-EVERY = {cls for config in CONFIGS.values() for cls in sections(config)}
+EVERY = {cls for config in (*CONFIGS.values(), *BENCHMARKS.values()) for cls in sections(config)}
 SECTIONS = sorted(EVERY, key=lambda cls: cls.__name__)
 
 
@@ -60,6 +87,67 @@ def test_every_field_refuses_a_value_that_is_not_in_its_range(cls: type[Any]):
                     cls(**{name: given})
                 assert error.value.field == (f"{cls.SECTION}.{name}" if cls.SECTION else name)
                 assert error.value.remedy.startswith("use ")
+
+
+@pytest.mark.parametrize("cls", SECTIONS, ids=lambda cls: cls.__name__)
+def test_every_field_refuses_a_choice_that_there_is_not(cls: type[Any]):
+    needed = {"repo_id": "owner/name"} if cls is PullConfig else {}
+    for name, hint in hints_of(cls).items():
+        kinds = [hint, *typing.get_args(hint)]
+        if any(typing.get_origin(kind) is Literal for kind in kinds) and typing.get_origin(hint) is not tuple:
+            with pytest.raises(InputError) as error:
+                cls(**(needed | {name: "no such choice"}))
+            assert error.value.field == (f"{cls.SECTION}.{name}" if cls.SECTION else name)
+
+
+RULES = [
+    (BackboneConfig, {"image": 48}, "sft.backbone.image=48: use a multiple of 32"),
+    (BackboneConfig, {"heads": 5}, "sft.backbone.heads=5: use a divisor of the width 96"),
+    (BackboneConfig, {"vision_heads": 3}, "sft.backbone.vision_heads=3: use a divisor of the width 64"),
+    (BackboneConfig, {"kv_heads": 3}, "sft.backbone.kv_heads=3: use a divisor of the 4 heads"),
+    (BackboneConfig, {"hidden": 12}, "sft.backbone.hidden=12: use a multiple of 8"),
+    (BenchAsyncVsSyncConfig, {"cvs": ()}, "cvs="),
+    (BenchBatchingConfig, {"waits_ms": ()}, "waits_ms="),
+    (BenchEfficiencyConfig, {"arms": ("none", "rollouts")}, "arms=('none', 'rollouts'): use a list"),
+    (BenchEfficiencyConfig, {"budgets": (4, 4)}, "budgets="),
+    (BenchLagConfig, {"algorithms": ()}, "algorithms="),
+    (BenchLagConfig, {"lags": (0, 0)}, "lags="),
+    (BenchReplayConfig, {"batch": 8}, "batch="),
+    (BenchReplayConfig, {"capacity": 256}, "capacity="),
+    (BenchScalingConfig, {"counts": (2, 2)}, "counts="),
+    (BenchTransportConfig, {"sizes": ("1 GB",)}, "sizes="),
+    (DemosConfig, {"repo_id": "plain"}, "demos.repo_id="),
+    (FlowSamplerConfig, {"noise": "learned", "noise_level": 0.05}, "policy.sampler.noise_min=0.08: use"),
+    (FlowSamplerConfig, {"noise": "learned", "noise_level": 0.5}, "policy.sampler.noise_max=0.4: use"),
+    (GaussianSamplerConfig, {"std_min": 0.2}, "policy.sampler.std_min="),
+    (GaussianSamplerConfig, {"std_max": 0.2}, "policy.sampler.std_max="),
+    (MachineryConfig, {"segment_length": 5}, "segment_length="),
+    (NetworkConfig, {"channels": ()}, "world_model.model.network.channels="),
+    (NoiseSpaceSamplerConfig, {"std_min": 1.0}, "policy.sampler.std_min="),
+    (NoiseSpaceSamplerConfig, {"std_max": 1.0}, "policy.sampler.std_max="),
+    (PixelModelConfig, {"refine_levels": (0.05, 0.2)}, "world_model.model.refine_levels="),
+    (PixelModelConfig, {"sigma_max": 0.001}, "world_model.model.sigma_max="),
+    (ReplayConfig, {"min_decisions": 5000}, "replay.min_decisions="),
+    (ReplayConfig, {"ahead": 5000}, "replay.ahead="),
+    (RoleConfig, {"nodes": " "}, "launch.placement.nodes=' ': name a node"),
+    (RolloutConfig, {"group_size": 1}, "rollout.group_size=1: groups of one have no comparison"),
+    (SFTConfig, {"policy": {"chunk_size": 4}}, "sft.policy="),
+    (TimelineConfig, {"runs": ()}, "runs="),
+    (TuningConfig, {"targets": "("}, "policy.tuning.targets='(': not a regular"),
+    (WorldModelConfig, {"image_size": 60}, "world_model.image_size="),
+]
+
+
+@pytest.mark.parametrize(("cls", "values", "said"), RULES)
+def test_values_that_do_not_go_together_name_their_field(cls: type[Any], values: dict[str, Any], said: str):
+    with pytest.raises(InputError) as error:
+        cls(**values)
+    assert str(error.value).startswith(said)
+
+
+@pytest.mark.parametrize("values", [{"std_min": 0.2}, {"std_max": 0.2}])
+def test_bounds_of_a_std_that_is_not_learnt_do_not_matter(values: dict[str, Any]):
+    GaussianSamplerConfig(**values, learn_std=False)
 
 
 @pytest.mark.parametrize(

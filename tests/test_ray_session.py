@@ -27,14 +27,7 @@ from tests.light_workers import light_ray
 __all__ = ["light_ray"]
 
 TOKEN, TOKEN_PATH = "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"
-VARIABLES = (
-    *ray_session.WORKERS,
-    *ray_session.PRIVATE,
-    "RAY_AUTH_MODE",
-    TOKEN,
-    TOKEN_PATH,
-    "RAY_TMPDIR",
-)
+VARIABLES = (*ray_session.WORKERS, *ray_session.PRIVATE, "RAY_AUTH_MODE", TOKEN, TOKEN_PATH, "RAY_TMPDIR")
 
 
 @pytest.fixture
@@ -166,11 +159,7 @@ def listening() -> list[str]:
     return [row[1].partition(":")[0] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in inodes]
 
 
-LOOPBACK = {
-    "0100007F",
-    "0000000000000000FFFF00000100007F",
-    "00000000000000000000000001000000",
-}
+LOOPBACK = {"0100007F", "0000000000000000FFFF00000100007F", "00000000000000000000000001000000"}
 """127.0.0.1, the same as IPv6, and ::1, as a little-endian kernel writes them."""
 
 
@@ -315,8 +304,7 @@ def hidden(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("responds", "calls"),
-    [(True, ["init", "shutdown"]), (False, ["init", "shutdown", "init", "shutdown"])],
+    ("responds", "calls"), [(True, ["init", "shutdown"]), (False, ["init", "shutdown", "init", "shutdown"])]
 )
 def test_it_is_kept_for_those_who_come_later_while_it_responds(
     hidden: None, responds: bool, calls: list[str], monkeypatch: pytest.MonkeyPatch

@@ -208,6 +208,7 @@ def test_a_damaged_or_hostile_run_is_refused_before_anything_is_written(
     assert sorted((path, path.stat().st_mtime_ns) for path in tmp_path.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_an_asynchronous_run_that_was_killed_and_stopped_goes_on(tiny_checkpoint: Path, tmp_path: Path):
     """All of it real, in processes of their own, of which the first gets SIGKILL and the second SIGTERM."""
     run = tmp_path / "run"

@@ -82,7 +82,7 @@ def until(engine: LocalEngine, version: int) -> list[Progress]:
 
 
 @pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("left_at", [1, 7])
+@pytest.mark.parametrize("left_at", [pytest.param(1, marks=pytest.mark.slow), 7])
 def test_a_run_that_was_left_goes_on_as_if_it_had_not(
     case: str, left_at: int, tiny_checkpoint: Path, tmp_path: Path
 ):

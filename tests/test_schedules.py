@@ -188,6 +188,7 @@ def load_dying(config: SimulatedPolicyConfig, size: int, died: Path, policy: Any
     return _Dies(load_simulated(config, policy), size, died)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("schedule", "lag"), [(SYNCHRONOUS, 0.0), (OVERLAP, 1.0)])
 @pytest.mark.parametrize(("size", "ahead"), [(3, 0.0), (1, 1.0)], ids=["none answered", "three of four"])
 def test_in_turn_a_service_that_is_lost_is_waited_for_and_the_round_is_finished(
@@ -219,6 +220,7 @@ def test_in_turn_a_service_that_is_lost_is_waited_for_and_the_round_is_finished(
         engine.close()
 
 
+@pytest.mark.slow
 def test_several_services_share_the_worlds_out(light_ray: None, monkeypatch: pytest.MonkeyPatch):
     from accerl_lerobot.engine.launch import RayEngine
 

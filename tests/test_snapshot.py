@@ -99,15 +99,11 @@ def test_two_kinds_of_one_name_are_refused():
     [
         "{",
         '{"$": "Popen", "fields": {"args": "true"}}',
-        '{"$": "Origin", "fields": {"task": "a"}}',
         '{"$": "Origin", "fields": {"task": "a", "seed": 1, "decision": 2, "more": 3}}',
         '{"$": "Segment", "fields": {}}',
         '{"$": "array", "name": "17"}',
-        '{"$": "array"}',
         '{"$": "generator", "state": {"bit_generator": "MT19937"}}',
-        '{"$": ["array"]}',
         '{"$": "map", "items": [[[1], 2]]}',
-        '{"$": "tuple", "items": 3}',
         "[" * 100_000,
     ],
 )

@@ -98,18 +98,6 @@ def test_what_does_not_exist_is_never_looked_at(config: AlgorithmConfig, level: 
 
 @each_algorithm
 @each_level
-def test_all_existing_is_the_same_as_saying_nothing(config: AlgorithmConfig, level: Any) -> None:
-    config = replace(config, level=level)
-    inputs = make_inputs(factors=4, actions=2)
-    told = replace(inputs, factors=torch.ones(12, 4, dtype=torch.bool))
-    expected, got = compute_loss(inputs, config), compute_loss(told, config)
-    torch.testing.assert_close(got.loss, expected.loss)
-    for name, metric in expected.metrics.items():
-        torch.testing.assert_close(got.metrics[name], metric, msg=name)
-
-
-@each_algorithm
-@each_level
 def test_micro_batches_add_up(config: AlgorithmConfig, level: Any) -> None:
     """Parts of 2 and 5 decisions, with different numbers of factors, against all 7."""
     config = replace(config, level=level)
@@ -124,13 +112,6 @@ def test_micro_batches_add_up(config: AlgorithmConfig, level: Any) -> None:
         share = len(part.value) / 7
         total += gradient(whole, compute_loss(part, config).loss * share)
     torch.testing.assert_close(total, expected)
-
-
-@each_algorithm
-def test_for_one_factor_per_action_tokens_are_actions(config: AlgorithmConfig) -> None:
-    inputs = make_inputs()
-    losses = [compute_loss(inputs, replace(config, level=level)).loss for level in ("token", "action")]
-    assert torch.equal(*losses)
 
 
 def test_a_ratio_per_action_needs_actions() -> None:

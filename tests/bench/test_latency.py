@@ -13,7 +13,6 @@ from accerl_lerobot.bench.latency import BenchLatencyConfig, bench_latency, desc
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.envs.simulated import read_trace
-from accerl_lerobot.errors import InputError
 
 
 def test_durations_by_hand():
@@ -52,9 +51,3 @@ def test_a_world_that_is_not_reset(tmp_path: Path):
     )
     assert result["reset_ms"] is None and result["neighbours"] is None
     assert "reset" not in (tmp_path / "latency.md").read_text()
-
-
-@pytest.mark.parametrize("values", [{"chunk": 0}, {"decisions": 1}, {"seed": -1}])
-def test_what_cannot_be_timed_is_refused(values: dict):
-    with pytest.raises(InputError, match=next(iter(values))):
-        BenchLatencyConfig(**values)

@@ -10,7 +10,6 @@ import pytest
 from rich.console import Console
 
 from accerl_lerobot.bench.world import BenchWorldConfig, bench_world, table
-from accerl_lerobot.errors import InputError
 
 
 def test_three_arms_in_turns():
@@ -28,12 +27,3 @@ def test_three_arms_in_turns():
     console = Console(width=120, record=True, file=io.StringIO())
     console.print(table(result))
     assert "stock" in console.export_text()
-
-
-@pytest.mark.parametrize(
-    ("values", "field"),
-    [({"task": "easy"}, "task"), ({"chunk": 0}, "chunk"), ({"seconds": 0.0}, "seconds")],
-)
-def test_bad_values_name_their_field(values: dict, field: str):
-    with pytest.raises(InputError, match=f"^{field}="):
-        BenchWorldConfig(**values)

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
-from accerl_lerobot.demos.record import DemosConfig, record_demos
-from accerl_lerobot.engine.config import DatasetConfig, RunConfig, encode, parse
-from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.engine.config import RunConfig, encode, parse
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.stats import Rate
 from benchmarks import efficiency as bench
@@ -129,6 +126,7 @@ def test_cells_differ_in_what_is_imagined_and_in_the_real_episodes(tmp_path: Pat
     assert learned.replay.samples_per_insert == pytest.approx(drawn / 2, abs=1)
 
 
+@pytest.mark.slow
 def test_a_study_is_run(tmp_path: Path, tiny_checkpoint: Path):
     config = small(tmp_path, tiny_checkpoint, arms=("none",), budgets=(8,), seeds=(3,))
     (cell,) = bench.bench_efficiency(config)["cells"]
@@ -138,51 +136,7 @@ def test_a_study_is_run(tmp_path: Path, tiny_checkpoint: Path):
     assert {"efficiency.json", "efficiency.md", "efficiency.png", "none-8-seed3"} < made
 
 
-def test_what_is_real_beside_the_cells_is_counted(tmp_path: Path, tiny_checkpoint: Path):
-    config = small(tmp_path, tiny_checkpoint, arms=("none", "copy"), budgets=(4,))
-    base = parse(RunConfig, [f"--config_path={config.recipe}"])
-    assert bench.beside(Study(config, cells(config, base)), base) == {}, "nobody says what it has learnt from"
-    env = SimulatedConfig(max_steps=8)
-    sizes = {}
-    for name, episodes in (("start-seed3", 2), ("start-seed4", 4), ("learnt", 3)):
-        root = tmp_path / "study" / name / "demos"
-        record_demos(env, DemosConfig(episodes=episodes, processes=1, root=str(root), repo_id="a/b"))
-        sizes[name] = json.loads((root / "meta" / "info.json").read_text())["total_frames"]
-    learnt = DatasetConfig(repo_id="a/b", root=str(tmp_path / "study" / "learnt" / "demos"))
-    learn = replace(base.imagination.learn, dataset=learnt)
-    # A recipe that makes its own policy, and says what its world model has learnt from.
-    base = replace(
-        base,
-        policy=replace(base.policy, path=None),
-        imagination=replace(base.imagination, learn=learn),
-    )
-    assert bench.beside(Study(config, cells(config, base)), base) == {
-        "demonstrations": {"episodes": 3, "env_steps": (sizes["start-seed3"] + sizes["start-seed4"]) / 2},
-        "world model": {"episodes": 3, "env_steps": sizes["learnt"]},
-    }
-    alone = small(tmp_path, tiny_checkpoint, arms=("none", "oracle"))
-    assert set(bench.beside(Study(alone, cells(alone, base)), base)) == {"demonstrations"}
-    named = replace(base, dataset=learnt)
-    assert bench.beside(Study(config, cells(config, named)), named)["demonstrations"]["episodes"] == 3
-
-
 def test_a_world_model_that_is_missing_is_found_before_anything_runs(tmp_path: Path, tiny_checkpoint: Path):
     with pytest.raises(InputError, match="imagination.path='nowhere'"):
         bench.bench_efficiency(small(tmp_path, tiny_checkpoint, arms=("none", "learned")))
     assert not (tmp_path / "study").exists()
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("arms", ("none", "rollouts"), r"arms=\('none', 'rollouts'\): use a list .*, each none, learned"),
-        ("arms", (), "arms="),
-        ("budgets", (4, 4), "budgets="),
-        ("budgets", (0,), r"budgets=\(0,\): use a list .*, each a whole number from 1"),
-        ("decisions", 0, "decisions=0"),
-        ("seeds", (), "seeds="),
-    ],
-)
-def test_bad_values_name_their_field(name: str, value: object, message: str):
-    with pytest.raises(InputError, match=message):
-        BenchEfficiencyConfig(**{name: value})

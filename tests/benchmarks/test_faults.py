@@ -23,7 +23,7 @@ from accerl_lerobot.replay import MixedReplay, ReplayConfig
 from accerl_lerobot.replay.journal import EPISODES, Journal
 from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.fault_injection import POINTS
-from benchmarks.faults import BenchFaultsConfig, bench_faults, markdown
+from benchmarks.faults import BenchFaultsConfig, bench_faults
 from benchmarks.hits import ANYWHERE, FAULTS, places
 from benchmarks.light_run import light_config
 from benchmarks.soak import BenchSoakConfig, compare, costs
@@ -146,58 +146,13 @@ def test_every_point_is_somewhere_that_a_target_can_be_hit():
     assert ANYWHERE not in places("driver", "kill")[1:] and places("driver", "stop") == []
 
 
-def told(
-    target: str, fault: str, outcome: str, seconds: float | None, place: str = ANYWHERE
-) -> dict[str, Any]:
-    return {
-        "target": target, "fault": fault, "place": place, "fired": outcome != "lost", "outcome": outcome,
-        "seconds": seconds,
-    }  # fmt: skip
-
-
-def test_the_table_says_all_of_it():
-    run = {
-        "target": "trainer", "updates": 40, "lost": 1, "doubled": 0, "segments": 9, "segments_lost": 0,
-        "segments_doubled": 2, "books": False, "left_behind": 2, "exit": 143, "saved": "000040",
-    }  # fmt: skip
-    died = {
-        "target": "driver",
-        "updates": 4,
-        "lost": 0,
-        "doubled": 0,
-        "books": None,
-        "error": "it ended\nmore",
-    }
-    hits = [
-        told("driver", "torn", "stopped", 9.0, "driver.renamed"),
-        told("trainer", "kill", "survived", 4.0),
-        told("trainer", "nan", "survived", None, "trainer.loss"),
-        told("trainer", "kill", "survived", 8.0, "trainer.write"),
-        told("trainer", "kill", "lost", None),
-    ]
-    config = {"targets": ["trainer", "driver"], "faults": list(FAULTS)}
-    rows = markdown({"config": config, "hits": hits, "runs": [run, died]}).splitlines()
-    assert rows[2:5] == [
-        "| kill trainer | 2 | 2 | 0 | 1 | 6.0, 7.8, 8.0 | anywhere, write |",
-        "| nan trainer | 1 | 1 | 0 | 0 | – | loss |",
-        "| torn driver | 1 | 0 | 1 | 0 | 9.0, 9.0, 9.0 | renamed |",
-    ]
-    assert rows[-2] == "| trainer | 40 | 1 | 0 | 9 | 0 | 2 | DO NOT | exit 143, 2 processes left behind |"
-    assert rows[-1] == "| driver | 4 | 0 | 0 | – | – | – | – | it ended |"
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"targets": ("everyone",)}, r"targets=\('everyone',\): use some of rollout, inference"),
         ({"targets": ()}, "use some of"),
         ({"faults": ("kill", "kill")}, "none twice"),
-        (
-            {"targets": ("everything",), "faults": ("nan", "torn")},
-            "none of them can befall everything",
-        ),
-        ({"repeats": 0}, "use a whole number from 1"),
-        ({"stall_s": 1.0}, "stall_s=1.0: use a number of at least 5"),
+        ({"targets": ("everything",), "faults": ("nan", "torn")}, "none of them can befall everything"),
     ],
 )
 def test_what_cannot_be_done_is_refused(options: dict[str, Any], message: str):
@@ -217,6 +172,7 @@ def test_nothing_is_begun_where_something_is(tmp_path: Path):
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.slow
 def test_a_run_of_time_survives_what_is_done_to_it(tmp_path: Path):
     """Everything real: a run, Ray, a rollout worker that raises where it was told to, and its successor."""
     root = tmp_path / "faults"
@@ -236,6 +192,7 @@ def test_a_run_of_time_survives_what_is_done_to_it(tmp_path: Path):
     assert written["hits"] == result["hits"] and (root / "faults.png").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_a_service_comes_back_long_after_the_run_was_taken_back(tmp_path: Path):
     """Where it begins again is still there, whatever has been saved since."""
     light = tmp_path / "light.yaml"
@@ -270,7 +227,6 @@ def test_a_soak_compares_each_block_with_its_neighbour():
     ("options", "message"),
     [
         ({"minutes": 3.0}, "minutes=3.0: use at least 4"),
-        ({"block_s": 5.0}, "block_s=5.0: use a number of at least 20"),
         ({"targets": ("driver",)}, "leave out driver"),
         ({"targets": ("rollout", "replay"), "faults": ("nan",)}, "add kill"),
     ],

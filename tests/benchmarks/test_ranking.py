@@ -27,7 +27,7 @@ from accerl_lerobot.world_model.model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.model.store import save_world_model
 from benchmarks import paired_eval
 from benchmarks import ranking as bench
-from benchmarks.paired_eval import agreement, rollout_imagined, rollout_real
+from benchmarks.paired_eval import rollout_imagined, rollout_real
 from benchmarks.ranking import BenchRankingConfig
 from tests.test_imagination import ENV
 from tests.world_model.real_segments import SPEC, WORLD, K, decided
@@ -128,14 +128,6 @@ def test_checkpoints_are_ranked(tmp_path: Path, tiny_checkpoint: Path):
     assert found["even"]["imagined"] == (said > found["even"]["threshold"]).sum(1).tolist()
     assert json.loads((tmp_path / "out" / "ranking.json").read_text())["policies"] == found["policies"]
     assert (tmp_path / "out" / "ranking.png").is_file()
-
-
-def test_of_one_policy_there_is_a_threshold_and_no_rank():
-    found = agreement(np.array([[True, False]]), np.array([[True, True]]))
-    rows = [{"path": "run", "real": 1, "imagined": 2, "n": 2}]
-    even = {"threshold": 0.9, "imagined": [1], "agreement": found}
-    shown = bench.table({"policies": rows, "threshold": 0.5, "agreement": found, "even": even})
-    assert shown.row_count == 1 and "Spearman nan" in str(shown.title)
 
 
 @pytest.mark.parametrize(

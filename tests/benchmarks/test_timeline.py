@@ -6,12 +6,10 @@ from __future__ import annotations
 import io
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 from rich.console import Console
 
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.timeline import COMPUTE, TRAINING, WAIT_IN
 from benchmarks.timeline import BenchTimelineConfig, bench_timeline, table
 from tests.timeline.folders import write_worker
@@ -34,12 +32,3 @@ def test_the_cost_of_an_entry_and_of_a_run(tmp_path: Path) -> None:
     console = Console(width=120, record=True, file=io.StringIO())
     console.print(table(result))
     assert "trainer" in console.export_text()
-
-
-@pytest.mark.parametrize(
-    ("values", "field"),
-    [({"entries": 1}, "entries"), ({"repeats": 0}, "repeats"), ({"folder": "no"}, "folder")],
-)
-def test_bad_values_name_their_field(values: dict[str, Any], field: str) -> None:
-    with pytest.raises(InputError, match=f"^{field}="):
-        BenchTimelineConfig(**values)

@@ -7,23 +7,16 @@ import io
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from rich.console import Console
 
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.transport.memfd import available
 from benchmarks.transport import (
     ARMS,
     FLOORS,
-    MEMCPY,
     SLOT,
     BenchTransportConfig,
-    arrays_of,
     bench_transport,
-    decision,
-    measure,
-    request_of,
     table,
 )
 from tests.light_workers import light_ray
@@ -50,59 +43,3 @@ def test_all_arms_in_turns(light_ray: None, tmp_path: Path):
     console = Console(width=140, record=True, file=io.StringIO())
     console.print(table(result))
     assert "shared_memory" in console.export_text()
-
-
-class PlayedCrowd:
-    """Every call takes as many microseconds as the place of its arm says."""
-
-    def __init__(self) -> None:
-        self.order: list[str] = []
-
-    def measure(self, arm: str, size: str, callers: int, calls: int) -> tuple[list[list[float]], float]:
-        self.order.append(arm)
-        us = 1 + (*ARMS, *FLOORS).index(arm)
-        return [[us * 1e-6] * calls] * callers, calls * us * 1e-6
-
-
-def test_blocks_go_forth_and_back_and_the_first_ones_do_not_count():
-    crowd, told = PlayedCrowd(), []
-    config = BenchTransportConfig(calls=20, rounds=2)
-    rows = measure(crowd, config, "301 KB", 1, lambda *said: told.append(said))
-    arms = [*ARMS, *FLOORS]
-    assert crowd.order == arms + 2 * (arms + arms[::-1]) and [number for number, _ in told] == [1, 2]
-    for place, row in enumerate(rows, 1):
-        assert row["bytes"] == 301_088
-        assert row["p50_us"]["blocks"] == row["p99_us"]["blocks"] == pytest.approx([place] * 4)
-        assert row["calls_per_s"]["median"] == pytest.approx(1e6 / place)
-        assert row["of_floor"]["median"] == pytest.approx(5 / place)
-    crowd.order.clear()
-    assert {row["arm"] for row in measure(crowd, config, "12 KB", 8, lambda *_: None)} == set(ARMS)
-    assert MEMCPY not in crowd.order, "floors are those of one caller"
-
-
-def test_what_is_sent_weighs_what_its_name_says():
-    assert sum(array.nbytes for array in arrays_of(request_of("301 KB", 0))) == 301_088
-    assert sum(array.nbytes for array in arrays_of(request_of("12 KB", 0))) == 12_304
-    assert not np.array_equal(*(arrays_of(request_of("12 KB", seed))[0] for seed in (0, 1)))
-    assert decision().chunk.shape == (50, 7)
-
-
-@pytest.mark.parametrize(
-    ("values", "field"),
-    [
-        ({"sizes": ("1 GB",)}, "sizes"),
-        ({"sizes": ()}, "sizes"),
-        ({"callers": (0,)}, "callers"),
-        ({"callers": ()}, "callers"),
-        ({"calls": 9}, "calls"),
-        ({"rounds": 0}, "rounds"),
-    ],
-)
-def test_bad_values_name_their_field(values: dict, field: str):
-    with pytest.raises(InputError, match=f"^{field}="):
-        BenchTransportConfig(**values)
-
-
-def test_a_folder_that_exists_is_not_written_into(tmp_path: Path):
-    with pytest.raises(InputError, match="^output_dir="):
-        bench_transport(BenchTransportConfig(output_dir=str(tmp_path)))

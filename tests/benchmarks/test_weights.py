@@ -40,6 +40,7 @@ def test_all_arms_at_all_sizes(light_ray: None, tmp_path: Path):
         bench_weights(config)
 
 
+@pytest.mark.slow
 def test_readers_apart_are_on_a_node_of_their_own(light_ray: None, tmp_path: Path):
     """In a process of its own, as this one has a Ray of one node."""
     with pytest.raises(InputError, match="^apart=True: Ray has been started already"):
@@ -58,12 +59,3 @@ def test_readers_apart_are_on_a_node_of_their_own(light_ray: None, tmp_path: Pat
     cells = json.loads((tmp_path / "apart" / "weights.json").read_text())["cells"]
     found = [(c["arm"], c["readers"], c["mb"]["median"]) for c in cells]
     assert found == [(arm, n, 1.0) for n in (1, 2) for arm in ("Ray",)]
-
-
-@pytest.mark.parametrize(
-    ("values", "field"),
-    [({"sizes_mb": ()}, "sizes_mb"), ({"readers": (0,)}, "readers"), ({"repeats": 0}, "repeats")],
-)
-def test_bad_values_name_their_field(values: dict, field: str):
-    with pytest.raises(InputError, match=f"^{field}="):
-        BenchWeightsConfig(**values)

@@ -6,9 +6,8 @@ import json
 
 import pytest
 
-from accerl_lerobot.errors import InputError
 from benchmarks.__main__ import main
-from benchmarks.world_model import BenchWorldModelConfig, bench_world_model, table
+from benchmarks.world_model import table
 
 
 def test_it_measures(capsys: pytest.CaptureFixture[str]) -> None:
@@ -23,24 +22,3 @@ def test_it_measures(capsys: pytest.CaptureFixture[str]) -> None:
     assert result["parameters"]["world"] > 1000 < result["parameters"]["success"]
     assert list(result["memory_gb"]) == ["predicted", "learnt"]
     assert [*table(result).columns[0].cells][:2] == ["predict (1)", "predict (3)"]
-
-
-def test_a_robot_without_a_state() -> None:
-    small = BenchWorldModelConfig(batches=(2,), repeats=1, device="cpu", state_dim=0)
-    assert bench_world_model(small)["seconds"]["predict"]["2"]["median"] > 0
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("batches", ()),
-        ("batches", (0,)),
-        ("cameras", 0),
-        ("action_dim", 0),
-        ("state_dim", -1),
-        ("repeats", 0),
-    ],
-)
-def test_bad_values_name_their_field(name: str, value: object) -> None:
-    with pytest.raises(InputError, match=f"^{name}="):
-        BenchWorldModelConfig(**{name: value})  # type: ignore[arg-type]

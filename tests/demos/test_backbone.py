@@ -6,10 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from accerl_lerobot.demos.backbone import SPECIAL_TOKENS, BackboneConfig, write_backbone
-from accerl_lerobot.errors import InputError
 
 TEXTS = ["Open the door", "Close the drawer"]
 
@@ -57,21 +54,3 @@ def test_the_vision_tower_has_the_sizes_asked_for(tmp_path: Path):
     text, vision = config.text_config, config.vision_config
     assert (text.hidden_size, text.num_hidden_layers, text.head_dim) == (48, 3, 12)
     assert (vision.hidden_size, vision.patch_size, vision.image_size) == (32, 8, 32)
-
-
-@pytest.mark.parametrize(
-    ("values", "sentence"),
-    [
-        ({"vocabulary": 263}, "sft.backbone.vocabulary=263: use a whole number from 264"),
-        ({"image": 48}, "sft.backbone.image=48: use a multiple of 32"),
-        ({"heads": 5}, "sft.backbone.heads=5: use a divisor of the width 96"),
-        ({"vision_heads": 3}, "sft.backbone.vision_heads=3: use a divisor of the width 64"),
-        ({"kv_heads": 3}, "sft.backbone.kv_heads=3: use a divisor of the 4 heads"),
-        ({"hidden": 12}, "sft.backbone.hidden=12: use a multiple of 8"),
-        ({"layers": 0}, "sft.backbone.layers=0: use a whole number from 1"),
-    ],
-)
-def test_impossible_sizes_name_their_field(values: dict, sentence: str):
-    with pytest.raises(InputError) as caught:
-        BackboneConfig(**values)
-    assert str(caught.value).startswith(sentence)

@@ -88,22 +88,15 @@ def test_another_format_version(copied: Path, version: str):
 @pytest.mark.parametrize(
     ("key", "template"),
     [
-        ("data_path", "/etc/{chunk_index}"),
         ("data_path", "../../{chunk_index}/{file_index}.parquet"),
         ("data_path", "{chunk_index:999999999}"),
         ("data_path", "{chunk_index.__class__.__mro__}"),
-        ("data_path", "{chunk_index:x>9}"),
-        ("data_path", "{chunk_index!r}"),
-        ("data_path", "{}"),
         ("data_path", "{chunk_index"),
-        ("data_path", "{video_key}"),
         ("data_path", "C:{chunk_index}"),
         ("data_path", "a" * 2000),
         ("data_path", None),
         ("video_path", "../{video_key}.mp4"),
-        ("video_path", "{video_key.__init__}"),
         ("video_path", "{video_key[0]}"),
-        ("video_path", "{video_key:>999999999}"),
     ],
 )
 def test_templates(copied: Path, key: str, template: str):
@@ -118,26 +111,17 @@ def feature(dtype: Any = "float32", shape: Any = (4,), **more: Any) -> dict[str,
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({"fps": 0}, "fps"),
         ({"fps": 10**9}, "fps: 1000000000; use 1 to 10000"),
-        ({"fps": "80"}, "fps"),
-        ({"fps": True}, "fps"),
         ({"total_frames": -1}, "total_frames"),
-        ({"total_frames": 10**30}, "total_frames"),
-        ({"total_episodes": 2.5}, "total_episodes"),
         ({"total_episodes": 9}, "4 episodes, and meta/info.json says 9"),
         ({"chunks_size": 0}, "chunks_size"),
         ({"codebase_version": "v" * 100}, "codebase_version"),
-        ({"codebase_version": None}, "codebase_version"),
         ({"features": {}}, "features"),
         ({"features": {"../../x": feature()}}, "cannot be part of a path"),
-        ({"features": {"a/b": feature("video", (64, 64, 3))}}, "cannot be part of a path"),
         ({"features": {"a": feature("object")}}, "a dtype is wanted"),
-        ({"features": {"a": feature([1])}}, "a dtype is wanted"),
         ({"features": {"a": feature(shape=(0,))}}, "shape"),
         ({"features": {"a": feature("image", (10**5, 10**5, 3))}}, "shape"),
         ({"features": {"a": feature("video", (9000, 10, 3))}}, "an image has 3 sides of at most 8192"),
-        ({"features": {"a": feature("image", (64, 64))}}, "an image has 3 sides"),
         ({"features": {"a": feature(info=7)}}, "info is a mapping"),
     ],
 )
@@ -162,10 +146,8 @@ def rewrite(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
     [
         ("dataset_to_index", 10**9),
         ("dataset_from_index", -1),
-        ("dataset_from_index", 300),
         ("data/chunk_index", -1),
         ("data/chunk_index", "../../x"),
-        ("data/chunk_index", None),
         ("data/file_index", 0.5),
     ],
 )
@@ -226,16 +208,12 @@ def data_with(root: Path, images: list[dict[str, Any]]) -> None:
     [
         ({"bytes": None, "path": "/etc/hostname"}, "an image without its bytes"),
         ({"bytes": None, "path": "http://127.0.0.1:9/x.png"}, "an image without its bytes"),
-        (None, "an image without its bytes"),
         ({"bytes": b"%!PS-Adobe-3.0 EPSF-3.0\n", "path": None}, "an image that is no PNG or JPEG, or broken"),
         (
             {"bytes": b"\xc5\xd0\xd3\xc6\x1e\0\0\0", "path": None},
             "an image that is no PNG or JPEG, or broken",
         ),
-        ({"bytes": b"GIF89a", "path": None}, "an image that is no PNG or JPEG, or broken"),
-        ({"bytes": b"", "path": None}, "an image that is no PNG or JPEG, or broken"),
         ({"bytes": PNG, "path": "/etc/hostname"}, "cannot be part of a path"),
-        ({"bytes": PNG, "path": "../x.png"}, "cannot be part of a path"),
         ({"bytes": PNG, "path": "zip://a::b"}, "cannot be part of a path"),
     ],
 )
@@ -336,10 +314,8 @@ def column(name: str, values: Callable[[list[Any]], Any]) -> Callable[[pa.Table]
         (lambda t: t.drop_columns(["action"]), "action is no column"),
         (lambda t: t.append_column("more", pa.array([0] * len(t))), "more is no feature of meta/info.json"),
         (column("task_index", lambda v: pa.array([99, *v])), "task_index=99, and there are 1"),
-        (column("task_index", lambda v: pa.array([-1, *v])), "task_index=-1, and there are 1"),
         (column("episode_index", lambda v: pa.array([4, *v])), "episode_index=4, and there are 4"),
         (column("action", lambda v: pa.array([[0.0], *v], pa.list_(pa.float32()))), "action has other num"),
-        (column("action", lambda v: pa.array([None, *v], pa.list_(pa.float32(), 4))), "action has other num"),
         (column("action", lambda v: pa.array(["a", *map(str, v)])), "action holds no numbers of type float"),
         (
             column("action", lambda v: pa.array([[float("nan")] * 4, *v])),
@@ -368,8 +344,6 @@ def test_rows_are_what_their_features_say(copied: Path, change: Callable[[pa.Tab
         ({"std": [float("inf")] * 4}, "action.std: a number that is not finite"),
         ({"q99": [0.0] * 5}, r"action.q99: shape \[5\], and the feature has \[4\]"),
         ({"mean": "x"}, "action.mean: numbers in lists of equal lengths"),
-        ({"mean": [[1], [1, 2]]}, "action.mean: numbers in lists of equal lengths"),
-        ({"mean": [[None]]}, "action.mean: numbers in lists of equal lengths"),
         (7, "action: a mapping"),
     ],
 )

@@ -101,10 +101,7 @@ def test_bad_input(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     for options, message in (
         (["--root=" + str(tmp_path)], "the folder exists; choose another or remove it"),
         (["--path=" + str(tmp_path), "--root=new"], "no run in it: there is no config.yaml"),
-        (["--pick=best"], "pick='best': use all, successes or failures"),
-        (["--last=-1"], "use a whole number from 0"),
         (["--repo_id=name"], "use the form owner/name"),
-        (["--processes=0"], "use a whole number from 1 to 64"),
     ):
         arguments = {"--path": str(run), "--root": str(tmp_path / "new")}
         arguments |= dict(option.split("=", 1) for option in options)

@@ -157,22 +157,6 @@ def test_an_environment_without_experts_is_refused(tmp_path: Path):
         record_demos(LeRobotEnvConfig(name="pusht"), DemosConfig(root=str(tmp_path / "x")))
 
 
-@pytest.mark.parametrize(
-    ("values", "field"),
-    [
-        ({"episodes": 0}, "demos.episodes"),
-        ({"action_noise": -0.1}, "demos.action_noise"),
-        ({"failure_share": 1.5}, "demos.failure_share"),
-        ({"processes": 0}, "demos.processes"),
-        ({"repo_id": "plain"}, "demos.repo_id"),
-        ({"seed": -1}, "demos.seed"),
-    ],
-)
-def test_bad_values_name_their_field(values: dict, field: str):
-    with pytest.raises(InputError, match=f"^{field}="):
-        DemosConfig(**values)
-
-
 def test_a_dataset_that_does_not_say_how_it_began(tmp_path: Path):
     origin, recorded = Origin("dataset.root", "here"), tmp_path / "recorded"
     demos = DemosConfig(episodes=8, failure_share=0.5, processes=1, root=str(recorded), repo_id="a/b")

@@ -131,10 +131,6 @@ def test_groups_and_lists_resolve_in_order():
         ({"task": ""}, "env.task=''"),
         ({"camera": "front"}, "corner2"),
         ({"camera": "corner,corner"}, "once"),
-        ({"image_size": 63}, "env.image_size=63: use a whole number from 64 to 480"),
-        ({"max_steps": 501}, "1 to 500"),
-        ({"lighting": "dark"}, "cheap or default"),
-        ({"reward": "sparse"}, "success or dense"),
     ],
 )
 def test_bad_values_name_field_and_remedy(values: dict, message: str):

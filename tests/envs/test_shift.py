@@ -13,7 +13,6 @@ import pytest
 from accerl_lerobot.demos.record import SIDECAR, DemosConfig, record_demos
 from accerl_lerobot.envs import MetaWorld, MetaWorldConfig
 from accerl_lerobot.envs.shift import ShiftConfig
-from accerl_lerobot.errors import InputError
 
 pytest.importorskip("metaworld")
 TASK = "push-v3"
@@ -81,8 +80,3 @@ def test_demonstrations_show_the_world_without_shift_unless_told(tmp_path: Path)
         root = tmp_path / str(shifted)
         record_demos(config, DemosConfig(episodes=1, root=str(root), processes=1, shifted=shifted))
         assert json.loads((root / SIDECAR).read_text())["env"]["shift"]["light"] == light
-
-
-def test_a_value_out_of_range_is_refused():
-    with pytest.raises(InputError, match=r"env\.shift\.action_delay=-1: use a whole number from 0 to 100"):
-        ShiftConfig(action_delay=-1)

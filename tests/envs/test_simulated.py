@@ -34,15 +34,6 @@ def test_success_counts_once_when_it_does_not_end_the_episode():
     assert sum(r.rewards.sum() for r in results) == 1
 
 
-def test_doing_nothing_rarely_succeeds():
-    world = SimulatedWorld(SimulatedConfig())
-    wins = 0
-    for seed in range(50):
-        world.reset(seed, "match")
-        wins += world.step_chunk(np.zeros((40, 2), np.float32)).success
-    assert 0 < wins < 15, "room to learn, and something to learn from"
-
-
 def test_the_picture_shows_the_target_and_the_actions():
     world = SimulatedWorld(SimulatedConfig(tolerance=0.01))
     pictures = [world.reset(seed, "match")["observation.images.front"] for seed in (0, 1)]
@@ -118,13 +109,9 @@ def test_resets_take_what_they_took(tmp_path, monkeypatch: pytest.MonkeyPatch):
     [
         (None, "cannot be read"),
         ("1.0\nfast\n", "line 2, 'fast', is no duration"),
-        ("1.0\n-1.0\n", "line 2"),
         ("1.0\nafter 1.0\n", "line 2, 'after 1.0'"),
-        ("1.0\nreset\n", "line 2, 'reset'"),
         ("nan\n", "line 1"),
-        ("inf\n", "line 1"),
         ("# nothing\n", "no time passes"),
-        ("reset 1.0\n", "no time passes"),
         ("0\n0\n", "no time passes"),
     ],
 )
@@ -159,12 +146,8 @@ def test_one_nan_ends_the_episode_and_the_next_is_healthy():
 @pytest.mark.parametrize(
     ("values", "field"),
     [
-        ({"task": "other"}, "env.task"),
         ({"state_dim": 3}, "env.state_dim"),
         ({"hold": 41}, "env.hold"),
-        ({"tolerance": 0.0}, "env.tolerance"),
-        ({"step_ms": -1.0}, "env.step_ms"),
-        ({"latency": "normal"}, "env.latency"),
         ({"latency": "trace"}, "env.latency_trace"),
         ({"latency_trace": "trace.txt"}, "env.latency_trace"),
         ({"latency": "trace", "latency_trace": "trace.txt", "step_ms": 1.0}, "env.step_ms"),

@@ -7,7 +7,7 @@ import shlex
 from pathlib import Path
 
 import pytest
-from huggingface_hub import DatasetCard, ModelCard
+from huggingface_hub import ModelCard
 
 from accerl_lerobot.cli.verbs import CONFIGS
 from accerl_lerobot.engine.config import RunConfig, parse
@@ -115,20 +115,6 @@ def test_a_validation_is_reported(tmp_path: Path):
     assert "| recall | 0.1 | no |" in text
 
 
-def test_a_world_model_of_another_class_says_where_that_is(tmp_path: Path):
-    write_json(tmp_path / "world_model" / "config.json", {"spec": {}, "model": {"type": "mine"}})
-    write_json(tmp_path / "validation.json", {"passed": True, "checks": {}})
-    recipe, package = tmp_path / "config.yaml", "--discover_packages_path="
-    recipe.write_text("world_model: {discover_packages_path: my.package}\n")
-    assert f"--dataset.repo_id=USER/DATASET {package}my.package\n" in card_of(
-        tmp_path / "world_model", "world model"
-    )
-    recipe.unlink()
-    assert f"{package}PACKAGE\n" in card_of(tmp_path / "world_model", "world model")
-    write_json(tmp_path / "world_model" / "config.json", {"spec": {}, "model": {"type": "pixels"}})
-    assert package not in card_of(tmp_path / "world_model", "world model")
-
-
 def test_the_users_own_card_is_left_alone(tmp_path: Path):
     folder = write_policy_folder(tmp_path / "policy")
     (folder / "README.md").write_text("# mine\n")
@@ -136,13 +122,3 @@ def test_the_users_own_card_is_left_alone(tmp_path: Path):
     assert own and files["README.md"] == b"# mine\n"
     (folder / "README.md").write_text(f"{MARK}\nold\n")  # ours, of an earlier push
     assert "old" not in card_of(folder, "policy")
-
-
-def test_a_dataset_gets_lerobots_card(tmp_path: Path):
-    import shutil
-
-    shutil.copytree(TINY, tmp_path / "dataset", ignore=shutil.ignore_patterns("README.md"))
-    text = card_of(tmp_path / "dataset", "dataset")
-    card = DatasetCard(text)
-    assert card.data.task_categories == ["robotics"] and "LeRobot" in card.data.tags
-    assert MARK in text and "4 episodes, 365 frames" in text and '"codebase_version": "v3.0"' in text

@@ -131,7 +131,9 @@ def test_a_policy_from_the_hub_can_be_improved_and_pushed_again(hub: HubServer, 
     assert {n: first[n] for n in names} == {n: second[n] for n in names}
 
 
-@pytest.mark.parametrize("start", ["hub", "folder", "folder, low rank"])
+@pytest.mark.parametrize(
+    "start", ["hub", *(pytest.param(n, marks=pytest.mark.slow) for n in ("folder", "folder, low rank"))]
+)
 def test_a_run_that_was_pulled_can_be_gone_on_with(
     hub: HubServer, tiny_checkpoint: Path, tmp_path: Path, start: str
 ):

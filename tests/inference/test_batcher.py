@@ -68,14 +68,6 @@ def test_the_clock_moves_on_with_the_remainder() -> None:
     assert not batcher.due(now=WAIT) and batcher.due(now=0.004 + WAIT)
 
 
-def test_the_clock_starts_anew_after_an_empty_spell() -> None:
-    batcher = make_batcher()
-    batcher.add("a", now=0.0)
-    batcher.take(now=WAIT)
-    batcher.add("b", now=100.0)
-    assert not batcher.due(now=100.0) and batcher.next_deadline() == 100.0 + WAIT
-
-
 def test_the_deadline_is_exactly_when_it_is_due() -> None:
     rng = random.Random(0)
     for _ in range(500):
@@ -85,30 +77,12 @@ def test_the_deadline_is_exactly_when_it_is_due() -> None:
         assert deadline is not None and batcher.due(now=deadline)
 
 
-def test_a_full_batch_has_a_deadline_in_the_past() -> None:
-    batcher = make_batcher()
-    batcher.add("abcd", now=7.0)
-    assert batcher.next_deadline() == 7.0
-
-
 def test_a_request_larger_than_a_batch_is_served_alone() -> None:
     batcher = make_batcher()
     batcher.add("a", now=0.0)
     batcher.add("bbbbbbb", now=0.0)
     batcher.add("c", now=0.0)
     assert [batcher.take(now=0.0) for _ in range(4)] == [["a"], ["bbbbbbb"], ["c"], []]
-
-
-def test_take_before_it_is_due_serves_what_is_there() -> None:
-    batcher = make_batcher()
-    batcher.add("a", now=0.0)
-    assert batcher.take(now=0.0) == ["a"] and len(batcher) == 0 and batcher.observations == 0
-
-
-def test_no_wait_means_due_at_once() -> None:
-    batcher = make_batcher(max_wait_s=0.0)
-    batcher.add("a", now=3.0)
-    assert batcher.due(now=3.0)
 
 
 def test_first_in_first_out_nothing_lost_nobody_starves() -> None:

@@ -228,16 +228,6 @@ def test_the_first_weights_are_version_zero_and_are_loaded(play):
     play(scene, max_batch=1, max_wait_s=0.0)
 
 
-def test_a_batch_served_after_weights_were_received_uses_them(play):
-    async def scene(worker, adapter):
-        for version in range(1, 30):
-            await worker.receive_weights(version, weights(version), time.time())
-            (decision,) = await worker.decide(requests(0))
-            assert decision.version == version
-
-    play(scene, max_batch=1, max_wait_s=0.0)
-
-
 def test_older_weights_are_ignored_even_while_newer_ones_are_loaded(play):
     async def scene(worker, adapter):
         await worker.receive_weights(4, weights(4), time.time())

@@ -29,9 +29,14 @@ from accerl_lerobot.policies.config import (
     SamplerConfig,
     TokenSamplerConfig,
 )
-from tests.conftest import write_smolvla
 from tests.policies import diffusion_oracle, oracle
-from tests.policies.checkpoints import write_act, write_bins, write_diffusion, write_gaussian_actor
+from tests.policies.checkpoints import (
+    write_act,
+    write_bins,
+    write_diffusion,
+    write_gaussian_actor,
+    write_smolvla,
+)
 from tests.policies.tiny import looking_back, perturb, requests
 from tests.policies.tiny_pi import small, write_pi
 

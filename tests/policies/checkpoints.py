@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,52 +23,96 @@ def write_policy(
     action_dim: int = 2,
     stats: dict[str, Any] | None = None,
     seed: int = 0,
+    prepare: Callable[[Any], None] = lambda policy: None,
     **fields: Any,
 ) -> Path:
     """Saves a new policy and its processors as a LeRobot ``pretrained_model`` folder.
 
     Args:
-        directory: where to.
-        kind: LeRobot's policy type.
         image: its side in pixels; 0: the policy reads none.
-        camera: what the image is called.
-        state_dim: of ``observation.state``.
-        action_dim: of the action.
-        stats: normalisation; None: states and actions of std 0.5 around 0, or within ±2.
-        seed: of the weights.
+        stats: in place of the default: states and actions of std 0.5 around 0, or within ±2.
+        prepare: changes the weights before they are saved.
         fields: of LeRobot's policy config.
     """
     import torch
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
 
+    sizes = {"observation.state": state_dim, "action": action_dim}
     inputs = {"observation.state": PolicyFeature(type=FeatureType.STATE, shape=(state_dim,))}
     if image:
         inputs = {camera: PolicyFeature(type=FeatureType.VISUAL, shape=(3, image, image))} | inputs
-    config = make_policy_config(
-        kind,
-        input_features=inputs,
-        output_features={"action": PolicyFeature(type=FeatureType.ACTION, shape=(action_dim,))},
-        device="cpu",
-        push_to_hub=False,
-        **fields,
-    )
+    options: dict[str, Any] = {
+        "input_features": inputs,
+        "output_features": {"action": PolicyFeature(type=FeatureType.ACTION, shape=(action_dim,))},
+        "device": "cpu",
+        "push_to_hub": False,
+    }
+    config = make_policy_config(kind, **options | fields)
     torch.manual_seed(seed)
     policy = get_policy_class(kind)(config)
-    if stats is None:
-        sizes = {"observation.state": state_dim, "action": action_dim}
-        stats = {
-            key: {
-                "mean": torch.zeros(size),
-                "std": torch.full((size,), 0.5),
-                "min": torch.full((size,), -2.0),
-                "max": torch.full((size,), 2.0),
-            }
-            for key, size in sizes.items()
-        }
-    for part in (policy, *make_pre_post_processors(config, dataset_stats=stats)):
+    values = {"mean": 0.0, "std": 0.5, "min": -2.0, "max": 2.0, "q01": -0.5, "q99": 0.5}
+    statistics = {
+        key: {name: torch.full((size,), value) for name, value in values.items()}
+        for key, size in sizes.items()
+    }
+    processors = make_pre_post_processors(config, dataset_stats=statistics | (stats or {}))
+    prepare(policy)
+    for part in (policy, *processors):
         part.save_pretrained(directory)
     return directory
+
+
+def with_backbone(directory: Path, image: int) -> dict[str, Any]:
+    """Fields of a policy on a tiny SmolVLM, which is written beside the policy's folder."""
+    from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
+
+    sizes = BackboneConfig(
+        hidden=32,
+        heads=2,
+        kv_heads=1,
+        vision_hidden=16,
+        vision_layers=1,
+        vision_heads=2,
+        patch=8,
+        image=image,
+    )
+    backbone = write_backbone(directory.parent / f"{directory.name}-backbone", sizes, ["Match the target"])
+    return {
+        "image": image,
+        "vlm_model_name": str(backbone),
+        "load_vlm_weights": False,
+        "num_vlm_layers": 2,
+        "resize_imgs_with_padding": (image, image),
+        "freeze_vision_encoder": False,
+    }
+
+
+def write_smolvla(
+    directory: Path,
+    *,
+    image: int = 32,
+    state_dim: int = 4,
+    padded_dim: int = 2,
+    chunk: int = 4,
+    executed: int = 4,
+    num_steps: int = 3,
+    **options: Any,
+) -> Path:
+    """Saves a random SmolVLA with identity-like normalisation as a LeRobot ``pretrained_model`` folder."""
+    small = {
+        "num_expert_layers": 2,
+        "chunk_size": chunk,
+        "n_action_steps": executed,
+        "state_dim": state_dim,
+        "max_state_dim": state_dim,
+        "max_action_dim": padded_dim,
+        "num_steps": num_steps,
+        "tokenizer_max_length": 48,
+        "expert_width_multiplier": 1.0,
+        "train_expert_only": False,
+    }
+    return write_policy(directory, "smolvla", **(with_backbone(directory, image) | small | options))
 
 
 def write_act(directory: Path, *, chunk: int = 5, executed: int = 3, **options: Any) -> Path:
@@ -118,52 +163,23 @@ def write_bins(
     *,
     chunk: int = 4,
     executed: int = 4,
-    num_bins: int = 32,
     action_range: tuple[float, float] = (-1.0, 1.0),
-    seed: int = 0,
-    **fields: Any,
+    **options: Any,
 ) -> Path:
     """A smolvla_bins of some 30 k parameters that fits ``SimulatedConfig()``, its backbone beside it."""
     import torch
-    from lerobot.configs.types import FeatureType, PolicyFeature
-    from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
 
-    from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
     from accerl_lerobot.policies.registry import register_policies
 
     register_policies()
-    sizes = BackboneConfig(
-        hidden=32, heads=2, kv_heads=1, vision_hidden=16, vision_layers=1, vision_heads=2, patch=8, image=32
-    )
-    backbone = write_backbone(directory.parent / f"{directory.name}-backbone", sizes, ["Match the target"])
-    options: dict[str, Any] = {
-        "input_features": {
-            "observation.images.front": PolicyFeature(type=FeatureType.VISUAL, shape=(3, 32, 32)),
-            "observation.state": PolicyFeature(type=FeatureType.STATE, shape=(4,)),
-        },
-        "output_features": {"action": PolicyFeature(type=FeatureType.ACTION, shape=(2,))},
-        "device": "cpu",
-        "push_to_hub": False,
-        "vlm_model_name": str(backbone),
-        "load_vlm_weights": False,
-        "num_vlm_layers": 2,
+    low, high = (torch.full((2,), bound) for bound in action_range)
+    small = {
         "chunk_size": chunk,
         "n_action_steps": executed,
-        "num_bins": num_bins,
-        "resize_imgs_with_padding": (32, 32),
-        "freeze_vision_encoder": False,
+        "num_bins": 32,
+        "stats": {"action": {"min": low, "max": high}},
     }
-    config = make_policy_config("smolvla_bins", **options | fields)
-    torch.manual_seed(seed)
-    policy = get_policy_class("smolvla_bins")(config)
-    low, high = (torch.full((2,), bound) for bound in action_range)
-    stats = {
-        "observation.state": {"mean": torch.zeros(4), "std": torch.full((4,), 0.5)},
-        "action": {"min": low, "max": high},
-    }
-    for part in (policy, *make_pre_post_processors(config, dataset_stats=stats)):
-        part.save_pretrained(directory)
-    return directory
+    return write_policy(directory, "smolvla_bins", **(with_backbone(directory, 32) | small | options))
 
 
 def edit_config(path: Path, **changes: Any) -> None:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
 from accerl_lerobot.policies.config import ValueHeadConfig
 from accerl_lerobot.policies.value_head import ValueHead
@@ -123,8 +122,3 @@ def test_detach(detach: bool):
 def test_half_precision_features_are_read_in_full():
     features, mask = inputs()
     assert head()(features.bfloat16(), mask).dtype == torch.float32
-
-
-def test_bad_options_name_their_field():
-    with pytest.raises(InputError, match=r"^policy\.value_head\.hidden=0: use"):
-        ValueHeadConfig(hidden=0)

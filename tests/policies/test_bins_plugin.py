@@ -319,6 +319,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[
     return path, losses
 
 
+@pytest.mark.slow
 def test_lerobot_s_trainer_lowers_the_loss(trained: tuple[Path, list[tuple[int, float]]]):
     path, losses = trained
     assert [step for step, _ in losses] == [10, 20, 30, 40, 50, 60]
@@ -330,6 +331,7 @@ def test_lerobot_s_trainer_lowers_the_loss(trained: tuple[Path, list[tuple[int, 
     assert_close(adapter.processing.unnormalise(ends)[:, 0], [stats["min"], stats["max"]])
 
 
+@pytest.mark.slow
 def test_lerobot_eval_runs_the_checkpoint(trained: tuple[Path, list[tuple[int, float]]], tmp_path: Path):
     command = [
         sys.executable, "-m", "lerobot.scripts.lerobot_eval", f"--policy.path={trained[0]}",

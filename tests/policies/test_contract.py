@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import copy
 import pickle
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -18,30 +18,20 @@ from torch import Tensor
 
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.adapter import LeRobotAdapter, Processing, stack_observations
-from accerl_lerobot.policies.config import (
-    FlowSamplerConfig,
-    PolicyConfig,
-    SamplerConfig,
-    TokenSamplerConfig,
-    ValueHeadConfig,
-)
-from accerl_lerobot.policies.family import Encoded
+from accerl_lerobot.policies.config import PolicyConfig, SamplerConfig, ValueHeadConfig
 from accerl_lerobot.policies.registry import POLICIES
 from accerl_lerobot.policies.saving import save_pretrained
 from tests.policies.cases import CASES, VARIANTS, Case
-from tests.policies.checkpoints import write_bins
 from tests.policies.tiny import (
     adapter_at,
     check_batches,
     check_gradient,
     check_journey,
-    deviation,
     log_ratio,
     perturb,
-    requests,
     stored,
 )
-from tests.policies.tiny_pi import LOWEST, SKIP, VOCABULARY, hub, small, write_pi
+from tests.policies.tiny_pi import hub
 from tests.rounding import assert_close
 
 
@@ -72,23 +62,8 @@ ONE_SAMPLER = pytest.mark.parametrize("policy", parameters(all_samplers=False), 
 TYPES = pytest.mark.parametrize("policy", parameters(all_samplers=False, cases=CASES), indirect=True)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def sizes() -> Iterator[None]:
-    with small():
-        yield
-
-
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory):  # noqa: ANN201
-    @cache
-    def write(name: str) -> Path:
-        return (CASES | VARIANTS)[name].write(tmp_path_factory.mktemp("policy") / "pretrained_model")
-
-    return write
-
-
-@pytest.fixture(scope="module")
-def loaded(written):  # noqa: ANN001, ANN201
+def loaded(written):
     @cache
     def load(name: str, sampler: SamplerConfig) -> LeRobotAdapter:
         adapter = adapter_at(written(name), sampler)
@@ -99,7 +74,7 @@ def loaded(written):  # noqa: ANN001, ANN201
 
 
 @pytest.fixture
-def policy(request: pytest.FixtureRequest, written, loaded) -> Policy:  # noqa: ANN001
+def policy(request: pytest.FixtureRequest, written, loaded) -> Policy:
     name, sampler = request.param
     case = (CASES | VARIANTS)[name]
     return Policy(case, written(name), copy.deepcopy(loaded(name, sampler)), case.requests(40))
@@ -273,7 +248,9 @@ def test_training_touches_neither_normalisation_nor_buffers_nor_what_is_frozen(
 
 @pytest.mark.parametrize("detach", [True, False])
 @pytest.mark.parametrize("name", ["smolvla", "pi0", "pi05"])
-def test_the_value_loss_reaches_the_backbone_only_when_asked(written, name: str, detach: bool):  # noqa: ANN001
+def test_the_value_loss_reaches_the_backbone_only_when_asked(
+    written: Callable[[str], Path], name: str, detach: bool
+):
     adapter = adapter_at(written(name), value_head=ValueHeadConfig(detach=detach))
     perturb(adapter, 0.1)
     asked = CASES[name].requests(4)
@@ -286,7 +263,9 @@ def test_the_value_loss_reaches_the_backbone_only_when_asked(written, name: str,
 
 
 @pytest.mark.parametrize("name", ["smolvla", "pi0", "pi05", "pi0_fast", "smolvla_bins"])
-def test_the_network_runs_in_bfloat16_and_log_probs_and_weights_are_float32(written, name: str):  # noqa: ANN001
+def test_the_network_runs_in_bfloat16_and_log_probs_and_weights_are_float32(
+    written: Callable[[str], Path], name: str
+):
     full, half = adapter_at(written(name)), adapter_at(written(name), precision="bf16")
     asked = CASES[name].requests(6)
     perturb(full, 0.1)
@@ -313,73 +292,6 @@ def test_example_is_what_evaluate_takes(policy: Policy):
     assert len(evaluation.log_prob) == len(tasks) == 2 and len(tasks[0]) != len(tasks[1])
 
 
-@torch.no_grad()
-def drift_flow(adapter: LeRobotAdapter, encoded: Encoded) -> None:
-    """Padded dims drift as well, and feed back."""
-    adapter.policy.model.action_out_proj.bias += torch.tensor([-0.25, -0.25, 0.4])
-
-
-@torch.no_grad()
-def drift_fast(adapter: LeRobotAdapter, encoded: Encoded) -> None:
-    """Towards tokens whose coefficient is above zero."""
-    last = VOCABULARY - 1 - SKIP + LOWEST
-    head = adapter.policy.model.paligemma_with_expert.paligemma.lm_head.weight
-    head[last - 30 : last] += 0.03 * encoded.features[0, -1]
-
-
-@torch.no_grad()
-def drift_bins(adapter: LeRobotAdapter, encoded: Encoded) -> None:
-    adapter.policy.model.head.bias += torch.linspace(-0.4, 0.4, 32)
-
-
-SMALL_PI = {"chunk": 2, "executed": 1, "padded_dim": 3, "num_steps": 2, "prompt": 28}
-WEIGHTED = {
-    "pi0": (lambda path: write_pi(path, "pi0", **SMALL_PI), FlowSamplerConfig(noise_level=0.5), drift_flow),
-    "pi05": (
-        lambda path: write_pi(path, "pi05", **SMALL_PI),
-        FlowSamplerConfig(stochastic="all", noise="flow_sde", noise_level=0.8),
-        drift_flow,
-    ),
-    "pi0_fast": (
-        lambda path: write_pi(path, "pi0_fast", chunk=2, executed=2, num_steps=4, prompt=28),
-        TokenSamplerConfig(temperature=0.6),
-        drift_fast,
-    ),
-    "smolvla_bins": (lambda path: write_bins(path, chunk=2, executed=2), TokenSamplerConfig(), drift_bins),
-}
-
-
-@pytest.mark.parametrize("name", WEIGHTED)
-def test_weighted_samples_of_mu_are_samples_of_pi(name: str, tmp_path: Path):
-    """E_μ[ρ f(a)] = E_π[f(a)]; of each family on a network small enough to sample often in its own tests."""
-    write, sampler, drift = WEIGHTED[name]
-    adapter, count = adapter_at(write(tmp_path / "pretrained_model"), sampler), 4000
-    prepared = adapter.processing.prepare(*stack_observations(requests(1)))
-    batch = {k: v.expand(count, *v.shape[1:]) if isinstance(v, Tensor) else v for k, v in prepared.items()}
-
-    @torch.no_grad()
-    def act(seed: int) -> tuple[Tensor, dict[str, Tensor], Tensor]:
-        asked = [Request(observation={}, noise_seed=seed + i) for i in range(count)]
-        action = adapter.family.act(adapter.model.encode(batch), asked)
-        executed = adapter.processing.unnormalise(action.chunk)
-        first, last, other = executed[:, 0, 0], executed[:, -1, 0], executed[:, -1, 1]
-        payoff = torch.tanh(first + last + 0.5) * (1 + torch.tanh(other) ** 2) + torch.tanh(other)
-        if name == "pi0_fast":  # of the first dimension, whose tokens come first
-            payoff = torch.tanh(first + last) * (1 + torch.tanh(executed[:, 0, 1]) ** 2)
-        return payoff, action.latent, action.log_prob.sum(1)
-
-    old, latent, behaviour = act(0)
-    perturb(adapter, 0.03)
-    drift(adapter, adapter.model.encode(prepared))
-    with torch.no_grad():
-        score = adapter.family.score(adapter.model.encode(batch), latent)
-    ratio = (score.log_prob.sum(1) - behaviour).exp()
-    new, _, _ = act(10_000)
-    assert deviation(old, new) > 6, "the weights must matter, or the test shows nothing"
-    assert deviation(ratio, torch.ones(2)) < 4
-    assert deviation(ratio * old, new) < 4
-
-
 @TYPES
 def test_stock_lerobot_runs_what_is_saved(policy: Policy, tmp_path: Path):
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
@@ -401,31 +313,3 @@ def test_stock_lerobot_runs_what_is_saved(policy: Policy, tmp_path: Path):
     action = stock.select_action(batch)
     assert torch.isfinite(action).all()
     assert torch.equal(post(action), adapter.processing.unnormalise(action))
-
-
-@pytest.mark.parametrize("name", [name for name in CASES if name != "gaussian_actor"])
-def test_lerobot_s_own_training_lowers_its_loss(written, name: str):  # noqa: ANN001
-    """gaussian_actor has no loss on demonstrations: LeRobot trains it by SAC."""
-    adapter, asked = adapter_at(written(name)), CASES[name].requests(24)
-    config, policy = adapter.policy.config, adapter.policy
-    observations, tasks = stack_observations(asked)
-    generator = torch.Generator().manual_seed(0)
-    rows, dims = len(config.action_delta_indices), config.output_features["action"].shape[0]
-    batch: dict[str, Any] = {"task": tasks}
-    for key in config.input_features:
-        value = torch.from_numpy(observations[key])
-        batch[key] = value.movedim(-1, -3) / 255.0 if value.dtype == torch.uint8 else value
-    batch["action"] = 0.3 * torch.randn(len(asked), rows, dims, generator=generator)
-    batch["action_is_pad"] = torch.zeros(len(asked), rows, dtype=torch.bool)
-    batch = adapter.processing.preprocessor(batch)
-    policy.train()
-    optimizer = torch.optim.AdamW([p for p in policy.parameters() if p.requires_grad], lr=1e-3)
-    losses = []
-    for _ in range(21):
-        torch.manual_seed(1)  # the same noise and times each step, so that losses can be compared
-        loss = policy.forward(batch)[0]
-        losses.append(loss.item())
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    assert losses[-1] < 0.99 * losses[0]

@@ -32,7 +32,7 @@ from accerl_lerobot.rollout.worker import RolloutWorker
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.policies.cases import slow_diffusion
 from tests.policies.checkpoints import edit_config, stock_chunk, write_diffusion
-from tests.policies.tiny import adapter_at, check_ratio_one, deviation, log_ratio, perturb, requests, stored
+from tests.policies.tiny import adapter_at, deviation, log_ratio, perturb, requests, stored
 from tests.rounding import assert_close
 from tests.runs import tiny_run
 from tests.transport.played import played
@@ -102,16 +102,6 @@ def test_not_exploring_is_lerobot_s_sampler_to_the_bit(
     assert np.abs(noisy - chunks).max() > 1e-2
 
 
-def test_lerobot_s_sampler_wants_what_its_processors_do_not_give(adapter: LeRobotAdapter):
-    batch = adapter.processing.prepare(*stack_observations(ask(2)))
-    with pytest.raises(AssertionError):
-        adapter.policy.predict_action_chunk(batch)
-    assert adapter.decide(ask(2), 0)[0].chunk.shape == (3, 2)
-    # Its queues would have answered the second question with the first one's observation.
-    adapter.policy.select_action(batch)
-    assert adapter.self_check(*stack_observations(ask(3))) == 0.0
-
-
 @pytest.mark.parametrize(
     ("fields", "config"),
     [
@@ -133,7 +123,7 @@ def test_other_weights_give_the_oracle_s_ratio(tmp_path: Path, fields: dict, con
     assert np.abs(change).max() > 0.05, "the weights must have moved the policy"
 
 
-# ---- what an importance weight is for, on a network in which every entry acts on every other
+# ---- importance weights, on a network in which every entry acts on every other
 
 SHAPE = DiffusionShape(horizon=3, executed=1, action_dim=1)
 SAMPLES = 100_000
@@ -204,16 +194,6 @@ def test_weighted_samples_of_mu_are_samples_of_pi(scheduler: str):
 
 
 @pytest.mark.parametrize("scheduler", ["DDPM", "DDIM"])
-def test_rows_that_are_not_executed_feed_back(scheduler: str, monkeypatch: pytest.MonkeyPatch):
-    config = DiffusionSamplerConfig(std_min=0.3)
-    executed = torch.tensor([[True], [False], [False]])
-    monkeypatch.setattr(diffusion, "_mask", lambda k, shape, schedule, device: executed)
-    ratio, product = weighted(scheduler, config)
-    assert deviation(ratio, torch.ones(2)) < EXACT, "E[ρ] = 1 does not catch it"
-    assert deviation(product, payoff(act(PI, scheduler, config, 12)[0])) > WRONG
-
-
-@pytest.mark.parametrize("scheduler", ["DDPM", "DDIM"])
 def test_the_last_steps_weight_towards_those_steps_alone(scheduler: str):
     config = DiffusionSamplerConfig(std_min=0.3, last_steps=1)
     ratio, product = weighted(scheduler, config)
@@ -249,18 +229,6 @@ def test_entropy_is_the_mean_surprise_of_what_is_sampled():
 # ---- loading and saving
 
 
-@pytest.mark.parametrize("config", [ALL, LAST], ids=["all", "last"])
-def test_only_executed_rows_of_the_outcome_are_scored(path: Path, config: DiffusionSamplerConfig):
-    adapter, asked = adapter_at(path, config), ask(4)
-    decisions = adapter.decide(asked, 0)
-    for decision in decisions:
-        decision.latent["path"][-1, 3:] += 1.0
-    check_ratio_one(adapter, asked, decisions)
-    for decision in decisions:
-        decision.latent["path"][-1, 2, 1] += 0.1
-    assert log_ratio(adapter, asked, decisions).abs().min() > 1e-3
-
-
 @pytest.mark.parametrize(("last", "points"), [(None, 5), (2, 3), (1, 2)])
 def test_the_latent_is_as_small_as_re_scoring_allows(path: Path, last: int | None, points: int):
     decision = adapter_at(path, DiffusionSamplerConfig(last_steps=last)).decide(ask(1), 0)[0]
@@ -291,11 +259,7 @@ def test_a_saved_checkpoint_is_stock_lerobot_s(path: Path, tmp_path: Path):
             {"sampler": DiffusionSamplerConfig(last_steps=5)},
             "policy.sampler.last_steps=5: use at most 4, the policy's denoising steps",
         ),
-        (
-            {},
-            {"n_action_steps": 9},
-            "policy.n_action_steps=9: use 1 to 8, the chunk the policy predicts",
-        ),
+        ({}, {"n_action_steps": 9}, "policy.n_action_steps=9: use 1 to 8, the chunk the policy predicts"),
         (
             {"n_obs_steps": 2},
             {"n_action_steps": 8},
@@ -308,20 +272,6 @@ def test_refusals(path: Path, tmp_path: Path, changes: dict, options: dict, sent
     edit_config(copied, **changes)
     with pytest.raises(InputError, match=f"^{sentence}"):
         load_adapter(PolicyConfig(path=str(copied), device="cpu", **options))
-
-
-@pytest.mark.parametrize(
-    ("values", "field"),
-    [
-        ({"std_min": 0.0}, "std_min"),
-        ({"std_min": 1.1}, "std_min"),
-        ({"last_steps": 0}, "last_steps"),
-        ({"scheduler": "PNDM"}, "scheduler"),
-    ],
-)
-def test_bad_values_name_their_field(values: dict, field: str):
-    with pytest.raises(InputError, match=f"^policy.sampler.{field}="):
-        DiffusionSamplerConfig(**values)
 
 
 # ---- a policy that looks back, LeRobot's default, in a world

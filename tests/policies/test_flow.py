@@ -6,14 +6,12 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies import flow
 from accerl_lerobot.policies.config import FlowSamplerConfig
 from accerl_lerobot.policies.family import Encoded
@@ -131,15 +129,6 @@ def test_not_exploring_is_the_stock_sampler_bit_for_bit(config: FlowSamplerConfi
     assert not torch.isclose(exploring[:, :2, :2], stock[:, :2, :2]).any()
 
 
-@pytest.mark.parametrize("config", SAMPLERS, ids=name)
-def test_without_noise_exploring_is_the_stock_sampler(config: FlowSamplerConfig):
-    quiet = replace(config, noise_level=1e-7)
-    shape = sizes(3)
-    x0, eps, index = draws(shape)
-    x, _, _ = flow.sample(velocity, x0, eps, index, explore_all(x0), shape, quiet)
-    assert (x - plain_ode(x0, 3))[:, :2, :2].abs().max() < 1e-5
-
-
 @pytest.mark.parametrize("noise", ["euler", "flow_sde"])
 def test_only_flow_sde_keeps_the_distribution(noise: str):
     # Data N(0.7, 0.5²): x_t is Gaussian, and v(x, t) = E[ε − a | x_t = x] is linear in x.
@@ -206,21 +195,6 @@ def test_entropy_is_minus_the_expected_log_density(config: FlowSamplerConfig):
     entropy = flow.entropy(latent, shape, config)
     error = (entropy + log_prob.sum(1)).std().item() / math.sqrt(count)
     assert entropy.mean().item() == pytest.approx(-log_prob.sum(1).mean().item(), abs=4 * error)
-
-
-@pytest.mark.parametrize("config", [c for c in SAMPLERS if c.stochastic == "last"], ids=name)
-def test_what_is_not_executed_is_marginalised(config: FlowSamplerConfig):
-    shape = sizes(3)
-    x0, eps, index = draws(shape)
-    _, latent, log_prob = flow.sample(velocity, x0, eps, index, explore_all(x0), shape, config)
-    elsewhere = ~shape.action_mask()
-    moved = latent["path"].clone()
-    moved[:, 1] += 3.0 * elsewhere
-    assert torch.allclose(flow.log_prob(velocity, {"path": moved}, shape, config), log_prob, atol=1e-12)
-    moved[:, 1, 1, 1] += 0.1
-    assert not torch.isclose(
-        flow.log_prob(velocity, {"path": moved}, shape, config)[:, 1], log_prob[:, 1]
-    ).any()
 
 
 # ---- importance weights: E_μ[ρ f(a)] = E_π[f(a)] for the action the environment executes. "ρ = 1 at equal
@@ -298,33 +272,6 @@ def test_weighted_samples_of_mu_are_samples_of_pi(config: FlowSamplerConfig):
 
 
 @pytest.mark.parametrize("noise", ["euler", "flow_sde"])
-def test_leaving_out_padded_dims_is_caught(noise: str, monkeypatch: pytest.MonkeyPatch):
-    config = FlowSamplerConfig(stochastic="all", noise=noise, noise_level=0.8)
-    real = torch.zeros(SHAPE.chunk_size, SHAPE.padded_dim, dtype=torch.bool)
-    real[:, : SHAPE.action_dim] = True
-    monkeypatch.setattr(flow, "_counted", lambda k, mask, shape: real)
-    _, latent, behaviour = act(MU, config, 11)
-    assert torch.allclose(flow.log_prob(MU, latent, SHAPE, config).sum(1), behaviour, atol=1e-4)
-    ratio, product = weighted(config)
-    assert deviation(ratio, torch.ones(2)) < EXACT, "E[ρ] = 1 does not catch it"
-    assert deviation(product, payoff(act(PI, config, 12)[0])) > WRONG
-
-
-def test_taking_the_last_step_s_start_as_given_is_caught():
-    # The tempting shortcut for ``last``: re-score from the stored x_{N−1} in one velocity pass.
-    config = FlowSamplerConfig(stochastic="last", noise="euler", noise_level=0.4)
-    action, latent, behaviour = act(MU, config, 11)
-    x, b, n = latent["path"][:, 0], SAMPLES, SHAPE.num_steps
-    for k in range(n - 1):
-        x = x - MU(x, x.new_full((b,), flow.step_time(k, n))) / n
-    t = x.new_full((b,), flow.step_time(n - 1, n))
-    mean, std = flow.transition(x, PI(x, t), t, SHAPE, config)
-    shortcut = flow.gaussian_log_prob(latent["path"][:, 1], mean, std, SHAPE.action_mask()).sum(1)
-    product = (shortcut - behaviour).exp() * payoff(action)
-    assert deviation(product, payoff(act(PI, config, 12)[0])) > WRONG
-
-
-@pytest.mark.parametrize("noise", ["euler", "flow_sde"])
 def test_one_drawn_step_weights_towards_that_step_alone(noise: str):
     config = FlowSamplerConfig(stochastic="one", noise=noise, noise_level=0.8)
     ratio, product = weighted(config)
@@ -395,22 +342,3 @@ def test_entropy_of_a_learned_std_by_hand(stochastic: str, entries: int):
     small, large = (flow.entropy(latent, SHAPE, config, head(config, s)(encoded)) for s in (0.0, 1.0))
     assert_close(small, torch.full((4,), entries * (math.log(0.2) + 0.5 * math.log(2 * math.pi * math.e))))
     assert (large > small).all() and small.requires_grad
-
-
-@pytest.mark.parametrize(
-    ("values", "field"),
-    [
-        ({"stochastic": "first"}, "policy.sampler.stochastic='first'"),
-        ({"noise": "none"}, "policy.sampler.noise='none'"),
-        ({"noise_level": 0.0}, "policy.sampler.noise_level=0.0"),
-        ({"noise_level": math.nan}, "policy.sampler.noise_level=nan"),
-        ({"noise_level": 2.5}, "policy.sampler.noise_level=2.5"),
-        ({"noise": "learned", "noise_level": 0.05}, "policy.sampler.noise_min=0.08"),
-        ({"noise": "learned", "noise_level": 0.5}, "policy.sampler.noise_max=0.4"),
-        ({"noise": "learned", "noise_min": 0.0}, "policy.sampler.noise_min=0.0"),
-        ({"noise": "learned", "noise_max": 3.0}, "policy.sampler.noise_max=3.0"),
-    ],
-)
-def test_bad_options_name_their_field(values: dict, field: str):
-    with pytest.raises(InputError, match=f"^{field}: use"):
-        FlowSamplerConfig(**values)

@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies import gaussian
 from accerl_lerobot.policies.config import GaussianSamplerConfig
@@ -171,20 +170,3 @@ def test_a_constant_std_is_no_parameter():
     it = GaussianFamily(Small(), GaussianSamplerConfig(std=0.3, learn_std=False))
     assert not list(it.parameters())
     assert torch.equal(it._gaussian(it.model.under(0.0, 2))[1], torch.full((2, 2, 2), 0.3))
-
-
-@pytest.mark.parametrize(
-    ("values", "field"),
-    [
-        ({"std": 0.0}, "std"),
-        ({"std": 2.1}, "std"),
-        ({"std_min": 0.0}, "std_min"),
-        ({"std_min": 0.2}, "std_min"),
-        ({"std_max": 0.2}, "std_max"),
-    ],
-)
-def test_bad_values_name_their_field(values: dict, field: str):
-    with pytest.raises(InputError, match=f"^policy.sampler.{field}="):
-        GaussianSamplerConfig(**values)
-    if field.startswith("std_") and values[field]:
-        GaussianSamplerConfig(**values, learn_std=False)  # bounds of what is not learnt do not matter

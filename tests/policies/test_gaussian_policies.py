@@ -149,16 +149,6 @@ def test_saturated_actions_are_re_scored(adapter: LeRobotAdapter):
     assert torch.isfinite(adapter.policy.actor.mean_layer.bias.grad).all()
 
 
-def test_neither_chunks_nor_scores_come_from_lerobot(adapter: LeRobotAdapter):
-    batch = adapter.processing.prepare(*stack_observations(requests(2)))
-    with pytest.raises(NotImplementedError):
-        adapter.policy.predict_action_chunk(batch)
-    one, other = adapter.policy(batch)["action"], adapter.policy(batch)["action"]
-    assert not torch.equal(one, other), "its forward samples anew and cannot score a given action"
-    decision = adapter.decide(requests(1), 0)[0]
-    assert decision.chunk.shape == (1, 2) and decision.latent["u"].shape == (1, 2)
-
-
 def test_a_repaired_lerobot_is_noticed(path: Path, monkeypatch: pytest.MonkeyPatch):
     """If what it clamps became the std that it is called, our log-probs would be another policy's."""
     from lerobot.policies.gaussian_actor import modeling_gaussian_actor as module

@@ -7,7 +7,7 @@ middle, so their return rises and not their success. SmolVLA's run is `test_loca
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.policies.checkpoints import write_act, write_bins, write_diffusion, write_gaussian_actor
 from tests.policies.tiny import TOLERANCE
-from tests.policies.tiny_pi import small, write_pi
+from tests.policies.tiny_pi import write_pi
 from tests.runs import collect, drive, tiny_run
 
 ENV = SimulatedConfig(max_steps=8, tolerance=0.3, reward="dense", terminate_on_success=False)
@@ -152,12 +152,6 @@ RUNS = {
 }
 
 
-@pytest.fixture(scope="module", autouse=True)
-def sizes() -> Iterator[None]:
-    with small():
-        yield
-
-
 def played(engine: Engine, episodes: int = 128) -> tuple[float, float]:
     """Mean success and return of episodes that do not explore."""
     engine.plan(evaluation_plans(("match",), episodes, "test"))
@@ -169,6 +163,7 @@ def test_every_type_but_smolvla_has_a_run():
     assert set(RUNS) == set(POLICIES) - {"smolvla"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)
 def test_a_random_policy_gets_better(name: str, tmp_path: Path):
     run = RUNS[name]

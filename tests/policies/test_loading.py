@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import logging
 import pickle
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -16,7 +15,6 @@ from pydoc import locate
 from typing import Any
 
 import draccus
-import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -26,10 +24,16 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig, SamplerConfig, ValueHeadConfig
 from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config, no_tf32, resolve_device
 from accerl_lerobot.policies.saving import save_pretrained
-from tests.conftest import write_smolvla
-from tests.policies.checkpoints import edit_config, stock_chunk, write_act, write_bins, write_diffusion
+from tests.policies.checkpoints import (
+    edit_config,
+    stock_chunk,
+    write_act,
+    write_bins,
+    write_diffusion,
+    write_smolvla,
+)
 from tests.policies.tiny import adapter_at, perturb, requests
-from tests.policies.tiny_pi import ACTIONS, COMMIT, KINDS, PALIGEMMA, SKIP, hub, small, write_pi
+from tests.policies.tiny_pi import ACTIONS, COMMIT, KINDS, PALIGEMMA, SKIP, hub, write_pi
 
 MODELING = "lerobot.policies.pi0_fast.modeling_pi0_fast"
 Tensors = dict[str, torch.Tensor]
@@ -43,12 +47,6 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
     "pi05": lambda path: write_pi(path, "pi05"),
     "pi0_fast": lambda path: write_pi(path, "pi0_fast", num_steps=8),
 }
-
-
-@pytest.fixture(scope="module", autouse=True)
-def sizes() -> Iterator[None]:
-    with small():
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -100,8 +98,6 @@ def refused(path: Path, sentence: str, **options: object) -> None:
     [
         (None, "policy.path=None: give a LeRobot checkpoint directory or Hub id"),
         ("./nowhere", "policy.path='./nowhere': no config.json there"),
-        ("~/nowhere", "policy.path='~/nowhere': no config.json there"),
-        ("a/b/c", "policy.path='a/b/c': not a directory here and not loadable from the Hub"),
         ("no/thing", "policy.path='no/thing': not a directory here and not loadable from the Hub"),
     ],
 )
@@ -114,9 +110,7 @@ def test_a_path_to_nothing(path: str | None, sentence: str):
 @pytest.mark.parametrize(
     ("kind", "why"),
     [
-        ("multi_task_dit", "no likelihood for it here; use one of smolvla, "),
         ("tdmpc", "it plans by sampling and has no action density"),
-        ("vqbet", "LeRobot does not return its code log-probs"),
         ("my_policy", "no likelihood for it here; use one of smolvla, "),
     ],
 )
@@ -147,18 +141,11 @@ def test_a_config_of_something_else(damaged: Any, text: str | None, why: str):
     ("name", "changes", "options", "sentence"),
     [
         ("smolvla", {"rtc_config": {"enabled": True}}, {}, "policy.rtc_config.enabled=True: real-time"),
-        ("pi0", {"rtc_config": {"enabled": True}}, {}, "policy.rtc_config.enabled=True: "),
-        ("pi0_fast", {"rtc_config": {"enabled": True}}, {}, "policy.rtc_config.enabled=True: "),
         ("smolvla", {"adapt_to_pi_aloha": True}, {}, "policy.adapt_to_pi_aloha=True: "),
         ("smolvla", {"compile_model": True}, {}, "policy.compile_model=True: a compiled sampler rounds"),
-        ("pi05", {"compile_model": True}, {}, "policy.compile_model=True: "),
-        ("pi0_fast", {"compile_model": True}, {}, "policy.compile_model=True: "),
-        ("diffusion", {"compile_model": True}, {}, "policy.compile_model=True: "),
         ("pi0_fast", {"temperature": 0.7}, {}, "policy.temperature=0.7: LeRobot's sampler has to be greedy"),
         ("pi0_fast", {"n_action_steps": 3}, {}, "policy.n_action_steps=3: LeRobot decodes so many rows from"),
-        ("pi0_fast", {}, {"n_action_steps": 2}, "policy.n_action_steps=2: LeRobot decodes so many rows"),
         ("pi0_fast", {}, {"num_steps": 3}, "policy.num_steps=3: a pi0_fast policy does not denoise"),
-        ("smolvla_bins", {}, {"num_steps": 3}, "policy.num_steps=3: a smolvla_bins policy does not denoise"),
         ("smolvla", {}, {"n_action_steps": 5}, "policy.n_action_steps=5: use 1 to 4, the chunk the policy"),
         ("act", {}, {"sampler": FlowSamplerConfig()}, "policy.sampler.type='flow': a act policy explores"),
     ],
@@ -172,12 +159,6 @@ def test_options_under_which_its_density_would_be_another(
     edit_config(path, **changes)
     refused(path, sentence, **options)
     torch.set_float32_matmul_precision(precision)
-
-
-@pytest.mark.parametrize("values", [{"num_steps": 0}, {"n_action_steps": 0}, {"n_action_steps": -1}])
-def test_sizes_below_one_are_refused_when_parsed(values: dict):
-    with pytest.raises(InputError, match=f"^policy.{next(iter(values))}=.*use a whole number from 1"):
-        PolicyConfig(**values)
 
 
 def test_devices(monkeypatch: pytest.MonkeyPatch):
@@ -217,18 +198,16 @@ def with_nan(tensors: Tensors, key: str) -> None:
     tensors[key].view(-1)[0] = float("nan")
 
 
-@pytest.mark.parametrize(("name", "key"), [("smolvla", OUT), ("pi0", OUT), ("pi05", OUT), ("pi0_fast", HEAD)])
+@pytest.mark.parametrize(("name", "key"), [("smolvla", OUT), ("pi0", OUT), ("pi0_fast", HEAD)])
 @pytest.mark.parametrize(
     ("damage", "detail"),
     [
         (lambda t, key: t.pop(key), r"1 tensors missing \['{key}'\], 0 unexpected \[\]"),
         (lambda t, key: t.update(x=torch.zeros(2)), r"0 tensors missing \[\], 1 unexpected \['(model.)?x'\]"),
-        (lambda t, key: t.update(x=t.pop(key)), r"1 tensors missing \['{key}'\], 1 unexpected"),
         (lambda t, key: t.update({key: torch.zeros(3, 3)}), r"size mismatch for {key}, \(3, 3\) in the file"),
         (with_nan, "model.safetensors: {key} holds NaN or infinity"),
-        (lambda t, key: {"another": torch.zeros(1)}, r"\d+ tensors missing \['.*', '.*', '.*'\], 1 unexp"),
     ],
-    ids=["missing", "unexpected", "renamed", "shape", "nan", "another"],
+    ids=["missing", "unexpected", "shape", "nan"],
 )  # fmt: skip
 def test_weights_that_did_not_load_are_named(
     damaged: Any, name: str, key: str, damage: Callable[..., object], detail: str
@@ -246,13 +225,6 @@ def test_a_weights_file_that_is_none(damaged: Any, name: str, content: bytes | N
     if content is not None:
         (path / "model.safetensors").write_bytes(content)
     refused(path, f"policy.path=.*model.safetensors: {why}")
-
-
-def test_weights_of_another_type_are_refused(written: Any, damaged: Any):
-    for one, other in (KINDS, KINDS[::-1]):
-        path = damaged(one)
-        shutil.copy(written(other) / "model.safetensors", path)
-        refused(path, "policy.path=.*the weights did not load: .* tensors missing")
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -286,12 +258,11 @@ def test_a_shared_embedding_is_read_as_lerobot_reads_it(damaged: Any):
     assert decided(path) == expected
 
 
-@pytest.mark.parametrize("number", [float("nan"), float("-inf")])
-def test_statistics_are_numbers(damaged: Any, number: float):
+def test_statistics_are_numbers(damaged: Any):
     path = damaged("smolvla")
     (file,) = path.glob("policy_preprocessor*.safetensors")
     tensors = load_file(file)
-    tensors["observation.state.mean"].view(-1)[-1] = number
+    tensors["observation.state.mean"].view(-1)[-1] = float("nan")
     save_file(tensors, file)
     refused(
         path, f"policy.path='{path}': {file.name}: observation.state.mean holds NaN or infinity; train it"
@@ -322,26 +293,13 @@ def test_torchvision_s_weights_are_not_asked_for(
 # ---- LeRobot's internals: what the sampler is compared with at load
 
 
-@pytest.mark.parametrize("name", ["smolvla", *KINDS])
-def test_another_integrator_in_lerobot_fails_at_load(
-    written: Any, name: str, monkeypatch: pytest.MonkeyPatch
-):
-    def midpoint(denoise: Any, noise: torch.Tensor, num_steps: int, **options: Any) -> torch.Tensor:
-        x, dt = noise, -1.0 / num_steps
-        for step in range(num_steps):
-            x = x + dt * denoise(x, torch.full((len(x),), 1.0 + (step + 0.5) * dt))
-        return x
-
-    module = importlib.import_module(f"lerobot.policies.{name}.modeling_{name}")
-    monkeypatch.setattr(module, "euler_integrate", midpoint)
-    refused(written(name), "lerobot=.*does not fit LeRobot .*: it differs from its sampler by")
-
-
 @pytest.mark.parametrize(
     ("name", "method"),
     [
         ("act", "act.modeling_act.ACTPolicy.predict_action_chunk"),
         ("smolvla", "smolvla.modeling_smolvla.SmolVLAPolicy.predict_action_chunk"),
+        ("pi0", "pi0.modeling_pi0.PI0Policy.predict_action_chunk"),
+        ("pi05", "pi05.modeling_pi05.PI05Policy.predict_action_chunk"),
         ("diffusion", "diffusion.modeling_diffusion.DiffusionPolicy.predict_action_chunk"),
         ("pi0_fast", "pi0_fast.modeling_pi0_fast.PI0FastPolicy.predict_action_chunk"),
         ("pi0_fast", "pi0_fast.modeling_pi0_fast.PI0FastPytorch.sample_actions_fast_kv_cache"),
@@ -418,19 +376,6 @@ def test_a_backbone_that_is_gone_is_named(tmp_path: Path):
     origin = write_smolvla(tmp_path / "origin" / PRETRAINED)
     shutil.rmtree(tmp_path / "origin" / f"{PRETRAINED}-backbone")
     refused(origin, rf"policy.path=.*{PRETRAINED}-backbone, which is gone; put a copy into {BACKBONE}/")
-
-
-def test_the_backbone_s_own_weights_are_not_copied(written: Any, tmp_path: Path):
-    config = PolicyConfig(path=str(written("smolvla")), device="cpu")
-    adapter = load_adapter(config)
-    backbone = Path(shutil.copytree(adapter.policy.config.vlm_model_name, tmp_path / "backbone"))
-    (backbone / "model.safetensors").write_bytes(b"large")
-    adapter.policy.config.vlm_model_name = str(backbone)
-    save_pretrained(adapter, tmp_path / "saved", config)
-    assert (tmp_path / "saved" / BACKBONE / "tokenizer.json").is_file()
-    assert not (tmp_path / "saved" / BACKBONE / "model.safetensors").exists()
-    config_file = json.loads((tmp_path / "saved" / "config.json").read_text())
-    assert config_file["vlm_model_name"] == str(tmp_path / "saved" / BACKBONE)
 
 
 def test_a_checkpoint_on_the_hub_is_loaded_whole(
@@ -629,14 +574,3 @@ def test_what_lerobot_forgets_of_its_action_tokeniser_is_put_back(written: Any):
     assert (step.fast_skip_tokens, step.paligemma_tokenizer_name) == (SKIP, str((path / BACKBONE).resolve()))
     stored = json.loads((path / PROCESSOR).read_text())["steps"][6]["config"]
     assert not {"fast_skip_tokens", "paligemma_tokenizer_name"} & stored.keys()
-
-
-def test_fewer_rows_are_not_the_first_of_a_chunk(written: Any):
-    # Why `n_action_steps` below `chunk_size` is refused: it is the same movement in less time, and larger.
-    policy = adapter_at(written("pi0_fast")).policy
-    chunk = np.linspace(-1, 1, 4)[:, None].repeat(2, 1)
-    tokens = [torch.tensor(policy.action_tokenizer(chunk[None])[0])]
-    whole = policy.decode_actions_with_fast(tokens, time_horizon=4, action_dim=2)[0]
-    half = policy.decode_actions_with_fast(tokens, time_horizon=2, action_dim=2)[0]
-    assert np.abs(whole - chunk).max() < 0.1
-    assert np.abs(half - chunk[:2]).max() > 0.5 and half[1, 0] > 0.5

@@ -13,10 +13,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies import tokens as tk
-from accerl_lerobot.policies.config import SamplerConfig, TokenSamplerConfig
+from accerl_lerobot.policies.config import TokenSamplerConfig
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.tokens import TokenContext, TokenFamily, TokenModel
 from tests.rounding import assert_close
@@ -218,15 +217,6 @@ def test_sequences_are_as_frequent_as_their_probability(kind: Any, temperature: 
     assert squares < freedom + 5 * math.sqrt(2 * freedom), "χ²"
 
 
-def test_positions_are_drawn_independently():
-    # One uniform number for all positions would give each its right marginal distribution.
-    model, count = Parallel(), 4000
-    model.out = torch.zeros_like(model.out)
-    action = family(model).act(encoded(model, observations(1).expand(count, -1)), requests(count))
-    correlation = np.corrcoef(action.latent["tokens"].numpy().T)
-    assert np.abs(correlation[np.triu_indices(LENGTH, 1)]).max() < 0.08
-
-
 def test_nothing_after_the_terminator_counts():
     model, count = Recurrent(), 60
     tokens_family, read = family(model, 2.0), encoded(model, observations(count))
@@ -348,10 +338,3 @@ def test_nan_logits_are_visible_in_the_log_prob_and_break_nothing():
     model = Parallel()
     action = family(model).act(encoded(model, torch.full((2, WIDTH), torch.nan)), requests(2))
     assert torch.isnan(action.log_prob).all() and (action.latent["tokens"] < VOCABULARY).all()
-
-
-@pytest.mark.parametrize("temperature", [0.0, -1.0, 10.1, math.nan, math.inf])
-def test_bad_temperatures_are_refused(temperature: float):
-    with pytest.raises(InputError, match=r"^policy\.sampler\.temperature="):
-        TokenSamplerConfig(temperature=temperature)
-    assert SamplerConfig.get_choice_class("tokens") is TokenSamplerConfig

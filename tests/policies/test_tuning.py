@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import pickle
 import threading
-from collections.abc import Iterator
-from functools import cache
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,6 @@ from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.weights.shared_memory import Received, SharedMemoryPublisher, SharedMemoryReader
 from tests.policies.cases import CASES
 from tests.policies.tiny import adapter_at, check_ratio_one, log_ratio, perturb, requests, stored
-from tests.policies.tiny_pi import small
 from tests.rounding import assert_close
 
 BACKBONES = {
@@ -40,23 +38,8 @@ TARGETS = dict.fromkeys(BACKBONES) | {
 """Type → regular expression of layers for low-rank adapters; None: LeRobot's own choice."""
 
 
-@pytest.fixture(scope="module", autouse=True)
-def sizes() -> Iterator[None]:
-    with small():
-        yield
-
-
-@pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory):  # noqa: ANN201
-    @cache
-    def write(name: str) -> Path:
-        return CASES[name].write(tmp_path_factory.mktemp("policy") / "pretrained_model")
-
-    return write
-
-
 @pytest.fixture
-def path(written) -> Path:  # noqa: ANN001
+def path(written) -> Path:
     return written("smolvla")
 
 
@@ -71,9 +54,7 @@ def policy_names(adapter: LeRobotAdapter) -> set[str]:
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_low_rank_adapters_start_as_the_policy_itself_and_are_saved_merged(
-    written,  # noqa: ANN001
-    name: str,
-    tmp_path: Path,
+    written, name: str, tmp_path: Path
 ):
     path, asked = written(name), CASES[name].requests(8)
     tuning = TuningConfig(mode="lora", rank=2, alpha=16, targets=TARGETS[name])
@@ -101,7 +82,7 @@ def test_low_rank_adapters_start_as_the_policy_itself_and_are_saved_merged(
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_full_and_expert(written, name: str):  # noqa: ANN001
+def test_full_and_expert(written: Callable[[str], Path], name: str):
     path = written(name)
     everything = {k for k, _ in adapter_at(path).policy.named_parameters()}
     idle = tuple(adapter_at(path).model.idle)
@@ -141,19 +122,11 @@ def test_the_merged_weight_by_hand(path: Path, tmp_path: Path):
         ("act", r".*self_attn\.out_proj", ".*matches none of the policy's .* linear layers"),
     ],
 )
-def test_targets_that_do_not_suit_the_policy(written, name: str, targets: str | None, sentence: str):  # noqa: ANN001
+def test_targets_that_do_not_suit_the_policy(
+    written: Callable[[str], Path], name: str, targets: str | None, sentence: str
+):
     with pytest.raises(InputError, match=rf"^policy\.tuning\.targets{sentence}"):
         tuned(written(name), mode="lora", targets=targets)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "why"),
-    [("mode", "qlora", "use"), ("rank", 0, "use"), ("alpha", 0, "use"), ("targets", "(", "not a regular")],
-)
-def test_bad_options_name_their_field_before_anything_is_loaded(name: str, value: object, why: str):
-    with pytest.raises(InputError) as caught:
-        TuningConfig(**{name: value})
-    assert str(caught.value).startswith(f"policy.tuning.{name}={value!r}: {why}")
 
 
 def test_only_what_is_trained_travels_and_is_copied_once(path: Path):

@@ -21,6 +21,7 @@ import pytest
 
 from accerl_lerobot.checkpoint.layout import BACKBONE, FAST
 from accerl_lerobot.policies.pi0_fast import data_only
+from tests.policies.checkpoints import write_policy
 
 PALIGEMMA = "google/paligemma-3b-pt-224"
 """The tokeniser that LeRobot's processors ask the Hub for."""
@@ -142,7 +143,6 @@ def write_pi(
     kind: str,
     *,
     state_dim: int = 4,
-    action_dim: int = 2,
     padded_dim: int = 2,
     chunk: int = 4,
     executed: int = 4,
@@ -159,44 +159,25 @@ def write_pi(
         prompt: tokens; the longest of `tiny.TEXTS` takes 20, and π0.5 adds 20 or so with the state.
         whole: with the tokeniser beside it, as our checkpoints have it; LeRobot's need the Hub for that.
     """
-    import torch
-    from lerobot.configs.types import FeatureType, PolicyFeature
-    from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
-
     fast = {"max_decoding_steps": num_steps, "max_action_tokens": 32, "fast_skip_tokens": SKIP}
-    config = make_policy_config(
-        kind,
-        input_features={
-            "observation.images.front": PolicyFeature(type=FeatureType.VISUAL, shape=(3, IMAGE, IMAGE)),
-            "observation.state": PolicyFeature(type=FeatureType.STATE, shape=(state_dim,)),
-        },
-        output_features={"action": PolicyFeature(type=FeatureType.ACTION, shape=(action_dim,))},
-        device="cpu",
-        push_to_hub=False,
-        chunk_size=chunk,
-        n_action_steps=executed,
-        max_state_dim=state_dim,
-        max_action_dim=padded_dim,
-        image_resolution=(IMAGE, IMAGE),
-        tokenizer_max_length=prompt,
-        **({"num_inference_steps": num_steps} if kind in KINDS else fast),
-        **fields,
-    )
-    torch.manual_seed(seed)
     cache = directory.parent / f"{directory.name}-hub"
     with hub(cache), data_only():
-        policy = get_policy_class(kind)(config)
-        processors = make_pre_post_processors(config, dataset_stats=_stats(state_dim, action_dim))
-    with torch.no_grad():
-        for name, parameter in policy.named_parameters():
-            if ".dense." in name:  # adaptive norms start at zero, where the time has no effect
-                parameter.normal_(std=0.1)
-        if kind == "pi0_fast":  # else every token is as likely as any, and few are actions
-            head = policy.model.paligemma_with_expert.paligemma.lm_head.weight
-            head.normal_(std=0.4)
-            head[: VOCABULARY - SKIP - CHARACTERS - 2] *= 0.1
-    for part in (policy, *processors):
-        part.save_pretrained(directory)
+        write_policy(
+            directory,
+            kind,
+            image=IMAGE,
+            state_dim=state_dim,
+            seed=seed,
+            prepare=_spread,
+            chunk_size=chunk,
+            n_action_steps=executed,
+            max_state_dim=state_dim,
+            max_action_dim=padded_dim,
+            image_resolution=(IMAGE, IMAGE),
+            tokenizer_max_length=prompt,
+            **({"num_inference_steps": num_steps} if kind in KINDS else fast),
+            **fields,
+        )
     if whole:
         write_tokenizer(directory / BACKBONE)
         shutil.rmtree(cache)
@@ -205,15 +186,15 @@ def write_pi(
     return directory
 
 
-def _stats(state_dim: int, action_dim: int) -> dict[str, Any]:
+def _spread(policy: Any) -> None:
+    """Makes the time matter, and action tokens of π0-FAST more likely than others."""
     import torch
 
-    return {
-        name: {
-            "mean": torch.zeros(size),
-            "std": torch.full((size,), 0.5),
-            "q01": torch.full((size,), -0.5),
-            "q99": torch.full((size,), 0.5),
-        }
-        for name, size in (("observation.state", state_dim), ("action", action_dim))
-    }
+    with torch.no_grad():
+        for name, parameter in policy.named_parameters():
+            if ".dense." in name:  # adaptive norms start at zero, where the time has no effect
+                parameter.normal_(std=0.1)
+        if policy.config.type == "pi0_fast":
+            head = policy.model.paligemma_with_expert.paligemma.lm_head.weight
+            head.normal_(std=0.4)
+            head[: VOCABULARY - SKIP - CHARACTERS - 2] *= 0.1

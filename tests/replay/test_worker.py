@@ -149,15 +149,6 @@ def test_close_releases_everyone_and_stores_nothing_more():
     play(scene)
 
 
-def test_a_segment_sent_twice_is_stored_once():
-    async def scene(worker: ReplayWorker) -> None:
-        assert await worker.insert([make_segment("a", 4), make_segment("a", 4)])
-        metrics = await worker.metrics()
-        assert metrics["inserted_segments"] == 1 and metrics["duplicates"] == 1
-
-    play(scene)
-
-
 def test_news_is_real_experience_alone():
     async def scene(_: ReplayWorker) -> None:
         worker = ReplayWorker(CONFIG, seed=0, imagined=CONFIG)

@@ -43,13 +43,6 @@ def test_thinning_by_hand() -> None:
     assert thinned.x[:2].tolist() == [0.5, 2.5]
 
 
-def test_uneven_points_leave_no_empty_span() -> None:
-    x = np.concatenate([np.linspace(0, 1, 400), [1000.0]])
-    thinned = line("a", x, np.ones(401))
-    assert len(thinned.x) == 2 and np.isfinite(thinned.y).all()
-    assert len(line("a", np.ones(300), np.ones(300)).x) == 1
-
-
 def test_short_lines_stay_as_they_are_without_their_gaps() -> None:
     kept = line("a", np.array([1.0, 2.0, 3.0]), np.array([5.0, np.nan, 7.0]))
     assert kept.x.tolist() == [1, 3] and kept.y.tolist() == [5, 7] and kept.low is None
@@ -63,11 +56,6 @@ def test_rates_by_hand() -> None:
     assert len(rates("a", seconds[:1], np.array([5.0])).x) == 0
 
 
-def test_a_chart_needs_a_line_of_two_points_or_a_point() -> None:
-    assert not chart(line("a", np.array([1.0]), np.array([1.0]))).drawable
-    assert chart(Series("a", np.array([1.0]), np.array([1.0]), points=True)).drawable
-
-
 def test_the_picture_shows_the_numbers_and_no_text_of_a_run() -> None:
     rising = line("<b>hostile</b> $\\frac{", np.array([0.0, 5.0, 10.0]), np.array([0.0, 1.0, 0.5]))
     svg = chart(rising, share=True, bottom=0.0, top=1.0).svg()
@@ -76,11 +64,6 @@ def test_the_picture_shows_the_numbers_and_no_text_of_a_run() -> None:
     assert high < middle < low and middle == pytest.approx((low + high) / 2, abs=0.01)
     assert "hostile" not in svg and "updates" in svg and "100\xa0%" in svg
     assert not any(colour in svg for colour in COLOURS), "colours follow the style sheet"
-
-
-def test_a_limit_is_within_sight() -> None:
-    svg = chart(line("a", np.arange(5.0), np.ones(5)), limit=20.0, bottom=0.0).svg()
-    assert 0 < heights(svg, colour=7)[0] < heights(svg)[0]
 
 
 def test_pictures_of_one_page_share_no_ids() -> None:

@@ -15,7 +15,7 @@ from accerl_lerobot.replay import decisions_under_way
 from accerl_lerobot.rollout.groups import GroupSlot
 from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig, RolloutRunner
-from tests.rollout.worlds import ScriptedWorld, decide, evaluate
+from tests.rollout.worlds import ScriptedWorld, decide
 
 CONFIG = RolloutConfig(segment_length=2, decision_cost=0.25, group_size=3, time_limit="truncate")
 
@@ -74,16 +74,6 @@ def test_segments_come_all_at_once_when_the_last_of_the_group_has_ended():
     assert (counted.groups_kept, counted.groups_dropped, counted.groups_dropped_decisions) == (1, 0, 0)
 
 
-def test_without_groups_nothing_is_held_back_or_stamped():
-    fleet = Fleet([ScriptedWorld(8)], replace(CONFIG, group_size=0))
-    fleet.start()
-    fleet.advance(0)
-    fleet.advance(0)
-    assert len(fleet.segments) == 1 and fleet.segments[0].advantage is None
-    fleet.runner.abandon_groups()
-    assert fleet.runner.counters.groups_dropped == 0
-
-
 def test_a_nan_takes_its_episode_out_of_the_group_and_leaves_the_others():
     worlds = [ScriptedWorld(4), ScriptedWorld(8, nan_at=5), ScriptedWorld(6, "failure")]
     fleet = Fleet(worlds)
@@ -96,28 +86,6 @@ def test_a_nan_takes_its_episode_out_of_the_group_and_leaves_the_others():
     assert sorted(found) == pytest.approx([-1, 1], abs=1e-4), "two are left, and they differ"
     counted = fleet.runner.counters
     assert counted.dropped_nonfinite == 1 and counted.groups_dropped_decisions == 2
-
-
-def test_a_group_that_only_failed_is_counted():
-    fleet = Fleet([ScriptedWorld(4, "failure"), ScriptedWorld(6, "limit"), ScriptedWorld(4, "limit")])
-    fleet.start()
-    fleet.exploring = False
-    for slot in (0, 1, 2) * 3:
-        fleet.advance(slot)
-    counted = fleet.runner.counters
-    assert fleet.segments == [] and len(fleet.results) == 3
-    assert (counted.groups_dropped, counted.groups_dropped_decisions) == (1, 7)
-
-
-def test_evaluations_are_in_no_group():
-    fleet = Fleet([ScriptedWorld(4), ScriptedWorld(4, nan_at=1)])
-    fleet.plans.queue([evaluate(1, 0), evaluate(2, 1)])
-    fleet.start()
-    fleet.exploring = False
-    for slot in (0, 1, 0):
-        fleet.advance(slot)
-    assert len(fleet.results) == 2 and fleet.segments == []
-    assert fleet.plans.groups is not None and fleet.plans.groups.open == 0
 
 
 def test_when_exploring_ends_unfinished_groups_are_dropped_even_if_a_decision_is_under_way():

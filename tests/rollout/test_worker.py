@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -226,21 +224,6 @@ def test_exploring_pauses_while_a_group_stands_at_the_door(stage):
         time.sleep(0.005)
 
 
-def test_the_end_of_training_drops_unfinished_groups(stage):
-    inserted: list[Segment] = []
-    one = stage(lambda segments: inserted.extend(segments) or True, group_size=200, group_filter="none")
-    one.until(lambda: len(one.episodes) >= 20)
-    assert inserted == [] and one.order(True).counters["groups_dropped"] == 0
-    one.order(False, planned(6))
-    one.until(lambda: len(one.evaluated) == 6, training=False)
-    counters = one.order(False).counters
-    assert inserted == [] and (counters["groups_kept"], counters["groups_dropped"]) == (0, 1)
-    assert counters["groups_dropped_decisions"] >= 2 * 20
-    seen = len(one.episodes)
-    one.until(lambda: len(one.episodes) > seen)  # were training to go on: a new group
-    assert {e.plan.place.start for e in one.episodes[seen:] if e.plan.place is not None} == {1}
-
-
 def test_an_insert_that_fails_ends_the_worker(stage):
     def insert(segments: list[Segment]) -> bool:
         raise OSError("replay is gone")
@@ -332,9 +315,3 @@ def test_what_is_not_finite_is_sent_where_it_is_ordered(stage, monkeypatch: pyte
     one = stage(lambda segments: inserted.extend(segments) or True)
     one.until(lambda: len(inserted) >= 4)
     assert [is_finite(segment) for segment in inserted[:4]] == [False, True, True, True]
-
-
-def test_the_process_needs_no_torch():
-    code = "import sys, accerl_lerobot.rollout.worker; print(*{'torch', 'lerobot'} & set(sys.modules))"
-    found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    assert found.stdout.strip() == ""

@@ -263,6 +263,7 @@ def first_action(update: OffPolicyUpdate) -> float:
     return float(np.mean([decision.chunk[0, 0] for decision in update.adapter.decide(asked, 0)]))
 
 
+@pytest.mark.slow
 def test_teacher_and_policy_go_where_the_critic_leads(tiny_checkpoint: Path):
     """Reward is how far the first action goes up; the state says nothing."""
     torch.manual_seed(0)
@@ -313,6 +314,7 @@ def test_what_was_learnt_is_restored_to_the_last_bit(tiny_checkpoint: Path):
     assert all(np.array_equal(left[name], right[name]) for name in left)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False], ids=["with the simulator's state", "without"])
 def test_self_imitation_goes_where_successes_are(tiny_checkpoint: Path, known: bool):
     """Success is a chunk whose first action goes up; half of the chunks do, by chance."""

@@ -46,7 +46,7 @@ class Stage:
         self.received: list[tuple[int, dict[str, np.ndarray]]] = []
         self.replay = Handle(sample=self._sample, learnt=lambda: None)
         self.reader = Handle(
-            receive_weights=lambda version, tensors, _: self.received.append((version, copied(tensors))),
+            receive_weights=lambda version, tensors, _: self.received.append((version, copied(tensors)))
         )
         self._batches = batches
         defaults = {"updates": 6, "batch_decisions": 7, "warmup_updates": 0, "value_warmup_updates": 0}

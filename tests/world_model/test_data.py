@@ -243,14 +243,8 @@ def metadata(**changes: Any) -> SimpleNamespace:
             {"shapes": {"observation.images.corner2": None, "observation.images.top": (64, 64, 3)}},
             "no observation.images.corner2: the dataset has observation.images.top; choose env.camera",
         ),
-        (
-            {"shapes": {"action": (7,)}},
-            r"action has shape \(7,\), the world's has \(4,\): it is another",
-        ),
-        (
-            {"shapes": {"observation.state": None}},
-            "observation.state has shape None, the world's has",
-        ),
+        ({"shapes": {"action": (7,)}}, r"action has shape \(7,\), the world's has \(4,\): it is another"),
+        ({"shapes": {"observation.state": None}}, "observation.state has shape None, the world's has"),
         ({"shapes": {"next.success": None}}, "no next.success: record it, as accerl demos does"),
         ({"fps": 10}, "10 frames a second, and the world makes 80 steps"),
         ({"total_episodes": 1}, "a single episode; at least one to train on and one to hold out"),

@@ -14,7 +14,6 @@ import torch
 from accerl_lerobot import cli
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.dataset_files import open_metadata
-from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.engine.config import DatasetConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
@@ -31,9 +30,8 @@ from accerl_lerobot.world_model.model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.model.store import Source, save_world_model
 from accerl_lerobot.world_model.validation import evaluate
 from accerl_lerobot.world_model.validation.evaluate import HELD_OUT, ONLINE, open_datasets, validate_datasets
-from accerl_lerobot.world_model.validation.tables import dataset_rows
 from tests.runs import replacing
-from tests.world_model.test_pretrain import moved
+from tests.world_model.test_pretrain import moved, recorded
 
 ENV = SimulatedConfig(max_steps=60, hold=25, image_size=16)
 CONFIG = WorldModelConfig(
@@ -43,18 +41,11 @@ CONFIG = WorldModelConfig(
 )
 
 
-def recorded(folder: Path, seed: int) -> Path:
-    episodes = DemosConfig(
-        episodes=8, failure_share=0.5, processes=1, root=str(folder), repo_id="a/b", seed=seed
-    )
-    return record_demos(ENV, episodes)
-
-
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
     """Demonstrations, a world model that has learnt from some of them (nothing yet), and other episodes."""
     root = tmp_path_factory.mktemp("evaluated")
-    demos, others = recorded(root / "demos", 0), recorded(root / "others", 1)
+    demos, others = recorded(root / "demos", 8, 0), recorded(root / "others", 8, 1)
     torch.manual_seed(0)
     print_ = fingerprint(open_metadata(DatasetConfig(repo_id="a/b", root=str(demos))))
     source = Source(repo_id="a/b", fingerprint=print_, learnt=(0, 1, 2, 3), held_out=(4, 5, 6, 7))
@@ -110,16 +101,6 @@ def test_both_models_go_to_the_device(
     monkeypatch.setattr(evaluate, "validate_datasets", validate_datasets)
     cli.main(told(folders, tmp_path / "out", "--device=cuda:3"))
     assert asked == ["cuda:3"] and tried == [["PixelWorldModel", "SuccessPairsRewardModel"]]
-    stands_in: list[Any] = []
-
-    def load_external_reward_model(*args: Any) -> Any:
-        stands_in.append(args[3])
-        raise InputError("success.path", "x", "enough")
-
-    monkeypatch.setattr(evaluate, "rehearse_external_reward_model", lambda *args: None)
-    monkeypatch.setattr(evaluate, "load_external_reward_model", load_external_reward_model)
-    cli.main(told(folders, tmp_path / "again", "--success.path=x"))
-    assert asked == ["cuda:3", "auto"] and stands_in == [torch.device("cpu", 0)]
 
 
 def test_one_that_does_not_know_the_dataset_is_tried_on_all_of_it(
@@ -147,18 +128,6 @@ def test_what_is_refused(
 ):
     assert cli.main(replacing(told(folders, tmp_path / "out"), option)) == 2
     assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
-
-
-def test_rows_of_datasets_leave_out_what_none_of_them_has():
-    skill = {"value": 0.5, "low": 0.25, "high": 0.75}
-    one = {"checks": {"a": {"holds": True}, "b": {"holds": False}}, "depths": [{"skill_changed": skill}]}
-    empty = {"checks": {}, "depths": [], "tried": {"episodes": 3}}
-    assert dataset_rows([one, empty]) == [
-        ("episodes", ["", "3"]),
-        ("checks that hold", ["1 of 2", "0 of 0"]),
-        ("skill, changed pixels, first chunk", ["0.50 [0.25, 0.75]", ""]),
-        ("last chunk", ["0.50 [0.25, 0.75]", ""]),
-    ]
 
 
 SAVED, SET = 0.8, 0.6
@@ -202,10 +171,7 @@ def test_what_is_set_on_a_policys_episodes_is_kept_and_classifies_the_others(tri
     of = {HELD_OUT: "demos", ONLINE: "policy's"}
     found, threshold = validated(tmp_path, of, trained_on=of, fresh=ONLINE, keep_threshold=True)
     assert threshold == SET
-    assert tried.judged == [
-        ("policy's", SAVED, True),
-        ("demos", SET, False),
-    ]
+    assert tried.judged == [("policy's", SAVED, True), ("demos", SET, False)]
     assert found["name"] == HELD_OUT and list(found["datasets"]) == [ONLINE]
     assert {path.name for path in tmp_path.iterdir()} == {"preview.mp4", "preview_online.mp4"}
 
@@ -232,17 +198,11 @@ def test_checks_of_what_it_has_learned_from_count(tried: Tried, tmp_path: Path):
 
 
 def test_a_dataset_is_known_by_the_order_of_its_episodes_too(tmp_path: Path):
-    env = SimulatedConfig(max_steps=60, hold=25, image_size=16)
-
-    def recorded(name: str, seed: int) -> DatasetConfig:
-        of = DemosConfig(
-            episodes=3, failure_share=0.5, processes=1, root=str(tmp_path / name), repo_id="a/b", seed=seed
-        )
-        return DatasetConfig(repo_id="a/b", root=str(record_demos(env, of)))
-
     config = WorldModelConfig(image_size=16, model=PixelModelConfig(network=NetworkConfig(channels=(16, 24))))
-    spec = world_spec(config, env)
-    one, other = recorded("one", 0), recorded("other", 1)
+    spec = world_spec(config, ENV)
+    one, other = (
+        DatasetConfig(repo_id="a/b", root=str(recorded(tmp_path / str(seed), 3, seed))) for seed in (0, 1)
+    )
     opened = open_datasets({"dataset": one, "online": other}, spec)
     assert [meta.total_episodes for meta in opened.values()] == [3, 3]
     meta = opened["dataset"]

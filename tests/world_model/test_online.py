@@ -211,21 +211,6 @@ def test_a_threshold_that_was_named_stays(
     assert promotion is not None and promotion.success.config.threshold == served
 
 
-def test_what_was_tried_is_shown(monkeypatch: pytest.MonkeyPatch):
-    shown: list[tuple[Any, ...]] = []
-    passes(monkeypatch, False, True)
-    made = learner(validate_every=4)
-    made._on_validation = lambda *tried: shown.append(tried)
-    for segment in episodes(*[False] * 8):
-        made.add(segment)
-        made.pending_steps = 0
-        made._learner.count = 1
-        if made.validation_due(last=False):
-            made.promote(last=False)
-    assert [(number, passed) for *_, number, passed in shown] == [(1, False), (2, True)]
-    assert all(any(episode is held for held in made._held) for _, _, episode, _, _ in shown)
-
-
 def test_after_the_last_episode_it_learns_on_until_it_passes_or_is_given_up(monkeypatch: pytest.MonkeyPatch):
     made = learner(final_validations=3)
     passes(monkeypatch, False, False, False)

@@ -101,6 +101,7 @@ def test_from_a_dataset_to_a_validation(demos: Path, tmp_path: Path, capsys: pyt
     assert (out / "preview.mp4").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_a_saved_one_is_tried_on_another_dataset(
     demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -130,13 +131,6 @@ def test_a_saved_one_is_tried_on_another_dataset(
     assert "path=None: name the folder world_model" in capsys.readouterr().err
 
 
-def test_what_is_refused_leaves_no_folder(demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    out = tmp_path / "out"
-    assert cli.main([*arguments(demos, out), "--env.state_dim=6"]) == 2
-    assert "observation.state has shape (4,), the world's has (6,)" in capsys.readouterr().err
-    assert not out.exists()
-
-
 @pytest.mark.parametrize(
     ("option", "message"),
     [
@@ -144,16 +138,7 @@ def test_what_is_refused_leaves_no_folder(demos: Path, tmp_path: Path, capsys: p
             "--world_model.validation.depth=20",
             "world_model.validation.depth=20: held-out episodes have at most",
         ),
-        (
-            "--world_model.success.weight_decay=-1",
-            "world_model.success.weight_decay=-1.0: use a number",
-        ),
-        (
-            "--world_model.model.state_weight=-1",
-            "world_model.model.state_weight=-1.0: use a number",
-        ),
-        ("--world_model.image_size=13", "world_model.image_size=13: use a multiple of 8"),
-        ("--seed=-1", "seed=-1: use a whole number from 0"),
+        ("--env.state_dim=6", "observation.state has shape (4,), the world's has (6,)"),
         ("--env.task=mirror", "env.task='mirror': an episode's task is"),
     ],
 )
@@ -173,6 +158,7 @@ def test_one_success_is_not_enough_to_learn_from_and_be_classified_on():
     pretrain._check_held_out(DatasetConfig(), success + failures[:2], success + failures[2:], config)
 
 
+@pytest.mark.slow
 def test_the_validation_is_on_episodes_that_were_not_learned_from(
     demos: Path, rollouts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -200,6 +186,7 @@ def test_the_validation_is_on_episodes_that_were_not_learned_from(
     assert set(seen["looked at"]) == set(seen["pairs"]) == set(seen["tried"])
 
 
+@pytest.mark.slow
 def test_held_out_losses_are_told_and_change_nothing(
     demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
@@ -250,6 +237,7 @@ def test_a_placebo_is_learned_where_one_is_asked_for(
         pretrain.pretrain(config, tmp_path, console.Console())
 
 
+@pytest.mark.slow
 def test_both_networks_learn_on_the_device_and_are_saved_for_any(
     demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -273,6 +261,7 @@ def test_both_networks_learn_on_the_device_and_are_saved_for_any(
     assert saved["device"] == "cpu"
 
 
+@pytest.mark.slow
 def test_a_policys_episodes_are_learned_from_beside_demonstrations(
     demos: Path, rollouts: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -387,13 +376,7 @@ def test_what_cannot_be_loaded(tmp_path: Path, harm: str, why: str):
 
 @pytest.mark.parametrize(
     ("where", "name", "value"),
-    [
-        ("spec", "context", 10**9),
-        ("spec", "image_size", [2**20, 2**20]),
-        ("network", "blocks", 10**9),
-        ("network", "channels", [10**6, 10**6]),
-        ("model", "steps", 10**9),
-    ],
+    [("spec", "image_size", [2**20, 2**20]), ("network", "blocks", 10**9), ("model", "steps", 10**9)],
 )
 def test_what_nobody_could_load_is_found_in_a_child_process(
     tmp_path: Path, where: str, name: str, value: object, monkeypatch: pytest.MonkeyPatch
@@ -409,15 +392,6 @@ def test_what_nobody_could_load_is_found_in_a_child_process(
     with pytest.raises(InputError) as caught:
         rehearse_world_model(tmp_path / "w")
     assert str(caught.value).startswith("path=") and "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("held_out", 0.0), ("held_out", 1.0), ("chunk", 0), ("image_size", 60), ("image_size", 4)],
-)
-def test_bad_values_name_their_field(name: str, value: float):
-    with pytest.raises(InputError, match=f"^world_model.{name}="):
-        WorldModelConfig(**{name: value})
 
 
 def moved(monkeypatch: pytest.MonkeyPatch) -> tuple[list[str], list[tuple[str, Any]]]:

@@ -158,13 +158,3 @@ def test_worlds_are_not_mixed(run: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert exported(run, tmp_path / "set") == 2
     assert "rollout 7 is of another world than 1" in capsys.readouterr().err
     assert not (tmp_path / "set").exists()
-
-
-def test_a_rate_that_is_no_integer_is_reported(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    for path in (run / FOLDER).iterdir():
-        path.unlink()
-    recorded(run / FOLDER, range(1, 2), pace=6.25)
-    assert exported(run, tmp_path / "set") == 0
-    out, err = capsys.readouterr()
-    assert "6.25 decisions a second, recorded in the dataset as 6" in " ".join(err.split())
-    assert json.loads(out)["decisions_per_s"] == 6.25

@@ -18,7 +18,6 @@ from accerl_lerobot.world_model.validation import rollout_eval
 from accerl_lerobot.world_model.validation.rollout_eval import (
     Scores,
     choose_threshold,
-    concatenate,
     outcome_metrics,
     score_episodes,
     spaced_frames,
@@ -109,19 +108,6 @@ def test_who_does_nothing_has_as_much_time_as_anybody():
     still = score_episodes(model, SimpleNamespace(), episodes, CONFIG, seed=0)  # type: ignore[arg-type]
     short = np.array([len(episodes[e]) < 10 for e in still.episode])
     assert short.sum() > 5 and (still.idle[short] > 0.5).mean() > 0.8
-
-
-def test_scores_of_different_episodes_are_put_together():
-    one, other = made([0.9, 0.1], [1, 0]), made([0.3], [0])
-    both = concatenate(one, other)
-    assert both.imagined.tolist() == [0.9, 0.1, 0.3] and both.episode.tolist() == [0, 1, 2]
-    assert concatenate(one) is not one and concatenate(one).episode.tolist() == [0, 1]
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 8])
-def test_pairs_may_be_few(count: int):
-    before, _, success, _ = Examples(ending_on_the_right(20), K).sample(count, np.random.default_rng(0))
-    assert len(before) == count and success.sum() == count // 2
 
 
 def made(imagined: list[float], achieved: list[int]) -> Scores:

@@ -122,14 +122,6 @@ def test_rewards_beyond_the_end_of_an_episode_are_no_success():
     assert float(loss) == pytest.approx(float(expected), rel=1e-4)
 
 
-def test_it_goes_through_lerobot_s_format(tmp_path: Path):
-    model = a_model().eval()
-    model.save_pretrained(tmp_path)
-    again = SuccessPairsRewardModel.from_pretrained(tmp_path, strict=True)
-    assert again.config == model.config and not again.training
-    assert all(torch.equal(v, again.state_dict()[k]) for k, v in model.state_dict().items())
-
-
 def test_stock_lerobot_trains_it(tmp_path: Path):
     out = tmp_path / "out"
     command = [

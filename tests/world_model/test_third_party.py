@@ -161,8 +161,6 @@ def test_ours_are_one_type_of_several():
     ("source", "why"),
     [
         (None, "cannot be imported .ModuleNotFoundError: "),
-        ("def", "cannot be imported .SyntaxError: "),
-        ("raise RuntimeError('no weather today')", "cannot be imported .RuntimeError: no weather today"),
         ("raise SystemExit(0)", "cannot be imported .SystemExit: 0"),
     ],
 )
@@ -178,7 +176,7 @@ def test_packages_that_cannot_be_imported(
         load_world_model(tmp_path / "w", "a_model_of_mine", section="imagination")
 
 
-@pytest.mark.parametrize("name", ["", ".", ".x", "a..b", "3", "a/b", "a-b"])
+@pytest.mark.parametrize("name", ["", ".x", "a/b"])
 def test_names_that_no_package_has(name: str):
     with pytest.raises(InputError, match="^world_model.discover_packages_path=.*: use the name of a package"):
         parse(WorldModelRun, [f"--world_model.discover_packages_path={name}"])
@@ -222,12 +220,6 @@ class BareConfig(LearnableModelConfig):
     [
         (None, "its config's make is '', which cannot be imported"),
         (f"{__name__}:Nothing", "cannot be imported .module .* has no attribute 'Nothing'"),
-        (".mine:Model", "cannot be imported .*; use module:name"),
-        ("no.such:Model", "cannot be imported .No module named 'no'"),
-        (
-            "accerl_lerobot.world_model.imagination.registry:CopyModel",
-            "CopyModel is no subclass of LearnableWorldModel",
-        ),
         (
             "accerl_lerobot.world_model.model.contract:LearnableWorldModel",
             "lacks begin, fit_statistics, loss, step",
@@ -268,6 +260,7 @@ def test_it_goes_on_learning_in_a_run_and_is_saved_when_promoted(tiny_checkpoint
     assert float(moved.abs().max()) > 0
 
 
+@pytest.mark.slow
 def test_in_processes_of_their_own_they_find_it_too(tiny_checkpoint: Path, tmp_path: Path):
     from accerl_lerobot.engine.launch import RayEngine
 
