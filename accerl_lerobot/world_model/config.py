@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 import draccus
 
@@ -24,7 +24,6 @@ from accerl_lerobot.config.ranges import (
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.pacing import ReplayConfig
 
-Objective = Literal["refiner", "edm", "flow"]
 PIXELS = "pixels"
 """The type of our own class of learned world models."""
 VIDEOS = "validation"
@@ -98,30 +97,14 @@ class PixelModelConfig(LearnableModelConfig):
 
     make = "accerl_lerobot.world_model.model.pixels:PixelWorldModel"
 
-    objective: Objective = "refiner"
-    """refiner: predict the change, then refine it. edm: denoise the frame, as DIAMOND does. flow: rectified
-    flow of the change."""
-    steps: Annotated[int, Range("[1, 10000]")] = 1
-    """Network passes per chunk. One pass of the refiner is regression."""
     context_noise: NonNegative = 0.02
     """Largest standard deviation of the noise on context and anchor in training, in units of [−1, 1].
     Imagined frames are never as clean as the training data."""
-    refine_levels: tuple[Positive, Positive] = (0.2, 0.05)
-    """Noise of the first and last refinement, in usual changes; those between are spaced evenly in log."""
-    sigma_max: Annotated[float, Range("(0.002, inf)")] = 5.0
-    """Noise that edm sampling starts from."""
     heads: Annotated[int, Range("[2, 1000]")] = 3
     """Size of the ensemble that predicts the robot's state; its disagreement is the uncertainty."""
     state_weight: NonNegative = 1.0
     """Weight of the state's loss beside the image's."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.refine_levels[0] < self.refine_levels[1]:
-            raise InputError(
-                "world_model.model.refine_levels", self.refine_levels, "use two falling numbers > 0"
-            )
 
     @property
     def multiple(self) -> int:

@@ -133,7 +133,7 @@ def test_its_fields_are_fields_of_the_command_line():
 
 def test_a_recipe_of_one_class_is_gone_on_with_as_another(tmp_path: Path):
     recipe = tmp_path / "config.yaml"
-    recipe.write_text(json.dumps(encode(parse(WorldModelRun, ["--world_model.model.steps=3"]))))
+    recipe.write_text(json.dumps(encode(parse(WorldModelRun, ["--world_model.model.heads=5"]))))
     other = parse(WorldModelRun, [f"--config_path={recipe}", *NAMED, "--world_model.model.context=3"])
     assert other.world_model.model == linear(context=3)
     written = encode(other)
@@ -149,8 +149,8 @@ def test_a_recipe_of_one_class_is_gone_on_with_as_another(tmp_path: Path):
 
 
 def test_ours_are_one_type_of_several():
-    assert parse(WorldModelRun, ["--world_model.model.steps=2"]).world_model.model == PixelModelConfig(
-        steps=2
+    assert parse(WorldModelRun, ["--world_model.model.heads=2"]).world_model.model == PixelModelConfig(
+        heads=2
     )
     for value, said in (("spiral", "'spiral'"), ("[linear]", r"\['linear'\]"), ("{a: 1}", "{'a': 1}")):
         with pytest.raises(InputError, match=rf"^world_model.model.type={said}: .*pixels"):
