@@ -18,16 +18,14 @@ from accerl_lerobot import cli
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.console import Console
-from accerl_lerobot.demos.dataset_files import open_metadata
-from accerl_lerobot.engine.config import DatasetConfig, RunConfig
+from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Progress
 from accerl_lerobot.engine.imagination_workers import ImaginationWorker, WorldLearningWorker
 from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.engine.run import train
-from accerl_lerobot.envs import SimulatedConfig, make_world
+from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Segment
-from accerl_lerobot.policies.features import check_features, dataset_features, env_features
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline.read import shares
@@ -41,7 +39,6 @@ from accerl_lerobot.world_model.config import (
     ValidationConfig,
     WorldModelConfig,
 )
-from accerl_lerobot.world_model.imagination.recorder import FOLDER, read_imagined, write_dataset
 from accerl_lerobot.world_model.learning.learners import new_success_model
 from accerl_lerobot.world_model.learning.pretrain import world_spec
 from accerl_lerobot.world_model.model.pixels import PixelWorldModel
@@ -252,7 +249,7 @@ def test_it_runs_asynchronously_with_two_workers(tiny_checkpoint: Path, world_mo
     learn = OnlineLearnConfig(
         steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE, batch=4
     )
-    config = imagining(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12, record=3, workers=2)
+    config = imagining(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12, workers=2)
     config = replace(config, rollout=replace(config.rollout, workers=2))
     engine = RayEngine(replace(config, output_dir=str(tmp_path)), ("match",))
     try:
@@ -294,14 +291,6 @@ def test_it_runs_asynchronously_with_two_workers(tiny_checkpoint: Path, world_mo
     assert sum(s["counters"].decisions for s in saved) >= last.imagination["decisions"]
     assert all(s["counters"].rollouts for s in saved) and saved[0]["rng"].random() != saved[1]["rng"].random()
     assert {"recovery", "compute", "transport", "wait_in"} <= spent["world learning"].keys()
-    kept = list(read_imagined(tmp_path / FOLDER))
-    assert len(kept) == 3 and kept[-1].number > 3, "the newest"
-    assert all(rollout.observations.keys() == kept[0].observations.keys() for rollout in kept)
-    assert all(rollout.decisions_per_s == 80 / 4 and 1 <= len(rollout) <= 4 for rollout in kept)
-    write_dataset(kept, tmp_path / "set", "some/rollouts", "simulated", Console())
-    made = dataset_features(open_metadata(DatasetConfig(repo_id="some/rollouts", root=str(tmp_path / "set"))))
-    with pytest.raises(InputError, match=r"its action is \(8,\), but \(2,\) in the environment"):
-        check_features(made, env_features(make_world(ENV).spec), {}, "dataset.repo_id", "some/rollouts")
 
 
 @pytest.mark.parametrize(
@@ -386,7 +375,6 @@ def test_sections_that_do_not_go_together(tiny_checkpoint: Path):
 
 
 def test_the_summary_says_what_was_imagined(tiny_checkpoint: Path, tmp_path: Path):
-    from accerl_lerobot.console import Console
 
     config = imagining(tiny_checkpoint, model="oracle")
     config = replace(config, launch=replace(config.launch, engine="local"))

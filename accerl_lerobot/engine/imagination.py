@@ -18,7 +18,6 @@ from accerl_lerobot.policies.loading import load_lerobot_config
 from accerl_lerobot.world_model.config import VIDEOS, OnlineLearnConfig
 from accerl_lerobot.world_model.data import Episode, fingerprint, load_episodes
 from accerl_lerobot.world_model.imagination.guard import worker_config
-from accerl_lerobot.world_model.imagination.recorder import FOLDER, Recorder
 from accerl_lerobot.world_model.imagination.registry import (
     ImaginationModels,
     check_fit,
@@ -58,10 +57,6 @@ def make_imagination(
     """
     world = _world_spec(config)
     models = load_models(config, world)
-    folder = journal_folder(config)
-    if config.imagination.record and folder is not None and index == 0:
-        pace = world.fps / models.model.spec.chunk
-        on_segment = _recorded(Recorder(folder / FOLDER, config.imagination.record, pace), on_segment)
     run = RolloutSettings(
         decision_cost=config.rollout.decision_cost,
         time_limit_fails=config.rollout.time_limit == "fail",
@@ -85,14 +80,6 @@ def _sources(config: RunConfig, spec: WorldModelSpec) -> list[Source]:
             name = sections[section].repo_id or ""
             sources.append(Source(repo_id=name, fingerprint=known, learnt=every, held_out=()))
     return [*sources, OWN_RUN]
-
-
-def _recorded(recorder: Recorder, on_segment: Callable[[Segment], object]) -> Callable[[Segment], object]:
-    def record(segment: Segment) -> None:
-        recorder.write(segment)
-        on_segment(segment)
-
-    return record
 
 
 def load_models(config: RunConfig, world: WorldSpec) -> ImaginationModels:

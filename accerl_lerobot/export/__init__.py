@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run's episodes, real and imagined, as LeRobotDatasets."""
+"""A run's episodes as a LeRobotDataset."""

@@ -401,10 +401,6 @@ class ImaginationConfig(Section, section="imagination"):
     training data."""
     memory: Annotated[int, Range("[1, 10000000]")] = 4096
     """Newest real decisions that rollouts start at."""
-    record: Annotated[int, Range("[0, 1000000]")] = 0
-    """Newest imagined rollouts kept on disk, in the run's folder ``imagined``, of which
-    ``accerl export --source=imagined`` makes a LeRobotDataset; 0: none. Images are stored as they are:
-    0.2 MB for 15 decisions seen by one camera of 64×64. Of several workers the first one's are kept."""
     guard: GuardConfig = field(default_factory=GuardConfig)
     replay: ReplayConfig = field(
         default_factory=lambda: ReplayConfig(
