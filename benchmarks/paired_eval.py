@@ -24,7 +24,7 @@ from accerl_lerobot.seeds import noise_seed
 from accerl_lerobot.world_model.data import model_arrays, policy_observation
 from accerl_lerobot.world_model.imagination.registry import ImaginationModels
 from accerl_lerobot.world_model.model.contract import Context
-from accerl_lerobot.world_model.model.external_reward_model import probabilities
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import probabilities
 from accerl_lerobot.world_model.validation.metrics import Estimate, ranks
 
 Start = tuple[str, int]

@@ -16,7 +16,6 @@ from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.world_model.config import (
-    ExternalRewardModelConfig,
     ValidationConfig,
     WorldModelConfig,
 )
@@ -109,8 +108,6 @@ class WorldModelEvalRun(Section):
     """Episodes it was not trained on; of its own dataset, those that were held out."""
     online: DatasetConfig = field(default_factory=DatasetConfig)
     """Likewise, episodes of a policy as ``accerl export`` writes them; none without a name."""
-    success: ExternalRewardModelConfig = field(default_factory=ExternalRewardModelConfig)
-    """Reward model to use instead of the success model beside the world model."""
     validation: ValidationConfig = field(default_factory=ValidationConfig)
 
     def __post_init__(self) -> None:

@@ -9,7 +9,6 @@ from typing import Annotated, ClassVar
 
 import draccus
 
-from accerl_lerobot.checkpoint.safety import check_remote_code
 from accerl_lerobot.config.dataset import DatasetConfig
 from accerl_lerobot.config.ranges import (
     Choice,
@@ -199,33 +198,6 @@ class ValidationConfig(Section, section="world_model.validation"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExternalRewardModelConfig(Section, section="success"):
-    """A LeRobot reward model that classifies successes, see `external_reward_model.py`."""
-
-    path: str | None = None
-    """A folder, or an id on the Hub. None: the success model saved with the world model."""
-    revision: str | None = None
-    """Hub revision."""
-    trust_remote_code: bool = False
-    """True if Python code from a Hub repository that the model names, such as the backbone's of LeRobot's
-    classifier, is run with your rights. It needs `code_revision`."""
-    code_revision: str | None = None
-    """Commit of that repository, 40 hexadecimal digits: the one whose code you have read. No other is run."""
-    threshold: Share | None = None
-    """P above which a frame counts as a success. None: ``accerl world-model-eval`` chooses it on the
-    episodes, a run refuses."""
-    discover_packages_path: str | None = None
-    """Package to import that registers the model's type with LeRobot, where that is not LeRobot's own."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_remote_code(self.trust_remote_code, self.code_revision, "success")
-        if self.path is None and self.threshold is not None:
-            remedy = "it belongs to the model in success.path; the one beside the world model has its own"
-            raise InputError("success.threshold", self.threshold, remedy)
-
-
-@dataclass(frozen=True, kw_only=True)
 class WorldModelConfig(Section, section="world_model"):
     """A world model and its success model. The default has 1.8 million weights and trains on two cores."""
 
@@ -267,8 +239,6 @@ class ModelKind:
     """True if it is built from the world model in ``imagination.path``."""
     learns: bool = False
     """True if that world model can be trained on during a run."""
-    knows_success: bool = False
-    """True if it needs no success model, see `Prediction.success`."""
     needs_history: bool = False
     """True if it can start only where all actions since the reset are known, see `ActionHistory`."""
     min_rollouts: int = 1
@@ -289,7 +259,6 @@ MODELS = {
         make=f"{_REGISTRY}:oracle",
         what="a simulator, put where a rollout starts: the best there can be.",
         needs_path=False,
-        knows_success=True,
         needs_history=True,
     ),
 }
@@ -375,9 +344,6 @@ class ImaginationConfig(Section, section="imagination"):
     discover_packages_path: str | None = None
     """Package to import that registers the type of the world model in `path`, where that is not one of ours;
     every machine of the cluster needs it."""
-    success: ExternalRewardModelConfig = field(default_factory=ExternalRewardModelConfig)
-    """A reward model used in place of the success model in `path`; neither it nor the world model is trained
-    in the run."""
     threshold: Share | None = None
     """P above which an imagined frame counts as a success; an oracle knows. None: the threshold saved with
     the success model of `path`, which is chosen anew as that is trained on.
@@ -422,22 +388,6 @@ class ImaginationConfig(Section, section="imagination"):
         if self.share and self.path is None and self.kind.needs_path:
             remedy = "give the folder world_model that accerl world-model has written"
             raise InputError("imagination.path", None, remedy)
-        if self.threshold is not None and self.success.path is not None:
-            remedy = "with an external reward model, use imagination.success.threshold alone"
-            raise InputError("imagination.threshold", self.threshold, remedy)
-        if self.share and self.success.path is not None:
-            self._check_external_reward_model()
-
-    def _check_external_reward_model(self) -> None:
-        if self.success.threshold is None:
-            remedy = "say what counts as a success; accerl world-model-eval --success.path=… finds it"
-            raise InputError("imagination.success.threshold", None, remedy)
-        if self.kind.knows_success:
-            remedy = f"leave it out: the {self.model} knows what has succeeded"
-            raise InputError("imagination.success.path", self.success.path, remedy)
-        if self.learns:
-            remedy = "use 0 with imagination.success.path: an external reward model is not trained"
-            raise InputError("imagination.learn.steps_per_episode", self.learn.steps_per_episode, remedy)
 
     @property
     def kind(self) -> ModelKind:

@@ -110,16 +110,6 @@ def test_both_models_go_to_the_device(
     monkeypatch.setattr(evaluate, "validate_datasets", validate_datasets)
     cli.main(told(folders, tmp_path / "out", "--device=cuda:3"))
     assert asked == ["cuda:3"] and tried == [["PixelWorldModel", "SuccessPairsRewardModel"]]
-    stands_in: list[Any] = []
-
-    def load_external_reward_model(*args: Any) -> Any:
-        stands_in.append(args[3])
-        raise InputError("success.path", "x", "enough")
-
-    monkeypatch.setattr(evaluate, "rehearse_external_reward_model", lambda *args: None)
-    monkeypatch.setattr(evaluate, "load_external_reward_model", load_external_reward_model)
-    cli.main(told(folders, tmp_path / "again", "--success.path=x"))
-    assert asked == ["cuda:3", "auto"] and stands_in == [torch.device("cpu", 0)]
 
 
 def test_one_that_does_not_know_the_dataset_is_tried_on_all_of_it(

@@ -23,7 +23,6 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED
 from accerl_lerobot.world_model.config import (
     MODELS,
-    ExternalRewardModelConfig,
     ImaginationConfig,
     ModelKind,
     NetworkConfig,
@@ -166,7 +165,7 @@ class Snow(WorldModel):
         )
 
 
-SNOW = ModelKind(make=f"{__name__}:Snow", what="a blizzard.", needs_path=False, knows_success=True)
+SNOW = ModelKind(make=f"{__name__}:Snow", what="a blizzard.", needs_path=False)
 
 
 @pytest.fixture
@@ -199,11 +198,6 @@ def test_what_is_asked_of_a_config_replaces_the_table(monkeypatch: pytest.Monkey
         parse(RunConfig, ["--imagination.model=magic"])
     config = ImaginationConfig(share=0.5, model="snow")
     assert not config.learns
-    judge = ExternalRewardModelConfig(path="somewhere", threshold=0.5)
-    with pytest.raises(InputError, match=r"^imagination\.success\.path=.* the snow knows what has succeeded"):
-        replace(config, success=judge)
-    told(knows_success=False)
-    replace(config, success=judge)
     told(needs_path=True)
     with pytest.raises(InputError, match=r"^imagination\.path=None"):
         replace(config)
@@ -241,8 +235,7 @@ def test_entries_of_the_table_are_true(name: str, made: type, tmp_path: Path):
         path = str(tmp_path / "world")
     config = ImaginationConfig(share=0.5, model=name, path=path)
     model, success = make_models(config, real.WORLD, world.spec, real.K, "cpu")
-    assert type(model) is made and (success is None) is kind.knows_success
-    assert ("success" in model.spec.provides) is kind.knows_success
+    assert type(model) is made and (success is None) is ("success" in model.spec.provides)
     learnt = model.model if isinstance(model, ShuffledModel) else model
     assert isinstance(learnt, PixelWorldModel) is kind.learns is config.learns
     frames = torch.zeros(1, real.SPEC.context, 1, 16, 16, 3, dtype=torch.uint8)

@@ -35,8 +35,8 @@ from accerl_lerobot.world_model.imagination.registry import (
 )
 from accerl_lerobot.world_model.imagination.starts import Start, StartPool
 from accerl_lerobot.world_model.model.contract import Context, Prediction, State, WorldModel, replace_rows
-from accerl_lerobot.world_model.model.external_reward_model import device_of, probabilities
 from accerl_lerobot.world_model.model.store import Source, save_world_model
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import probabilities
 
 if TYPE_CHECKING:
     from accerl_lerobot.world_model.learning.online import Promotion
@@ -129,7 +129,7 @@ class Imagination:
         self._rows, self._state = [None] * len(self._rows), None
         self._uncertain_in_a_row = 0
         assert self._success is not None  # or there would be nothing to promote
-        device = device_of(self._success)
+        device = self._success.out.weight.device
         model: WorldModel = promotion.model.to(device)
         self._model = ShuffledModel(model) if isinstance(self._model, ShuffledModel) else model
         self._success = promotion.success.to(device)
@@ -170,7 +170,7 @@ class Imagination:
         if isinstance(self._model, OracleModel):
             self._model.tasks = state["tasks"]
         if state["model_state"] is not None:
-            device = "cpu" if self._success is None else device_of(self._success)
+            device = "cpu" if self._success is None else self._success.out.weight.device
             self._state = {name: tensor.to(device) for name, tensor in state["model_state"].items()}
         for i, row in enumerate(state["rows"]):
             if row is not None:

@@ -29,11 +29,6 @@ from accerl_lerobot.world_model.data import (
     fingerprint,
     load_episodes,
 )
-from accerl_lerobot.world_model.model.external_reward_model import (
-    SuccessModel,
-    load_external_reward_model,
-    rehearse_external_reward_model,
-)
 from accerl_lerobot.world_model.model.store import (
     Source,
     find_source,
@@ -41,6 +36,7 @@ from accerl_lerobot.world_model.model.store import (
     load_world_model,
     rehearse_world_model,
 )
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 from accerl_lerobot.world_model.validation.validate import preview_video, validate
 
 if TYPE_CHECKING:
@@ -58,7 +54,7 @@ def validate_datasets(
     model: LearnableWorldModel,
     datasets: dict[str, list[Episode]],
     config: ValidationConfig,
-    success: SuccessModel | None,
+    success: SuccessPairsRewardModel | None,
     directory: Path,
     console: Console,
     *,
@@ -128,14 +124,10 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
     """
     device = resolve_device(config.device, "device")
     path = Path(str(config.path)).expanduser()
-    success: SuccessModel | None
     rehearse_world_model(path, config.discover_packages_path)
     model, success = load_world_model(path, config.discover_packages_path)
     model = model.to(device)
-    if config.success.path is not None:
-        rehearse_external_reward_model(config.success, model.spec, "success")
-        success = load_external_reward_model(config.success, model.spec, "success", device)
-    elif success is not None:
+    if success is not None:
         success = success.to(device)
     spec, sources = model.spec, load_sources(path)
     parts: dict[str, _Part] = {}
@@ -159,17 +151,12 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
                 datasets[ONLINE] = load_episodes(
                     config.online, spec, ONLINE, both=False, only=parts[ONLINE].episodes
                 )
-    fresh, keep = None, False
-    if config.success.path is None:
-        # The threshold was chosen on what was held out of the last source: there, it is chosen in folds.
-        fresh = next((names[r] for r, part in parts.items() if sources[-1:] == (part.source,)), None)
-    elif config.success.threshold is None:  # an external reward model has none yet
-        both = len({episode.success for episode in datasets.get(ONLINE, ())}) == 2
-        fresh, keep = (ONLINE if both else names[DATASET]), True
+    # The threshold was chosen on what was held out of the last source: there, it is chosen in folds.
+    fresh = next((names[r] for r, part in parts.items() if sources[-1:] == (part.source,)), None)
     result = validate_datasets(
         model, datasets, config.validation, success, directory, console,
         trained_on=[names[section] for section, part in parts.items() if part.source is not None],
-        fresh=fresh, keep_threshold=keep, seed=config.seed,
+        fresh=fresh, seed=config.seed,
     )  # fmt: skip
     (directory / RESULT).write_text(json.dumps(result, indent=2) + "\n")
     return result

@@ -26,7 +26,10 @@ from accerl_lerobot.world_model.data import (
     longest_rollout,
 )
 from accerl_lerobot.world_model.model.contract import Context, WorldModel, select_rows
-from accerl_lerobot.world_model.model.external_reward_model import SuccessModel, probabilities
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import (
+    SuccessPairsRewardModel,
+    probabilities,
+)
 from accerl_lerobot.world_model.validation import metrics
 
 BATCH = 64
@@ -201,7 +204,7 @@ class Scores(NamedTuple):
 
 def score_episodes(
     model: WorldModel,
-    success: SuccessModel,
+    success: SuccessPairsRewardModel,
     episodes: Sequence[Episode],
     config: ValidationConfig,
     seed: int,

@@ -32,7 +32,10 @@ from accerl_lerobot.world_model.data import (
     longest_rollout,
 )
 from accerl_lerobot.world_model.model.contract import LearnableWorldModel, WorldModel
-from accerl_lerobot.world_model.model.external_reward_model import SuccessModel, probabilities
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import (
+    SuccessPairsRewardModel,
+    probabilities,
+)
 from accerl_lerobot.world_model.validation import metrics
 from accerl_lerobot.world_model.validation.rollout_eval import (
     Predictions,
@@ -94,7 +97,7 @@ def validate(
     model: WorldModel,
     episodes: Sequence[Episode],
     config: ValidationConfig,
-    success: SuccessModel | None = None,
+    success: SuccessPairsRewardModel | None = None,
     seed: int = 0,
     fresh: bool = False,
 ) -> dict[str, Any]:
@@ -227,7 +230,11 @@ def preview_video(
 
 
 def comparison_video(
-    path: Path, model: WorldModel, success: SuccessModel | None, episode: Episode, scale: int = SCALE
+    path: Path,
+    model: WorldModel,
+    success: SuccessPairsRewardModel | None,
+    episode: Episode,
+    scale: int = SCALE,
 ) -> None:
     """An episode above its replay in the model, from beginning to end; the file appears when it is complete.
 
@@ -258,7 +265,7 @@ class ValidationVideos:
         self.folder, self.every = folder, every
 
     def __call__(
-        self, model: WorldModel, success: SuccessModel, episode: Episode, number: int, passed: bool
+        self, model: WorldModel, success: SuccessPairsRewardModel, episode: Episode, number: int, passed: bool
     ) -> None:
         """Called after the validation of this number, counted from 1, with a held-out episode."""
         if (number - 1) % self.every:
