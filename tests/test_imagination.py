@@ -243,18 +243,18 @@ def test_nothing_moves_in_rollouts_of_a_copy(tiny_checkpoint: Path, world_model:
         assert all(np.array_equal(f, frames[0]) for f in frames)
 
 
-def test_it_runs_asynchronously_with_two_workers(tiny_checkpoint: Path, world_model: Path, tmp_path: Path):
+def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_path: Path):
     from accerl_lerobot.engine.launch import RayEngine
 
     learn = OnlineLearnConfig(
         steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE, batch=4
     )
-    config = imagining(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12, workers=2)
+    config = imagining(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12)
     config = replace(config, rollout=replace(config.rollout, workers=2))
     engine = RayEngine(replace(config, output_dir=str(tmp_path)), ("match",))
     try:
         pids = engine.pids()
-        assert {"imagination 0", "imagination 1", "world learning"} < set(pids)
+        assert {"imagination", "world learning"} < set(pids)
         engine.train()
         history: list[Progress] = []
         for progress in polls(engine):
@@ -282,14 +282,9 @@ def test_it_runs_asynchronously_with_two_workers(tiny_checkpoint: Path, world_mo
     assert films[0].startswith("0001_") and tried - 1 <= len(films) <= tried + 1
     spent = shares(tmp_path)
     assert {"recovery", "compute", "transport", "wait_in"} <= spent["imagination"].keys()
-    assert len(list((tmp_path / "timeline").glob("imagination*"))) == 2
-    saved = [
-        snapshot.load(tmp_path / "saved" / TRAINING_STATE / name)["imagination"]
-        for name in ("imagination", "imagination1")
-    ]
-    assert [len(s["rows"]) for s in saved] == [2, 2] and len({s["version"] for s in saved}) == 1
-    assert sum(s["counters"].decisions for s in saved) >= last.imagination["decisions"]
-    assert all(s["counters"].rollouts for s in saved) and saved[0]["rng"].random() != saved[1]["rng"].random()
+    assert len(list((tmp_path / "timeline").glob("imagination*"))) == 1
+    saved = snapshot.load(tmp_path / "saved" / TRAINING_STATE / "imagination")["imagination"]
+    assert len(saved["rows"]) == 4 and saved["counters"].decisions >= last.imagination["decisions"]
     assert {"recovery", "compute", "transport", "wait_in"} <= spent["world learning"].keys()
 
 

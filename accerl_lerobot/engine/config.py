@@ -68,7 +68,7 @@ class PlacementConfig(Section, section="launch.placement"):
     inference: RoleConfig = field(default_factory=RoleConfig)
     """Each replica."""
     imagination: RoleConfig = field(default_factory=RoleConfig)
-    """Each worker that imagines, and the one that trains the world model."""
+    """The worker that imagines, and the one that trains the world model."""
     rollout: RoleConfig = field(default_factory=RoleConfig)
     """Each rollout worker."""
 
@@ -216,7 +216,6 @@ class RunConfig(Section):
             raise InputError("replay.max_lag", self.replay.max_lag, remedy)
         for name, count in (
             ("inference.workers", self.inference.workers),
-            ("imagination.workers", self.imagination.workers),
             ("trainer.ranks", self.trainer.ranks),
         ):
             if count > 1 and self.launch.engine == "local":

@@ -17,7 +17,6 @@ from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.loading import load_lerobot_config
 from accerl_lerobot.world_model.config import VIDEOS, OnlineLearnConfig
 from accerl_lerobot.world_model.data import Episode, fingerprint, load_episodes
-from accerl_lerobot.world_model.imagination.guard import worker_config
 from accerl_lerobot.world_model.imagination.registry import (
     ImaginationModels,
     check_fit,
@@ -41,16 +40,12 @@ EARLIER = "earlier"
 """`Episode.source` of the pre-training episodes."""
 
 
-def make_imagination(
-    config: RunConfig, name: str, on_segment: Callable[[Segment], object], index: int = 0
-) -> Imagination:
-    """Builds the imagination of a run, or of one of its workers.
+def make_imagination(config: RunConfig, on_segment: Callable[[Segment], object]) -> Imagination:
+    """Builds the imagination of a run.
 
     Args:
         config: of the run; its ``policy.path`` must be set.
-        name: prefix of the segments' keys.
         on_segment: receives the imagined segments.
-        index: of `ImaginationConfig.workers`.
 
     Raises:
         InputError: the world model cannot be loaded, or does not fit environment and policy.
@@ -61,11 +56,9 @@ def make_imagination(
         decision_cost=config.rollout.decision_cost,
         time_limit_fails=config.rollout.time_limit == "fail",
         seed=config.seed,
-        name=name,
     )
-    sources = _sources(config, models.model.spec) if index == 0 else ()
-    part = worker_config(config.imagination, index)
-    return Imagination(models, world, part, run, on_segment, index=index, sources=sources)
+    sources = _sources(config, models.model.spec)
+    return Imagination(models, world, config.imagination, run, on_segment, sources)
 
 
 def _sources(config: RunConfig, spec: WorldModelSpec) -> list[Source]:

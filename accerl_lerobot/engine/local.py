@@ -87,7 +87,7 @@ class LocalEngine(Engine):
         if imagination.share:
             from accerl_lerobot.engine.imagination import make_imagination, make_learner
 
-            self._imagination = make_imagination(config, IMAGINATION, self._replay.insert)
+            self._imagination = make_imagination(config, self._replay.insert)
             if imagination.learns:
                 self._world_learner = make_learner(config, self._imagination.models)
         self._rng = np.random.default_rng(config.seed)

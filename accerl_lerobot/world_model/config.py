@@ -352,11 +352,8 @@ class ImaginationConfig(Section, section="imagination"):
     often: ``python -m benchmarks ranking`` says at which threshold it succeeds as often as in reality.
     Validation uses it too, so a strict one needs a lower `learn.validation.recall`.
     """
-    workers: Annotated[int, Range("[1, 1000]")] = 1
-    """Processes that imagine, each with a copy of the world model, its own random draws, and its part of
-    `rollouts`; they are assigned to inference replicas as rollout workers are, from the last one on."""
     rollouts: Annotated[int, Range("[1, 100000]")] = 32
-    """Imagined rollouts at a time, over all workers; each worker steps its part as one batch."""
+    """Imagined rollouts at a time, as one batch."""
     start_at_reset_prob: Share = 0.0
     """Share of rollouts that start where an episode began; others may, too. The later one starts, the less
     of it is imagined, and the truer is how it ends."""
@@ -378,13 +375,9 @@ class ImaginationConfig(Section, section="imagination"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.workers > self.rollouts:
-            remedy = f"use at most imagination.rollouts, {self.rollouts}: each worker needs one"
-            raise InputError("imagination.workers", self.workers, remedy)
-        if self.rollouts < (least := self.kind.min_rollouts * self.workers):
-            remedy = f"use at least {least}, or fewer imagination.workers"
-            why = f"{remedy}: {self.model} needs {self.kind.min_rollouts} in each"
-            raise InputError("imagination.rollouts", self.rollouts, why)
+        if self.rollouts < self.kind.min_rollouts:
+            remedy = f"use at least {self.kind.min_rollouts}: {self.model} needs them"
+            raise InputError("imagination.rollouts", self.rollouts, remedy)
         if self.share and self.path is None and self.kind.needs_path:
             remedy = "give the folder world_model that accerl world-model has written"
             raise InputError("imagination.path", None, remedy)

@@ -204,10 +204,8 @@ def test_what_is_asked_of_a_config_replaces_the_table(monkeypatch: pytest.Monkey
     told(needs_path=True, learns=True)
     assert replace(config, path="x").learns and not replace(config, path="x", share=0.0).learns
     told(min_rollouts=3)
-    with pytest.raises(
-        InputError, match=r"^imagination\.rollouts=5: use at least 6, or fewer .*: snow needs 3"
-    ):
-        replace(config, rollouts=5, workers=2)
+    with pytest.raises(InputError, match=r"^imagination\.rollouts=2: use at least 3: snow needs them"):
+        replace(config, rollouts=2)
 
 
 def test_the_table_is_read_without_torch():
@@ -270,7 +268,7 @@ def test_rollouts_start_only_where_their_model_can(whole: bool, monkeypatch: pyt
     world = make_world(real.WORLD)
     models = make_models(config, real.WORLD, world.spec, real.K, "cpu")
     world.close()
-    settings = RolloutSettings(decision_cost=0.0, time_limit_fails=True, seed=0, name="imagination")
+    settings = RolloutSettings(decision_cost=0.0, time_limit_fails=True, seed=0)
     rollouts = Imagination(models, world.spec, config, settings, print)
     _, later = real.real_episode(1, length=2)
     rollouts.remember(later)  # what came before is not known

@@ -91,7 +91,7 @@ def imagination(
         "learn": OnlineLearnConfig(steps_per_episode=0),
     }  # fmt: skip
     made: list[Segment] = []
-    settings = RolloutSettings(decision_cost=0.01, time_limit_fails=fails, seed=0, name="imagination")
+    settings = RolloutSettings(decision_cost=0.01, time_limit_fails=fails, seed=0)
     models = ImaginationModels(model, success)
     batch = Imagination(models, world, ImaginationConfig(**(fields | config)), settings, made.append)
     return batch, made

@@ -96,7 +96,7 @@ def test_what_is_promoted_says_what_it_has_learned_from(
     config = run(
         tiny_checkpoint, tmp_path / "model", OnlineLearnConfig(dataset=demos, online=rollouts), [source]
     )
-    imagination = make_imagination(config, "rollout", lambda segment: None)
+    imagination = make_imagination(config, lambda segment: None)
     model, success = imagination.models
     assert isinstance(model, PixelWorldModel) and isinstance(success, SuccessPairsRewardModel)
     imagination.swap(Promotion(model, success, 7, {}))

@@ -26,7 +26,7 @@ from accerl_lerobot.experience import IMAGINED, Decision, Observation, Request, 
 from accerl_lerobot.rollout.segments import SegmentBuilder
 from accerl_lerobot.world_model.config import ImaginationConfig
 from accerl_lerobot.world_model.data import policy_observation
-from accerl_lerobot.world_model.imagination.guard import ImaginationCounters, KillSwitch
+from accerl_lerobot.world_model.imagination.guard import IMAGINATION, ImaginationCounters, KillSwitch
 from accerl_lerobot.world_model.imagination.registry import (
     ImaginationModels,
     OracleModel,
@@ -50,8 +50,6 @@ class RolloutSettings(NamedTuple):
     time_limit_fails: bool
     """True if the time limit is a failure, False if it truncates; see `RolloutConfig.time_limit`."""
     seed: int
-    name: str
-    """Prefix of the segments' keys."""
 
 
 @dataclass(kw_only=True)
@@ -79,7 +77,6 @@ class Imagination:
         config: of imagination.
         run: settings of the run.
         on_segment: receives the imagined segments.
-        index: of several workers with the same seed.
         sources: datasets that a promoted model was trained on, beside the run's own episodes.
     """
 
@@ -90,8 +87,6 @@ class Imagination:
         config: ImaginationConfig,
         run: RolloutSettings,
         on_segment: Callable[[Segment], object],
-        *,
-        index: int = 0,
         sources: Sequence[Source] = (),
     ) -> None:
         self.config, self.counters = config, ImaginationCounters()
@@ -107,7 +102,7 @@ class Imagination:
         self._sources = tuple(sources)
         self._run, self._on_segment = run, on_segment
         self._starts = StartPool(models.model.spec, config)
-        self._rng = np.random.default_rng((run.seed, 3, index))
+        self._rng = np.random.default_rng((run.seed, 3))
         self._rows: list[_Row | None] = [None] * config.rollouts
         self._state: State | None = None
         self._sequence = self._uncertain_in_a_row = 0
@@ -278,7 +273,7 @@ class Imagination:
             return
         self._sequence += 1
         segment = row.builder.cut(
-            f"{self._run.name}.{self._sequence}", terminated, truncated and not terminated, success
+            f"{IMAGINATION}.{self._sequence}", terminated, truncated and not terminated, success
         )
         segment.world_version = self.version
         self._on_segment(segment)
