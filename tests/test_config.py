@@ -120,7 +120,7 @@ class TestOverrides:
 
 
 MISTAKES: list[tuple[list[str], str]] = [
-    (["--lr=3"], "lr=3: no such field; did you mean sft.lr or trainer.lr or imagination.learn.lr?"),
+    (["--lr=3"], "lr=3: no such field; did you mean sft.lr or trainer.lr?"),
     (["--trainer.lrr=3"], "trainer.lrr=3: no such field; did you mean trainer.lr?"),
     (["--traner.lr=1"], "traner={'lr': 1}: no such field; did you mean trainer?"),
     (["--wandb.zzz=1"], "wandb.zzz=1: no such field; wandb has enable, project, entity"),

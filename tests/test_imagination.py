@@ -138,9 +138,7 @@ def test_without_imagination_a_run_ends_when_its_episodes_are_used_up(tiny_check
 
 
 def test_two_runs_are_equal_to_the_last_bit(tiny_checkpoint: Path, world_model: Path):
-    learn = OnlineLearnConfig(
-        steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE, batch=4
-    )
+    learn = OnlineLearnConfig(steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE)
     config = imagining(tiny_checkpoint, path=str(world_model), learn=learn, episodes=24)
     runs = [run_locally(config) for _ in range(2)]
     one, other = ([u for p in history for u in p.updates] for history, _, _ in runs)
@@ -158,9 +156,7 @@ def test_a_run_that_was_left_goes_on_as_if_it_had_not(
     model: str, left_at: float, tiny_checkpoint: Path, world_model: Path, tmp_path: Path
 ):
     """Rollouts, world model and success model included."""
-    learn = OnlineLearnConfig(
-        steps_per_episode=1.0, validate_every=8, held_out=0.5, validation=LOOSE, batch=4
-    )
+    learn = OnlineLearnConfig(steps_per_episode=1.0, validate_every=8, held_out=0.5, validation=LOOSE)
     chosen: dict[str, Any] = {
         "model": model,
         "start_at_reset_prob": 0.5,
@@ -196,9 +192,7 @@ def test_a_run_that_was_left_goes_on_as_if_it_had_not(
 
 
 def test_rollouts_of_a_model_that_is_trained_are_compared(tiny_checkpoint: Path, world_model: Path):
-    learn = OnlineLearnConfig(
-        steps_per_episode=1.0, validate_every=8, held_out=0.5, validation=LOOSE, batch=4
-    )
+    learn = OnlineLearnConfig(steps_per_episode=1.0, validate_every=8, held_out=0.5, validation=LOOSE)
     config = imagining(
         tiny_checkpoint, path=str(world_model), learn=learn, episodes=24, start_at_reset_prob=0.5,
         window=4, min_real_episodes=2, max_gap=2.0,
@@ -216,9 +210,7 @@ def test_rollouts_of_a_model_that_is_trained_are_compared(tiny_checkpoint: Path,
 
 
 def test_nothing_is_imagined_before_the_model_has_passed(tiny_checkpoint: Path, world_model: Path):
-    learn = OnlineLearnConfig(
-        steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE, batch=4
-    )
+    learn = OnlineLearnConfig(steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE)
     history, batches, _ = run_locally(
         imagining(tiny_checkpoint, path=str(world_model), learn=learn, episodes=24)
     )
@@ -228,7 +220,7 @@ def test_nothing_is_imagined_before_the_model_has_passed(tiny_checkpoint: Path, 
     assert imagined[first - 1] == 0 < imagined[-1]
     versions = {s.world_version for b in batches for s in b if s.source == IMAGINED}
     assert versions and 0 not in versions, "the one it began with never imagined"
-    strict = replace(learn, validation=replace(LOOSE, sensitivity=1e9), final_validations=2)
+    strict = replace(learn, validation=replace(LOOSE, sensitivity=1e9))
     history, batches, _ = run_locally(imagining(tiny_checkpoint, path=str(world_model), learn=strict))
     assert history[-1].imagination["rejected"] >= 2 and history[-1].imagination["rollouts"] == 0
     assert 0 < len(batches) < 12 and not any(decisions(b, IMAGINED) for b in batches)
@@ -246,9 +238,7 @@ def test_nothing_moves_in_rollouts_of_a_copy(tiny_checkpoint: Path, world_model:
 def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_path: Path):
     from accerl_lerobot.engine.launch import RayEngine
 
-    learn = OnlineLearnConfig(
-        steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE, batch=4
-    )
+    learn = OnlineLearnConfig(steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE)
     config = imagining(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12)
     config = replace(config, rollout=replace(config.rollout, workers=2))
     engine = RayEngine(replace(config, output_dir=str(tmp_path)), ("match",))
@@ -343,9 +333,7 @@ def test_what_does_not_fit_is_refused_before_the_run_begins(
 
 
 def test_what_a_run_learns_its_world_model_from_is_real(tiny_checkpoint: Path, world_model: Path):
-    learn = OnlineLearnConfig(
-        steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE, batch=4
-    )
+    learn = OnlineLearnConfig(steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE)
     config = imagining(tiny_checkpoint, path=str(world_model), learn=learn, episodes=24)
     engine = LocalEngine(config, ("match",))
     assert engine._world_learner is not None

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 from accerl_lerobot.engine.config import DatasetConfig, RunConfig, journal_folder
@@ -16,7 +15,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.loading import load_lerobot_config
 from accerl_lerobot.world_model.config import VIDEOS, OnlineLearnConfig
-from accerl_lerobot.world_model.data import Episode, fingerprint, load_episodes
+from accerl_lerobot.world_model.data import fingerprint, load_episodes
 from accerl_lerobot.world_model.imagination.registry import (
     ImaginationModels,
     check_fit,
@@ -24,7 +23,7 @@ from accerl_lerobot.world_model.imagination.registry import (
     make_models,
 )
 from accerl_lerobot.world_model.imagination.rollouts import Imagination, RolloutSettings
-from accerl_lerobot.world_model.learning.online import OnlineLearner
+from accerl_lerobot.world_model.learning.online import OnlineLearner, PretrainingEpisodes
 from accerl_lerobot.world_model.model.contract import WorldModelSpec
 from accerl_lerobot.world_model.model.store import OWN_RUN, Source, find_source, load_sources
 from accerl_lerobot.world_model.validation.evaluate import (
@@ -99,26 +98,22 @@ def make_learner(config: RunConfig, models: ImaginationModels | None = None) -> 
     longest = _longest(world, model.spec.chunk)
     assert success is not None  # as `check_imagination` has found
     sources = load_sources(Path(str(config.imagination.path)), "imagination")
-    offline: list[Episode] = []
-    held_out: list[Episode] = []
+    known = PretrainingEpisodes([], [])
     sections = _dataset_sections(learn)
     for section, meta in open_datasets(sections, model.spec).items():
         with name_section(section):
             # Not ``online``, even if a policy recorded them: in validation this run's own failures count.
             episodes = load_episodes(sections[section], model.spec, EARLIER, both=False)
-            check_disjoint(sections[section], episodes, offline + held_out)
+            check_disjoint(sections[section], episodes, known.learnt + known.held_out)
         source = find_source(sources, fingerprint(meta))
-        offline += episodes if source is None else [episodes[i] for i in source.learnt]
-        held_out += [] if source is None else [episodes[i] for i in source.held_out]
+        known.learnt.extend(episodes if source is None else [episodes[i] for i in source.learnt])
+        known.held_out.extend([] if source is None else [episodes[i] for i in source.held_out])
     return OnlineLearner(
         model,
         success,
-        learn,
-        replace(learn.validation, depth=min(learn.validation.depth, longest)),
-        offline=offline,
-        held_out=held_out,
-        longest=longest,
-        threshold=config.imagination.threshold,
+        config.imagination,
+        known,
+        longest,
         seed=config.seed,
         on_validation=_videos(config),
     )
@@ -144,9 +139,9 @@ def _dataset_sections(learn: OnlineLearnConfig) -> dict[str, DatasetConfig]:
 
 
 def _videos(config: RunConfig) -> ValidationVideos | None:
-    """Videos into the run's folder, if that is known and they are wanted."""
-    folder, every = journal_folder(config), config.imagination.learn.videos
-    return None if folder is None or not every else ValidationVideos(folder / VIDEOS, every)
+    """Videos into the run's folder, if that is known."""
+    folder = journal_folder(config)
+    return None if folder is None else ValidationVideos(folder / VIDEOS)
 
 
 def _longest(world: WorldSpec, chunk: int) -> int:

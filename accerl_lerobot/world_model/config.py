@@ -26,7 +26,7 @@ from accerl_lerobot.replay.pacing import ReplayConfig
 PIXELS = "pixels"
 """The type of our own class of learned world models."""
 VIDEOS = "validation"
-"""Folder of a run with `OnlineLearnConfig.videos`."""
+"""Folder of a run with a video of each validation of its world model."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -276,24 +276,12 @@ class OnlineLearnConfig(Section, section="imagination.learn"):
     them after four decisions, and 2 % after 100 steps on 64 episodes of that policy. So nothing is imagined
     before it has passed validation on the policy's own episodes.
     """
-    batch: Annotated[int, Range("[2, 65536]")] = 16
-    """Windows per gradient step."""
-    lr: LearningRate = 3e-4
-    """Constant after the first 50 steps."""
-    offline: Share = 0.5
-    """Share of windows from the pre-training data, where `dataset` and `online` name it."""
-    recent: Share = 0.7
-    """Share of the others from the newest quarter of episodes."""
-    failures: Share = 0.6
-    """Share of those from episodes that failed, as long as there are both kinds."""
     held_out: Annotated[float, Range("(0, 1)")] = 0.2
     """Share of real episodes held out for validation."""
     validate_every: Annotated[int, Range("[1, 1000000]")] = 16
     """Real episodes between two validations. Where real episodes are counted, no more are collected until
     the validation is over. Once all are in, it is repeated after as many steps as so many would have
-    brought, `final_validations` times at most."""
-    final_validations: Annotated[int, Range("[1, 1000000]")] = 5
-    """Validations after the last real episode; a model that has not passed by then is never used."""
+    brought, five times at most; a model that has not passed by then is never used."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """Dataset of the pre-training: the model trains on the episodes it already knows, and is validated on
     those that were held out. Of another dataset it trains on all episodes."""
@@ -306,11 +294,6 @@ class OnlineLearnConfig(Section, section="imagination.learn"):
     )
     """Checks that a model must pass to be used. A dozen held-out episodes say little; beyond that, `guard`
     watches."""
-    memory: Annotated[int, Range("[2, 1000000]")] = 400
-    """Real episodes kept for training."""
-    videos: Annotated[int, Range("[0, 1000000]")] = 1
-    """A video after every so many validations, in the run's folder ``validation``: the newest held-out
-    episode beside its prediction with the same actions. 0: none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -355,10 +338,8 @@ class ImaginationConfig(Section, section="imagination"):
     rollouts: Annotated[int, Range("[1, 100000]")] = 32
     """Imagined rollouts at a time, as one batch."""
     start_at_reset_prob: Share = 0.0
-    """Share of rollouts that start where an episode began; others may, too. The later one starts, the less
-    of it is imagined, and the truer is how it ends."""
-    start_at_high_td_prob: Share = 0.5
-    """Share of the others that start where the critic's TD error was large; the rest start anywhere."""
+    """Share of rollouts that start where an episode began; the others start anywhere. The later one starts,
+    the less of it is imagined, and the truer is how it ends."""
     max_uncertainty: Positive = 2.0
     """A rollout ends before a prediction with a higher uncertainty, where 1 is the 95th percentile on
     training data."""

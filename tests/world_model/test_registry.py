@@ -59,7 +59,7 @@ def begun(model: WorldModel, starts: list[Start]) -> State:
 
 
 def starts_of(*seeds: int, solve_at: int = 99) -> tuple[list[Start], dict[int, object]]:
-    pool = StartPool(SPEC, ImaginationConfig(memory=1000, start_at_high_td_prob=0.0))
+    pool = StartPool(SPEC, ImaginationConfig(memory=1000))
     segments = {seed: real_episode(seed, solve_at=solve_at)[0] for seed in seeds}
     for segment in segments.values():
         pool.add(segment)

@@ -216,7 +216,6 @@ def test_rollouts_that_succeed_too_often_are_switched_off_until_a_promotion(brig
         bright,
         rollouts=4,
         guard=GuardConfig(window=4, min_real_episodes=4, max_gap=0.5),
-        start_at_high_td_prob=0.0,
         world=ENDLESS,
     )
     for seed in range(8):
@@ -370,7 +369,7 @@ def test_one_that_tells_successes_needs_no_success_model():
     ("name", "value"),
     [
         ("share", 1.0), ("share", -0.1), ("model", "magic"), ("rollouts", 0),
-        ("memory", 0), ("max_uncertainty", 0.0), ("start_at_high_td_prob", 1.1),
+        ("memory", 0), ("max_uncertainty", 0.0),
     ],
 )  # fmt: skip
 def test_bad_values_name_their_field(name: str, value: object):
@@ -381,8 +380,7 @@ def test_bad_values_name_their_field(name: str, value: object):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("steps_per_episode", -1.0), ("batch", 1), ("validate_every", 0), ("memory", 1), ("offline", 1.1),
-        ("recent", -0.1), ("failures", 2.0), ("held_out", 0.0), ("lr", 0.0),
+        ("steps_per_episode", -1.0), ("validate_every", 0), ("held_out", 0.0),
     ],
 )  # fmt: skip
 def test_bad_values_of_learning_name_their_field(name: str, value: float):

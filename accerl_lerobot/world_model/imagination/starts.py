@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Start states of imagined rollouts: real observations, drawn at resets, at high TD errors, or anywhere.
+"""Start states of imagined rollouts: real observations, drawn at resets or anywhere.
 
 Shapes: see `contract.py`; T decisions of a segment.
 """
@@ -126,16 +126,12 @@ class StartPool:
         """
         if not self._count:
             raise ValueError("no real experience to start from yet")
-        config = self.config
         lengths = np.array([len(h.segment) for h in self._held])
         allowed = np.concatenate([h.allowed for h in self._held])
-        td_error = np.concatenate([h.td_error for h in self._held]) * allowed
-        even = allowed / max(1, allowed.sum())
-        high_td = td_error / td_error.sum() if td_error.sum() > 0 else even
-        weights = config.start_at_high_td_prob * high_td + (1 - config.start_at_high_td_prob) * even
+        weights = allowed / max(1, allowed.sum())
         first = np.concatenate([h.first for h in self._held])
         if first.any():
-            reset = config.start_at_reset_prob
+            reset = self.config.start_at_reset_prob
             weights = reset * first / first.sum() + (1 - reset) * weights
         drawn = rng.choice(self._count, size=count, p=weights / weights.sum())
         ends = np.cumsum(lengths)
@@ -181,9 +177,6 @@ class _Held:
         self.frames, self.robot = model_arrays(segment.observations, spec)
         nothing = np.zeros(spec.action_dim, np.float32)
         self.lead = lead or _Lead(segment.origin.decision, nothing, self.robot[0])
-        # V of a truncated segment's last observation is not known: the V before stands for it.
-        following = np.append(segment.value[1:], 0.0 if segment.terminated else segment.value[-1])
-        self.td_error = np.abs(segment.reward + following - segment.value).astype(np.float64)
         # In mid-episode, the context of the first decisions of a segment is not known.
         self.allowed = np.ones(len(segment), bool)
         if segment.origin.decision:

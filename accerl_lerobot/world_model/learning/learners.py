@@ -101,7 +101,7 @@ class Learner:
         if not bool(torch.isfinite(norm)):
             raise FloatingPointError(
                 f"the world model's loss or gradient is not finite at step {self.count + 1}; "
-                "lower world_model.learn.lr, or imagination.learn.lr in a run"
+                "lower world_model.learn.lr; in a run, use imagination.learn.steps_per_episode=0"
             )
         self._optimizer.step()
         self._average()
@@ -368,7 +368,7 @@ class SuccessLearner:
         if not bool(torch.isfinite(norm)):
             raise FloatingPointError(
                 f"the success model's loss or gradient is not finite at step {self._count}; "
-                "lower world_model.success.lr, or imagination.learn.lr in a run"
+                "lower world_model.success.lr; in a run, use imagination.learn.steps_per_episode=0"
             )
         self._optimizer.step()
         return metrics

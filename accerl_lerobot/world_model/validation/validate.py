@@ -259,17 +259,15 @@ def comparison_video(
 
 
 class ValidationVideos:
-    """A comparison video after every so many validations of a run; the folder is made with the first."""
+    """A comparison video after each validation of a run; the folder is made with the first."""
 
-    def __init__(self, folder: Path, every: int) -> None:
-        self.folder, self.every = folder, every
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
 
     def __call__(
         self, model: WorldModel, success: SuccessPairsRewardModel, episode: Episode, number: int, passed: bool
     ) -> None:
         """Called after the validation of this number, counted from 1, with a held-out episode."""
-        if (number - 1) % self.every:
-            return
         self.folder.mkdir(exist_ok=True)
         name = f"{number:04d}_{'passed' if passed else 'failed'}.mp4"
         comparison_video(self.folder / name, model, success, episode)
