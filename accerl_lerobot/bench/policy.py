@@ -38,7 +38,7 @@ class BenchPolicyConfig(Section):
     """Decisions made together, and learned from together."""
     num_steps: Annotated[int, Range("[1, 10000]")] | None = None
     """Denoising steps; None: the published 10."""
-    stochastic: Literal["last", "all", "one"] = "last"
+    stochastic: Literal["last", "all"] = "last"
     """Which denoising steps are random; see ``policy.sampler.stochastic``."""
     precision: Literal["fp32", "bf16"] = "fp32"
     """fp32 or bf16; see ``policy.precision``."""

@@ -46,23 +46,13 @@ def _check_order(config: SamplerConfig, low: str, middle: str, high: str) -> Non
 class FlowSamplerConfig(SamplerConfig):
     """Flow policies: which denoising steps are Gaussian, and how wide. `flow.py` explains the choices."""
 
-    stochastic: Literal["last", "all", "one"] = "last"
-    """Which denoising steps are Gaussian: last, all or one."""
-    noise: Literal["euler", "flow_sde", "learned"] = "euler"
-    """euler (stock mean, constant std), flow_sde (marginal-preserving, std grows with t) or learned (stock
-    mean, a std that is learned per observation, step and action dim, as in ReinFlow)."""
+    stochastic: Literal["last", "all"] = "last"
+    """Which denoising steps are Gaussian: last or all."""
+    noise: Literal["euler", "flow_sde"] = "euler"
+    """euler (stock mean, constant std) or flow_sde (marginal-preserving, std grows with t)."""
     noise_level: Annotated[float, Range("(0, 2]")] = 0.2
     """euler: total injected std in normalised action units. flow_sde: the factor a of
-    σ_t = a·√(t/(1−t)). learned: the std of each step at the start."""
-    noise_min: Annotated[float, Range("(0, 2]")] = 0.08
-    """learned: lower bound of the std, > 0 and below `noise_level`."""
-    noise_max: Annotated[float, Range("(0, 2]")] = 0.4
-    """learned: upper bound of the std, above `noise_level`."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.noise == "learned":
-            _check_order(self, "noise_min", "noise_level", "noise_max")
+    σ_t = a·√(t/(1−t))."""
 
 
 @SamplerConfig.register_subclass("noise_space")
@@ -138,9 +128,6 @@ class DiffusionSamplerConfig(SamplerConfig):
     std_min: Annotated[float, Range("(0, 1]")] = 0.1
     """Lower bound of a step's std while exploring, in normalised units. The last step has no noise
     of its own, so this is the executed action's std around what the chain arrives at."""
-    last_steps: Annotated[int, Range("[1, 10000]")] | None = None
-    """Explore in, and learn from, this many steps at the end of the chain; those before act as LeRobot's and
-    are left out of the ratio, which then is an approximation off-policy. None: all steps, which is exact."""
     scheduler: Literal["DDPM", "DDIM"] | None = None
     """DDPM or DDIM, whatever the policy was trained with: both reverse the same noising. None keeps the
     checkpoint's. Written into what is saved."""
