@@ -156,7 +156,7 @@ def _adapter(config: BenchPolicyConfig, device: Any, directory: Path) -> Any:
     inputs: Any = _RandomInputs(config, device)
     critic = ValueHead(model.width, ValueHeadConfig())
     adapter = LeRobotAdapter(policy, inputs, model, family, critic, config.precision)
-    tune(policy, model, family, config.tuning)
+    tune(policy, model, config.tuning)
     return adapter
 
 

@@ -55,33 +55,6 @@ class FlowSamplerConfig(SamplerConfig):
     σ_t = a·√(t/(1−t))."""
 
 
-@SamplerConfig.register_subclass("noise_space")
-@dataclass(frozen=True, kw_only=True)
-class NoiseSpaceSamplerConfig(SamplerConfig):
-    """A frozen flow policy, steered by the initial noise it is given (DSRL); see `flow.py`."""
-
-    std: Annotated[float, Range("(0, 2]")] = 1.0
-    """Std of the noise at the start; 1 is what the policy was trained with."""
-    std_min: Positive = 0.1
-    """Lower bound of the learned std, > 0 and below `std`."""
-    std_max: Positive = 2.0
-    """Upper bound of the learned std, above `std`."""
-    bound: Positive = 2.0
-    """Largest absolute mean: from noise it never saw in training the policy makes arbitrary actions."""
-    hidden: Annotated[int, Range("[1, 65536]")] = 128
-    """Width of the head's hidden layer."""
-    per_row: bool = False
-    """True: every row of a chunk gets a noise of its own. False: one row's noise for all, which is a far
-    smaller space to search, and not how the policy was trained."""
-    deterministic_eval: bool = True
-    """Start from the mean when not exploring. False: sample, which with `per_row` and `std` 1 is the frozen
-    policy itself as long as nothing has been learned."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_order(self, "std_min", "std", "std_max")
-
-
 @SamplerConfig.register_subclass("tokens")
 @dataclass(frozen=True, kw_only=True)
 class TokenSamplerConfig(SamplerConfig):

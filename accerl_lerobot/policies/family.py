@@ -89,8 +89,6 @@ class Model(ABC):
 class Family(nn.Module, ABC):
     """One way of acting at random with a known density; may own parameters, which are trained."""
 
-    frozen: ClassVar[bool] = False
-    """True: only the family's own parameters are trained, never the policy's."""
     imitates: ClassVar[bool] = False
     """True if it has an `imitation_loss`."""
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Likelihoods of flow policies: noise in the denoising steps, or over the initial noise (DSRL, at the end).
+"""Likelihood of flow policies: noise in the denoising steps.
 
 A flow policy integrates x from t = 1 (noise) to t = 0 (action) in N Euler steps of δ = 1/N:
 x ← x − δ·v(x, t). That map has no usable density, so exploration makes some steps Gaussian and the log-prob
@@ -31,14 +31,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
-from accerl_lerobot.policies.config import FlowSamplerConfig, NoiseSpaceSamplerConfig
+from accerl_lerobot.policies.config import FlowSamplerConfig
 from accerl_lerobot.policies.family import (
     Action,
-    BoundedStd,
     Encoded,
     Family,
     Model,
@@ -46,7 +45,6 @@ from accerl_lerobot.policies.family import (
     exploring,
     normal_entropy,
     normal_log_prob,
-    pooled,
     standard_normal,
 )
 
@@ -293,70 +291,3 @@ class FlowFamily(Family):
     def actions(self) -> int:
         """Every factor is one row of the chunk."""
         return factors(self.shape, self.sampler)
-
-
-class NoiseSpaceFamily(Family):
-    """Steers a frozen flow policy by its initial noise (DSRL, Wagenmaker et al., arXiv 2506.15799).
-
-    The Euler loop is left as it is; a small head samples the noise that it starts from, z ~ N(m(o), s(o)²).
-    The ratio is exact and costs no velocity pass to re-score, and every objective here applies; the paper
-    uses SAC. The head lies beside the checkpoint in ``family.safetensors``; stock LeRobot loads the frozen
-    policy without it.
-    """
-
-    frozen = True
-
-    def __init__(self, model: FlowModel, sampler: NoiseSpaceSamplerConfig) -> None:
-        super().__init__()
-        self.model, self.sampler, self.shape = model, sampler, model.shape
-        self.rows = self.shape.chunk_size if sampler.per_row else 1
-        size = self.rows * self.shape.padded_dim
-        self.norm = nn.LayerNorm(model.width)
-        self.hidden = nn.Linear(model.width, sampler.hidden)
-        self.mean = nn.Linear(sampler.hidden, size)
-        self.width = nn.Linear(sampler.hidden, size)
-        nn.init.zeros_(self.mean.weight)
-        nn.init.zeros_(self.mean.bias)
-        self.bounded = BoundedStd(sampler.std_min, sampler.std_max)
-        self.bounded.start(self.width, sampler.std)
-
-    def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
-        mean, std = self._gaussian(encoded)
-        shape, size = self.shape, tuple(mean.shape[1:])
-        (eps,) = standard_normal(requests, size, device=mean.device)
-        explore = exploring(requests, mean.device)
-        noisy = explore | (not self.sampler.deterministic_eval)
-        z = torch.where(noisy[:, None, None], mean + std * eps, mean)
-        x = integrate(encoded.context.velocity, z.expand(-1, shape.chunk_size, -1), shape)
-        return Action(
-            chunk=x[:, : shape.executed, : shape.action_dim],
-            latent={"z": z},
-            log_prob=torch.where(explore[:, None], _noise_log_prob(z, mean, std), 0.0),
-        )
-
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
-        mean, std = self._gaussian(encoded)
-        entropy = normal_entropy(std).sum((1, 2))
-        return Score(log_prob=_noise_log_prob(latent["z"], mean, std), entropy=entropy)
-
-    def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
-        """Compares the frozen policy with the one LeRobot runs."""
-        return difference(self.model, batch, encoded)
-
-    @property
-    def actions(self) -> int:
-        """One factor per row of noise."""
-        return self.rows
-
-    def _gaussian(self, encoded: Encoded) -> tuple[Tensor, Tensor]:
-        """Mean and std of z, each (B, rows, D)."""
-        hidden = torch.relu(self.hidden(self.norm(pooled(encoded.features, encoded.mask))))
-        size = (-1, self.rows, self.shape.padded_dim)
-        bound = self.sampler.bound
-        mean = bound * torch.tanh(self.mean(hidden).float() / bound)
-        return mean.view(size), self.bounded(self.width(hidden)).view(size)
-
-
-def _noise_log_prob(z: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    """(B, rows), summed over dims; padded ones act on the others, so they are part of the choice."""
-    return normal_log_prob(z, mean, std).sum(-1)

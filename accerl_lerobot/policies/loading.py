@@ -240,7 +240,7 @@ def _load(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAdapter:
         elif sum(parameter.numel() for parameter in policy.parameters()) <= ACTS_MOST:
             observation = requests[0].observation | {TASK: TEXT}
             adapter.decide([replace(requests[0], observation=observation)], 0)
-        tune(policy, model, family, config.tuning)
+        tune(policy, model, config.tuning)
     except InputError:
         raise
     except Exception as error:  # what its files say fits nowhere, and may fail over any of it

@@ -10,19 +10,18 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import PolicyConfig, SamplerConfig
 
 POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "smolvla": ("accerl_lerobot.policies.smolvla:SmolVLA", ("flow", "noise_space")),
+    "smolvla": ("accerl_lerobot.policies.smolvla:SmolVLA", ("flow",)),
     "act": ("accerl_lerobot.policies.act:ACT", ("gaussian",)),
     "gaussian_actor": ("accerl_lerobot.policies.gaussian_actor:GaussianActor", ("gaussian",)),
     "diffusion": ("accerl_lerobot.policies.diffusion:Diffusion", ("diffusion",)),
-    "pi0": ("accerl_lerobot.policies.pi0:Pi0", ("flow", "noise_space")),
-    "pi05": ("accerl_lerobot.policies.pi0:Pi05", ("flow", "noise_space")),
+    "pi0": ("accerl_lerobot.policies.pi0:Pi0", ("flow",)),
+    "pi05": ("accerl_lerobot.policies.pi0:Pi05", ("flow",)),
     "pi0_fast": ("accerl_lerobot.policies.pi0_fast:Pi0Fast", ("tokens",)),
     "smolvla_bins": ("accerl_lerobot.policies.smolvla:SmolVLABins", ("tokens",)),
 }
 """LeRobot policy type → its model, and the families that suit it, the default one first."""
 FAMILIES = {
     "flow": "accerl_lerobot.policies.flow:FlowFamily",
-    "noise_space": "accerl_lerobot.policies.flow:NoiseSpaceFamily",
     "gaussian": "accerl_lerobot.policies.gaussian:GaussianFamily",
     "diffusion": "accerl_lerobot.policies.diffusion:DiffusionFamily",
     "tokens": "accerl_lerobot.policies.tokens:TokenFamily",

@@ -11,21 +11,16 @@ from torch import Tensor, nn
 from accerl_lerobot.checkpoint.tensors import whole
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import TuningConfig
-from accerl_lerobot.policies.family import Family, Model
+from accerl_lerobot.policies.family import Model
 
 
-def tune(policy: Any, model: Model, family: Family, config: TuningConfig) -> None:
+def tune(policy: Any, model: Model, config: TuningConfig) -> None:
     """Sets what is trainable in `policy`; puts low-rank adapters in, for ``lora``.
 
     Raises:
         InputError: the policy has no expert, or ``lora`` targets nothing in it.
     """
-    if family.frozen:
-        if config.mode not in ("checkpoint", "full"):
-            remedy = "this sampler leaves the whole policy as it is; leave the field out"
-            raise InputError("policy.tuning.mode", config.mode, remedy)
-        policy.requires_grad_(False)
-    elif config.mode == "full":
+    if config.mode == "full":
         policy.requires_grad_(True)
     elif config.mode == "expert":
         if model.backbone is None:

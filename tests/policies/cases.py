@@ -25,7 +25,6 @@ from accerl_lerobot.policies.config import (
     DiffusionSamplerConfig,
     FlowSamplerConfig,
     GaussianSamplerConfig,
-    NoiseSpaceSamplerConfig,
     SamplerConfig,
     TokenSamplerConfig,
 )
@@ -135,22 +134,6 @@ def stock_flow(
     adapter: LeRobotAdapter, batch: dict[str, Tensor], asked: list[Request], latent: Latent
 ) -> Tensor:
     return adapter.policy.predict_action_chunk(batch, noise=latent["path"][:, 0])
-
-
-def slow_noise_space(adapter: LeRobotAdapter, asked: list[Request], latent: Latent) -> list[float]:
-    weights, config, totals = arrays(adapter.family), adapter.family.sampler, []
-    for request, z in zip(asked, latent["z"].double().numpy(), strict=True):
-        x = linear(layer_norm(features_of(adapter, request), weights, "norm"), weights, "hidden").clip(0)
-        mean = config.bound * np.tanh(linear(x, weights, "mean") / config.bound)
-        std = bounded(linear(x, weights, "width"), config.std_min, config.std_max)
-        totals.append(sum(map(normal_log_prob, z.flatten(), mean, std)))
-    return totals
-
-
-def stock_noise_space(
-    adapter: LeRobotAdapter, batch: dict[str, Tensor], asked: list[Request], latent: Latent
-) -> Tensor:
-    return adapter.policy.predict_action_chunk(batch, noise=latent["z"].expand(-1, 5, -1))
 
 
 # ---- Gaussian: ACT, gaussian_actor
@@ -421,18 +404,6 @@ CASES = {
 }
 """The eight types, by their names in LeRobot."""
 VARIANTS = {
-    "smolvla, noise space": Case(
-        kind="smolvla",
-        write=CASES["smolvla"].write,
-        samplers=tuple(
-            NoiseSpaceSamplerConfig(per_row=rows, deterministic_eval=False) for rows in (False, True)
-        ),
-        slow=slow_noise_space,
-        stock=stock_noise_space,
-        parts=("family.norm", "family.hidden", "family.mean", "family.width"),
-        prepare=lambda adapter: perturb(adapter, 0.5),
-        moved=0.3,
-    ),
     "diffusion, DDIM, one observation, batch norm": Case(
         kind="diffusion",
         write=lambda path: write_diffusion(
