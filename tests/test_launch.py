@@ -78,7 +78,7 @@ def story(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> It
     engine = RayEngine(config, ("match",))
     try:
         pids = engine.pids()
-        engine.plan(evaluation_plans(("match",), 6, "before", film=1))
+        engine.plan(evaluation_plans(("match",), 6, "before", filmed=1))
         told.before = collect(engine, "before", 6)
         engine.train()
         planned = killed = lost = False

@@ -233,7 +233,7 @@ def test_without_learning_success_stays_where_it_was(tiny_checkpoint: Path):
 
 def test_planned_episodes_run_without_training_and_are_not_learned_from(tiny_checkpoint: Path):
     engine = LocalEngine(tiny_run(tiny_checkpoint), ("match",))
-    engine.plan(evaluation_plans(("match",), 9, "test", film=1))
+    engine.plan(evaluation_plans(("match",), 9, "test", filmed=1))
     results = collect(engine, "test", 9)
     progress = engine.poll()
     engine.close()

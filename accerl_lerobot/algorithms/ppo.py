@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 from accerl_lerobot.algorithms.contract import AlgorithmConfig, LossInputs, RatioConfig
-from accerl_lerobot.algorithms.objective import LossOutput, advantage_column, assemble, mean_over_ratios
+from accerl_lerobot.algorithms.objective import Clip, LossOutput, advantage_column, assemble, mean_over_ratios
 from accerl_lerobot.algorithms.ratio import at_level, ratio
 from accerl_lerobot.config.ranges import Range
 
@@ -69,7 +69,7 @@ def ppo_loss(inputs: LossInputs, config: PPOConfig) -> LossOutput:
         policy_loss=-mean_over_ratios(surrogate, inputs, config.level),
         log_ratio=logs,
         weight=(~dropped).to(logs.dtype),
-        clip=(config.clip_low, config.clip_high),
+        clip=Clip(config.clip_low, config.clip_high),
     )
 
 
@@ -108,6 +108,5 @@ def decoupled_loss(inputs: LossInputs, config: DecoupledConfig) -> LossOutput:
         policy_loss=-mean_over_ratios(behaviour * surrogate, inputs, config.level),
         log_ratio=at_level(inputs.log_prob_new - old, inputs, config.level),
         weight=(~dropped & (behaviour > 0.0)).to(moved.dtype),
-        clip=(config.clip_low, config.clip_high),
-        clipped=moved,
+        clip=Clip(config.clip_low, config.clip_high, moved),
     )

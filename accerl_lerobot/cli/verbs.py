@@ -166,7 +166,7 @@ def evaluate(arguments: list[str]) -> int:
     sections = ("seed", "env", "policy", "rollout", "inference", "evaluation", "launch")
     whole = RunConfig(**{name: getattr(config, name) for name in sections})
     check_machine(whole)
-    film = config.evaluation.videos if out else 0
+    filmed = config.evaluation.videos if out else 0
     console = Console()
     with redirect_stdout(sys.stderr):
         spec = run.check_world(whole.env)
@@ -174,7 +174,8 @@ def evaluate(arguments: list[str]) -> int:
         engine = run.make_engine(whole, tasks, history)
         try:
             episodes = config.evaluation.episodes
-            engine.plan(evaluation_plans(tasks, episodes, "eval", seed=config.seed, film=film))
+            film = config.evaluation.film
+            engine.plan(evaluation_plans(tasks, episodes, "eval", seed=config.seed, filmed=filmed, film=film))
             results = run_plans(engine, config.evaluation.episodes, "eval", console)
         finally:
             engine.close()

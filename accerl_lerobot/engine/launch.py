@@ -201,7 +201,7 @@ class RayEngine(Engine):
 
     def _start(self) -> None:
         from accerl_lerobot.replay.worker import ReplayWorker
-        from accerl_lerobot.trainer.peers import TrainerRank
+        from accerl_lerobot.trainer.peers import LearnerSettings, TrainerRank
         from accerl_lerobot.trainer.worker import TrainerWorker
 
         c, timeline = self._config, timeline_folder(self._config)
@@ -212,10 +212,10 @@ class RayEngine(Engine):
             return ray.remote(kind).options(**options).remote(*arguments)
 
         # The ranks first: Ray fills the GPU that is fullest, and each of them needs more than half of one.
-        learner = (c.policy, c.algorithm, c.trainer, c.seed, self._state, self._load)
+        learner = LearnerSettings(c.policy, c.algorithm, c.trainer, c.seed, self._state, self._load)
         names = [f"trainer rank {rank}" for rank in range(1, c.trainer.ranks)]
-        ranks = [make(name, TrainerRank, 1, rank, *learner) for rank, name in enumerate(names, start=1)]
-        trainer = make("trainer", TrainerWorker, 4, *learner, timeline, ranks, journal_folder(c))
+        ranks = [make(name, TrainerRank, 1, rank, learner) for rank, name in enumerate(names, start=1)]
+        trainer = make("trainer", TrainerWorker, 4, learner, timeline, ranks, journal_folder(c))
         self._inference.start(plan)
         imagined, counted = imagination.replay if imagination.share else None, c.rollout.episodes > 0
         stores = (c.replay, c.seed, imagined, counted, self._state, journal_folder(c), timeline)

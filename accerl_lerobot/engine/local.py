@@ -111,7 +111,6 @@ class LocalEngine(Engine):
             "local",
             self._outbox.append,
             self._ended,
-            (config.evaluation.video_size, config.evaluation.video_every),
             self._plans.groups,
         )
         self._due: dict[int, Request] = {}

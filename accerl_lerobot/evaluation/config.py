@@ -32,9 +32,20 @@ class EvaluationConfig(Section, section="evaluation"):
     video_every: Annotated[int, Range("[1, 1000]")] = 4
     """Env steps per video frame, of which 20 are shown in a second."""
 
+    @property
+    def film(self) -> tuple[int, int]:
+        """See `EpisodePlan.film`."""
+        return self.video_size, self.video_every
+
 
 def evaluation_plans(
-    tasks: Sequence[str], episodes: int, group: str, *, seed: int = 0, film: int = 0
+    tasks: Sequence[str],
+    episodes: int,
+    group: str,
+    *,
+    seed: int = 0,
+    filmed: int = 0,
+    film: tuple[int, int] = (128, 4),
 ) -> list[EpisodePlan]:
     """`episodes` plans, spread evenly over `tasks`.
 
@@ -43,7 +54,8 @@ def evaluation_plans(
         episodes: over all tasks.
         group: label of this evaluation.
         seed: of the run; decides on the starts, see `eval_seed`.
-        film: how many of the first episodes record frames.
+        filmed: how many of the first episodes record frames.
+        film: see `EpisodePlan.film`.
     """
     return [
         EpisodePlan(
@@ -52,7 +64,7 @@ def evaluation_plans(
             explore=False,
             index=i,
             group=group,
-            film=i < film,
+            film=film if i < filmed else None,
         )
         for i in range(episodes)
     ]

@@ -106,8 +106,9 @@ class EpisodePlan:
     """Which evaluation it belongs to."""
     place: GroupSlot | None = None
     """Its group of equal starts and which of them it is, where exploring episodes are compared."""
-    film: bool = False
-    """Record frames for people. Executes a chunk in parts, which changes nothing else."""
+    film: tuple[int, int] | None = None
+    """Side in pixels and env steps per frame of a video for people; None: none. It executes a chunk in parts,
+    which changes nothing else."""
 
 
 @kind
@@ -154,7 +155,6 @@ class RolloutRunner:
         name: unique per incarnation of a worker; the prefix of its segments' keys.
         on_segment: receives finished segments of exploring episodes; those of a group all at its end.
         on_episode: receives every finished episode.
-        film: (side in pixels, env steps per frame) of filmed episodes.
         groups: those that plans with a `place` belong to.
     """
 
@@ -166,7 +166,6 @@ class RolloutRunner:
         name: str,
         on_segment: Callable[[Segment], object],
         on_episode: Callable[[EpisodeResult], object],
-        film: tuple[int, int] = (240, 2),
         groups: Groups | None = None,
     ) -> None:
         self.config, self.name = config, name
@@ -175,7 +174,6 @@ class RolloutRunner:
         self._slots = [Slot(world) for world in worlds]
         self._next_plan, self._on_segment, self._on_episode = next_plan, on_segment, on_episode
         self._sequence = 0
-        self._film = film
 
     def __len__(self) -> int:
         return len(self._slots)
@@ -204,7 +202,7 @@ class RolloutRunner:
         state = self._slots[slot]
         plan, builder = state.plan, state.builder
         assert plan is not None and builder is not None
-        result = self._filmed(state, decision.chunk) if plan.film else state.world.step_chunk(decision.chunk)
+        result = self._execute(state, plan, decision.chunk)
         state.chunks.append(decision.chunk)
         self.counters.env_steps += result.steps
         self.counters.decisions += 1
@@ -267,9 +265,11 @@ class RolloutRunner:
         for state in self._slots:
             state.world.close()
 
-    def _filmed(self, state: Slot, actions: np.ndarray) -> ChunkResult:
-        """Executes a chunk part by part and keeps a frame of each."""
-        side, every = self._film
+    def _execute(self, state: Slot, plan: EpisodePlan, actions: np.ndarray) -> ChunkResult:
+        """Executes a chunk; if it is filmed, part by part, with a frame of each."""
+        if plan.film is None:
+            return state.world.step_chunk(actions)
+        side, every = plan.film
         rewards = []
         for i in range(0, len(actions), every):
             result = state.world.step_chunk(actions[i : i + every])

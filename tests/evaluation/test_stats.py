@@ -192,9 +192,9 @@ class TestPlans:
         assert [sum(p.task == t for p in plans) for t in "abc"] == [3, 3, 2]
 
     def test_do_not_explore_and_are_filmed_first(self) -> None:
-        plans = evaluation_plans(("a",), 4, "x", film=2)
+        plans = evaluation_plans(("a",), 4, "x", filmed=2, film=(8, 2))
         assert not any(p.explore for p in plans)
-        assert [p.film for p in plans] == [True, True, False, False]
+        assert [p.film for p in plans] == [(8, 2), (8, 2), None, None]
         assert [p.index for p in plans] == [0, 1, 2, 3] and {p.group for p in plans} == {"x"}
 
 

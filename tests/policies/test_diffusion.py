@@ -28,7 +28,7 @@ from accerl_lerobot.policies.family import standard_normal
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.rollout.worker import RolloutWorker
+from accerl_lerobot.rollout.worker import RolloutWorker, WorkerShare
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.policies.cases import slow_diffusion
 from tests.policies.checkpoints import edit_config, stock_chunk, write_diffusion
@@ -372,7 +372,7 @@ def test_a_world_without_a_history_is_refused_in_words(looking: Path):
 
 
 def test_a_rollout_process_asks_with_the_history():
-    worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), ("match",), 0, 0, 0, (8, 2), OBSERVED)
+    worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), ("match",), 0, WorkerShare(0), OBSERVED)
     asked: list[Request] = []
 
     def decide(due: list[Request]) -> list[Request]:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -157,6 +157,13 @@ class HeldOutLoss:
         return metrics | {"loss": loss.item()}
 
 
+class HeldOut(NamedTuple):
+    """Episodes on which losses are taken during the training, and what receives these."""
+
+    episodes: Sequence[Episode]
+    on_losses: OnStep
+
+
 def train_from_scratch(
     model: LearnableWorldModel,
     episodes: Sequence[Episode],
@@ -165,24 +172,23 @@ def train_from_scratch(
     *,
     shuffle: bool = False,
     on_step: OnStep = lambda step, metrics: None,
-    held_out: Sequence[Episode] = (),
-    on_held_out: OnStep = lambda step, metrics: None,
+    held_out: HeldOut | None = None,
 ) -> Learner:
     """Fits the statistics of a new model and trains it.
 
-    `on_held_out` gets the losses on `held_out`, every `LearnConfig.validate_every` steps, see `HeldOutLoss`.
+    Losses on `held_out` are taken every `LearnConfig.validate_every` steps, see `HeldOutLoss`.
     """
     at = window_starts(episodes)
     learner = Learner(model, config, seed, shuffle)
     model.fit_statistics(learner.draw(episodes, at, min(STATISTICS_WINDOWS, 4 * len(at))))
     learner.serving.load_state_dict(model.state_dict())
     held_out_loss = None
-    if config.validate_every and window_starts(held_out):
-        held_out_loss = HeldOutLoss(held_out, model.spec, config, seed)
+    if config.validate_every and held_out is not None and window_starts(held_out.episodes):
+        held_out_loss = HeldOutLoss(held_out.episodes, model.spec, config, seed)
     for step in range(1, config.steps + 1):
         on_step(step, learner.step(learner.draw(episodes, at)))
-        if held_out_loss is not None and step % config.validate_every == 0:
-            on_held_out(step, held_out_loss(learner.serving))
+        if held_out is not None and held_out_loss is not None and step % config.validate_every == 0:
+            held_out.on_losses(step, held_out_loss(learner.serving))
     return learner
 
 

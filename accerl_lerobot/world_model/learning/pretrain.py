@@ -36,6 +36,7 @@ from accerl_lerobot.world_model.data import (
 )
 from accerl_lerobot.world_model.learning.learners import (
     Examples,
+    HeldOut,
     SuccessLearner,
     held_out_success_metrics,
     new_success_model,
@@ -54,6 +55,7 @@ from accerl_lerobot.world_model.validation.evaluate import (
     HELD_OUT,
     ONLINE,
     RESULT,
+    DatasetRoles,
     check_disjoint,
     dataset_sections,
     name_section,
@@ -135,10 +137,9 @@ def pretrain(run: WorldModelRun, directory: Path, console: Console) -> dict[str,
     save_world_model(directory / "world_model", serving, None, [part.source for part in parts.values()])
     # The threshold is chosen on the policy's failures, where there are any, as demonstrations fail otherwise.
     *_, fresh = held_out
-    result = validate_datasets(
-        serving, held_out, config.validation, success, directory, console,
-        trained_on=held_out, fresh=fresh, keep_threshold=True, seed=seed,
-    )  # fmt: skip
+    roles = DatasetRoles(trained_on=held_out, fresh=fresh, keep_threshold=True)
+    with console.stage("validation"):
+        result = validate_datasets(serving, held_out, config.validation, success, directory, roles, seed)
     result |= {
         "seconds": seconds,
         "learnt": count_episodes(learn),
@@ -184,7 +185,7 @@ def _train(
 
             serving = train_from_scratch(
                 model, learn, config.learn, seed, shuffle=config.shuffle_actions,
-                on_step=on_step, held_out=held_out, on_held_out=on_held_out,
+                on_step=on_step, held_out=HeldOut(held_out, on_held_out),
             ).serving  # fmt: skip
         fit_uncertainty_scale(serving, learn, config.validation, seed)
         success = new_success_model(config.chunk).to(device)

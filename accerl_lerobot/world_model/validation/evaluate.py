@@ -15,6 +15,7 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -50,17 +51,26 @@ HELD_OUT, DATASET, ONLINE = "held out", "dataset", "online"
 PREVIEW, RESULT = "preview.mp4", "validation.json"
 
 
+@dataclass(frozen=True, kw_only=True)
+class DatasetRoles:
+    """How the datasets of a validation count, by their names."""
+
+    trained_on: Collection[str] = ()
+    """Those of which the model was trained on other episodes. Their checks count, too."""
+    fresh: str | None = None
+    """The one on which the success threshold is chosen: of each fold, on the others. All other datasets are
+    judged by the present threshold."""
+    keep_threshold: bool = False
+    """Keep the threshold that is chosen on all of `fresh`, for the other datasets too."""
+
+
 def validate_datasets(
     model: LearnableWorldModel,
     datasets: dict[str, list[Episode]],
     config: ValidationConfig,
     success: SuccessPairsRewardModel | None,
     directory: Path,
-    console: Console,
-    *,
-    trained_on: Collection[str] = (),
-    fresh: str | None = None,
-    keep_threshold: bool = False,
+    roles: DatasetRoles,
     seed: int = 0,
 ) -> dict[str, Any]:
     """Validates a world model on each dataset and makes a video of it.
@@ -71,11 +81,7 @@ def validate_datasets(
         config: data and checks.
         success: None: outcomes are not checked.
         directory: receives the videos.
-        console: progress for people.
-        trained_on: datasets of which it was trained on other episodes. Their checks count, too.
-        fresh: the dataset on which the success threshold is chosen: of each fold, on the others. All other
-            datasets are judged by the present threshold.
-        keep_threshold: keep the threshold that is chosen on all of `fresh`, for the other datasets too.
+        roles: of the datasets.
         seed: of windows and shuffles.
 
     Returns:
@@ -85,19 +91,18 @@ def validate_datasets(
     """
     first, *others = datasets
     results: dict[str, dict[str, Any]] = {}
-    for name in sorted(datasets, key=lambda name: name != fresh):
+    for name in sorted(datasets, key=lambda name: name != roles.fresh):
         episodes = datasets[name]
         threshold = None if success is None else success.config.threshold
-        with console.stage(f"validation, {name}"):
-            result = validate(model, episodes, config, success, seed, name == fresh)
-            results[name] = {"name": name} | result | {"tried": count_episodes(episodes)}
-            video = directory / (PREVIEW if name == first else f"preview_{name}.mp4")
-            preview_video(video, model, episodes, config, seed)
-        if success is not None and threshold is not None and not keep_threshold:
+        result = validate(model, episodes, config, success, seed, name == roles.fresh)
+        results[name] = {"name": name} | result | {"tried": count_episodes(episodes)}
+        video = directory / (PREVIEW if name == first else f"preview_{name}.mp4")
+        preview_video(video, model, episodes, config, seed)
+        if success is not None and threshold is not None and not roles.keep_threshold:
             success.config.threshold = threshold
     checks = dict(results[first]["checks"])
     for name in others:
-        if name in trained_on:
+        if name in roles.trained_on:
             checks |= {f"{name}.{check}": held for check, held in results[name]["checks"].items()}
     passed = all(check["holds"] for check in checks.values())
     rest = {name: results[name] for name in others}
@@ -153,11 +158,10 @@ def evaluate(config: WorldModelEvalRun, directory: Path, console: Console) -> di
                 )
     # The threshold was chosen on what was held out of the last source: there, it is chosen in folds.
     fresh = next((names[r] for r, part in parts.items() if sources[-1:] == (part.source,)), None)
-    result = validate_datasets(
-        model, datasets, config.validation, success, directory, console,
-        trained_on=[names[section] for section, part in parts.items() if part.source is not None],
-        fresh=fresh, seed=config.seed,
-    )  # fmt: skip
+    trained_on = [names[section] for section, part in parts.items() if part.source is not None]
+    roles = DatasetRoles(trained_on=trained_on, fresh=fresh)
+    with console.stage("validation"):
+        result = validate_datasets(model, datasets, config.validation, success, directory, roles, config.seed)
     (directory / RESULT).write_text(json.dumps(result, indent=2) + "\n")
     return result
 
