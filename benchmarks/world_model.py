@@ -55,10 +55,10 @@ def bench_world_model(config: BenchWorldModelConfig) -> dict[str, Any]:
     import torch
 
     from accerl_lerobot.policies.loading import resolve_device
-    from accerl_lerobot.world_model.learning.learners import Learner, new_success_model
-    from accerl_lerobot.world_model.model.contract import WorldModelSpec, new_learnable
+    from accerl_lerobot.world_model.contract import WorldModelSpec, new_learnable
+    from accerl_lerobot.world_model.learners import Learner, new_success_model
+    from accerl_lerobot.world_model.rollout_eval import context_of
     from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import probabilities
-    from accerl_lerobot.world_model.validation.rollout_eval import context_of
 
     torch.set_num_threads(config.num_threads)
     torch.manual_seed(0)

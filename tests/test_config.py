@@ -13,7 +13,7 @@ import yaml
 
 from accerl_lerobot import cli
 from accerl_lerobot.algorithms import GIPOConfig, PPOConfig
-from accerl_lerobot.cli.configs import DemosRun, EvalRun, SFTRun
+from accerl_lerobot.cli.verbs import DemosRun, EvalRun, SFTRun
 from accerl_lerobot.config import parsing
 from accerl_lerobot.config.help import help_text
 from accerl_lerobot.config.ranges import Positive, Range, Share

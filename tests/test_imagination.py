@@ -39,10 +39,10 @@ from accerl_lerobot.world_model.config import (
     ValidationConfig,
     WorldModelConfig,
 )
-from accerl_lerobot.world_model.learning.learners import new_success_model
-from accerl_lerobot.world_model.learning.pretrain import world_spec
-from accerl_lerobot.world_model.model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.model.store import save_world_model
+from accerl_lerobot.world_model.learners import new_success_model
+from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.pretrain import world_spec
+from accerl_lerobot.world_model.store import save_world_model
 from tests.runs import drive, polls, tiny_run
 
 # About half of all episodes succeed when it is acted at random.

@@ -12,7 +12,7 @@ from accerl_lerobot.bench.host import Processors
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Progress
 from accerl_lerobot.policies.config import Load
-from accerl_lerobot.replay.turns import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
+from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
 
 SETTLE = 2
 """Updates after a change that are not counted, beside those that need nothing new."""

@@ -16,8 +16,7 @@ from typing import Annotated, Any, Literal
 
 from rich.table import Table
 
-from accerl_lerobot.bench.host import Memory, device_name, ranged, timed
-from accerl_lerobot.bench.tables import as_table
+from accerl_lerobot.bench.host import Memory, as_table, device_name, ranged, timed
 from accerl_lerobot.config.ranges import Device, Range, Repeats, Section
 from accerl_lerobot.policies.config import TuningConfig
 
@@ -137,13 +136,11 @@ def _adapter(config: BenchPolicyConfig, device: Any, directory: Path) -> Any:
     import torch
     from lerobot.policies.factory import get_policy_class
 
-    from accerl_lerobot.config.imports import imported
-    from accerl_lerobot.policies.adapter import LeRobotAdapter
-    from accerl_lerobot.policies.config import FlowSamplerConfig, ValueHeadConfig
+    from accerl_lerobot.config.parsing import imported
+    from accerl_lerobot.policies.adapter import LeRobotAdapter, ValueHead
+    from accerl_lerobot.policies.config import POLICIES, FlowSamplerConfig, ValueHeadConfig, steps_field
     from accerl_lerobot.policies.flow import FlowFamily
-    from accerl_lerobot.policies.registry import POLICIES, steps_field
-    from accerl_lerobot.policies.tuning import tune
-    from accerl_lerobot.policies.value_head import ValueHead
+    from accerl_lerobot.policies.saving import tune
 
     torch.manual_seed(0)
     settings = lerobot_config(config, directory)

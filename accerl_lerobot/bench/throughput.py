@@ -16,15 +16,13 @@ import numpy as np
 from rich.table import Table
 
 from accerl_lerobot.bench.blocks import ARMS, Block, Measured, as_rows
-from accerl_lerobot.bench.host import host, ranged, spread
-from accerl_lerobot.bench.tables import as_markdown, as_table, write
+from accerl_lerobot.bench.host import as_markdown, as_table, host, ranged, spread, write
 from accerl_lerobot.config.ranges import Positive, Repeats, Section
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.errors import InputError, expanded, make_folder
 from accerl_lerobot.evaluation.pictures import drawing
-from accerl_lerobot.replay.pacing import decisions_under_way
-from accerl_lerobot.replay.turns import Schedule
+from accerl_lerobot.replay.pacing import Schedule, decisions_under_way
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,12 +25,11 @@ from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.config import EvaluationConfig
+from accerl_lerobot.evaluation.stats import EvaluationConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.metrics import WandBConfig
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.replay.pacing import ReplayConfig
-from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
+from accerl_lerobot.replay.pacing import ASYNCHRONOUS, ReplayConfig, Schedule
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline import TIMELINE
 from accerl_lerobot.trainer.config import TrainerConfig

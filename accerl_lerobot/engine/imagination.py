@@ -15,25 +15,25 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.loading import load_lerobot_config
 from accerl_lerobot.world_model.config import VIDEOS, OnlineLearnConfig
+from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.data import fingerprint, load_episodes
-from accerl_lerobot.world_model.imagination.registry import (
+from accerl_lerobot.world_model.online import OnlineLearner, PretrainingEpisodes
+from accerl_lerobot.world_model.registry import (
     ImaginationModels,
     check_fit,
     learned_part,
     make_models,
 )
-from accerl_lerobot.world_model.imagination.rollouts import Imagination, RolloutSettings
-from accerl_lerobot.world_model.learning.online import OnlineLearner, PretrainingEpisodes
-from accerl_lerobot.world_model.model.contract import WorldModelSpec
-from accerl_lerobot.world_model.model.store import OWN_RUN, Source, find_source, load_sources
-from accerl_lerobot.world_model.validation.evaluate import (
+from accerl_lerobot.world_model.rollouts import Imagination, RolloutSettings
+from accerl_lerobot.world_model.store import OWN_RUN, Source, find_source, load_sources
+from accerl_lerobot.world_model.validation import (
     DATASET,
     ONLINE,
+    ValidationVideos,
     check_disjoint,
     name_section,
     open_datasets,
 )
-from accerl_lerobot.world_model.validation.validate import ValidationVideos
 
 EARLIER = "earlier"
 """`Episode.source` of the pre-training episodes."""

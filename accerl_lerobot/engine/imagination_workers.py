@@ -32,8 +32,8 @@ from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
-from accerl_lerobot.world_model.imagination.guard import IMAGINATION, WORLD_LEARNING
-from accerl_lerobot.world_model.learning.online import Promotion
+from accerl_lerobot.world_model.guard import IMAGINATION, WORLD_LEARNING
+from accerl_lerobot.world_model.online import Promotion
 
 if TYPE_CHECKING:
     from accerl_lerobot.engine.config import RunConfig

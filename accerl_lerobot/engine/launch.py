@@ -37,11 +37,11 @@ from accerl_lerobot.engine.replicas import START_S, InferenceReplicas, RolloutWo
 from accerl_lerobot.engine.supervisor import ActorHandle, end
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.policies.config import Load
-from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
+from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from accerl_lerobot.transport.endpoint import Endpoint, uses_shared_memory
-from accerl_lerobot.world_model.imagination.guard import IMAGINATION, WORLD_LEARNING
+from accerl_lerobot.world_model.guard import IMAGINATION, WORLD_LEARNING
 
 logger = logging.getLogger(__name__)
 
@@ -119,7 +119,7 @@ class RayEngine(Engine):
             self._learner.work = self._learner.actor.run.remote(imaginer.actor, self._replay.actor)
 
     def follow(self, schedule: Schedule) -> None:
-        """Change the schedule of collecting and learning, see `replay.turns`."""
+        """Change the schedule of collecting and learning, see `replay.pacing`."""
         if schedule == self._schedule:
             return
         in_turn = schedule != ASYNCHRONOUS

@@ -26,8 +26,7 @@ from accerl_lerobot.engine.placement import actor_options, alive_nodes
 from accerl_lerobot.engine.ray_session import NO_HUB_TOKEN
 from accerl_lerobot.engine.supervisor import ActorHandle, ReplicaSet, WorkerSlot
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.inference.batcher import BatcherStats
-from accerl_lerobot.inference.pool import dealt, merge_metrics, merge_stats
+from accerl_lerobot.inference.batcher import BatcherStats, dealt, merge_metrics, merge_stats
 from accerl_lerobot.metrics import numbered
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.rollout.plans import budgets, incarnation_after, whole_groups

@@ -5,7 +5,7 @@
                                                             └──────Family.score(latent) ──► log-prob
 
 A model knows LeRobot's internals and nothing of densities; a family knows densities and asks the model for
-what its `Encoded.context` offers, a velocity field for instance. `registry.POLICIES` says which go together.
+what its `Encoded.context` offers, a velocity field for instance. `config.POLICIES` says which go together.
 """
 
 from __future__ import annotations

@@ -25,10 +25,9 @@ import numpy as np
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import REAL, Segment
 from accerl_lerobot.fault_points import fault_point
+from accerl_lerobot.replay.buffer import MixedReplay
 from accerl_lerobot.replay.journal import EPISODES, Journal
-from accerl_lerobot.replay.mixed import MixedReplay
-from accerl_lerobot.replay.pacing import ReplayConfig
-from accerl_lerobot.replay.turns import Schedule, Turns
+from accerl_lerobot.replay.pacing import ReplayConfig, Schedule, Turns
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
 from accerl_lerobot.transport.contract import stopped
 from accerl_lerobot.transport.shared_memory import Address, serve_on_loop

@@ -31,8 +31,7 @@ from accerl_lerobot.trainer.config import TrainerConfig
 
 if TYPE_CHECKING:
     from accerl_lerobot.trainer.off_policy import OffPolicyUpdate
-    from accerl_lerobot.trainer.ranks import Ranks
-    from accerl_lerobot.trainer.rendezvous import Rendezvous
+    from accerl_lerobot.trainer.ranks import Ranks, Rendezvous
     from accerl_lerobot.trainer.update import Update
 
 LOAD_S = 600.0
@@ -48,14 +47,14 @@ class RankError(RuntimeError):
 
 
 class LearnerSettings(NamedTuple):
-    """What every rank is made of."""
+    """Inputs of every rank's `Learner`."""
 
     policy: PolicyConfig
     """The checkpoint to start from."""
     algorithm: AlgorithmConfig
     trainer: TrainerConfig
     seed: int
-    """Of torch's global generator."""
+    """Seed of torch's global generator."""
     state: Path | None = None
     """The ``training_state`` to resume from; None: begin."""
     load: Load | None = None
@@ -111,7 +110,7 @@ class TrainerRank:
     def join(self, rendezvous: Rendezvous) -> None:
         """Meets the others."""
         from accerl_lerobot.trainer import ranks
-        from accerl_lerobot.trainer.rendezvous import LOOPBACK, join, use_only
+        from accerl_lerobot.trainer.ranks import LOOPBACK, join, use_only
 
         config = self._config
         here = rendezvous.address == LOOPBACK
@@ -156,7 +155,7 @@ class Peers:
     def begin(self, learner: Learner) -> Update | OffPolicyUpdate:
         """Meets them, once they have loaded their policies."""
         from accerl_lerobot.trainer import ranks
-        from accerl_lerobot.trainer.rendezvous import LOOPBACK, create, use_only
+        from accerl_lerobot.trainer.ranks import LOOPBACK, create, use_only
 
         if not self._actors:
             return learner.begin(ranks.Ranks())

@@ -94,7 +94,7 @@ class LearnableModelConfig(Section, draccus.ChoiceRegistry, section="world_model
 class PixelModelConfig(LearnableModelConfig):
     """Our own world model of images and robot state."""
 
-    make = "accerl_lerobot.world_model.model.pixels:PixelWorldModel"
+    make = "accerl_lerobot.world_model.pixels:PixelWorldModel"
 
     context_noise: NonNegative = 0.02
     """Largest standard deviation of the noise on context and anchor in training, in units of [−1, 1].
@@ -245,7 +245,7 @@ class ModelKind:
     """Imagined rollouts that it must have at the same time, at least."""
 
 
-_REGISTRY = "accerl_lerobot.world_model.imagination.registry"
+_REGISTRY = "accerl_lerobot.world_model.registry"
 MODELS = {
     "learned": ModelKind(make=f"{_REGISTRY}:learned", what="the one in `path`.", learns=True),
     "shuffled": ModelKind(

@@ -12,8 +12,15 @@ import pytest
 from rich.console import Console
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.config import EvaluationConfig, evaluation_plans
-from accerl_lerobot.evaluation.stats import Rate, mean_interval, summarise, table, wilson_interval
+from accerl_lerobot.evaluation.stats import (
+    EvaluationConfig,
+    Rate,
+    evaluation_plans,
+    mean_interval,
+    summarise,
+    table,
+    wilson_interval,
+)
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seeds import DEMO_SEEDS, EVAL_SEEDS, TRAIN_SEEDS
 

@@ -129,7 +129,7 @@ def write_bins(
     from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
 
     from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
-    from accerl_lerobot.policies.registry import register_policies
+    from accerl_lerobot.policies.config import register_policies
 
     register_policies()
     sizes = BackboneConfig(

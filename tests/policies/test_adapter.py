@@ -10,9 +10,8 @@ import pytest
 import torch
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
+from accerl_lerobot.policies.adapter import LeRobotAdapter, ValueHead, stack_observations
 from accerl_lerobot.policies.config import ValueHeadConfig
-from accerl_lerobot.policies.value_head import ValueHead
 from tests.policies.checkpoints import write_act
 from tests.policies.tiny import TEXTS, adapter_at, requests
 from tests.rounding import assert_close

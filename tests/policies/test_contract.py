@@ -19,6 +19,7 @@ from torch import Tensor
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.adapter import LeRobotAdapter, Processing, stack_observations
 from accerl_lerobot.policies.config import (
+    POLICIES,
     FlowSamplerConfig,
     PolicyConfig,
     SamplerConfig,
@@ -26,7 +27,6 @@ from accerl_lerobot.policies.config import (
     ValueHeadConfig,
 )
 from accerl_lerobot.policies.family import Encoded
-from accerl_lerobot.policies.registry import POLICIES
 from accerl_lerobot.policies.saving import save_pretrained
 from tests.policies.cases import CASES, VARIANTS, Case
 from tests.policies.checkpoints import write_bins

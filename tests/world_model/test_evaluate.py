@@ -17,6 +17,7 @@ from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.engine.config import DatasetConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model import validation as evaluate
 from accerl_lerobot.world_model.config import (
     NetworkConfig,
     PixelModelConfig,
@@ -24,19 +25,18 @@ from accerl_lerobot.world_model.config import (
     WorldModelConfig,
 )
 from accerl_lerobot.world_model.data import fingerprint
-from accerl_lerobot.world_model.learning.learners import new_success_model
-from accerl_lerobot.world_model.learning.pretrain import world_spec
-from accerl_lerobot.world_model.model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.model.store import Source, save_world_model
-from accerl_lerobot.world_model.validation import evaluate
-from accerl_lerobot.world_model.validation.evaluate import (
+from accerl_lerobot.world_model.learners import new_success_model
+from accerl_lerobot.world_model.metrics import dataset_rows
+from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.pretrain import world_spec
+from accerl_lerobot.world_model.store import Source, save_world_model
+from accerl_lerobot.world_model.validation import (
     HELD_OUT,
     ONLINE,
     DatasetRoles,
     open_datasets,
     validate_datasets,
 )
-from accerl_lerobot.world_model.validation.tables import dataset_rows
 from tests.runs import replacing
 from tests.world_model.test_pretrain import moved
 

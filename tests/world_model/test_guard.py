@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from accerl_lerobot.world_model.imagination.guard import (
+from accerl_lerobot.world_model.guard import (
     KillSwitch,
 )
 

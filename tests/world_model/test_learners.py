@@ -13,7 +13,7 @@ import torch
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import LearnConfig, PixelModelConfig, SuccessLearnConfig
 from accerl_lerobot.world_model.data import Episode, Windows
-from accerl_lerobot.world_model.learning.learners import (
+from accerl_lerobot.world_model.learners import (
     HELD_OUT_SAMPLES,
     Examples,
     HeldOut,
@@ -23,8 +23,8 @@ from accerl_lerobot.world_model.learning.learners import (
     new_success_model,
     train_from_scratch,
 )
-from accerl_lerobot.world_model.model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.validation.metrics import skill, squared_errors
+from accerl_lerobot.world_model.metrics import skill, squared_errors
+from accerl_lerobot.world_model.pixels import PixelWorldModel
 from tests.world_model.test_pixels import NETWORK, SIZE, SPEC, K, awake, dots, model, rollout, windows
 from tests.world_model.test_validate import Deterministic, with_successes
 

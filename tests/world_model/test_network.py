@@ -9,7 +9,7 @@ from torch import Tensor
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import NetworkConfig
-from accerl_lerobot.world_model.model.pixels import Attention, FrameNetwork
+from accerl_lerobot.world_model.pixels import Attention, FrameNetwork
 from tests.rounding import assert_close
 
 SMALL = NetworkConfig(channels=(8, 12), condition=16, planes=4)

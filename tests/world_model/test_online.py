@@ -12,6 +12,7 @@ import torch
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import IMAGINED, Segment
+from accerl_lerobot.world_model import online
 from accerl_lerobot.world_model.config import (
     ImaginationConfig,
     NetworkConfig,
@@ -20,16 +21,15 @@ from accerl_lerobot.world_model.config import (
     ValidationConfig,
 )
 from accerl_lerobot.world_model.data import model_arrays
-from accerl_lerobot.world_model.learning import online
-from accerl_lerobot.world_model.learning.learners import new_success_model
-from accerl_lerobot.world_model.learning.online import (
+from accerl_lerobot.world_model.learners import new_success_model
+from accerl_lerobot.world_model.online import (
     OnlineLearner,
     PretrainingEpisodes,
     UnfinishedEpisodes,
     episode_from_segments,
     episode_weights,
 )
-from accerl_lerobot.world_model.model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.pixels import PixelWorldModel
 from tests.world_model.real_segments import SPEC, K, real_episode
 
 NETWORK = NetworkConfig(space_to_depth=2, channels=(8, 8), condition=8, planes=2)

@@ -11,18 +11,18 @@ import torch
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import LearnConfig, NetworkConfig, PixelModelConfig
+from accerl_lerobot.world_model.contract import Prediction, WorldModelSpec
 from accerl_lerobot.world_model.data import Episode, Windows, cut_windows, window_starts
-from accerl_lerobot.world_model.learning.learners import Learner, train_from_scratch
-from accerl_lerobot.world_model.model.contract import Prediction, WorldModelSpec
-from accerl_lerobot.world_model.model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.validation.metrics import (
+from accerl_lerobot.world_model.learners import Learner, train_from_scratch
+from accerl_lerobot.world_model.metrics import (
     mean_error,
     sensitivity,
     shuffle_across_groups,
     skill,
     squared_errors,
 )
-from accerl_lerobot.world_model.validation.rollout_eval import context_of
+from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.rollout_eval import context_of
 from tests.rounding import assert_close
 
 SIZE, K = 16, 2

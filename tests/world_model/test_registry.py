@@ -28,13 +28,7 @@ from accerl_lerobot.world_model.config import (
     NetworkConfig,
     PixelModelConfig,
 )
-from accerl_lerobot.world_model.data import model_arrays
-from accerl_lerobot.world_model.imagination.guard import worker_config
-from accerl_lerobot.world_model.imagination.registry import CopyModel, OracleModel, ShuffledModel, make_models
-from accerl_lerobot.world_model.imagination.rollouts import Imagination, RolloutSettings
-from accerl_lerobot.world_model.imagination.starts import Start, StartPool
-from accerl_lerobot.world_model.learning.learners import new_success_model
-from accerl_lerobot.world_model.model.contract import (
+from accerl_lerobot.world_model.contract import (
     ActionHistory,
     BuildInputs,
     Context,
@@ -42,8 +36,13 @@ from accerl_lerobot.world_model.model.contract import (
     State,
     WorldModel,
 )
-from accerl_lerobot.world_model.model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.model.store import save_world_model
+from accerl_lerobot.world_model.data import model_arrays
+from accerl_lerobot.world_model.guard import worker_config
+from accerl_lerobot.world_model.learners import new_success_model
+from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.registry import CopyModel, OracleModel, ShuffledModel, make_models
+from accerl_lerobot.world_model.rollouts import Imagination, RolloutSettings, Start, StartPool
+from accerl_lerobot.world_model.store import save_world_model
 from tests.test_imagination import imagining, run_locally
 from tests.world_model import real_segments as real
 from tests.world_model.real_segments import SPEC, WORLD, real_episode

@@ -16,17 +16,17 @@ from torch import Tensor
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Decision, Request, Segment
+from accerl_lerobot.world_model import rollouts
 from accerl_lerobot.world_model.config import GuardConfig, ImaginationConfig, OnlineLearnConfig
-from accerl_lerobot.world_model.imagination import rollouts
-from accerl_lerobot.world_model.imagination.registry import (
+from accerl_lerobot.world_model.contract import ActionHistory, Context, Prediction, State, WorldModel
+from accerl_lerobot.world_model.online import Promotion
+from accerl_lerobot.world_model.registry import (
     ImaginationModels,
     OracleModel,
     ShuffledModel,
     check_fit,
 )
-from accerl_lerobot.world_model.imagination.rollouts import Imagination, RolloutSettings
-from accerl_lerobot.world_model.learning.online import Promotion
-from accerl_lerobot.world_model.model.contract import ActionHistory, Context, Prediction, State, WorldModel
+from accerl_lerobot.world_model.rollouts import Imagination, RolloutSettings
 from tests.world_model.real_segments import SPEC, WORLD, K, decided, real_episode
 
 WORLD_SPEC = make_world(WORLD).spec

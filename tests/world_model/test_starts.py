@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from accerl_lerobot.world_model import rollouts as starts_module
 from accerl_lerobot.world_model.config import ImaginationConfig
+from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.data import model_arrays
-from accerl_lerobot.world_model.imagination import starts as starts_module
-from accerl_lerobot.world_model.imagination.starts import StartPool
-from accerl_lerobot.world_model.model.contract import WorldModelSpec
+from accerl_lerobot.world_model.rollouts import StartPool
 from tests.rounding import assert_close
 from tests.world_model.real_segments import SPEC, K, real_episode
 

@@ -19,7 +19,7 @@ import torch
 from torch import nn
 
 from accerl_lerobot import cli, console
-from accerl_lerobot.cli.configs import WorldModelEvalRun, WorldModelRun
+from accerl_lerobot.cli.verbs import WorldModelEvalRun, WorldModelRun
 from accerl_lerobot.config.parsing import encode
 from accerl_lerobot.engine.config import parse
 from accerl_lerobot.envs import SimulatedConfig
@@ -32,11 +32,11 @@ from accerl_lerobot.world_model.config import (
     PixelModelConfig,
     WorldModelConfig,
 )
-from accerl_lerobot.world_model.imagination.registry import make_models
-from accerl_lerobot.world_model.learning.learners import Learner, new_success_model
-from accerl_lerobot.world_model.learning.pretrain import world_spec
-from accerl_lerobot.world_model.model.contract import LearnableWorldModel, learnable_class, new_learnable
-from accerl_lerobot.world_model.model.store import load_world_model, save_world_model
+from accerl_lerobot.world_model.contract import LearnableWorldModel, learnable_class, new_learnable
+from accerl_lerobot.world_model.learners import Learner, new_success_model
+from accerl_lerobot.world_model.pretrain import world_spec
+from accerl_lerobot.world_model.registry import make_models
+from accerl_lerobot.world_model.store import load_world_model, save_world_model
 from benchmarks.ranking import BenchRankingConfig
 from tests.runs import drive, replacing
 from tests.test_imagination import LOOSE, decisions, imagining, run_locally
@@ -225,11 +225,11 @@ class BareConfig(LearnableModelConfig):
         (".mine:Model", "cannot be imported .*; use module:name"),
         ("no.such:Model", "cannot be imported .No module named 'no'"),
         (
-            "accerl_lerobot.world_model.imagination.registry:CopyModel",
+            "accerl_lerobot.world_model.registry:CopyModel",
             "CopyModel is no subclass of LearnableWorldModel",
         ),
         (
-            "accerl_lerobot.world_model.model.contract:LearnableWorldModel",
+            "accerl_lerobot.world_model.contract:LearnableWorldModel",
             "lacks begin, fit_statistics, loss, step",
         ),
     ],

@@ -21,17 +21,17 @@ import numpy as np
 
 from accerl_lerobot.experience import REAL, Segment
 from accerl_lerobot.world_model.config import ImaginationConfig, LearnConfig, SuccessLearnConfig
+from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModelSpec
 from accerl_lerobot.world_model.data import Episode, WindowStart, executed_actions, model_arrays
-from accerl_lerobot.world_model.learning.learners import Examples, Learner, SuccessLearner
-from accerl_lerobot.world_model.model.contract import LearnableWorldModel, WorldModelSpec
-from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
-from accerl_lerobot.world_model.validation.rollout_eval import (
+from accerl_lerobot.world_model.learners import Examples, Learner, SuccessLearner
+from accerl_lerobot.world_model.rollout_eval import (
     Scores,
     choose_threshold,
     concatenate,
     score_episodes,
 )
-from accerl_lerobot.world_model.validation.validate import fit_uncertainty_scale, validate
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+from accerl_lerobot.world_model.validation import fit_uncertainty_scale, validate
 
 BATCH, LEARNING_RATE = 16, 3e-4
 """Windows per gradient step, and the learning rate after the first steps."""

@@ -22,8 +22,7 @@ from torch.nn import functional
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig
-from accerl_lerobot.world_model.data import Windows
-from accerl_lerobot.world_model.model.contract import (
+from accerl_lerobot.world_model.contract import (
     ActionHistory,
     Context,
     LearnableWorldModel,
@@ -31,6 +30,7 @@ from accerl_lerobot.world_model.model.contract import (
     State,
     WorldModelSpec,
 )
+from accerl_lerobot.world_model.data import Windows
 
 COARSE = 8
 """Side of the coarse view that the state heads get."""

@@ -23,16 +23,16 @@ import torch
 from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
 from accerl_lerobot.world_model.config import LearnConfig, SuccessLearnConfig
+from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.data import Episode, Windows, WindowStart, cut_windows, window_starts
-from accerl_lerobot.world_model.model.contract import LearnableWorldModel, WorldModel, WorldModelSpec
+from accerl_lerobot.world_model.metrics import shuffle_across_groups
+from accerl_lerobot.world_model.rollout_eval import replay
 from accerl_lerobot.world_model.success_plugin import SuccessPairsConfig
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import (
     SuccessPairsRewardModel,
     as_floats,
     probabilities,
 )
-from accerl_lerobot.world_model.validation.metrics import shuffle_across_groups
-from accerl_lerobot.world_model.validation.rollout_eval import replay
 
 STATISTICS_WINDOWS = 2048
 """Windows from which normalisation statistics are taken."""

@@ -18,15 +18,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from accerl_lerobot.config.imports import imported
+from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK
 from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model.config import ImaginationConfig
-from accerl_lerobot.world_model.data import model_arrays
-from accerl_lerobot.world_model.model.contract import (
+from accerl_lerobot.world_model.contract import (
     ActionHistory,
     BuildInputs,
     Context,
@@ -36,7 +35,8 @@ from accerl_lerobot.world_model.model.contract import (
     WorldModel,
     WorldModelSpec,
 )
-from accerl_lerobot.world_model.model.store import load_world_model, rehearse_world_model
+from accerl_lerobot.world_model.data import model_arrays
+from accerl_lerobot.world_model.store import load_world_model, rehearse_world_model
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
 SECTION = "imagination"

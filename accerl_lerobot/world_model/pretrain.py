@@ -27,6 +27,12 @@ from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model.config import WorldModelConfig
+from accerl_lerobot.world_model.contract import (
+    LearnableWorldModel,
+    WorldModelSpec,
+    learnable_class,
+    new_learnable,
+)
 from accerl_lerobot.world_model.data import (
     Episode,
     count_episodes,
@@ -34,7 +40,7 @@ from accerl_lerobot.world_model.data import (
     load_episodes,
     split_episodes,
 )
-from accerl_lerobot.world_model.learning.learners import (
+from accerl_lerobot.world_model.learners import (
     Examples,
     HeldOut,
     SuccessLearner,
@@ -42,15 +48,9 @@ from accerl_lerobot.world_model.learning.learners import (
     new_success_model,
     train_from_scratch,
 )
-from accerl_lerobot.world_model.model.contract import (
-    LearnableWorldModel,
-    WorldModelSpec,
-    learnable_class,
-    new_learnable,
-)
-from accerl_lerobot.world_model.model.store import SUCCESS, Source, save_world_model
+from accerl_lerobot.world_model.store import SUCCESS, Source, save_world_model
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
-from accerl_lerobot.world_model.validation.evaluate import (
+from accerl_lerobot.world_model.validation import (
     DATASET,
     HELD_OUT,
     ONLINE,
@@ -58,14 +58,14 @@ from accerl_lerobot.world_model.validation.evaluate import (
     DatasetRoles,
     check_disjoint,
     dataset_sections,
+    fit_uncertainty_scale,
     name_section,
     open_datasets,
     validate_datasets,
 )
-from accerl_lerobot.world_model.validation.validate import fit_uncertainty_scale
 
 if TYPE_CHECKING:
-    from accerl_lerobot.cli.configs import WorldModelRun
+    from accerl_lerobot.cli.verbs import WorldModelRun
 
 LOG_EVERY = 20
 """Steps between two lines of training losses."""

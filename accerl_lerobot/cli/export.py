@@ -37,8 +37,7 @@ from accerl_lerobot.demos.writing import (
 )
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.envs import make_world
-from accerl_lerobot.envs.base import World
-from accerl_lerobot.envs.config import EnvConfig
+from accerl_lerobot.envs.base import EnvConfig, World
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.journal import EPISODES, Done, read_journal, whole_episodes
 
