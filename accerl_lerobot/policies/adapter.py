@@ -54,7 +54,7 @@ class ValueHead(nn.Module):
 
     def forward(self, features: Tensor, mask: Tensor) -> Tensor:
         """V (B,) from features (B, P, width) and mask (B, P) bool, True where a token is real."""
-        features = (features.detach() if self.config.detach else features).float()
+        features = features.detach().float()  # the critic does not shape the backbone
         scores = (features @ self.query) / features.shape[-1] ** 0.5
         weights = torch.softmax(scores.masked_fill(~mask, float("-inf")), -1)
         return self.out(torch.relu(self.hidden(self.norm(pooled(features, weights))))).float()[:, 0]

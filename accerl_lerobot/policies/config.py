@@ -74,24 +74,19 @@ class TokenSamplerConfig(SamplerConfig):
 class GaussianSamplerConfig(SamplerConfig):
     """Policies that predict one chunk, with a Gaussian around it; see `gaussian.py`.
 
-    A policy with a std of its own, gaussian_actor, reads only `deterministic_eval`.
+    A policy with a std of its own, gaussian_actor, reads none of these.
     """
 
     std: Annotated[float, Range("(0, 2]")] = 0.2
     """Std of every action at the start, in normalised units."""
     std_min: Positive = 0.05
-    """With `learn_std`: lower bound of the std, > 0 and below `std`."""
+    """Lower bound of the learned std, > 0 and below `std`."""
     std_max: Positive = 0.5
-    """With `learn_std`: upper bound of the std, above `std`."""
-    learn_std: bool = True
-    """True: the std is learned, per observation, row and action dim. False: it stays `std`."""
-    deterministic_eval: bool = False
-    """gaussian_actor: execute the mean when not exploring. False: sample, as LeRobot's policy does."""
+    """Upper bound of the learned std, above `std`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.learn_std:
-            _check_order(self, "std_min", "std", "std_max")
+        _check_order(self, "std_min", "std", "std_max")
 
 
 @SamplerConfig.register_subclass("diffusion")
@@ -120,10 +115,6 @@ class ValueHeadConfig(Section, section="policy.value_head"):
 
     hidden: Annotated[int, Range("[1, 65536]")] = 128
     """Width of the hidden layer."""
-    detach: bool = True
-    """True: the critic reads the backbone without shaping it (AcceRL). False lets its gradient in; measured
-    on a policy of 0.4 M parameters (MetaWorld door-open, 200 updates) that took success from 0.65 to 0.00,
-    against 0.98 when detached."""
 
 
 @dataclass(frozen=True, kw_only=True)

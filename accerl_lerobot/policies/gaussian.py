@@ -113,16 +113,15 @@ class GaussianFamily(Family):
         super().__init__()
         self.model, self.sampler = model, sampler
         self.std: StdHead | None = None
-        if sampler.learn_std and model.row_width is not None:
+        if model.row_width is not None:
             self.std = StdHead(model.row_width, model.action_dim, sampler)
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         mean, std = self._gaussian(encoded)
         (eps,) = standard_normal(requests, tuple(mean.shape[1:]), device=mean.device)
         explore = exploring(requests, mean.device)
-        noisy = explore
-        if encoded.context.std is not None and not self.sampler.deterministic_eval:
-            noisy = torch.ones_like(explore)
+        # A policy with a std of its own samples in LeRobot too.
+        noisy = explore if encoded.context.std is None else torch.ones_like(explore)
         u = torch.where(noisy[:, None, None], mean + std * eps, mean)
         return Action(
             chunk=self._action(u),
@@ -160,9 +159,7 @@ class GaussianFamily(Family):
         mean = context.mean[:, :executed]
         if context.std is not None:
             return mean, context.std[:, :executed]
-        if self.std is None:
-            return mean, torch.full_like(mean, self.sampler.std)
-        assert context.rows is not None
+        assert self.std is not None and context.rows is not None
         return mean, self.std(context.rows[:, :executed])
 
     def _action(self, u: Tensor) -> Tensor:
