@@ -20,9 +20,9 @@ from typing import Annotated, Any
 
 from rich.console import Group
 
-from accerl_lerobot.bench.blocks import ARMS, MOST_BUSY, Block, as_rows
 from accerl_lerobot.bench.host import as_markdown, as_table, floors, host, ranged, spread, write
 from accerl_lerobot.bench.latency import TRACE
+from accerl_lerobot.bench.throughput import ARMS, MOST_BUSY, Block, as_rows
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs.simulated import read_trace

@@ -14,8 +14,8 @@ from typing import Annotated, Any
 
 from rich.table import Table
 
-from accerl_lerobot.bench.blocks import MOST_BUSY
 from accerl_lerobot.bench.host import as_markdown, as_table, floors, host, ranged, spread, write
+from accerl_lerobot.bench.throughput import MOST_BUSY
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Repeats
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs.simulated import read_trace

@@ -193,7 +193,7 @@ POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
     "diffusion": ("accerl_lerobot.policies.diffusion:Diffusion", ("diffusion",)),
     "pi0": ("accerl_lerobot.policies.pi0:Pi0", ("flow",)),
     "pi05": ("accerl_lerobot.policies.pi0:Pi05", ("flow",)),
-    "pi0_fast": ("accerl_lerobot.policies.pi0_fast:Pi0Fast", ("tokens",)),
+    "pi0_fast": ("accerl_lerobot.policies.pi0:Pi0Fast", ("tokens",)),
     "smolvla_bins": ("accerl_lerobot.policies.smolvla:SmolVLABins", ("tokens",)),
 }
 """LeRobot policy type → its model, and the families that suit it, the default one first."""

@@ -22,9 +22,15 @@ from accerl_lerobot.config.ranges import NonNegative, Range, Section, Steps
 from accerl_lerobot.envs.base import ChunkResult, World
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Observation, Origin, Request, Segment
-from accerl_lerobot.rollout.groups import EpisodeOutcome, GroupAdvantage, GroupFilter, Groups, GroupSlot
+from accerl_lerobot.rollout.groups import (
+    EpisodeOutcome,
+    GroupAdvantage,
+    GroupFilter,
+    Groups,
+    GroupSlot,
+    TaskSampling,
+)
 from accerl_lerobot.rollout.segments import SegmentBuilder
-from accerl_lerobot.rollout.tasks import TaskSampling
 from accerl_lerobot.seeds import noise_seed
 
 _STATE = ("plan", "episode_return", "steps", "decisions", "versions", "frames", "chunks")
