@@ -62,14 +62,13 @@ def item_bytes(meta: Any) -> int:
 
 
 def _without_simulator(stock: Any) -> Any:
-    """LeRobot's function that makes the datasets, which then offer no simulator's state beside images."""
+    """LeRobot's function that makes datasets, without a simulator's state beside the images to train on."""
 
     def make(cfg: Any) -> tuple[Any, Any]:
-        made: tuple[Any, Any] = stock(cfg)
-        for dataset in made:
-            if dataset is not None and dataset.meta.camera_keys:
-                dataset.meta.features.pop(ENVIRONMENT_STATE, None)
-        return made
+        train, evaluation = stock(cfg)
+        if train.meta.camera_keys:
+            train.meta.features.pop(ENVIRONMENT_STATE, None)
+        return train, evaluation
 
     return make
 

@@ -271,7 +271,7 @@ class LeRobotAdapter(PolicyAdapter):
         self.teacher: Teacher | None = None
         """Acts in its place in part of the exploring episodes; given by `teacher.WithTeacher`."""
         self.demonstrations: DatasetConfig | None = None
-        """What off-policy learning remembers from the start; given by `demonstrations.WithDemonstrations`."""
+        """Remembered by off-policy learning from the start; given by `demonstrations.WithDemonstrations`."""
 
     def encode(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Encoded:
         """Reads raw observations, each (B, ...), and B instructions, for the family; differentiable."""

@@ -66,7 +66,9 @@ def like() -> Segment:
 
 def test_decisions_are_the_frames_from_every_step_on(dataset: DatasetConfig, like: Segment):
     data = LeRobotDataset("a/b", root=dataset.root)
-    ends = list(zip(data.meta.episodes["dataset_from_index"], data.meta.episodes["dataset_to_index"], strict=True))
+    ends = list(
+        zip(data.meta.episodes["dataset_from_index"], data.meta.episodes["dataset_to_index"], strict=True)
+    )
     episodes = [[data[i] for i in range(first, last)] for first, last in ends]
     read = list(demonstrations(dataset, like))
     expected = [(e, phase) for e in range(4) for phase in range(min(K, len(episodes[e])))]
