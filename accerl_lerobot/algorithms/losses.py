@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GIPO: a Gaussian trust weight on the log-ratio instead of a clip (arXiv 2603.03955, used by AcceRL,
+"""The objectives of an update: GIPO, importance sampling, SAPO, AWR, PPO and decoupled PPO.
+
+GIPO: a Gaussian trust weight on the log-ratio instead of a clip (arXiv 2603.03955, used by AcceRL,
 2603.18464).
 
     ρ = π(a|o) / μ(a|o)
