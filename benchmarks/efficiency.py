@@ -18,7 +18,7 @@ from typing import Annotated, Any
 
 from rich.table import Table
 
-from accerl_lerobot.bench.tables import as_markdown, write
+from accerl_lerobot.bench.host import as_markdown, write
 from accerl_lerobot.checkpoint.layout import DEMOS
 from accerl_lerobot.config.dataset import DatasetConfig
 from accerl_lerobot.config.ranges import Choice, Range, Seed

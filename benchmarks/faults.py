@@ -24,8 +24,7 @@ import numpy as np
 import yaml
 from rich.table import Table
 
-from accerl_lerobot.bench.host import host
-from accerl_lerobot.bench.tables import as_markdown, as_table, write
+from accerl_lerobot.bench.host import as_markdown, as_table, host, write
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.config.ranges import Range, Repeats, Section, Seed, Steps
 from accerl_lerobot.console import Console

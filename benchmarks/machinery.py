@@ -15,7 +15,7 @@ from typing import Annotated
 
 import numpy as np
 
-from accerl_lerobot.bench.blocks import Measured
+from accerl_lerobot.bench.throughput import Measured
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Section
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig

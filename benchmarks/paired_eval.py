@@ -21,11 +21,11 @@ from accerl_lerobot.envs.base import World
 from accerl_lerobot.experience import Observation, Request
 from accerl_lerobot.policies.adapter import PolicyAdapter
 from accerl_lerobot.seeds import noise_seed
+from accerl_lerobot.world_model.contract import Context
 from accerl_lerobot.world_model.data import model_arrays, policy_observation
-from accerl_lerobot.world_model.imagination.registry import ImaginationModels
-from accerl_lerobot.world_model.model.contract import Context
-from accerl_lerobot.world_model.model.external_reward_model import probabilities
-from accerl_lerobot.world_model.validation.metrics import Estimate, ranks
+from accerl_lerobot.world_model.metrics import Estimate, ranks
+from accerl_lerobot.world_model.registry import ImaginationModels
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import probabilities
 
 Start = tuple[str, int]
 """Task and seed of `World.reset`."""

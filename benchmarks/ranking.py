@@ -74,11 +74,11 @@ def bench_ranking(config: BenchRankingConfig) -> dict[str, Any]:
     import torch
 
     from accerl_lerobot.envs import make_world
-    from accerl_lerobot.evaluation.config import evaluation_plans
+    from accerl_lerobot.evaluation.stats import evaluation_plans
     from accerl_lerobot.policies.config import PolicyConfig
     from accerl_lerobot.policies.loading import load_adapter, rehearsed_config, resolve_device
-    from accerl_lerobot.world_model.imagination.registry import ImaginationModels, check_fit
-    from accerl_lerobot.world_model.model.store import load_world_model, rehearse_world_model
+    from accerl_lerobot.world_model.registry import ImaginationModels, check_fit
+    from accerl_lerobot.world_model.store import load_world_model, rehearse_world_model
     from benchmarks.paired_eval import agreement, even_threshold, rollout_imagined, rollout_real
 
     torch.set_num_threads(config.num_threads)

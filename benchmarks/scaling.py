@@ -16,15 +16,14 @@ from typing import Annotated, Any
 
 from rich.table import Table
 
-from accerl_lerobot.bench.blocks import MOST_BUSY, Block, as_rows
-from accerl_lerobot.bench.host import floors, host, ranged, spread
-from accerl_lerobot.bench.tables import as_markdown, as_table, write
+from accerl_lerobot.bench.host import as_markdown, as_table, floors, host, ranged, spread, write
+from accerl_lerobot.bench.throughput import MOST_BUSY, Block, as_rows
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Repeats
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs.simulated import read_trace
 from accerl_lerobot.errors import InputError, output_folder
 from accerl_lerobot.evaluation.pictures import drawing
-from accerl_lerobot.replay.turns import ASYNCHRONOUS
+from accerl_lerobot.replay.pacing import ASYNCHRONOUS
 from benchmarks.machinery import MachineryConfig
 
 

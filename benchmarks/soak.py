@@ -21,8 +21,7 @@ from typing import Annotated, Any
 import psutil
 from rich.console import Group
 
-from accerl_lerobot.bench.host import host, ranged, spread
-from accerl_lerobot.bench.tables import as_markdown, as_table, write
+from accerl_lerobot.bench.host import as_markdown, as_table, host, ranged, spread, write
 from accerl_lerobot.config.ranges import Positive, Range, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import InputError, check_absent, make_folder

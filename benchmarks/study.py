@@ -21,7 +21,7 @@ from typing import Annotated, Any, NamedTuple
 import yaml
 from rich.table import Table
 
-from accerl_lerobot.bench.tables import as_table
+from accerl_lerobot.bench.host import as_table
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, DEMOS, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.config.ranges import Range, Section, Seed, Steps
 from accerl_lerobot.console import Console

@@ -23,8 +23,7 @@ from rich.table import Table
 from accerl_lerobot.bench.host import host, spread
 from accerl_lerobot.config.ranges import Range, Repeats, Section
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.timeline.clock import Clock, NoClock
-from accerl_lerobot.timeline.states import COMPUTE, WAIT_IN
+from accerl_lerobot.timeline.clock import COMPUTE, WAIT_IN, Clock, NoClock
 
 ON, OFF, FLOOR = "on", "off", "floor"
 

@@ -23,8 +23,7 @@ from typing import Annotated, Any
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot.bench.host import host, ranged, spread
-from accerl_lerobot.bench.tables import as_markdown, as_table, write
+from accerl_lerobot.bench.host import as_markdown, as_table, host, ranged, spread, write
 from accerl_lerobot.config.ranges import Range, Repeats, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import ray_session

@@ -13,8 +13,7 @@ import ray
 
 from accerl_lerobot.engine.ray_session import check_private, start_ray
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.weights.buffer import Tensors
-from accerl_lerobot.weights.publisher import monotonic_clock
+from accerl_lerobot.weights.publisher import Tensors, monotonic_clock
 from accerl_lerobot.weights.shared_memory import Received, SharedMemoryReader
 
 _APART = "apart"

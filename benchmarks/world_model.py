@@ -17,7 +17,7 @@ from accerl_lerobot.bench.host import Memory, device_name, timed
 from accerl_lerobot.config.parsing import encode
 from accerl_lerobot.config.ranges import Device, Range, Repeats, Section, Threads
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.world_model.config import PIXELS, WorldModelConfig
+from accerl_lerobot.world_model.config import WorldModelConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,10 +55,10 @@ def bench_world_model(config: BenchWorldModelConfig) -> dict[str, Any]:
     import torch
 
     from accerl_lerobot.policies.loading import resolve_device
-    from accerl_lerobot.world_model.learning.learners import Learner, new_success_model
-    from accerl_lerobot.world_model.model.contract import WorldModelSpec, new_learnable
-    from accerl_lerobot.world_model.model.external_reward_model import probabilities
-    from accerl_lerobot.world_model.validation.rollout_eval import context_of
+    from accerl_lerobot.world_model.contract import WorldModelSpec, new_learnable
+    from accerl_lerobot.world_model.learners import Learner, new_success_model
+    from accerl_lerobot.world_model.rollout_eval import context_of
+    from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import probabilities
 
     torch.set_num_threads(config.num_threads)
     torch.manual_seed(0)
@@ -112,7 +112,7 @@ def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
     of, parameters, host = result["config"]["world_model"], result["parameters"], result["host"]
     shown = Table(
-        title=f"{_model_name(of['model'])}, {of['image_size']} px: "
+        title=f"{of['model']['type']}, {of['image_size']} px: "
         f"{parameters['world'] / 1e6:.1f} M parameters, on {host['device']}, {host['threads']} thread(s)"
     )
     for heading in ("what", "ms", "range", "chunks/s"):
@@ -132,13 +132,6 @@ def table(result: dict[str, Any]) -> Table:
     for stage, size in result["memory_gb"].items():
         shown.add_row(f"memory, {stage}", f"{size:.1f} GB", "", "")
     return shown
-
-
-def _model_name(model: dict[str, Any]) -> str:
-    """Objective and steps of our own class, the name of another."""
-    if model["type"] != PIXELS:
-        return str(model["type"])
-    return f"{model['objective']}, {model['steps']} step(s)"
 
 
 def _windows(spec: Any, count: int, chunks: int) -> Any:

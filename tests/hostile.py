@@ -113,9 +113,9 @@ def write_examples(scratch: Path) -> dict[str, Path]:
     from accerl_lerobot.policies.loading import load_adapter
     from accerl_lerobot.policies.saving import save_pretrained
     from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig
-    from accerl_lerobot.world_model.model.contract import WorldModelSpec
-    from accerl_lerobot.world_model.model.pixels import PixelWorldModel
-    from accerl_lerobot.world_model.model.store import Source, save_world_model
+    from accerl_lerobot.world_model.contract import WorldModelSpec
+    from accerl_lerobot.world_model.pixels import PixelWorldModel
+    from accerl_lerobot.world_model.store import Source, save_world_model
     from accerl_lerobot.world_model.success_plugin.configuration_success_pairs import SuccessPairsConfig
     from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
     from tests.policies.checkpoints import write_gaussian_actor
@@ -287,7 +287,7 @@ def loaders(trial: Trial, at: dict[str, Path], times: int) -> None:
     from accerl_lerobot.engine.config import DatasetConfig
     from accerl_lerobot.policies.config import PolicyConfig
     from accerl_lerobot.policies.loading import load_adapter, rehearsed_config
-    from accerl_lerobot.world_model.model.store import load_sources, load_world_model, rehearse_world_model
+    from accerl_lerobot.world_model.store import load_sources, load_world_model, rehearse_world_model
 
     isolation.CPU_S = CPU_S
     world, policy, dataset = at["world_model"], at["policy"], at["dataset"]

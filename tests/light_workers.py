@@ -20,7 +20,8 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.inference.batcher import BatcherStats
-from accerl_lerobot.rollout.worker import Report, RolloutWorker
+from accerl_lerobot.rollout.worker import Report, RolloutWorker, WorkerShare
+from accerl_lerobot.trainer.peers import LearnerSettings
 from accerl_lerobot.transport.shared_memory import Address, serve_on_loop
 
 
@@ -91,11 +92,9 @@ def _decision(request: Request, version: int) -> Decision:
 class FalteringRollout(RolloutWorker):
     """The first process in the first seat fails when it is to report for the third time."""
 
-    def __init__(
-        self, env: Any, config: Any, tasks: Any, seed: int, index: int, incarnation: int, *rest: Any
-    ) -> None:
-        super().__init__(env, config, tasks, seed, index, incarnation, *rest)
-        self._left = 2 if (index, incarnation) == (0, 0) else 1_000_000
+    def __init__(self, env: Any, config: Any, tasks: Any, seed: int, share: WorkerShare, *rest: Any) -> None:
+        super().__init__(env, config, tasks, seed, share, *rest)
+        self._left = 2 if (share.index, share.incarnation) == (0, 0) else 1_000_000
 
     def report(self, *arguments: Any) -> Report:
         self._left -= 1
@@ -107,12 +106,10 @@ class FalteringRollout(RolloutWorker):
 class LightTrainer:
     """Takes batches and learns nothing from them but what they were; breaks or idles on request."""
 
-    def __init__(
-        self, policy: Any, algorithm: Any, config: Any, seed: int, state: Path | None = None, *_: Any
-    ) -> None:
-        if policy.path == NO_WEIGHTS:
+    def __init__(self, settings: LearnerSettings, *_: Any) -> None:
+        if settings.policy.path == NO_WEIGHTS:
             raise FileNotFoundError("no weights there")
-        self._config = config
+        self._config, state = settings.trainer, settings.state
         self._records: list[dict[str, float]] = []
         self._lock = threading.Lock()
         self._failure: str | None = None

@@ -13,7 +13,7 @@ import yaml
 
 from accerl_lerobot import cli
 from accerl_lerobot.algorithms import GIPOConfig, PPOConfig
-from accerl_lerobot.cli.configs import DemosRun, EvalRun, SFTRun
+from accerl_lerobot.cli.verbs import DemosRun, EvalRun, SFTRun
 from accerl_lerobot.config import parsing
 from accerl_lerobot.config.help import help_text
 from accerl_lerobot.config.ranges import Positive, Range, Share
@@ -120,7 +120,7 @@ class TestOverrides:
 
 
 MISTAKES: list[tuple[list[str], str]] = [
-    (["--lr=3"], "lr=3: no such field; did you mean sft.lr or trainer.lr or imagination.learn.lr?"),
+    (["--lr=3"], "lr=3: no such field; did you mean sft.lr or trainer.lr?"),
     (["--trainer.lrr=3"], "trainer.lrr=3: no such field; did you mean trainer.lr?"),
     (["--wandb.zzz=1"], "wandb.zzz=1: no such field; wandb has enable, project, entity"),
     (["--trainer.lr=many"], "trainer.lr='many': use a number"),

@@ -19,7 +19,7 @@ from accerl_lerobot.checkpoint.layout import PRETRAINED
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Progress
 from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.evaluation.config import evaluation_plans
+from accerl_lerobot.evaluation.stats import evaluation_plans
 from accerl_lerobot.replay import ReplayConfig, lag_bound
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.timeline.read import ABSENT, read_timeline
@@ -78,7 +78,7 @@ def story(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> It
     engine = RayEngine(config, ("match",))
     try:
         pids = engine.pids()
-        engine.plan(evaluation_plans(("match",), 6, "before", film=1))
+        engine.plan(evaluation_plans(("match",), 6, "before", filmed=1))
         told.before = collect(engine, "before", 6)
         engine.train()
         planned = killed = lost = False

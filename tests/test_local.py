@@ -14,7 +14,7 @@ from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Engine, Progress
 from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.evaluation.config import evaluation_plans
+from accerl_lerobot.evaluation.stats import evaluation_plans
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
@@ -172,7 +172,7 @@ def test_without_learning_success_stays_where_it_was(tiny_checkpoint: Path):
 
 def test_planned_episodes_run_without_training_and_are_not_learned_from(tiny_checkpoint: Path):
     engine = LocalEngine(tiny_run(tiny_checkpoint), ("match",))
-    engine.plan(evaluation_plans(("match",), 9, "test", film=1))
+    engine.plan(evaluation_plans(("match",), 9, "test", filmed=1))
     results = collect(engine, "test", 9)
     progress = engine.poll()
     engine.close()

@@ -47,7 +47,7 @@ def run(
     ranks: int = 1,
     services: int = 1,
     rollouts: int = 2,
-    imaginers: int = 0,
+    imagining: bool = False,
     device: str = "auto",
     transport: Any = "auto",
     **placement: RoleConfig,
@@ -60,9 +60,7 @@ def run(
         trainer=TrainerConfig(updates=1, batch_decisions=16, ranks=ranks, sharding=sharding),
         inference=InferenceConfig(workers=services),
         rollout=RolloutConfig(workers=max(rollouts, services), worlds=1, segment_length=3),
-        imagination=ImaginationConfig(
-            share=0.5 if imaginers else 0.0, model="oracle", workers=max(1, imaginers)
-        ),
+        imagination=ImaginationConfig(share=0.5 if imagining else 0.0, model="oracle"),
         launch=LaunchConfig(address="auto", transport=transport, placement=PlacementConfig(**placement)),
     )
 
@@ -124,18 +122,18 @@ def test_parts_that_add_up_but_fit_on_no_single_gpu_are_refused():
 
 def test_each_role_goes_where_it_is_sent_and_shares_what_is_there():
     nodes = cluster((8, 2), (8, 1), (64, 0), (32, 0), n2="sim", n3="sim")
-    config = run(ranks=2, services=2, rollouts=6, imaginers=2, imagination=at("1"), rollout=at("sim"))
+    config = run(ranks=2, services=2, rollouts=6, imagining=True, imagination=at("1"), rollout=at("sim"))
     plan = plan_workers(nodes, config)
     found = where(plan)
     assert [found[name] for name in ("trainer", "trainer rank 1")] == [(0, 0.6)] * 2
     assert [found[f"inference {i}"] for i in range(2)] == [(0, 0.4)] * 2
-    assert [found[f"imagination {i}"] for i in range(2)] == [(1, 0.5)] * 2
+    assert found["imagination"] == (1, 1.0)
     assert rollouts_by_node(plan) == {2: 4, 3: 2}  # as their cores
     assert found["replay"] == (0, 0.0)
     assert list(plan.rows()) == [
         "node 0 (10.0.0.1), 8 CPUs, 2 GPUs: trainer × 0.6 GPU, trainer rank × 0.6 GPU, "
         "2 inference × 0.4 GPU, replay",
-        "node 1 (10.0.0.2), 8 CPUs, 1 GPUs: 2 imagination × 0.5 GPU",
+        "node 1 (10.0.0.2), 8 CPUs, 1 GPUs: imagination × 1 GPU",
         "node 2 (10.0.0.3), 64 CPUs, 0 GPUs: 4 rollout",
         "node 3 (10.0.0.4), 32 CPUs, 0 GPUs: 2 rollout",
     ]

@@ -23,17 +23,15 @@ from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engine.config import RoleConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.hub.artifact_types import PullConfig
+from accerl_lerobot.hub.card import PullConfig
 from accerl_lerobot.policies.config import (
-    FlowSamplerConfig,
     GaussianSamplerConfig,
-    NoiseSpaceSamplerConfig,
     TuningConfig,
 )
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.timeline.show import TimelineConfig
-from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, WorldModelConfig
+from accerl_lerobot.timeline.read import TimelineConfig
+from accerl_lerobot.world_model.config import NetworkConfig, WorldModelConfig
 from benchmarks.__main__ import CONFIGS as BENCHMARKS
 from benchmarks.async_vs_sync import BenchAsyncVsSyncConfig
 from benchmarks.batching import BenchBatchingConfig
@@ -117,16 +115,10 @@ RULES = [
     (BenchScalingConfig, {"counts": (2, 2)}, "counts="),
     (BenchTransportConfig, {"sizes": ("1 GB",)}, "sizes="),
     (DemosConfig, {"repo_id": "plain"}, "demos.repo_id="),
-    (FlowSamplerConfig, {"noise": "learned", "noise_level": 0.05}, "policy.sampler.noise_min=0.08: use"),
-    (FlowSamplerConfig, {"noise": "learned", "noise_level": 0.5}, "policy.sampler.noise_max=0.4: use"),
     (GaussianSamplerConfig, {"std_min": 0.2}, "policy.sampler.std_min="),
     (GaussianSamplerConfig, {"std_max": 0.2}, "policy.sampler.std_max="),
     (MachineryConfig, {"segment_length": 5}, "segment_length="),
     (NetworkConfig, {"channels": ()}, "world_model.model.network.channels="),
-    (NoiseSpaceSamplerConfig, {"std_min": 1.0}, "policy.sampler.std_min="),
-    (NoiseSpaceSamplerConfig, {"std_max": 1.0}, "policy.sampler.std_max="),
-    (PixelModelConfig, {"refine_levels": (0.05, 0.2)}, "world_model.model.refine_levels="),
-    (PixelModelConfig, {"sigma_max": 0.001}, "world_model.model.sigma_max="),
     (ReplayConfig, {"min_decisions": 5000}, "replay.min_decisions="),
     (ReplayConfig, {"ahead": 5000}, "replay.ahead="),
     (RoleConfig, {"nodes": " "}, "launch.placement.nodes=' ': name a node"),
@@ -143,11 +135,6 @@ def test_values_that_do_not_go_together_name_their_field(cls: type[Any], values:
     with pytest.raises(InputError) as error:
         cls(**values)
     assert str(error.value).startswith(said)
-
-
-@pytest.mark.parametrize("values", [{"std_min": 0.2}, {"std_max": 0.2}])
-def test_bounds_of_a_std_that_is_not_learnt_do_not_matter(values: dict[str, Any]):
-    GaussianSamplerConfig(**values, learn_std=False)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.algorithms import ChunkCriticConfig, GIPOConfig, SelfImitationConfig
-from accerl_lerobot.algorithms.ppo import DecoupledConfig
+from accerl_lerobot.algorithms.losses import DecoupledConfig
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Progress
@@ -19,7 +19,7 @@ from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.engine.run import make_engine
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.config import evaluation_plans
+from accerl_lerobot.evaluation.stats import evaluation_plans
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig

@@ -32,7 +32,7 @@ from accerl_lerobot.engine.config import LaunchConfig, PlacementConfig, RoleConf
 from accerl_lerobot.engine.launch import RayEngine  # noqa: E402
 from accerl_lerobot.envs import SimulatedConfig  # noqa: E402
 from accerl_lerobot.errors import InputError  # noqa: E402
-from accerl_lerobot.evaluation.config import evaluation_plans  # noqa: E402
+from accerl_lerobot.evaluation.stats import evaluation_plans  # noqa: E402
 from accerl_lerobot.inference import worker as inference_worker  # noqa: E402
 from accerl_lerobot.rollout.runner import RolloutConfig  # noqa: E402
 from accerl_lerobot.trainer import worker as trainer_worker  # noqa: E402

@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from accerl_lerobot.algorithms.awr import AWRConfig, awr_loss
 from accerl_lerobot.algorithms.chunk_critic import ChunkCriticConfig
 from accerl_lerobot.algorithms.contract import (
     AlgorithmConfig,
@@ -28,10 +27,21 @@ from accerl_lerobot.algorithms.contract import (
     RatioConfig,
     check_level,
 )
-from accerl_lerobot.algorithms.gipo import GIPOConfig, ImportanceConfig, gipo_loss, importance_loss
+from accerl_lerobot.algorithms.losses import (
+    AWRConfig,
+    DecoupledConfig,
+    GIPOConfig,
+    ImportanceConfig,
+    PPOConfig,
+    SAPOConfig,
+    awr_loss,
+    decoupled_loss,
+    gipo_loss,
+    importance_loss,
+    ppo_loss,
+    sapo_loss,
+)
 from accerl_lerobot.algorithms.objective import LossOutput
-from accerl_lerobot.algorithms.ppo import DecoupledConfig, PPOConfig, decoupled_loss, ppo_loss
-from accerl_lerobot.algorithms.sapo import SAPOConfig, sapo_loss
 from accerl_lerobot.algorithms.self_imitation import SelfImitationConfig
 
 ALGORITHMS: dict[str, Callable[[LossInputs, Any], LossOutput]] = {

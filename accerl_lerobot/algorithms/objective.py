@@ -8,7 +8,7 @@ L = L_policy + value_coef · mean value error + kl_coef · KL(μ‖π) + referen
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from accerl_lerobot.algorithms.contract import Level, LossInputs, RatioConfig
 from accerl_lerobot.algorithms.diagnostics import Samples
@@ -24,9 +24,20 @@ from accerl_lerobot.algorithms.ratio import (
 if TYPE_CHECKING:
     from torch import Tensor
 
-USUAL_CLIP = (0.2, 0.2)
-"""Clip range of the reported clip fraction for an algorithm that clips nothing, so that runs can be
-compared."""
+
+class Clip(NamedTuple):
+    """Range of the reported clip fraction, which counts ratios outside [1 − low, 1 + high].
+
+    The default is for algorithms that clip nothing, so that runs can be compared.
+    """
+
+    low: float = 0.2
+    high: float = 0.2
+    log_ratio: Tensor | None = None
+    """(N, F), log of the ratios that are clipped; None: log π/μ."""
+
+
+USUAL_CLIP = Clip()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,8 +83,7 @@ def assemble(
     policy_loss: Tensor,
     log_ratio: Tensor,
     weight: Tensor,
-    clip: tuple[float, float] = USUAL_CLIP,
-    clipped: Tensor | None = None,
+    clip: Clip = USUAL_CLIP,
     grad_weight: Tensor | None = None,
 ) -> LossOutput:
     """Adds the shared terms to a policy loss and measures the batch.
@@ -84,8 +94,6 @@ def assemble(
         policy_loss: (), with gradient.
         log_ratio: (N, F), log π/μ with gradient, from `ratio.at_level`.
         weight: (N, F), how much of each sample's gradient the algorithm keeps, ω.
-        clip: (low, high), the clip fraction counts ratios outside [1 − low, 1 + high].
-        clipped: (N, F), log of the ratios that are clipped; None: `log_ratio`.
         grad_weight: (N, F), factor of Â∇log π in the gradient; None: ω·ρ.
     """
     value_loss, mean_entropy = inputs.value_error.mean(), inputs.entropy.mean()
@@ -107,11 +115,11 @@ def assemble(
         log_ratio=log_ratio.detach(),
         weight=weight.detach(),
         grad_weight=(weight * ratio(log_ratio) if grad_weight is None else grad_weight).detach(),
-        clipped=(log_ratio if clipped is None else clipped).detach(),
+        clipped=(log_ratio if clip.log_ratio is None else clip.log_ratio).detach(),
         keep=log_ratio.new_ones(log_ratio.shape).bool() if keep is None else keep,
         value=inputs.value.detach(),
         returns=inputs.returns.detach(),
-        clip=clip,
+        clip=(clip.low, clip.high),
     )
     return LossOutput(loss=loss, means={k: v.detach() for k, v in means.items()}, samples=samples)
 

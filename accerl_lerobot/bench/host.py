@@ -1,19 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The machine of a measurement: its parts, how busy it was, its floors; and timing and memory of models."""
+"""The machine of a measurement: its parts, how busy it was, its floors; and timing and memory of models.
+
+Tables of measurements, for people and for the docs, and the files they are kept in.
+"""
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import resource
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import psutil
+from rich.table import Table
 
 PACKAGES = ("accerl-lerobot", "lerobot", "torch", "ray", "numpy")
 MEMCPY_BYTES = 64 << 20
@@ -118,3 +124,33 @@ def device_name(device: Any) -> str:
     import torch
 
     return torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
+
+
+def as_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    """Rows for people."""
+    shown = Table(title=title)
+    for column in columns:
+        shown.add_column(column)
+    for row in rows:
+        shown.add_row(*row)
+    return shown
+
+
+def as_markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Rows for the docs."""
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def write(
+    root: Path,
+    name: str,
+    result: dict[str, Any],
+    markdown: str,
+    draw: Callable[[Path, dict[str, Any]], object] | None = None,
+) -> None:
+    """Into a folder that is there: the numbers, the table and the picture, if any, under one name."""
+    (root / f"{name}.json").write_text(json.dumps(result, indent=2) + "\n")
+    (root / f"{name}.md").write_text(markdown)
+    if draw is not None:
+        draw(root / f"{name}.png", result)

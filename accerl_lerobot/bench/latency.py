@@ -18,8 +18,7 @@ from typing import Annotated, Any
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot.bench.host import host
-from accerl_lerobot.bench.tables import as_markdown, as_table, write
+from accerl_lerobot.bench.host import as_markdown, as_table, host, write
 from accerl_lerobot.config.ranges import Range, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, World, make_world

@@ -16,8 +16,7 @@ from typing import Annotated, Any, Literal
 
 from rich.table import Table
 
-from accerl_lerobot.bench.host import Memory, device_name, ranged, timed
-from accerl_lerobot.bench.tables import as_table
+from accerl_lerobot.bench.host import Memory, as_table, device_name, ranged, timed
 from accerl_lerobot.config.ranges import Device, Range, Repeats, Section
 from accerl_lerobot.policies.config import TuningConfig
 
@@ -38,7 +37,7 @@ class BenchPolicyConfig(Section):
     """Decisions made together, and learned from together."""
     num_steps: Annotated[int, Range("[1, 10000]")] | None = None
     """Denoising steps; None: the published 10."""
-    stochastic: Literal["last", "all", "one"] = "last"
+    stochastic: Literal["last", "all"] = "last"
     """Which denoising steps are random; see ``policy.sampler.stochastic``."""
     precision: Literal["fp32", "bf16"] = "fp32"
     """fp32 or bf16; see ``policy.precision``."""
@@ -137,13 +136,11 @@ def _adapter(config: BenchPolicyConfig, device: Any, directory: Path) -> Any:
     import torch
     from lerobot.policies.factory import get_policy_class
 
-    from accerl_lerobot.config.imports import imported
-    from accerl_lerobot.policies.adapter import LeRobotAdapter
-    from accerl_lerobot.policies.config import FlowSamplerConfig, ValueHeadConfig
+    from accerl_lerobot.config.parsing import imported
+    from accerl_lerobot.policies.adapter import LeRobotAdapter, ValueHead
+    from accerl_lerobot.policies.config import POLICIES, FlowSamplerConfig, ValueHeadConfig, steps_field
     from accerl_lerobot.policies.flow import FlowFamily
-    from accerl_lerobot.policies.registry import POLICIES, steps_field
-    from accerl_lerobot.policies.tuning import tune
-    from accerl_lerobot.policies.value_head import ValueHead
+    from accerl_lerobot.policies.saving import tune
 
     torch.manual_seed(0)
     settings = lerobot_config(config, directory)
@@ -156,7 +153,7 @@ def _adapter(config: BenchPolicyConfig, device: Any, directory: Path) -> Any:
     inputs: Any = _RandomInputs(config, device)
     critic = ValueHead(model.width, ValueHeadConfig())
     adapter = LeRobotAdapter(policy, inputs, model, family, critic, config.precision)
-    tune(policy, model, family, config.tuning)
+    tune(policy, model, config.tuning)
     return adapter
 
 

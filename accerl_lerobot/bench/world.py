@@ -19,12 +19,10 @@ from typing import Annotated, Any
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot.bench.host import host, ranged, spread
-from accerl_lerobot.bench.tables import as_table
+from accerl_lerobot.bench.host import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Section
 from accerl_lerobot.demos.writing import simulators
-from accerl_lerobot.envs.gl import import_mujoco
-from accerl_lerobot.envs.metaworld import ACTION_DIM, MetaWorld, MetaWorldConfig
+from accerl_lerobot.envs.metaworld import ACTION_DIM, MetaWorld, MetaWorldConfig, import_mujoco
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import train_seed
 

@@ -113,7 +113,7 @@ def exit_code(program: str, work: Callable[[], int]) -> int:
 
 def run(verb: str, rest: list[str]) -> int:
     """Runs a verb, or shows its help."""
-    from accerl_lerobot.config.imports import imported
+    from accerl_lerobot.config.parsing import imported
 
     set_up_logging()
     if (section := help_asked(rest)) is not None:

@@ -45,7 +45,7 @@ RENDER_TIMEOUT_S = 120
 
 DRAW = """
 import time
-from accerl_lerobot.envs.gl import import_mujoco, new_renderer
+from accerl_lerobot.envs.metaworld import import_mujoco, new_renderer
 mujoco = import_mujoco()
 model = mujoco.MjModel.from_xml_string(
     "<mujoco><worldbody><light pos='0 0 3'/><geom size='.3' rgba='1 0 0 1'/></worldbody></mujoco>"
@@ -195,7 +195,7 @@ def cuda(config: RunConfig | None) -> Check:
 
 def rendering(*, needed: bool, script: str = DRAW) -> Check:
     """Draws a frame in a process of its own; if it is not `needed`, a failure is only a warning."""
-    from accerl_lerobot.envs.gl import choose_backend
+    from accerl_lerobot.envs.metaworld import choose_backend
 
     bad = FAIL if needed else WARN
     if importlib.util.find_spec("mujoco") is None:
@@ -351,7 +351,7 @@ def _resolve(arguments: list[str]) -> tuple[RunConfig | None, int, list[Check]]:
 def pulled(arguments: list[str]) -> Iterator[Check]:
     """The fields that `pull` has dropped from the recipe."""
     from accerl_lerobot.config.parsing import read_arguments
-    from accerl_lerobot.hub.artifact_types import RECORD, read_json
+    from accerl_lerobot.hub.card import RECORD, read_json
 
     with contextlib.suppress(InputError):
         recipe = read_arguments(arguments)[0]

@@ -3,6 +3,8 @@
 
 Results go to the standard output, everything else to the standard error: LeRobot prints while it loads, and
 results should stay readable for programs.
+
+Fields of the verbs' command lines, where they are not a whole run's.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from contextlib import redirect_stdout
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,24 +26,119 @@ from accerl_lerobot.bench.policy import BenchPolicyConfig
 from accerl_lerobot.bench.throughput import BenchThroughputConfig
 from accerl_lerobot.bench.world import BenchWorldConfig
 from accerl_lerobot.checkpoint.layout import CONFIG
-from accerl_lerobot.cli.configs import DemosRun, EvalRun, SFTRun, WorldModelEvalRun, WorldModelRun
+from accerl_lerobot.cli.export import ExportConfig
 from accerl_lerobot.config.parsing import read_arguments
+from accerl_lerobot.config.ranges import Device, Section, Seed
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine.config import RunConfig, encode, parse
-from accerl_lerobot.errors import (
-    InputError,
-    check_absent,
-    expanded,
-    is_full,
-    kept_traceback,
-    make_folder,
-)
-from accerl_lerobot.export.episodes import ExportConfig
-from accerl_lerobot.hub.artifact_types import PullConfig, PushConfig
-from accerl_lerobot.policies.config import Load
+from accerl_lerobot.demos.record import DemosConfig
+from accerl_lerobot.demos.sft import SFTConfig
+from accerl_lerobot.engine.config import DatasetConfig, LaunchConfig, RunConfig, check_chunk, encode, parse
+from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
+from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, make_folder
+from accerl_lerobot.evaluation.stats import EvaluationConfig
+from accerl_lerobot.hub.card import PullConfig, PushConfig
+from accerl_lerobot.inference.worker import InferenceConfig
+from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.report import ReportConfig, write_report
-from accerl_lerobot.rollout.runner import EpisodeResult
-from accerl_lerobot.timeline.show import TimelineConfig, show_timelines, timeline_table
+from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
+from accerl_lerobot.timeline.read import TimelineConfig, show_timelines, timeline_table
+from accerl_lerobot.world_model.config import ValidationConfig, WorldModelConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemosRun(Section):
+    """``accerl demos``: scripted experts, recorded."""
+
+    env: EnvConfig = field(default_factory=MetaWorldConfig)
+    demos: DemosConfig = field(default_factory=DemosConfig)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SFTRun(Section):
+    """``accerl sft``: LeRobot's own trainer on a LeRobotDataset."""
+
+    seed: Seed = 0
+    output_dir: str | None = None
+    """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
+    job_name: str = "sft"
+    """Last part of the folder's name."""
+    device: Device = "auto"
+    """cpu, cuda, or auto."""
+    env: EnvConfig | None = None
+    """When given, the dataset is checked against it first."""
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    sft: SFTConfig = field(default_factory=SFTConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.sft.init_path is None:
+            check_chunk(self.sft.policy)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalRun(Section):
+    """``accerl eval``: a checkpoint on seeds that no run trains on."""
+
+    seed: Seed = 0
+    """Selects the initial states: those of a run with this seed, or others, on which nothing was tuned."""
+    output_dir: str | None = None
+    """Folder for ``evaluation.json`` and videos; None prints only."""
+    env: EnvConfig = field(default_factory=MetaWorldConfig)
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    rollout: RolloutConfig = field(default_factory=RolloutConfig)
+    inference: InferenceConfig = field(default_factory=InferenceConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    launch: LaunchConfig = field(default_factory=LaunchConfig)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldModelRun(Section):
+    """``accerl world-model``: a world model, and a success model, from one or two LeRobotDatasets."""
+
+    seed: Seed = 0
+    output_dir: str | None = None
+    """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
+    job_name: str = "world_model"
+    """Last part of the folder's name."""
+    device: Device = "auto"
+    """cpu, cuda, or auto: where both networks are trained and validated."""
+    env: EnvConfig = field(default_factory=MetaWorldConfig)
+    """Environment to model: its cameras, sizes, rate and tasks."""
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    """Demonstrations, some of which fail."""
+    online: DatasetConfig = field(default_factory=DatasetConfig)
+    """Episodes of a policy, as ``accerl export`` writes them, to train on as well; none without a name. No
+    demonstration shows how a policy fails."""
+    world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldModelEvalRun(Section):
+    """``accerl world-model-eval``: a saved world model on one or two LeRobotDatasets."""
+
+    path: str | None = None
+    """The folder named world_model that ``accerl world-model`` wrote."""
+    discover_packages_path: str | None = None
+    """Package to import that registers the type of the world model, where that is not one of ours."""
+    seed: Seed = 0
+    """Seed of the choice of windows."""
+    output_dir: str | None = None
+    """Folder to create. None: ``outputs/<date>/<time>_<job_name>``."""
+    job_name: str = "world_model_eval"
+    """Last part of the folder's name."""
+    device: Device = "auto"
+    """cpu, cuda, or auto: where the world model and the success model run."""
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    """Episodes it was not trained on; of its own dataset, those that were held out."""
+    online: DatasetConfig = field(default_factory=DatasetConfig)
+    """Likewise, episodes of a policy as ``accerl export`` writes them; none without a name."""
+    validation: ValidationConfig = field(default_factory=ValidationConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.path is None:
+            raise InputError("path", None, "name the folder world_model of an accerl world-model run")
+
 
 NO_DATASET = "name a LeRobotDataset, on the Hub or with dataset.root"
 
@@ -160,13 +258,12 @@ def evaluate(arguments: list[str]) -> int:
     from accerl_lerobot.engine import run
     from accerl_lerobot.engine.loop import run_plans
     from accerl_lerobot.engine.preflight import check_machine
-    from accerl_lerobot.evaluation.config import evaluation_plans
-    from accerl_lerobot.evaluation.stats import summarise, table
+    from accerl_lerobot.evaluation.stats import evaluation_plans, summarise, table
 
     sections = ("seed", "env", "policy", "rollout", "inference", "evaluation", "launch")
     whole = RunConfig(**{name: getattr(config, name) for name in sections})
     check_machine(whole)
-    film = config.evaluation.videos if out else 0
+    filmed = config.evaluation.videos if out else 0
     console = Console()
     with redirect_stdout(sys.stderr):
         spec = run.check_world(whole.env)
@@ -174,7 +271,8 @@ def evaluate(arguments: list[str]) -> int:
         engine = run.make_engine(whole, tasks, history)
         try:
             episodes = config.evaluation.episodes
-            engine.plan(evaluation_plans(tasks, episodes, "eval", seed=config.seed, film=film))
+            film = config.evaluation.film
+            engine.plan(evaluation_plans(tasks, episodes, "eval", seed=config.seed, filmed=filmed, film=film))
             results = run_plans(engine, config.evaluation.episodes, "eval", console)
         finally:
             engine.close()
@@ -192,7 +290,7 @@ def world_model(arguments: list[str]) -> int:
     config: WorldModelRun = parse(WorldModelRun, arguments, recipe_class=RunConfig)
     if config.dataset.repo_id is None:
         raise InputError("dataset.repo_id", None, NO_DATASET)
-    from accerl_lerobot.world_model.learning.pretrain import pretrain
+    from accerl_lerobot.world_model.pretrain import pretrain
 
     return _validated(config, lambda directory, console: pretrain(config, directory, console))
 
@@ -200,7 +298,7 @@ def world_model(arguments: list[str]) -> int:
 def world_model_eval(arguments: list[str]) -> int:
     """``accerl world-model-eval``; 1 if it fails validation."""
     config: WorldModelEvalRun = parse(WorldModelEvalRun, arguments, recipe_class=RunConfig)
-    from accerl_lerobot.world_model.validation.evaluate import evaluate
+    from accerl_lerobot.world_model.validation import evaluate
 
     return _validated(config, lambda directory, console: evaluate(config, directory, console))
 
@@ -210,7 +308,7 @@ def _validated(
 ) -> int:
     """Does the work in a new folder and shows the validation that it ends with."""
     from accerl_lerobot.engine.run import make_output_dir
-    from accerl_lerobot.world_model.validation.tables import (
+    from accerl_lerobot.world_model.metrics import (
         check_lines,
         datasets_table,
         depth_table,
@@ -284,7 +382,7 @@ def timeline(arguments: list[str]) -> int:
 def export(arguments: list[str]) -> int:
     """``accerl export``."""
     config: ExportConfig = parse(ExportConfig, arguments)
-    from accerl_lerobot.export.episodes import export_episodes
+    from accerl_lerobot.cli.export import export_episodes
 
     console = Console()
     with redirect_stdout(sys.stderr):

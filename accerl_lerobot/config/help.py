@@ -9,6 +9,7 @@ import inspect
 import sys
 import textwrap
 import typing
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import yaml
@@ -142,31 +143,70 @@ def docstrings(cls: type[Any]) -> dict[str, str]:
     return found
 
 
-def _fields(cls: type[Any], prefix: str, usual: Any = None) -> list[str]:
-    """Lines of its fields with their defaults: those of `usual`, which is one of it, or its own."""
-    hints, docs = hints_of(cls), docstrings(cls)
+def _fields(cls: type[Any], prefix: str, usual: Any = None, without: Collection[str] = ()) -> list[str]:
+    """Lines of its fields with their defaults: those of `usual`, which is one of it, or its own.
+
+    Sections of one class and equal defaults beside each other are listed once, as are the fields that types
+    of a choice have in common.
+    """
+    hints = hints_of(cls)
     lines: list[str] = []
     sections: list[str] = []
-    for field in dataclasses.fields(cls):
+    listed: list[str] = []
+    fields = [field for field in dataclasses.fields(cls) if field.name not in without]
+    for field in fields:
         name, section = f"{prefix}{field.name}", section_of(hints[field.name])
         if section is None:
-            text = " ".join([docs[field.name], *_choices(field)])
-            span = range_in_words(hints[field.name])
-            if span and not all(choice in text for choice in span.split(" | ")):
-                text = f"{text} {span[0].upper()}{span[1:]}.".strip()
-            lines += _entry(f"--{name}={_shown(_default(field, usual))}", text)
+            lines += _field(cls, field, prefix, usual)
             continue
         choices, default = choices_of(section), _default(field, usual)
-        if not choices:
-            note = "" if default is not None else " (off unless given)"
-            sections += ["", f"{name}{note}: {_summary(section)}", *_fields(section, f"{name}.", default)]
+        if choices:
+            sections += _types(choices, name, default)
             continue
-        for kind, subclass in choices.items():
-            chosen = default if getattr(default, TYPE, None) == kind else None
-            note = "" if chosen is None else " (default)"
-            sections += ["", f"{name}.{TYPE}={kind}{note}: {_summary(subclass)}"]
-            sections += _fields(subclass, f"{name}.", chosen)
+        if field.name in listed:
+            continue
+        alike = [
+            f.name for f in fields if hints[f.name] is hints[field.name] and _default(f, usual) == default
+        ]
+        listed += alike
+        others = f" (likewise {', '.join(alike[1:])})" if default is not None and len(alike) > 1 else ""
+        note = others if default is not None else " (off unless given)"
+        sections += ["", f"{name}{note}: {_summary(section)}", *_fields(section, f"{name}.", default)]
     return lines + sections
+
+
+def _field(cls: type[Any], field: Any, prefix: str, usual: Any) -> list[str]:
+    """Lines of a field that is no section."""
+    text = " ".join([docstrings(cls)[field.name], *_choices(field)])
+    span = range_in_words(hints_of(cls)[field.name])
+    if span and not all(choice in text for choice in span.split(" | ")):
+        text = f"{text} {span[0].upper()}{span[1:]}.".strip()
+    return _entry(f"--{prefix}{field.name}={_shown(_default(field, usual))}", text)
+
+
+def _types(choices: Mapping[str, type[Any]], name: str, default: Any) -> list[str]:
+    """Lines of the types of a choice: what they have in common, then each."""
+    usual = {kind: default if getattr(default, TYPE, None) == kind else None for kind in choices}
+    owners: dict[tuple[str, ...], list[str]] = {}
+    for kind, subclass in choices.items():
+        for field in dataclasses.fields(subclass):
+            if section_of(hints_of(subclass)[field.name]) is None:
+                entry = (field.name, *_field(subclass, field, f"{name}.", usual[kind]))
+                owners.setdefault(entry, []).append(kind)
+    common: dict[tuple[str, ...], list[tuple[str, ...]]] = {}
+    for entry, kinds in owners.items():
+        if len(kinds) > 1:
+            common.setdefault(tuple(kinds), []).append(entry)
+    lines: list[str] = []
+    for alike, entries in common.items():
+        lines += ["", f"{name}.{TYPE}={' | '.join(alike)}: Fields that these have in common."]
+        lines += [line for entry in entries for line in entry[1:]]
+    for kind, subclass in choices.items():
+        note = "" if usual[kind] is None else " (default)"
+        shared = {entry[0] for entry, kinds in owners.items() if kind in kinds and len(kinds) > 1}
+        lines += ["", f"{name}.{TYPE}={kind}{note}: {_summary(subclass)}"]
+        lines += _fields(subclass, f"{name}.", usual[kind], shared)
+    return lines
 
 
 def _entry(flag: str, text: str) -> list[str]:

@@ -11,11 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from accerl_lerobot.envs.base import World
-from accerl_lerobot.envs.config import EnvConfig
-from accerl_lerobot.envs.gl import import_mujoco
-from accerl_lerobot.envs.metaworld import MetaWorld, MetaWorldConfig
-from accerl_lerobot.envs.metaworld_tasks import expert_name
+from accerl_lerobot.envs.base import EnvConfig, World
+from accerl_lerobot.envs.metaworld import MetaWorld, MetaWorldConfig, expert_name, import_mujoco
 from accerl_lerobot.envs.simulated import SimulatedConfig, SimulatedWorld
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Observation

@@ -91,7 +91,7 @@ def main() -> None:
     """Runs ``lerobot-train`` on the command line's arguments."""
     from lerobot.scripts import lerobot_train
 
-    from accerl_lerobot.policies.pi0_fast import data_only
+    from accerl_lerobot.policies.pi0 import data_only
 
     def given(prefix: str) -> str | None:
         return next((a.removeprefix(prefix) for a in sys.argv[1:] if a.startswith(prefix)), None)

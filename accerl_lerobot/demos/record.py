@@ -34,8 +34,7 @@ from accerl_lerobot.demos.writing import (
     write_starts,
 )
 from accerl_lerobot.envs import make_world
-from accerl_lerobot.envs.base import World, WorldSpec
-from accerl_lerobot.envs.config import EnvConfig
+from accerl_lerobot.envs.base import EnvConfig, World, WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.seeds import demo_seed

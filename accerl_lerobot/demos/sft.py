@@ -28,7 +28,7 @@ from accerl_lerobot.config.ranges import LearningRate, Range, Section, Share, St
 from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
 from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.experience import SUCCESS
-from accerl_lerobot.policies.registry import discovery, register_policies
+from accerl_lerobot.policies.config import discovery, register_policies
 
 logger = logging.getLogger(__name__)
 

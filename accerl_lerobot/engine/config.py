@@ -25,12 +25,11 @@ from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.config import EvaluationConfig
+from accerl_lerobot.evaluation.stats import EvaluationConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.metrics import WandBConfig
 from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.replay.pacing import ReplayConfig
-from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
+from accerl_lerobot.replay.pacing import ASYNCHRONOUS, ReplayConfig, Schedule
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline import TIMELINE
 from accerl_lerobot.trainer.config import TrainerConfig
@@ -68,7 +67,7 @@ class PlacementConfig(Section, section="launch.placement"):
     inference: RoleConfig = field(default_factory=RoleConfig)
     """Each replica."""
     imagination: RoleConfig = field(default_factory=RoleConfig)
-    """Each worker that imagines, and the one that trains the world model."""
+    """The worker that imagines, and the one that trains the world model."""
     rollout: RoleConfig = field(default_factory=RoleConfig)
     """Each rollout worker."""
 
@@ -216,7 +215,6 @@ class RunConfig(Section):
             raise InputError("replay.max_lag", self.replay.max_lag, remedy)
         for name, count in (
             ("inference.workers", self.inference.workers),
-            ("imagination.workers", self.imagination.workers),
             ("trainer.ranks", self.trainer.ranks),
         ):
             if count > 1 and self.launch.engine == "local":

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 from accerl_lerobot.engine.config import DatasetConfig, RunConfig, journal_folder
@@ -16,61 +15,49 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.loading import load_lerobot_config
 from accerl_lerobot.world_model.config import VIDEOS, OnlineLearnConfig
-from accerl_lerobot.world_model.data import Episode, fingerprint, load_episodes
-from accerl_lerobot.world_model.imagination.guard import worker_config
-from accerl_lerobot.world_model.imagination.recorder import FOLDER, Recorder
-from accerl_lerobot.world_model.imagination.registry import (
+from accerl_lerobot.world_model.contract import WorldModelSpec
+from accerl_lerobot.world_model.data import fingerprint, load_episodes
+from accerl_lerobot.world_model.online import OnlineLearner, PretrainingEpisodes
+from accerl_lerobot.world_model.registry import (
     ImaginationModels,
     check_fit,
     learned_part,
     make_models,
 )
-from accerl_lerobot.world_model.imagination.rollouts import Imagination, RolloutSettings
-from accerl_lerobot.world_model.learning.online import OnlineLearner
-from accerl_lerobot.world_model.model.contract import WorldModelSpec
-from accerl_lerobot.world_model.model.store import OWN_RUN, Source, find_source, load_sources
-from accerl_lerobot.world_model.validation.evaluate import (
+from accerl_lerobot.world_model.rollouts import Imagination, RolloutSettings
+from accerl_lerobot.world_model.store import OWN_RUN, Source, find_source, load_sources
+from accerl_lerobot.world_model.validation import (
     DATASET,
     ONLINE,
+    ValidationVideos,
     check_disjoint,
     name_section,
     open_datasets,
 )
-from accerl_lerobot.world_model.validation.validate import ValidationVideos
 
 EARLIER = "earlier"
 """`Episode.source` of the pre-training episodes."""
 
 
-def make_imagination(
-    config: RunConfig, name: str, on_segment: Callable[[Segment], object], index: int = 0
-) -> Imagination:
-    """Builds the imagination of a run, or of one of its workers.
+def make_imagination(config: RunConfig, on_segment: Callable[[Segment], object]) -> Imagination:
+    """Builds the imagination of a run.
 
     Args:
         config: of the run; its ``policy.path`` must be set.
-        name: prefix of the segments' keys.
         on_segment: receives the imagined segments.
-        index: of `ImaginationConfig.workers`.
 
     Raises:
         InputError: the world model cannot be loaded, or does not fit environment and policy.
     """
     world = _world_spec(config)
     models = load_models(config, world)
-    folder = journal_folder(config)
-    if config.imagination.record and folder is not None and index == 0:
-        pace = world.fps / models.model.spec.chunk
-        on_segment = _recorded(Recorder(folder / FOLDER, config.imagination.record, pace), on_segment)
     run = RolloutSettings(
         decision_cost=config.rollout.decision_cost,
         time_limit_fails=config.rollout.time_limit == "fail",
         seed=config.seed,
-        name=name,
     )
-    sources = _sources(config, models.model.spec) if index == 0 else ()
-    part = worker_config(config.imagination, index)
-    return Imagination(models, world, part, run, on_segment, index=index, sources=sources)
+    sources = _sources(config, models.model.spec)
+    return Imagination(models, world, config.imagination, run, on_segment, sources)
 
 
 def _sources(config: RunConfig, spec: WorldModelSpec) -> list[Source]:
@@ -85,14 +72,6 @@ def _sources(config: RunConfig, spec: WorldModelSpec) -> list[Source]:
             name = sections[section].repo_id or ""
             sources.append(Source(repo_id=name, fingerprint=known, learnt=every, held_out=()))
     return [*sources, OWN_RUN]
-
-
-def _recorded(recorder: Recorder, on_segment: Callable[[Segment], object]) -> Callable[[Segment], object]:
-    def record(segment: Segment) -> None:
-        recorder.write(segment)
-        on_segment(segment)
-
-    return record
 
 
 def load_models(config: RunConfig, world: WorldSpec) -> ImaginationModels:
@@ -119,26 +98,22 @@ def make_learner(config: RunConfig, models: ImaginationModels | None = None) -> 
     longest = _longest(world, model.spec.chunk)
     assert success is not None  # as `check_imagination` has found
     sources = load_sources(Path(str(config.imagination.path)), "imagination")
-    offline: list[Episode] = []
-    held_out: list[Episode] = []
+    known = PretrainingEpisodes([], [])
     sections = _dataset_sections(learn)
     for section, meta in open_datasets(sections, model.spec).items():
         with name_section(section):
             # Not ``online``, even if a policy recorded them: in validation this run's own failures count.
             episodes = load_episodes(sections[section], model.spec, EARLIER, both=False)
-            check_disjoint(sections[section], episodes, offline + held_out)
+            check_disjoint(sections[section], episodes, known.learnt + known.held_out)
         source = find_source(sources, fingerprint(meta))
-        offline += episodes if source is None else [episodes[i] for i in source.learnt]
-        held_out += [] if source is None else [episodes[i] for i in source.held_out]
+        known.learnt.extend(episodes if source is None else [episodes[i] for i in source.learnt])
+        known.held_out.extend([] if source is None else [episodes[i] for i in source.held_out])
     return OnlineLearner(
         model,
         success,
-        learn,
-        replace(learn.validation, depth=min(learn.validation.depth, longest)),
-        offline=offline,
-        held_out=held_out,
-        longest=longest,
-        threshold=config.imagination.threshold,
+        config.imagination,
+        known,
+        longest,
         seed=config.seed,
         on_validation=_videos(config),
     )
@@ -164,9 +139,9 @@ def _dataset_sections(learn: OnlineLearnConfig) -> dict[str, DatasetConfig]:
 
 
 def _videos(config: RunConfig) -> ValidationVideos | None:
-    """Videos into the run's folder, if that is known and they are wanted."""
-    folder, every = journal_folder(config), config.imagination.learn.videos
-    return None if folder is None or not every else ValidationVideos(folder / VIDEOS, every)
+    """Videos into the run's folder, if that is known."""
+    folder = journal_folder(config)
+    return None if folder is None else ValidationVideos(folder / VIDEOS)
 
 
 def _longest(world: WorldSpec, chunk: int) -> int:

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The processes that imagine, and the one that trains their world model.
+"""The process that imagines, and the one that trains its world model.
 
     Imagination   consumes    decisions from inference, real segments from replay, promoted models
                   produces    imagined segments for replay
                   waits for   decisions; and replay, while segments are pending there
                   outlives    inference: unanswered requests go to its successor
     WorldLearning consumes    real segments from replay
-                  produces    world models that have passed validation, for all that imagine
+                  produces    world models that have passed validation, for imagination
                   waits for   real experience
 
 Both end with the process, or when replay says that the run is over. Until a model has passed, batches are
@@ -30,11 +30,10 @@ from accerl_lerobot.checkpoint.layout import TRAINING_STATE, WORLD_MODEL
 from accerl_lerobot.engine.imagination import make_imagination, make_learner
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import fault_point
-from accerl_lerobot.metrics import numbered
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
-from accerl_lerobot.world_model.imagination.guard import IMAGINATION, check_workers
-from accerl_lerobot.world_model.learning.online import Promotion
+from accerl_lerobot.world_model.guard import IMAGINATION, WORLD_LEARNING
+from accerl_lerobot.world_model.online import Promotion
 
 if TYPE_CHECKING:
     from accerl_lerobot.engine.config import RunConfig
@@ -58,18 +57,10 @@ class ImaginationWorker:
         config: of the run; its ``policy.path`` must be set.
         state: the ``training_state`` to resume from; None: begin.
         timeline: folder of the timeline; None: none is kept.
-        index: of `ImaginationConfig.workers`.
-
-    Raises:
-        InputError: the state is of a run with another number of workers.
     """
 
-    def __init__(
-        self, config: RunConfig, state: Path | None = None, timeline: Path | None = None, index: int = 0
-    ) -> None:
-        workers = config.imagination.workers
-        name = numbered(IMAGINATION, workers)[index]
-        self._clock = open_clock(timeline, name)
+    def __init__(self, config: RunConfig, state: Path | None = None, timeline: Path | None = None) -> None:
+        self._clock = open_clock(timeline, IMAGINATION)
         import torch
 
         torch.set_num_threads(config.trainer.num_threads)
@@ -78,8 +69,7 @@ class ImaginationWorker:
         self._patience_s = 2 * self._limit
         self._share, self._batch = config.imagination.share, config.inference.max_batch
         self._outbox: list[Segment] = []
-        self._imagination = make_imagination(config, name.replace(" ", ""), self._outbox.append, index)
-        self._index, self._saved = index, f"{IMAGINATION}{index or ''}"
+        self._imagination = make_imagination(config, self._outbox.append)
         self._lock = threading.Lock()
         self._imagining = threading.Lock()
         """Held while the imagination changes; outside, the outbox is empty."""
@@ -88,8 +78,7 @@ class ImaginationWorker:
         self._may_promote = config.imagination.learns
         self._cursor = 0
         if state is not None:
-            check_workers(state, workers)
-            saved = snapshot.load(state / self._saved)
+            saved = snapshot.load(state / IMAGINATION)
             self._imagination.restore(saved["imagination"])
             self._cursor = saved["cursor"]
         self._clock.enter(WAIT_IN)
@@ -129,9 +118,8 @@ class ImaginationWorker:
         left = began + self._limit - time.monotonic()
         with _within(left, self._imagining, "an imagination step"):
             saved = {"imagination": self._imagination.state(), "cursor": self._cursor}
-            snapshot.save(directory / TRAINING_STATE / self._saved, saved)
-            if not self._index:  # all have the same model
-                self._imagination.save_promoted(directory / WORLD_MODEL)
+            snapshot.save(directory / TRAINING_STATE / IMAGINATION, saved)
+            self._imagination.save_promoted(directory / WORLD_MODEL)
 
     def run(self, inference: Endpoint, inserting: Endpoint, replay: Any) -> None:
         """Imagines until replay is closed."""
@@ -151,7 +139,7 @@ class ImaginationWorker:
             if reported != (self._imagination.on, may_promote):
                 reported = (self._imagination.on, may_promote)
                 share = self._share if self._imagination.on else 0.0
-                ray.get(replay.mix.remote(share, any(reported), self._index))
+                ray.get(replay.mix.remote(share, any(reported)))
             self._clock.enter(TRANSPORT)
             for ticket, stored in connection.done(0.0):
                 pending.discard(ticket)
@@ -199,7 +187,7 @@ class WorldLearningWorker:
     """
 
     def __init__(self, config: RunConfig, state: Path | None = None, timeline: Path | None = None) -> None:
-        self._clock = open_clock(timeline, "world learning")
+        self._clock = open_clock(timeline, WORLD_LEARNING)
         import torch
 
         torch.set_num_threads(config.trainer.num_threads)
@@ -234,7 +222,7 @@ class WorldLearningWorker:
             saved = {"learner": self._learner.state(), "cursor": self._cursor}
         snapshot.save(directory / TRAINING_STATE / LEARNER, saved)
 
-    def run(self, imaginers: list[Any], replay: Any) -> None:
+    def run(self, imaginer: Any, replay: Any) -> None:
         """Trains until replay is closed."""
         news, learner = _News(replay, self._cursor), self._learner
         may_promote: bool | None = None
@@ -253,7 +241,7 @@ class WorldLearningWorker:
                 ray.get(replay.hold.remote(hold))
             if may_promote is not learner.may_promote(last):
                 may_promote = learner.may_promote(last)
-                ray.get([imaginer.expect.remote(may_promote) for imaginer in imaginers])
+                ray.get(imaginer.expect.remote(may_promote))
             if learner.pending_steps >= 1:
                 self._clock.enter(CHECKPOINT)
                 with self._learning:
@@ -264,8 +252,7 @@ class WorldLearningWorker:
                 self._clock.enter(COMPUTE)
                 if promotion := learner.promote(last):
                     self._clock.enter(WEIGHT_SYNC)
-                    promoted = ray.put(promotion)
-                    ray.get([imaginer.promote.remote(promoted) for imaginer in imaginers])
+                    ray.get(imaginer.promote.remote(promotion))
                     learner.mark_served()
             else:
                 self._clock.enter(WAIT_IN)

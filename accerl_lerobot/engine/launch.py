@@ -36,13 +36,12 @@ from accerl_lerobot.engine.ray_session import RaySession
 from accerl_lerobot.engine.replicas import START_S, InferenceReplicas, RolloutWorkers
 from accerl_lerobot.engine.supervisor import ActorHandle, end
 from accerl_lerobot.inference.batcher import BatcherStats
-from accerl_lerobot.metrics import numbered
 from accerl_lerobot.policies.config import Load
-from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
+from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from accerl_lerobot.transport.endpoint import Endpoint, uses_shared_memory
-from accerl_lerobot.world_model.imagination.guard import IMAGINATION, combine_metrics
+from accerl_lerobot.world_model.guard import IMAGINATION, WORLD_LEARNING
 
 logger = logging.getLogger(__name__)
 
@@ -84,7 +83,7 @@ class RayEngine(Engine):
         self._inference = InferenceReplicas(config, self._version, state, load)
         self._others: list[ActorHandle] = []
         """All other workers."""
-        self._imaginers: list[ActorHandle] = []
+        self._imaginer: ActorHandle | None = None
         self._learner: ActorHandle | None = None
         self._updates: list[dict[str, float]] = []
         self._metrics: dict[str, dict[str, float]] = {}
@@ -113,14 +112,14 @@ class RayEngine(Engine):
         self._trainer.work = self._trainer.actor.run.remote(
             self._replay.actor, readers, self._config.launch.transport
         )
-        for imaginer, inference in zip(self._imaginers, self._imaginers_ask, strict=True):
-            imaginer.work = imaginer.actor.run.remote(inference, self._inserting, self._replay.actor)
+        if (imaginer := self._imaginer) is None:
+            return
+        imaginer.work = imaginer.actor.run.remote(self._imaginer_asks, self._inserting, self._replay.actor)
         if self._learner is not None:
-            actors = [imaginer.actor for imaginer in self._imaginers]
-            self._learner.work = self._learner.actor.run.remote(actors, self._replay.actor)
+            self._learner.work = self._learner.actor.run.remote(imaginer.actor, self._replay.actor)
 
     def follow(self, schedule: Schedule) -> None:
-        """Change the schedule of collecting and learning, see `replay.turns`."""
+        """Change the schedule of collecting and learning, see `replay.pacing`."""
         if schedule == self._schedule:
             return
         in_turn = schedule != ASYNCHRONOUS
@@ -142,8 +141,6 @@ class RayEngine(Engine):
         updates, self._updates = self._updates, []
         if updates:
             self._version = int(updates[-1]["update"])
-        imagined = [self._metrics[w.name] for w in self._imaginers if w.name in self._metrics]
-        learned = {} if self._learner is None else self._metrics.get(self._learner.name, {})
         progress = Progress(
             version=self._version,
             done=self._done,
@@ -152,7 +149,7 @@ class RayEngine(Engine):
             rollout=self._rollouts.counters(),
             replay=self._metrics.get("replay", {}),
             inference=self._metrics.get("inference", {}),
-            imagination=combine_metrics(imagined) | learned,
+            imagination=self._metrics.get(IMAGINATION, {}) | self._metrics.get(WORLD_LEARNING, {}),
         )
         self._check_moving(progress)
         return progress
@@ -165,10 +162,10 @@ class RayEngine(Engine):
         self._updates = []
         timeouts = {"timeout": max(START_S, self._limit), "silence": self._limit}  # files may be large
         version, records = self._trainer.call("hold", timeout=self._limit)  # it waits for an update at most
-        # At once, so that little comes in that was decided by weights of later updates. The imaginers may
-        # know of more than replay then; they are told anew of what comes after.
+        # At once, so that little comes in that was decided by weights of later updates. The imaginer may
+        # know of more than replay then; it is told anew of what comes after.
         self._replay.call("save", state, version, **timeouts)
-        for worker in self._with_learner():
+        for worker in filter(None, (self._learner, self._imaginer)):
             worker.call("save", directory, **timeouts)
         self._trainer.call("write", directory, **timeouts)
         self._rollouts.save(state)
@@ -196,10 +193,6 @@ class RayEngine(Engine):
         """Batches of the inference replicas so far."""
         return self._inference.batching()
 
-    def _with_learner(self) -> list[ActorHandle]:
-        """Workers that imagine, in the order in which they are saved."""
-        return [*([] if self._learner is None else [self._learner]), *self._imaginers]
-
     def _everyone(self) -> Iterator[ActorHandle]:
         """All workers, those that others depend on first."""
         yield from self._inference.workers()
@@ -208,7 +201,7 @@ class RayEngine(Engine):
 
     def _start(self) -> None:
         from accerl_lerobot.replay.worker import ReplayWorker
-        from accerl_lerobot.trainer.peers import TrainerRank
+        from accerl_lerobot.trainer.peers import LearnerSettings, TrainerRank
         from accerl_lerobot.trainer.worker import TrainerWorker
 
         c, timeline = self._config, timeline_folder(self._config)
@@ -219,26 +212,25 @@ class RayEngine(Engine):
             return ray.remote(kind).options(**options).remote(*arguments)
 
         # The ranks first: Ray fills the GPU that is fullest, and each of them needs more than half of one.
-        learner = (c.policy, c.algorithm, c.trainer, c.seed, self._state, self._load)
+        learner = LearnerSettings(c.policy, c.algorithm, c.trainer, c.seed, self._state, self._load)
         names = [f"trainer rank {rank}" for rank in range(1, c.trainer.ranks)]
-        ranks = [make(name, TrainerRank, 1, rank, *learner) for rank, name in enumerate(names, start=1)]
-        trainer = make("trainer", TrainerWorker, 4, *learner, timeline, ranks, journal_folder(c))
+        ranks = [make(name, TrainerRank, 1, rank, learner) for rank, name in enumerate(names, start=1)]
+        trainer = make("trainer", TrainerWorker, 4, learner, timeline, ranks, journal_folder(c))
         self._inference.start(plan)
         imagined, counted = imagination.replay if imagination.share else None, c.rollout.episodes > 0
         stores = (c.replay, c.seed, imagined, counted, self._state, journal_folder(c), timeline)
-        self._replay = self._add("replay", make("replay", ReplayWorker, 1000, *stores, imagination.workers))
+        self._replay = self._add("replay", make("replay", ReplayWorker, 1000, *stores))
         for name, rank in zip(names, ranks, strict=True):
             self._add(name, rank)
         self._trainer = self._add("trainer", trainer)
         if imagination.share:
             from accerl_lerobot.engine.imagination_workers import ImaginationWorker, WorldLearningWorker
 
-            for i, name in enumerate(numbered(IMAGINATION, imagination.workers)):
-                imaginer = make(name, ImaginationWorker, 4, c, self._state, timeline, i)
-                self._imaginers.append(self._add(name, imaginer))
+            imaginer = make(IMAGINATION, ImaginationWorker, 4, c, self._state, timeline)
+            self._imaginer = self._add(IMAGINATION, imaginer)
             if imagination.learns:
-                learns = make("world learning", WorldLearningWorker, 4, c, self._state, timeline)
-                self._learner = self._add("world learning", learns)
+                learns = make(WORLD_LEARNING, WorldLearningWorker, 4, c, self._state, timeline)
+                self._learner = self._add(WORLD_LEARNING, learns)
         self._rollouts.start(plan)
         ready = [(worker, worker.actor.ready.remote()) for worker in self._everyone()]
         for worker, reference in ready:
@@ -246,8 +238,8 @@ class RayEngine(Engine):
             worker.await_start(reference, max(START_S, self._limit), here)
         deciding = self._inference.open()
         self._inserting = self._replay.endpoint("insert", c.launch.transport, self._limit)
-        # From the last replica on: the first ones may have one rollout worker more.
-        self._imaginers_ask = [deciding[-1 - i % len(deciding)] for i in range(len(self._imaginers))]
+        # The last replica: the first ones may have one rollout worker more.
+        self._imaginer_asks = deciding[-1]
         self._replay.work = self._replay.actor.run.remote()
         self._rollouts.run(deciding, self._inserting)
 
@@ -258,11 +250,9 @@ class RayEngine(Engine):
     def _move(self, index: int, inference: Endpoint) -> None:
         """Tell the clients of an inference replica its new endpoint."""
         self._rollouts.move(index, inference)
-        replicas = self._config.inference.workers
-        for i, imaginer in enumerate(self._imaginers):
-            if replicas - 1 - i % replicas == index:
-                self._imaginers_ask[i] = inference
-                imaginer.call("move", inference, timeout=self._limit)
+        if self._imaginer is not None and index == self._config.inference.workers - 1:
+            self._imaginer_asks = inference
+            self._imaginer.call("move", inference, timeout=self._limit)
 
     def _ask(self) -> None:
         self._inference.ask()
@@ -294,7 +284,7 @@ class RayEngine(Engine):
             raise WorkerError(f"{worker.name} worker failed for good:\n{error}") from error
         if worker is self._trainer:
             self._finish(int(result))
-        elif not (self._done and worker in (self._replay, *self._with_learner())):
+        elif not (self._done and worker in (self._replay, self._learner, self._imaginer)):
             raise WorkerError(f"{worker.name} worker ended without being asked to")
 
     def _blame(self) -> None:

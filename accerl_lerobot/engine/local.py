@@ -34,7 +34,7 @@ from accerl_lerobot.seeds import global_generators, restore_global_generators
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.nonfinite import keeping
 from accerl_lerobot.weights.publisher import PublishDelay
-from accerl_lerobot.world_model.imagination.guard import IMAGINATION
+from accerl_lerobot.world_model.guard import IMAGINATION
 
 logger = logging.getLogger(__name__)
 
@@ -87,7 +87,7 @@ class LocalEngine(Engine):
         if imagination.share:
             from accerl_lerobot.engine.imagination import make_imagination, make_learner
 
-            self._imagination = make_imagination(config, IMAGINATION, self._replay.insert)
+            self._imagination = make_imagination(config, self._replay.insert)
             if imagination.learns:
                 self._world_learner = make_learner(config, self._imagination.models)
         self._rng = np.random.default_rng(config.seed)
@@ -111,7 +111,6 @@ class LocalEngine(Engine):
             "local",
             self._outbox.append,
             self._ended,
-            (config.evaluation.video_size, config.evaluation.video_every),
             self._plans.groups,
         )
         self._due: dict[int, Request] = {}

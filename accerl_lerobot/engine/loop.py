@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,9 +31,8 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Engine, Progress
 from accerl_lerobot.engine.stopping import Stopping, raise_if_stopped
-from accerl_lerobot.evaluation.config import evaluation_plans
 from accerl_lerobot.evaluation.pictures import before_after, success_curve
-from accerl_lerobot.evaluation.stats import summarise
+from accerl_lerobot.evaluation.stats import evaluation_plans, summarise
 from accerl_lerobot.metrics import MetricsLog, plain
 from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.timeline import CHECKPOINT, EVALUATION, TIMELINE, TRAINING, Clock, NoClock
@@ -94,28 +93,28 @@ class Times:
         return (self.before_s or 0.0) + time.monotonic() - self.started
 
 
-class Loop:
-    """Evaluates, trains, saves checkpoints, and writes the results.
+class Outputs(NamedTuple):
+    """Where a run writes to."""
 
-    Args:
-        console: progress for people.
-        log: of all numbers.
-        stop: tells when to save and end.
-    """
+    directory: Path
+    console: Console
+    log: MetricsLog
+
+
+class Loop:
+    """Evaluates, trains, saves checkpoints, and writes the results; `stop` tells when to save and end."""
 
     def __init__(
         self,
         config: RunConfig,
-        directory: Path,
-        console: Console,
+        outputs: Outputs,
         engine: Engine,
-        log: MetricsLog,
         tasks: tuple[str, ...],
         times: Times,
         stop: Stopping,
     ) -> None:
-        self.config, self.directory, self.console = config, directory, console
-        self.engine, self.log, self.tasks = engine, log, tasks
+        self.config, self.engine, self.tasks = config, engine, tasks
+        self.directory, self.console, self.log = outputs
         self.times, self.stop = times, stop
         self.before: dict[str, Any] | None = None
         """The evaluation before training, where there was one."""
@@ -137,7 +136,7 @@ class Loop:
         self._began_at: str | None = None
         self._training_since: float | None = None
         self._saved_at = time.monotonic()
-        self._watch = Watch(directory / TIMELINE)
+        self._watch = Watch(self.directory / TIMELINE)
 
     def run(self, state: Path | None) -> dict[str, Any]:
         """Do the run, or the rest of it; returns the summary.
@@ -326,8 +325,10 @@ class Loop:
         self, group: str, episodes: int, steps: float
     ) -> tuple[dict[str, Any], list[EpisodeResult]]:
         self.times.clock.enter(EVALUATION)
-        film = self.config.evaluation.videos
-        self.engine.plan(evaluation_plans(self.tasks, episodes, group, seed=self.config.seed, film=film))
+        seed, videos = self.config.seed, self.config.evaluation
+        self.engine.plan(
+            evaluation_plans(self.tasks, episodes, group, seed=seed, filmed=videos.videos, film=videos.film)
+        )
         # An evaluation planned while training may end only now.
         results = run_plans(self.engine, episodes, group, self.console, self._meanwhile)
         return self._report(group, results, steps, results[0].versions[1]), results

@@ -157,9 +157,8 @@ def roles_of(config: RunConfig) -> list[Role]:
         Role("inference", tuple(numbered("inference", c.inference.workers)), placement.inference),
     ]
     if c.imagination.share:
-        names = numbered("imagination", c.imagination.workers)
         learns = ["world learning"] if c.imagination.learns else []
-        roles.append(Role("imagination", (*names, *learns), placement.imagination))
+        roles.append(Role("imagination", ("imagination", *learns), placement.imagination))
     rollouts = tuple(f"rollout {i}" for i in range(c.rollout.workers))
     return [*roles, Role("rollout", rollouts, placement.rollout, network=False)]
 

@@ -300,7 +300,7 @@ def policy_gib(config: RunConfig) -> float:
 
 def _check_off_policy(config: RunConfig, spec: WorldSpec, policy: Any) -> None:
     """Refuse policies that cannot imitate a chunk, and segments that are not whole episodes."""
-    from accerl_lerobot.policies.registry import sampler_config
+    from accerl_lerobot.policies.config import sampler_config
 
     sampler = sampler_config(config.policy, policy.type)
     if sampler.type not in ("flow", "gaussian"):
@@ -323,8 +323,8 @@ def policy_to_be(config: RunConfig) -> Any:
     Raises:
         InputError: there is no such checkpoint; RL has no likelihood for it; what `check_sft_policy` raises.
     """
+    from accerl_lerobot.policies.config import check_observations, check_type, override, sampler_config
     from accerl_lerobot.policies.loading import rehearsed_config
-    from accerl_lerobot.policies.registry import check_observations, check_type, override, sampler_config
 
     if config.policy.path is not None:
         return rehearsed_config(config.policy)
@@ -396,8 +396,8 @@ def sft_policy(config: SFTConfig) -> Any:
     from lerobot.configs.policies import PreTrainedConfig
 
     from accerl_lerobot.checkpoint.safety import brief
+    from accerl_lerobot.policies.config import register_policies
     from accerl_lerobot.policies.guard import fetched_checkpoint
-    from accerl_lerobot.policies.registry import register_policies
 
     register_policies()
     folder = fetched_checkpoint(config.init_path, None, "sft.init_path")

@@ -26,8 +26,7 @@ from accerl_lerobot.engine.placement import actor_options, alive_nodes
 from accerl_lerobot.engine.ray_session import NO_HUB_TOKEN
 from accerl_lerobot.engine.supervisor import ActorHandle, ReplicaSet, WorkerSlot
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.inference.batcher import BatcherStats
-from accerl_lerobot.inference.pool import dealt, merge_metrics, merge_stats
+from accerl_lerobot.inference.batcher import BatcherStats, dealt, merge_metrics, merge_stats
 from accerl_lerobot.metrics import numbered
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.rollout.plans import budgets, incarnation_after, whole_groups
@@ -251,15 +250,14 @@ class RolloutWorkers(ReplicaSet[RolloutSlot]):
         return ""
 
     def _new(self, slot: RolloutSlot) -> ActorHandle:
-        from accerl_lerobot.rollout.worker import RolloutWorker
+        from accerl_lerobot.rollout.worker import RolloutWorker, WorkerShare
 
         c, place = self._config, self._plan.places[slot.name]
-        film = (c.evaluation.video_size, c.evaluation.video_every)
         actor = ray.remote(RolloutWorker).options(**actor_options(place), max_concurrency=4, **NO_HUB_TOKEN)
         # A node that does not see the run's folder would write a timeline that nobody finds.
         timeline = None if place.node.unseen else timeline_folder(c)
-        seeds = (c.seed, slot.index, slot.incarnation)
-        made = actor.remote(c.env, c.rollout, self._tasks, *seeds, film, self._history, slot.budget, timeline)
+        share = WorkerShare(slot.index, slot.incarnation, slot.budget)
+        made = actor.remote(c.env, c.rollout, self._tasks, c.seed, share, self._history, timeline)
         return ActorHandle(slot.name, made)
 
     def _restart(self, slot: RolloutSlot, error: Exception) -> None:

@@ -44,7 +44,7 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.engine import ray_session
 from accerl_lerobot.engine.config import RunConfig, encode, timeline_folder
 from accerl_lerobot.engine.contract import Engine, WorkerError, pause_s
-from accerl_lerobot.engine.loop import Loop, Times
+from accerl_lerobot.engine.loop import Loop, Outputs, Times
 from accerl_lerobot.engine.preflight import check_placement, check_policy, check_start, check_world
 from accerl_lerobot.engine.stopping import Stopping, raise_if_stopped
 from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, make_folder
@@ -212,7 +212,8 @@ def train(
                     raise_if_stopped(stop, directory)
                     raise
                 with contextlib.closing(engine):
-                    return Loop(config, directory, console, engine, log, tasks, times, stop).run(state)
+                    outputs = Outputs(directory, console, log)
+                    return Loop(config, outputs, engine, tasks, times, stop).run(state)
             except Exception as error:
                 lost = "" if session is None else session.lost  # whatever error that has led to
                 loss = WorkerError(lost) if lost else error

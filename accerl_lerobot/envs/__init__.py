@@ -9,9 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec
-from accerl_lerobot.envs.config import EnvConfig
-from accerl_lerobot.envs.history import HistoryWorld
+from accerl_lerobot.envs.base import ChunkResult, EnvConfig, HistoryWorld, World, WorldSpec
 from accerl_lerobot.envs.lerobot_env import LeRobotEnvConfig, LeRobotWorld
 from accerl_lerobot.envs.metaworld import MetaWorld, MetaWorldConfig
 from accerl_lerobot.envs.simulated import SimulatedConfig, SimulatedWorld

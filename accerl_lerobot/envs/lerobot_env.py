@@ -24,9 +24,8 @@ import yaml
 
 from accerl_lerobot.checkpoint.layout import write_atomically
 from accerl_lerobot.config.ranges import Range
-from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec, checked_actions
-from accerl_lerobot.envs.config import EnvConfig
-from accerl_lerobot.envs.gl import close_at_exit, import_mujoco
+from accerl_lerobot.envs.base import ChunkResult, EnvConfig, World, WorldSpec, checked_actions
+from accerl_lerobot.envs.metaworld import close_at_exit, import_mujoco
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Observation
 from accerl_lerobot.seeds import start_state

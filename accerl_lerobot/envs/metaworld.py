@@ -4,26 +4,261 @@
 The same physics, state, camera and instruction as LeRobot's own wrapper, but the image has the size a small
 policy needs, lights are cheap to draw in software, and nothing is rendered that no policy looks at.
 Importing this file loads neither MuJoCo nor metaworld.
+
+LeRobot's MetaWorld tables (instructions, difficulty groups, experts), read without importing LeRobot.
+
+They are one JSON file inside the LeRobot package; importing ``lerobot.envs`` to reach it would cost a rollout
+worker four seconds and several hundred megabytes.
+
+Differences between the world a policy was trained in and the one it must work in.
+
+An offscreen OpenGL for MuJoCo: pick a backend before the import, and say in one line what is missing.
+
+MuJoCo reads ``MUJOCO_GL`` once, when it is imported: call `import_mujoco` before importing what uses it.
 """
 
 from __future__ import annotations
 
+import atexit
+import ctypes
+import difflib
+import functools
+import importlib
+import importlib.util
+import json
 import math
+import os
+import sys
+import weakref
 from collections import deque
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
-from typing import Annotated, Any, Literal
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 
-from accerl_lerobot.config.ranges import Range
-from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec, checked_actions
-from accerl_lerobot.envs.config import EnvConfig
-from accerl_lerobot.envs.gl import import_mujoco, new_renderer
-from accerl_lerobot.envs.metaworld_tasks import description, resolve
-from accerl_lerobot.envs.shift import ShiftConfig
+from accerl_lerobot.config.ranges import Positive, Range, Section
+from accerl_lerobot.envs.base import ChunkResult, EnvConfig, World, WorldSpec, checked_actions
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+
+@functools.cache
+def _tables() -> dict[str, Any]:
+    spec = importlib.util.find_spec("lerobot")
+    if spec is None or not spec.submodule_search_locations:
+        raise ModuleNotFoundError("LeRobot is not installed: pip install lerobot[metaworld]", name="lerobot")
+    path = Path(spec.submodule_search_locations[0]) / "envs" / "metaworld_config.json"
+    return json.loads(path.read_text())
+
+
+def all_tasks() -> tuple[str, ...]:
+    """All 50 names, sorted."""
+    return tuple(sorted(_tables()["TASK_DESCRIPTIONS"]))
+
+
+def groups() -> dict[str, tuple[str, ...]]:
+    """LeRobot's difficulty groups, plus ``all``."""
+    return {k: tuple(v) for k, v in _tables()["DIFFICULTY_TO_TASKS"].items()} | {"all": all_tasks()}
+
+
+def description(task: str) -> str:
+    """The instruction text of `task`, as LeRobot's own datasets have it."""
+    return _tables()["TASK_DESCRIPTIONS"][task]
+
+
+def expert_name(task: str) -> str:
+    """Class name in ``metaworld.policies`` of the scripted expert for `task`."""
+    return _tables()["TASK_POLICY_MAPPING"][task]
+
+
+def resolve(text: str, field: str = "env.task") -> tuple[str, ...]:
+    """Expands comma-separated names and groups; keeps the order, drops repetitions.
+
+    Example:
+        >>> resolve("drawer-open-v3, door-open-v3")
+        ('drawer-open-v3', 'door-open-v3')
+
+    Raises:
+        InputError: a name is neither a task nor a group, or there is none.
+    """
+    known, named = set(all_tasks()), groups()
+    found: dict[str, None] = {}
+    for name in (part.strip() for part in text.split(",")):
+        if name in named:
+            found |= dict.fromkeys(named[name])
+        elif name in known:
+            found[name] = None
+        else:
+            raise InputError(field, text, _remedy(name, sorted(known), list(named)))
+    return tuple(found)
+
+
+def _remedy(name: str, tasks: list[str], group_names: list[str]) -> str:
+    wanted = name.replace("metaworld-", "").replace("-v2", "-v3")
+    close = difflib.get_close_matches(wanted, tasks, n=3, cutoff=0.5)
+    hint = f"did you mean {' or '.join(close)}? Otherwise " if close else ""
+    return (
+        f"{name!r} is not a MetaWorld task; {hint}use names such as drawer-open-v3, separated by commas, "
+        f"or a group: {', '.join(group_names)}"
+    )
+
+
+Metres = Annotated[float, Range("[-2, 2]")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShiftConfig(Section, section="env.shift"):
+    """Deployment shift of a MetaWorld scene; the defaults change nothing.
+
+    Scripted demonstrations are recorded without it, unless ``demos.shifted`` says otherwise.
+
+    Example:
+        >>> ShiftConfig(camera=(0.0, 0.05, 0.0), action_delay=2).action_delay
+        2
+    """
+
+    camera: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
+    """Metres added to the position of every camera, along its body's x, y and z."""
+    light: Positive = 1.0
+    """Factor on the intensity of all lights."""
+    friction: Positive = 1.0
+    """Factor on the sliding friction of all surfaces."""
+    action_delay: Annotated[int, Range("[0, 100]")] = 0
+    """Env steps between an action and its execution; zero actions fill the gap at the start of an episode."""
+    start_range: Positive = 1.0
+    """Factor on the ranges that start and goal positions are drawn from, about their centres. Far above 1,
+    some starts are out of reach."""
+
+    def apply(self, simulator: Any, cameras: Sequence[str]) -> None:
+        """Changes a MetaWorld simulator that has just been built.
+
+        Args:
+            simulator: MetaWorld's own environment object.
+            cameras: names of those that are moved.
+        """
+        from gymnasium.spaces import Box
+
+        model = simulator.model
+        for name in cameras:
+            model.cam(name).pos[:] += self.camera
+        for kind in ("ambient", "diffuse", "specular"):
+            getattr(model, f"light_{kind}")[:] *= self.light
+            getattr(model.vis.headlight, kind)[:] *= self.light
+        model.geom_friction[:, 0] *= self.friction
+        if self.start_range != 1:
+            space = simulator._random_reset_space
+            centre, half = (space.high + space.low) / 2, (space.high - space.low) / 2
+            low, high = centre - self.start_range * half, centre + self.start_range * half
+            simulator._random_reset_space = Box(low, high, dtype=space.dtype)
+
+
+_LIBRARIES = {
+    "egl": ("libEGL.so.1", "libEGL.so"),
+    "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"),
+}
+_GPU_NODES = ("/dev/nvidia0", "/dev/dri/renderD128")
+REMEDY = (
+    "install an offscreen OpenGL: apt-get install -y libosmesa6 (MUJOCO_GL=osmesa) "
+    "or apt-get install -y libegl1 libgl1-mesa-dri libgles2 (MUJOCO_GL=egl)"
+)
+_open: weakref.WeakSet[Any] = weakref.WeakSet()
+
+
+def choose_backend() -> str | None:
+    """Names the backend for a headless Linux machine: EGL where there is a GPU, else OSMesa, else EGL.
+
+    Returns:
+        ``"egl"``, ``"osmesa"``, or None where MuJoCo's own default is right (a display, or not Linux).
+
+    Raises:
+        InputError: neither library is installed.
+    """
+    if not _headless():
+        return None
+    order = ("egl", "osmesa") if any(Path(node).exists() for node in _GPU_NODES) else ("osmesa", "egl")
+    for backend in order:
+        if any(_loads(library) for library in _LIBRARIES[backend]):
+            return backend
+    raise InputError("MUJOCO_GL", "", REMEDY)
+
+
+def import_mujoco() -> ModuleType:
+    """Imports MuJoCo with a backend that works here; respects ``MUJOCO_GL`` if it is set.
+
+    Raises:
+        InputError: the backend's library is missing.
+    """
+    imported = "mujoco" in sys.modules
+    # One software-rendering thread per world: several worlds then share the cores without fighting.
+    os.environ.setdefault("LP_NUM_THREADS", "1")
+    given = os.environ.get("MUJOCO_GL", "").lower()
+    if given and given not in _LIBRARIES and _headless():
+        # GLFW without a display takes the whole process down, with no Python error to catch.
+        raise InputError("MUJOCO_GL", given, "there is no display: use egl or osmesa, or unset it")
+    chosen = None if given else choose_backend()
+    if chosen is not None:
+        os.environ["MUJOCO_GL"] = chosen
+    try:
+        mujoco = importlib.import_module("mujoco")
+        if imported and chosen is not None:
+            # Somebody imported MuJoCo before us, without a backend; only this module reads the variable.
+            importlib.reload(mujoco.gl_context)
+        return mujoco
+    except (ImportError, AttributeError, RuntimeError) as error:
+        if isinstance(error, ModuleNotFoundError) and error.name == "mujoco":
+            raise
+        raise InputError("MUJOCO_GL", os.environ.get("MUJOCO_GL", ""), REMEDY) from error
+
+
+def new_renderer(model: Any, height: int, width: int) -> Any:
+    """A `mujoco.Renderer` whose framebuffer is exactly (height, width).
+
+    Raises:
+        InputError: no OpenGL context can be created here.
+    """
+    mujoco = import_mujoco()
+    model.vis.global_.offheight, model.vis.global_.offwidth = height, width
+    try:
+        renderer = mujoco.Renderer(model, height, width)
+    except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+        raise InputError("MUJOCO_GL", os.environ.get("MUJOCO_GL", ""), REMEDY) from error
+    close_at_exit(renderer)
+    return renderer
+
+
+def close_at_exit(drawing: Any) -> None:
+    """Has `drawing` closed when the interpreter ends, unless it is gone by then; call it once it has drawn.
+
+    MuJoCo registers EGL's end with its first context, and `atexit` calls the latest function first: ours has
+    to be registered after it, or contexts are destroyed in a display that is gone, which prints tracebacks.
+    """
+    _open.add(drawing)
+    atexit.unregister(_close_all)
+    atexit.register(_close_all)
+
+
+def _close_all() -> None:
+    for drawing in tuple(_open):
+        drawing.close()
+
+
+def _headless() -> bool:
+    return sys.platform == "linux" and not any(os.environ.get(k) for k in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
+
 
 CAMERAS = ("topview", "corner", "corner2", "corner3", "corner4", "behindGripper", "gripperPOV")
 STATE_DIM = 4

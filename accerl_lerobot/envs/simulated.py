@@ -16,8 +16,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Steps
-from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec, checked_actions
-from accerl_lerobot.envs.config import EnvConfig
+from accerl_lerobot.envs.base import ChunkResult, EnvConfig, World, WorldSpec, checked_actions
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 

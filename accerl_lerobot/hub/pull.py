@@ -30,7 +30,7 @@ from accerl_lerobot.checkpoint.safety import REVISION, brief, unsafe_name
 from accerl_lerobot.config.parsing import drop_consents, read_recipe
 from accerl_lerobot.engine.stopping import LOCK
 from accerl_lerobot.errors import InputError, check_absent, expanded
-from accerl_lerobot.hub.artifact_types import (
+from accerl_lerobot.hub.card import (
     CARD,
     MANIFEST,
     MANIFEST_FORMAT,

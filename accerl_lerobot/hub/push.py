@@ -31,23 +31,27 @@ from accerl_lerobot.checkpoint.layout import (
     places_of_names,
 )
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.hub.artifact_types import (
+from accerl_lerobot.hub.card import (
     CARD,
     CODEBASE_VERSION,
     CONFIG,
     DATASET,
     MANIFEST,
     MANIFEST_FORMAT,
+    MARK,
     POLICY,
     RECORD,
     REPO_TYPES,
     RUN,
+    Files,
     PushConfig,
+    dataset_card,
+    find_provenance,
+    model_card,
     read_json,
     recognise,
     repo_type,
 )
-from accerl_lerobot.hub.card import MARK, Files, dataset_card, find_provenance, model_card
 from accerl_lerobot.hub.errors import LOGIN, check_commit, hub_errors
 
 logger = logging.getLogger(__name__)

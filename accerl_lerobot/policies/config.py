@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The policy section of a recipe: the checkpoint, how it explores, what is trained. Free of torch."""
+"""The policy section of a recipe: the checkpoint, how it explores, what is trained. Free of torch.
+
+LeRobot policy types that have a likelihood here, and the families that suit them; free of torch.
+"""
 
 from __future__ import annotations
 
+import importlib
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import draccus
 
 from accerl_lerobot.checkpoint.safety import check_remote_code
-from accerl_lerobot.config.imports import imported
+from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.config.ranges import Device, Positive, Range, Section
 from accerl_lerobot.errors import InputError
 
@@ -46,50 +50,13 @@ def _check_order(config: SamplerConfig, low: str, middle: str, high: str) -> Non
 class FlowSamplerConfig(SamplerConfig):
     """Flow policies: which denoising steps are Gaussian, and how wide. `flow.py` explains the choices."""
 
-    stochastic: Literal["last", "all", "one"] = "last"
-    """Which denoising steps are Gaussian: last, all or one."""
-    noise: Literal["euler", "flow_sde", "learned"] = "euler"
-    """euler (stock mean, constant std), flow_sde (marginal-preserving, std grows with t) or learned (stock
-    mean, a std that is learned per observation, step and action dim, as in ReinFlow)."""
+    stochastic: Literal["last", "all"] = "last"
+    """Which denoising steps are Gaussian: last or all."""
+    noise: Literal["euler", "flow_sde"] = "euler"
+    """euler (stock mean, constant std) or flow_sde (marginal-preserving, std grows with t)."""
     noise_level: Annotated[float, Range("(0, 2]")] = 0.2
     """euler: total injected std in normalised action units. flow_sde: the factor a of
-    σ_t = a·√(t/(1−t)). learned: the std of each step at the start."""
-    noise_min: Annotated[float, Range("(0, 2]")] = 0.08
-    """learned: lower bound of the std, > 0 and below `noise_level`."""
-    noise_max: Annotated[float, Range("(0, 2]")] = 0.4
-    """learned: upper bound of the std, above `noise_level`."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.noise == "learned":
-            _check_order(self, "noise_min", "noise_level", "noise_max")
-
-
-@SamplerConfig.register_subclass("noise_space")
-@dataclass(frozen=True, kw_only=True)
-class NoiseSpaceSamplerConfig(SamplerConfig):
-    """A frozen flow policy, steered by the initial noise it is given (DSRL); see `flow.py`."""
-
-    std: Annotated[float, Range("(0, 2]")] = 1.0
-    """Std of the noise at the start; 1 is what the policy was trained with."""
-    std_min: Positive = 0.1
-    """Lower bound of the learned std, > 0 and below `std`."""
-    std_max: Positive = 2.0
-    """Upper bound of the learned std, above `std`."""
-    bound: Positive = 2.0
-    """Largest absolute mean: from noise it never saw in training the policy makes arbitrary actions."""
-    hidden: Annotated[int, Range("[1, 65536]")] = 128
-    """Width of the head's hidden layer."""
-    per_row: bool = False
-    """True: every row of a chunk gets a noise of its own. False: one row's noise for all, which is a far
-    smaller space to search, and not how the policy was trained."""
-    deterministic_eval: bool = True
-    """Start from the mean when not exploring. False: sample, which with `per_row` and `std` 1 is the frozen
-    policy itself as long as nothing has been learned."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_order(self, "std_min", "std", "std_max")
+    σ_t = a·√(t/(1−t))."""
 
 
 @SamplerConfig.register_subclass("tokens")
@@ -107,24 +74,19 @@ class TokenSamplerConfig(SamplerConfig):
 class GaussianSamplerConfig(SamplerConfig):
     """Policies that predict one chunk, with a Gaussian around it; see `gaussian.py`.
 
-    A policy with a std of its own, gaussian_actor, reads only `deterministic_eval`.
+    A policy with a std of its own, gaussian_actor, reads none of these.
     """
 
     std: Annotated[float, Range("(0, 2]")] = 0.2
     """Std of every action at the start, in normalised units."""
     std_min: Positive = 0.05
-    """With `learn_std`: lower bound of the std, > 0 and below `std`."""
+    """Lower bound of the learned std, > 0 and below `std`."""
     std_max: Positive = 0.5
-    """With `learn_std`: upper bound of the std, above `std`."""
-    learn_std: bool = True
-    """True: the std is learned, per observation, row and action dim. False: it stays `std`."""
-    deterministic_eval: bool = False
-    """gaussian_actor: execute the mean when not exploring. False: sample, as LeRobot's policy does."""
+    """Upper bound of the learned std, above `std`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.learn_std:
-            _check_order(self, "std_min", "std", "std_max")
+        _check_order(self, "std_min", "std", "std_max")
 
 
 @SamplerConfig.register_subclass("diffusion")
@@ -138,9 +100,6 @@ class DiffusionSamplerConfig(SamplerConfig):
     std_min: Annotated[float, Range("(0, 1]")] = 0.1
     """Lower bound of a step's std while exploring, in normalised units. The last step has no noise
     of its own, so this is the executed action's std around what the chain arrives at."""
-    last_steps: Annotated[int, Range("[1, 10000]")] | None = None
-    """Explore in, and learn from, this many steps at the end of the chain; those before act as LeRobot's and
-    are left out of the ratio, which then is an approximation off-policy. None: all steps, which is exact."""
     scheduler: Literal["DDPM", "DDIM"] | None = None
     """DDPM or DDIM, whatever the policy was trained with: both reverse the same noising. None keeps the
     checkpoint's. Written into what is saved."""
@@ -156,10 +115,6 @@ class ValueHeadConfig(Section, section="policy.value_head"):
 
     hidden: Annotated[int, Range("[1, 65536]")] = 128
     """Width of the hidden layer."""
-    detach: bool = True
-    """True: the critic reads the backbone without shaping it (AcceRL). False lets its gradient in; measured
-    on a policy of 0.4 M parameters (MetaWorld door-open, 200 updates) that took success from 0.65 to 0.00,
-    against 0.98 when detached."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,3 +184,112 @@ Load = Callable[[PolicyConfig], "PolicyAdapter"]
 def loader(load: Load | None) -> Load:
     """Function that makes a worker's adapter; None: the one that loads LeRobot checkpoints."""
     return load or imported("accerl_lerobot.policies.loading:load_adapter")
+
+
+POLICIES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "smolvla": ("accerl_lerobot.policies.smolvla:SmolVLA", ("flow",)),
+    "act": ("accerl_lerobot.policies.gaussian:ACT", ("gaussian",)),
+    "gaussian_actor": ("accerl_lerobot.policies.gaussian:GaussianActor", ("gaussian",)),
+    "diffusion": ("accerl_lerobot.policies.diffusion:Diffusion", ("diffusion",)),
+    "pi0": ("accerl_lerobot.policies.pi0:Pi0", ("flow",)),
+    "pi05": ("accerl_lerobot.policies.pi0:Pi05", ("flow",)),
+    "pi0_fast": ("accerl_lerobot.policies.pi0:Pi0Fast", ("tokens",)),
+    "smolvla_bins": ("accerl_lerobot.policies.smolvla:SmolVLABins", ("tokens",)),
+}
+"""LeRobot policy type → its model, and the families that suit it, the default one first."""
+FAMILIES = {
+    "flow": "accerl_lerobot.policies.flow:FlowFamily",
+    "gaussian": "accerl_lerobot.policies.gaussian:GaussianFamily",
+    "diffusion": "accerl_lerobot.policies.diffusion:DiffusionFamily",
+    "tokens": "accerl_lerobot.policies.tokens:TokenFamily",
+}
+"""Family → class; its config is registered under the same name in `config`."""
+PLUGINS = {"smolvla_bins": "accerl_lerobot.policies.bins_plugin"}
+"""LeRobot policy type of this package → the package that registers it with LeRobot."""
+USES_HISTORY = ("diffusion",)
+"""Types that read the observations of ``n_obs_steps`` env steps; the others read one."""
+NO_DENSITY = {
+    "tdmpc": "it plans by sampling and has no action density; LeRobot trains it with its own RL objective",
+    "vqbet": "LeRobot does not return its code log-probs; use smolvla",
+}
+
+
+def register_policies() -> None:
+    """Fills LeRobot's registry of policy types in this process: its own, and ours."""
+    importlib.import_module("lerobot.policies")
+    for package in PLUGINS.values():
+        importlib.import_module(package)
+
+
+def discovery(policy_type: str | None) -> list[str]:
+    """Arguments by which stock LeRobot commands find this type; none for LeRobot's own."""
+    if policy_type not in PLUGINS:
+        return []
+    return [f"--policy.discover_packages_path={PLUGINS[policy_type]}"]
+
+
+def check_type(policy_type: Any, field: str, prefix: str = "") -> str:
+    """Refuses a LeRobot policy type that has no likelihood here; `prefix` begins the remedy.
+
+    Raises:
+        InputError: it has none.
+    """
+    if policy_type not in POLICIES:
+        why = NO_DENSITY.get(policy_type, f"no likelihood for it here; use one of {', '.join(POLICIES)}")
+        raise InputError(field, policy_type, prefix + why)
+    return str(policy_type)
+
+
+def check_observations(policy_config: Any, field: str) -> None:
+    """Refuses an observation history that LeRobot's policy of this type does not read.
+
+    Raises:
+        InputError: as above.
+    """
+    if policy_config.n_obs_steps != 1 and policy_config.type not in USES_HISTORY:
+        remedy = f"only {', '.join(USES_HISTORY)} looks back; a {policy_config.type} policy takes 1"
+        raise InputError(field, policy_config.n_obs_steps, remedy)
+
+
+def sampler_config(config: PolicyConfig, policy_type: str) -> SamplerConfig:
+    """How a policy of this type explores in this run.
+
+    Raises:
+        InputError: the configured sampler is of a family that does not suit it.
+    """
+    families = POLICIES[policy_type][1]
+    if config.sampler is None:
+        default: SamplerConfig = SamplerConfig.get_choice_class(families[0])()
+        return default
+    if config.sampler.type not in families:
+        remedy = f"a {policy_type} policy explores by {' or '.join(families)}"
+        raise InputError("policy.sampler.type", config.sampler.type, remedy)
+    return config.sampler
+
+
+def steps_field(policy_config: Any) -> str | None:
+    """Field of a LeRobot policy config that holds its denoising steps; None if it does not denoise."""
+    return next((n for n in ("num_steps", "num_inference_steps") if hasattr(policy_config, n)), None)
+
+
+def override(policy_config: Any, config: PolicyConfig) -> None:
+    """Puts a run's choices of denoising steps, executed rows and precision into LeRobot's policy config."""
+    if hasattr(policy_config, "pretrained_backbone_weights"):
+        # The checkpoint has them; LeRobot would download torchvision's first, even when told to stay offline.
+        policy_config.pretrained_backbone_weights = None
+    if config.num_steps is not None:
+        name = steps_field(policy_config)
+        if name is None:
+            remedy = f"a {policy_config.type} policy does not denoise; leave the field out"
+            raise InputError("policy.num_steps", config.num_steps, remedy)
+        setattr(policy_config, name, config.num_steps)
+    if hasattr(policy_config, "dtype"):
+        policy_config.dtype = "float32"  # see `PolicyConfig.precision`
+    if config.n_action_steps is not None:
+        chunk = int(getattr(policy_config, "chunk_size", 0) or getattr(policy_config, "horizon", 1))
+        if policy_config.type in USES_HISTORY:
+            chunk -= policy_config.n_obs_steps - 1  # rows that stand for the past
+        if config.n_action_steps > chunk:
+            remedy = f"use 1 to {chunk}, the chunk the policy predicts"
+            raise InputError("policy.n_action_steps", config.n_action_steps, remedy)
+        policy_config.n_action_steps = config.n_action_steps

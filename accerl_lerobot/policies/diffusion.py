@@ -10,17 +10,14 @@ network decides (Ren et al., arXiv 2409.00588):
 
 with ᾱ at the step and ᾱ′ at the one after it (arXiv 2006.11239, eq. 7; arXiv 2010.02502, eq. 12). These are
 the operations of LeRobot's scheduler, in its order. While exploring, a step's std is max(s, std_min) and its
-log-density counts; the chain is what is stored, and re-scoring takes a network pass per counted step. x_N's
+log-density counts; the chain is what is stored, and re-scoring takes a network pass per step. x_N's
 density does not depend on the weights and is left out. In every step but the last all rows feed back through
 the network, so all count; after the last nothing feeds back, and rows that are not executed are left out.
 
-`DiffusionSamplerConfig.last_steps` limits exploration to the end of the chain, as DPPO does to save passes.
-Where the chain is by then moves with the weights too but is taken as given, so weighting with ρ gives the
-policy in which only the last steps are new. DPPO keeps a frozen copy of the network for the steps before,
-which LeRobot's checkpoint could not hold. DPPO's other liberties are not taken: it may score with a wider std
-than it sampled with, clips its noise, and gives each denoising step a ratio of its own with a discount.
+DPPO's other liberties are not taken: it may explore in the last steps alone, score with a wider std than it
+sampled with, clips its noise, and gives each denoising step a ratio of its own with a discount.
 
-Shapes: B batch, H horizon, A action dims, N steps, C counted steps, L factors: one per row.
+Shapes: B batch, H horizon, A action dims, N steps, L factors: one per row.
 """
 
 from __future__ import annotations
@@ -126,14 +123,9 @@ class Schedule:
         return mean, std.clamp(min=config.std_min).to(x).view(1, 1, 1)
 
 
-def counted_steps(schedule: Schedule, config: DiffusionSamplerConfig) -> int:
-    """C, how many steps at the end of the chain are explored in."""
-    return len(schedule) if config.last_steps is None else config.last_steps
-
-
-def factors(shape: DiffusionShape, counted: int) -> slice:
+def factors(shape: DiffusionShape, schedule: Schedule) -> slice:
     """L rows. Those without a density are left out: as constant factors they would dilute means."""
-    return shape.rows if counted == 1 else slice(0, shape.horizon)
+    return shape.rows if len(schedule) == 1 else slice(0, shape.horizon)
 
 
 def sample(
@@ -153,25 +145,20 @@ def sample(
         explore: (B,) bool.
 
     Returns:
-        x_0 (B, H, A); the end of the chain (B, C + 1, H, A); its log-prob (B, L), zero where not exploring.
+        x_0 (B, H, A); the chain (B, N + 1, H, A); its log-prob (B, L), zero where not exploring.
     """
-    first = len(schedule) - counted_steps(schedule, config)
-    path = []
+    path = [x]
     logp = x.new_zeros(x.shape[:2])
     for k, timestep in enumerate(schedule.timesteps):
-        if k >= first:
-            path.append(x)
         output = network(x, timestep)
         mean, std = schedule.step(k, x, output)
         step = mean + std * eps[:, k]
-        if k >= first:
-            mean, width = schedule.exploring_step(k, x, output, config)
-            step = torch.where(explore[:, None, None], mean + width * eps[:, k], step)
-            counted = gaussian_log_prob(step, mean, width, _mask(k, shape, schedule, x.device))
-            logp = logp + torch.where(explore[:, None], counted, 0.0)
-        x = step
-    path.append(x)
-    return x, torch.stack(path, 1), logp[:, factors(shape, len(path) - 1)]
+        mean, width = schedule.exploring_step(k, x, output, config)
+        x = torch.where(explore[:, None, None], mean + width * eps[:, k], step)
+        counted = gaussian_log_prob(x, mean, width, _mask(k, shape, schedule, x.device))
+        logp = logp + torch.where(explore[:, None], counted, 0.0)
+        path.append(x)
+    return x, torch.stack(path, 1), logp[:, factors(shape, schedule)]
 
 
 def log_prob(
@@ -181,21 +168,20 @@ def log_prob(
     schedule: Schedule,
     config: DiffusionSamplerConfig,
 ) -> Tensor:
-    """Log-density of stored chains (B, C + 1, H, A) under the current network, (B, L), differentiable."""
-    counted = counted_steps(schedule, config)
+    """Log-density of stored chains (B, N + 1, H, A) under the current network, (B, L), differentiable."""
     logp = path.new_zeros(len(path), shape.horizon)
-    for i, k in enumerate(range(len(schedule) - counted, len(schedule))):
-        x = path[:, i]
-        mean, std = schedule.exploring_step(k, x, network(x, schedule.timesteps[k]), config)
-        logp = logp + gaussian_log_prob(path[:, i + 1], mean, std, _mask(k, shape, schedule, x.device))
-    return logp[:, factors(shape, counted)]
+    for k, timestep in enumerate(schedule.timesteps):
+        x = path[:, k]
+        mean, std = schedule.exploring_step(k, x, network(x, timestep), config)
+        logp = logp + gaussian_log_prob(path[:, k + 1], mean, std, _mask(k, shape, schedule, x.device))
+    return logp[:, factors(shape, schedule)]
 
 
 def entropy(shape: DiffusionShape, schedule: Schedule, config: DiffusionSamplerConfig) -> float:
-    """Differential entropy of the counted steps; no weight changes it."""
+    """Differential entropy of the steps; no weight changes it."""
     zero = torch.zeros(1, 1, 1)
     total = 0.0
-    for k in range(len(schedule) - counted_steps(schedule, config), len(schedule)):
+    for k in range(len(schedule)):
         _, std = schedule.exploring_step(k, zero, zero, config)
         entries = int(_mask(k, shape, schedule, zero.device).sum()) * shape.action_dim
         total += entries * float(normal_entropy(std))
@@ -316,9 +302,6 @@ class DiffusionFamily(Family):
         super().__init__()
         self.model, self.sampler = model, sampler
         self.shape, self.schedule = model.shape, model.schedule
-        if sampler.last_steps is not None and sampler.last_steps > len(self.schedule):
-            remedy = f"use at most {len(self.schedule)}, the policy's denoising steps, or null for all"
-            raise InputError("policy.sampler.last_steps", sampler.last_steps, remedy)
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         """Samples; without exploration a DDPM policy still draws step noise, as LeRobot's does."""
@@ -350,5 +333,5 @@ class DiffusionFamily(Family):
     @property
     def actions(self) -> int:
         """Every factor is one row of the chunk."""
-        rows = factors(self.shape, counted_steps(self.schedule, self.sampler))
+        rows = factors(self.shape, self.schedule)
         return rows.stop - rows.start

@@ -5,7 +5,7 @@
                                                             └──────Family.score(latent) ──► log-prob
 
 A model knows LeRobot's internals and nothing of densities; a family knows densities and asks the model for
-what its `Encoded.context` offers, a velocity field for instance. `registry.POLICIES` says which go together.
+what its `Encoded.context` offers, a velocity field for instance. `config.POLICIES` says which go together.
 """
 
 from __future__ import annotations
@@ -89,8 +89,6 @@ class Model(ABC):
 class Family(nn.Module, ABC):
     """One way of acting at random with a known density; may own parameters, which are trained."""
 
-    frozen: ClassVar[bool] = False
-    """True: only the family's own parameters are trained, never the policy's."""
     imitates: ClassVar[bool] = False
     """True if it has an `imitation_loss`."""
 

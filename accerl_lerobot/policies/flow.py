@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Likelihoods of flow policies: noise in the denoising steps, or over the initial noise (DSRL, at the end).
+"""Likelihood of flow policies: noise in the denoising steps.
 
 A flow policy integrates x from t = 1 (noise) to t = 0 (action) in N Euler steps of δ = 1/N:
 x ← x − δ·v(x, t). That map has no usable density, so exploration makes some steps Gaussian and the log-prob
@@ -12,21 +12,14 @@ is that of the path. Which steps:
 ``all``   Every step is Gaussian; the path density is the sum over steps (Flow-GRPO, arXiv 2505.05470; πRL,
           arXiv 2510.25889). Exact as well; N velocity passes. Padded dims feed back into real ones, so they
           get noise and belong to the density.
-``one``   One randomly drawn step is Gaussian, the rest ODE, and re-scoring takes its start point as given:
-          one velocity pass (the "mixed ODE-SDE" of MixGRPO, arXiv 2507.21802, and of πRL). The steps around
-          the drawn one move with the weights too but are left out of the ratio, so weighting with it gives
-          the policy in which *only* the drawn transition is new: E_μ[ρ f(a)] is that policy's E[f(a)], not
-          π's. Cheap for large models; the ratio is still 1 at equal weights.
-
-Three noise laws, `FlowSamplerConfig.noise`: ``euler`` keeps the ODE's mean and adds a constant std, so that
+Two noise laws, `FlowSamplerConfig.noise`: ``euler`` keeps the ODE's mean and adds a constant std, so that
 under ``last`` the executed mean is the stock action; it does not preserve the ODE's marginals. ``flow_sde``
 scales the noise with t and corrects the drift, so that under ``all`` it does preserve them, up to the step
-size. ``learned`` keeps the ODE's mean and learns the std within bounds (ReinFlow, arXiv 2505.22094); the
-density of x₀, which the weights do not change, is left out.
+size.
 
 Shapes: B batch, K actions per chunk, D = max_action_dim (real dims first, then padding), A real dims,
-N steps, L log-prob factors: one per executed row under ``last``; one per row otherwise, since all rows feed
-back.
+N steps, L log-prob factors: one per executed row under ``last``; one per row under ``all``, since all rows
+feed back.
 """
 
 from __future__ import annotations
@@ -37,16 +30,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
-from accerl_lerobot.policies.config import FlowSamplerConfig, NoiseSpaceSamplerConfig
+from accerl_lerobot.policies.config import FlowSamplerConfig
 from accerl_lerobot.policies.family import (
     Action,
-    BoundedStd,
     Encoded,
     Family,
     Model,
@@ -54,14 +45,11 @@ from accerl_lerobot.policies.family import (
     exploring,
     normal_entropy,
     normal_log_prob,
-    pooled,
     standard_normal,
 )
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 """(x (B, K, D), t (B,)) → v (B, K, D)."""
-Std = Callable[[Tensor], Tensor]
-"""t (B,) → std (B, 1, D) of a step that begins there."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +93,7 @@ def step_time(k: int, num_steps: int) -> float:
 
 
 def transition(
-    x: Tensor, v: Tensor, t: Tensor, shape: FlowShape, config: FlowSamplerConfig, std: Std | None = None
+    x: Tensor, v: Tensor, t: Tensor, shape: FlowShape, config: FlowSamplerConfig
 ) -> tuple[Tensor, Tensor]:
     """Mean and std of one Gaussian denoising step.
 
@@ -115,15 +103,11 @@ def transition(
         t: (B,) in (0, 1].
         shape: the sizes.
         config: the noise law.
-        std: the learned one, needed under ``learned``.
 
     Returns:
-        mean (B, K, D) and std (B, 1, 1) or (B, 1, D).
+        mean (B, K, D) and std (B, 1, 1).
     """
     delta = 1.0 / shape.num_steps
-    if config.noise == "learned":
-        assert std is not None
-        return x + (-delta) * v, std(t)
     t = t.to(x)[:, None, None]
     ode = x + (-delta) * v
     if config.noise == "euler":
@@ -144,18 +128,15 @@ def sample(
     velocity: Velocity,
     x0: Tensor,
     eps: Tensor,
-    index: Tensor,
     explore: Tensor,
     shape: FlowShape,
     config: FlowSamplerConfig,
-    std: Std | None = None,
 ) -> tuple[Tensor, dict[str, Tensor], Tensor]:
     """Denoises a batch, some samples exploring and the others by the stock ODE.
 
     Args:
         x0: (B, K, D) initial noise.
         eps: (B, N, K, D) standard normal, the step noise; only stochastic steps read it.
-        index: (B,) int64, the step drawn under ``one``; ignored otherwise.
         explore: (B,) bool; False samples take the stock path, equal to LeRobot's sampler.
 
     Returns:
@@ -168,92 +149,52 @@ def sample(
     for k in range(n):
         t = x0.new_full((x0.shape[0],), step_time(k, n))
         v = velocity(x, t)
-        noisy = explore & _is_stochastic(k, index, n, config)
-        mean, width = transition(x, v, t, shape, config, std)
+        noisy = explore & (config.stochastic == "all" or k == n - 1)
+        mean, width = transition(x, v, t, shape, config)
         step = torch.where(noisy[:, None, None], mean + width * eps[:, k], x + (-1.0 / n) * v)
         counted = gaussian_log_prob(step, mean, width, _counted(k, mask, shape))
         logp = logp + torch.where(noisy[:, None], counted, 0.0)
         x = step
         path.append(x)
-    return x, _latent(path, index, config), logp[:, : factors(shape, config)]
+    kept = path if config.stochastic == "all" else [x0, x]
+    return x, {"path": torch.stack(kept, 1)}, logp[:, : factors(shape, config)]
 
 
 def log_prob(
-    velocity: Velocity,
-    latent: dict[str, Tensor],
-    shape: FlowShape,
-    config: FlowSamplerConfig,
-    std: Std | None = None,
+    velocity: Velocity, latent: dict[str, Tensor], shape: FlowShape, config: FlowSamplerConfig
 ) -> Tensor:
     """Log-density of stored latents under the current velocity field, (B, L), differentiable."""
     path, n = latent["path"], shape.num_steps
     b = path.shape[0]
     mask = shape.action_mask().to(path.device)
-    if config.stochastic == "one":
-        index = latent["index"]
-        # Gathered, not computed from `index`: single-precision arithmetic would differ from `step_time` in
-        # the last bit, which a sinusoidal time embedding of period 4e-3 turns into a log-prob error of 1e-4.
-        t = path.new_tensor([step_time(k, n) for k in range(n)])[index]
-        mean, width = transition(path[:, 0], velocity(path[:, 0], t), t, shape, config, std)
-        rows = torch.stack([_counted(k, mask, shape) for k in range(n)])[index]
-        return gaussian_log_prob(path[:, 1], mean, width, rows)
     if config.stochastic == "last":
         x = path[:, 0]
         for k in range(n - 1):
             x = x + (-1.0 / n) * velocity(x, x.new_full((b,), step_time(k, n)))
         t = x.new_full((b,), step_time(n - 1, n))
-        mean, width = transition(x, velocity(x, t), t, shape, config, std)
+        mean, width = transition(x, velocity(x, t), t, shape, config)
         return gaussian_log_prob(path[:, 1], mean, width, mask)[:, : factors(shape, config)]
     total = path.new_zeros(b, shape.chunk_size)
     for k in range(n):
         t = path.new_full((b,), step_time(k, n))
-        mean, width = transition(path[:, k], velocity(path[:, k], t), t, shape, config, std)
+        mean, width = transition(path[:, k], velocity(path[:, k], t), t, shape, config)
         total = total + gaussian_log_prob(path[:, k + 1], mean, width, _counted(k, mask, shape))
     return total
 
 
-def entropy(
-    latent: dict[str, Tensor], shape: FlowShape, config: FlowSamplerConfig, std: Std | None = None
-) -> Tensor:
-    """Differential entropy (B,) of the Gaussian steps that were drawn; only ``learned`` weights change it."""
-    path, n = latent["path"], shape.num_steps
-    b = path.shape[0]
-    mask = shape.action_mask().to(path.device)
-    zero = path.new_zeros(b, 1, 1)
-    per_step = []
-    for k in range(n):
-        t = path.new_full((b,), step_time(k, n))
-        _, width = transition(zero, zero, t, shape, config, std)
-        each = normal_entropy(width).expand(b, *mask.shape)
-        per_step.append(torch.where(_counted(k, mask, shape), each, 0.0).sum((1, 2)))
-    steps = torch.stack(per_step, 1)
-    if config.stochastic == "all":
-        return steps.sum(1)
-    if config.stochastic == "last":
-        return steps[:, -1]
-    return steps.gather(1, latent["index"][:, None])[:, 0]
-
-
-def _is_stochastic(k: int, index: Tensor, n: int, config: FlowSamplerConfig) -> Tensor:
-    if config.stochastic == "one":
-        return index == k
-    return torch.full_like(index, config.stochastic == "all" or k == n - 1, dtype=torch.bool)
+def entropy(shape: FlowShape, config: FlowSamplerConfig) -> float:
+    """Differential entropy of the Gaussian steps; no weight changes it."""
+    n, mask, zero = shape.num_steps, shape.action_mask(), torch.zeros(1, 1, 1)
+    total = 0.0
+    for k in range(n) if config.stochastic == "all" else (n - 1,):
+        _, width = transition(zero, zero, torch.tensor([step_time(k, n)]), shape, config)
+        total += int(_counted(k, mask, shape).sum()) * float(normal_entropy(width))
+    return total
 
 
 def _counted(k: int, action_mask: Tensor, shape: FlowShape) -> Tensor:
     """(K, D) entries of step k's outcome that belong to the density; all but the last's feed back."""
     return action_mask if k == shape.num_steps - 1 else torch.ones_like(action_mask)
-
-
-def _latent(path: list[Tensor], index: Tensor, config: FlowSamplerConfig) -> dict[str, Tensor]:
-    """Latent that replay must keep: the whole path, its two ends, or the drawn transition."""
-    if config.stochastic == "all":
-        return {"path": torch.stack(path, 1)}
-    if config.stochastic == "last":
-        return {"path": torch.stack([path[0], path[-1]], 1)}
-    stacked = torch.stack(path, 1)
-    rows = torch.arange(len(index), device=index.device)
-    return {"path": torch.stack([stacked[rows, index], stacked[rows, index + 1]], 1), "index": index}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -309,31 +250,6 @@ def difference(model: FlowModel, batch: dict[str, Tensor], encoded: Encoded) -> 
     return float((ours[..., : shape.action_dim] - stock).abs().max())
 
 
-class NoiseHead(nn.Module):
-    """The std of ``noise=learned``, per observation, step and action dim; starts at `noise_level`.
-
-    It reads features of `width` without shaping them.
-    """
-
-    def __init__(self, width: int, shape: FlowShape, config: FlowSamplerConfig) -> None:
-        super().__init__()
-        self.steps, self.dims = shape.num_steps, shape.padded_dim
-        self.norm, self.out = nn.LayerNorm(width), nn.Linear(width, self.steps * self.dims)
-        self.bounded = BoundedStd(config.noise_min, config.noise_max)
-        self.bounded.start(self.out, config.noise_level)
-
-    def forward(self, encoded: Encoded) -> Std:
-        """The std of each step, given the observations."""
-        raw = self.out(self.norm(pooled(encoded.features.detach(), encoded.mask)))
-        widths = self.bounded(raw).view(-1, self.steps, self.dims)
-
-        def std(t: Tensor) -> Tensor:
-            k = ((1 - t) * self.steps).round().long()
-            return widths.gather(1, k[:, None, None].expand(-1, 1, self.dims))
-
-        return std
-
-
 class FlowFamily(Family):
     """Flow policies explored by noise in their denoising steps; the functions above do the work."""
 
@@ -342,21 +258,18 @@ class FlowFamily(Family):
     def __init__(self, model: FlowModel, sampler: FlowSamplerConfig) -> None:
         super().__init__()
         self.model, self.sampler, self.shape = model, sampler, model.shape
-        self.noise = NoiseHead(model.width, self.shape, sampler) if sampler.noise == "learned" else None
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
-        x0, eps, index = self._noise(requests, encoded.features.device)
-        explore, shape = exploring(requests, x0.device), self.shape
-        velocity, std = encoded.context.velocity, self._std(encoded)
-        x, latent, log_prob = sample(velocity, x0, eps, index, explore, shape, self.sampler, std)
+        n, size = self.shape.num_steps, (self.shape.chunk_size, self.shape.padded_dim)
+        x0, eps = standard_normal(requests, size, (n, *size), device=encoded.features.device)
+        explore, velocity = exploring(requests, x0.device), encoded.context.velocity
+        x, latent, log_prob = sample(velocity, x0, eps, explore, self.shape, self.sampler)
         return Action(chunk=self._executed_part(x), latent=latent, log_prob=log_prob)
 
     def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
-        velocity, std = encoded.context.velocity, self._std(encoded)
-        return Score(
-            log_prob=log_prob(velocity, latent, self.shape, self.sampler, std),
-            entropy=entropy(latent, self.shape, self.sampler, std),
-        )
+        logp = log_prob(encoded.context.velocity, latent, self.shape, self.sampler)
+        constant = entropy(self.shape, self.sampler)
+        return Score(log_prob=logp, entropy=logp.new_full((len(logp),), constant))
 
     def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
         return difference(self.model, batch, encoded)
@@ -378,80 +291,3 @@ class FlowFamily(Family):
     def actions(self) -> int:
         """Every factor is one row of the chunk."""
         return factors(self.shape, self.sampler)
-
-    def _std(self, encoded: Encoded) -> Std | None:
-        return None if self.noise is None else self.noise(encoded)
-
-    def _noise(self, requests: Sequence[Request], device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-        """x0 (B, K, D), eps (B, N, K, D) and the drawn step (B,), each from its own request's seed."""
-        n, size = self.shape.num_steps, (self.shape.chunk_size, self.shape.padded_dim)
-        x0, eps = standard_normal(requests, size, (n, *size), device=device)
-        index = [np.random.default_rng((r.noise_seed, n)).integers(n) for r in requests]
-        return x0, eps, torch.tensor(index, device=device)
-
-
-class NoiseSpaceFamily(Family):
-    """Steers a frozen flow policy by its initial noise (DSRL, Wagenmaker et al., arXiv 2506.15799).
-
-    The Euler loop is left as it is; a small head samples the noise that it starts from, z ~ N(m(o), s(o)²).
-    The ratio is exact and costs no velocity pass to re-score, and every objective here applies; the paper
-    uses SAC. The head lies beside the checkpoint in ``family.safetensors``; stock LeRobot loads the frozen
-    policy without it.
-    """
-
-    frozen = True
-
-    def __init__(self, model: FlowModel, sampler: NoiseSpaceSamplerConfig) -> None:
-        super().__init__()
-        self.model, self.sampler, self.shape = model, sampler, model.shape
-        self.rows = self.shape.chunk_size if sampler.per_row else 1
-        size = self.rows * self.shape.padded_dim
-        self.norm = nn.LayerNorm(model.width)
-        self.hidden = nn.Linear(model.width, sampler.hidden)
-        self.mean = nn.Linear(sampler.hidden, size)
-        self.width = nn.Linear(sampler.hidden, size)
-        nn.init.zeros_(self.mean.weight)
-        nn.init.zeros_(self.mean.bias)
-        self.bounded = BoundedStd(sampler.std_min, sampler.std_max)
-        self.bounded.start(self.width, sampler.std)
-
-    def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
-        mean, std = self._gaussian(encoded)
-        shape, size = self.shape, tuple(mean.shape[1:])
-        (eps,) = standard_normal(requests, size, device=mean.device)
-        explore = exploring(requests, mean.device)
-        noisy = explore | (not self.sampler.deterministic_eval)
-        z = torch.where(noisy[:, None, None], mean + std * eps, mean)
-        x = integrate(encoded.context.velocity, z.expand(-1, shape.chunk_size, -1), shape)
-        return Action(
-            chunk=x[:, : shape.executed, : shape.action_dim],
-            latent={"z": z},
-            log_prob=torch.where(explore[:, None], _noise_log_prob(z, mean, std), 0.0),
-        )
-
-    def score(self, encoded: Encoded, latent: dict[str, Tensor]) -> Score:
-        mean, std = self._gaussian(encoded)
-        entropy = normal_entropy(std).sum((1, 2))
-        return Score(log_prob=_noise_log_prob(latent["z"], mean, std), entropy=entropy)
-
-    def difference(self, batch: dict[str, Tensor], encoded: Encoded) -> float:
-        """Compares the frozen policy with the one LeRobot runs."""
-        return difference(self.model, batch, encoded)
-
-    @property
-    def actions(self) -> int:
-        """One factor per row of noise."""
-        return self.rows
-
-    def _gaussian(self, encoded: Encoded) -> tuple[Tensor, Tensor]:
-        """Mean and std of z, each (B, rows, D)."""
-        hidden = torch.relu(self.hidden(self.norm(pooled(encoded.features, encoded.mask))))
-        size = (-1, self.rows, self.shape.padded_dim)
-        bound = self.sampler.bound
-        mean = bound * torch.tanh(self.mean(hidden).float() / bound)
-        return mean.view(size), self.bounded(self.width(hidden)).view(size)
-
-
-def _noise_log_prob(z: Tensor, mean: Tensor, std: Tensor) -> Tensor:
-    """(B, rows), summed over dims; padded ones act on the others, so they are part of the choice."""
-    return normal_log_prob(z, mean, std).sum(-1)

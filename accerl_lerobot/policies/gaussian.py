@@ -11,6 +11,19 @@ A policy that is deterministic in itself (act) gets a std from `StdHead`, whose 
 that has a std of its own (gaussian_actor) keeps it.
 
 Shapes: B batch, K rows of a chunk, A action dims, W width of a row's features; L = executed rows.
+
+ACT: one pass of LeRobot's transformer; its own forward is run, and watched at two places.
+
+At inference the variational encoder is not run and the latent is 0, so the policy is deterministic. The
+ResNet's batch norms are frozen in LeRobot's own code, and dropout is off, since a policy here is never in
+training mode: nothing but the observations and the weights moves the chunk.
+
+LeRobot's gaussian_actor, the policy of its SAC: one action a decision, a Gaussian through tanh.
+
+Three things in LeRobot 0.6.1 are not what its config says, and the comparison at load time covers them: what
+it clamps to [std_min, std_max] is handed to `MultivariateNormal` as a covariance, so the std is the
+*square root* of it; ``use_tanh_squash`` is not read, every action is squashed; and ``select_action`` samples,
+it does not take the mean. `predict_action_chunk` raises, and `forward` cannot score a stored action.
 """
 
 from __future__ import annotations
@@ -19,12 +32,14 @@ import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Request
 from accerl_lerobot.policies.config import GaussianSamplerConfig
 from accerl_lerobot.policies.family import (
@@ -98,16 +113,15 @@ class GaussianFamily(Family):
         super().__init__()
         self.model, self.sampler = model, sampler
         self.std: StdHead | None = None
-        if sampler.learn_std and model.row_width is not None:
+        if model.row_width is not None:
             self.std = StdHead(model.row_width, model.action_dim, sampler)
 
     def act(self, encoded: Encoded, requests: Sequence[Request]) -> Action:
         mean, std = self._gaussian(encoded)
         (eps,) = standard_normal(requests, tuple(mean.shape[1:]), device=mean.device)
         explore = exploring(requests, mean.device)
-        noisy = explore
-        if encoded.context.std is not None and not self.sampler.deterministic_eval:
-            noisy = torch.ones_like(explore)
+        # A policy with a std of its own samples in LeRobot too.
+        noisy = explore if encoded.context.std is None else torch.ones_like(explore)
         u = torch.where(noisy[:, None, None], mean + std * eps, mean)
         return Action(
             chunk=self._action(u),
@@ -145,9 +159,7 @@ class GaussianFamily(Family):
         mean = context.mean[:, :executed]
         if context.std is not None:
             return mean, context.std[:, :executed]
-        if self.std is None:
-            return mean, torch.full_like(mean, self.sampler.std)
-        assert context.rows is not None
+        assert self.std is not None and context.rows is not None
         return mean, self.std(context.rows[:, :executed])
 
     def _action(self, u: Tensor) -> Tensor:
@@ -172,3 +184,101 @@ def expected_log_slope(mean: Tensor, std: Tensor) -> Tensor:
     x = torch.from_numpy(nodes).to(mean)
     w = torch.from_numpy(weights / weights.sum()).to(mean)
     return log_slope(mean[..., None] + std[..., None] * x) @ w
+
+
+class ACT(GaussianModel):
+    """Drives LeRobot's `ACTPolicy`."""
+
+    idle = ("model.vae_encoder", "model.encoder_latent_input_proj.weight")
+
+    def __init__(self, policy: Any) -> None:
+        config = policy.config
+        if config.temporal_ensemble_coeff is not None:
+            remedy = "averaging over earlier chunks makes actions depend on more than the observation"
+            raise InputError(
+                "policy.temporal_ensemble_coeff", config.temporal_ensemble_coeff, f"{remedy}; set it to null"
+            )
+        self.policy = policy
+        self.executed, self.action_dim = config.n_action_steps, config.action_feature.shape[0]
+        self.width = self.row_width = config.dim_model
+
+    def encode(self, batch: dict[str, Tensor]) -> Encoded:
+        """The features are the encoder's output: latent, state, image positions."""
+        from lerobot.utils.constants import OBS_IMAGES
+
+        model: Any = self.policy.model
+        inputs: dict[str, Any] = dict(batch)
+        if self.policy.config.image_features:
+            inputs[OBS_IMAGES] = [batch[key] for key in self.policy.config.image_features]
+        seen: dict[str, Tensor] = {}
+
+        def encoder_done(module: nn.Module, arguments: Any, output: Tensor) -> None:
+            seen["features"] = output.transpose(0, 1)
+
+        def head_starts(module: nn.Module, arguments: tuple[Tensor]) -> None:
+            seen["rows"] = arguments[0]
+
+        hooks = [
+            model.encoder.register_forward_hook(encoder_done),
+            model.action_head.register_forward_pre_hook(head_starts),
+        ]
+        try:
+            mean, _ = model(inputs)
+        finally:
+            for hook in hooks:
+                hook.remove()
+        features = seen["features"]
+        return Encoded(
+            features=features,
+            mask=features.new_ones(features.shape[:2]).bool(),
+            context=GaussianContext(mean=mean.float(), rows=seen["rows"]),
+        )
+
+    def stock(self, batch: dict[str, Tensor]) -> tuple[Tensor, None]:
+        return self.policy.predict_action_chunk(batch), None
+
+
+class GaussianActor(GaussianModel):
+    """Drives LeRobot's `GaussianActorPolicy`."""
+
+    squashed = True
+    executed = 1
+
+    def __init__(self, policy: Any) -> None:
+        config = policy.config
+        if config.num_discrete_actions is not None:
+            remedy = "LeRobot takes the discrete action that a critic likes best, which has no density"
+            raise InputError("policy.num_discrete_actions", config.num_discrete_actions, remedy)
+        self.policy = policy
+        self.action_dim = policy.actor.action_dim
+        self.width = policy.actor.encoder.output_dim
+        if not config.shared_encoder:
+            self.idle = ("encoder_critic.",)
+
+    def encode(self, batch: dict[str, Tensor]) -> Encoded:
+        """The features are the encoder's output, one token.
+
+        Unlike in LeRobot's SAC, whose critic shapes a shared image encoder, the log-prob's gradient reaches
+        it: our critic reads features and does not shape them.
+        """
+        actor = self.policy.actor
+        features = actor.encoder(batch)
+        hidden = actor.network(features)
+        variance = torch.exp(actor.std_layer(hidden).float()).clamp(actor.std_min, actor.std_max)
+        mean = actor.mean_layer(hidden).float()
+        return Encoded(
+            features=features[:, None],
+            mask=features.new_ones(len(features), 1).bool(),
+            context=GaussianContext(mean=mean[:, None], std=variance.sqrt()[:, None]),
+        )
+
+    def stock(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """LeRobot draws from the global generator, which is put back."""
+        device = next(self.policy.parameters()).device
+        with torch.random.fork_rng([device] if device.type == "cuda" else []):
+            torch.manual_seed(0)
+            action = self.policy.select_action(batch)
+            torch.manual_seed(0)
+            zeros = torch.zeros_like(action)
+            eps = torch.normal(zeros, zeros + 1)
+        return action[:, None], eps[:, None]

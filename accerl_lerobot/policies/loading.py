@@ -23,16 +23,27 @@ from accerl_lerobot.checkpoint import layout, snapshot
 from accerl_lerobot.checkpoint.isolation import rehearse
 from accerl_lerobot.checkpoint.layout import BACKBONE, CONFIG_FOLDERS, PREPROCESSOR, STEP_FOLDERS
 from accerl_lerobot.checkpoint.safety import Origin, brief, read_tensors, tensor_shapes
-from accerl_lerobot.config.imports import imported
+from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK
 from accerl_lerobot.policies.adapter import (
     LeRobotAdapter,
     Processing,
+    ValueHead,
     example_requests,
     stack_observations,
 )
-from accerl_lerobot.policies.config import PolicyConfig, SamplerConfig
+from accerl_lerobot.policies.config import (
+    FAMILIES,
+    POLICIES,
+    PolicyConfig,
+    SamplerConfig,
+    check_observations,
+    check_type,
+    override,
+    register_policies,
+    sampler_config,
+)
 from accerl_lerobot.policies.family import Model
 from accerl_lerobot.policies.guard import (
     CONFIG,
@@ -46,18 +57,7 @@ from accerl_lerobot.policies.guard import (
     guarded,
     input_error,
 )
-from accerl_lerobot.policies.registry import (
-    FAMILIES,
-    POLICIES,
-    check_observations,
-    check_type,
-    override,
-    register_policies,
-    sampler_config,
-)
-from accerl_lerobot.policies.saving import save_pretrained
-from accerl_lerobot.policies.tuning import subtract_adapters, tune
-from accerl_lerobot.policies.value_head import ValueHead
+from accerl_lerobot.policies.saving import save_pretrained, subtract_adapters, tune
 
 logger = logging.getLogger(__name__)
 
@@ -240,7 +240,7 @@ def _load(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAdapter:
         elif sum(parameter.numel() for parameter in policy.parameters()) <= ACTS_MOST:
             observation = requests[0].observation | {TASK: TEXT}
             adapter.decide([replace(requests[0], observation=observation)], 0)
-        tune(policy, model, family, config.tuning)
+        tune(policy, model, config.tuning)
     except InputError:
         raise
     except Exception as error:  # what its files say fits nowhere, and may fail over any of it

@@ -12,17 +12,46 @@ keeps it whole.
 *Precision.* Weights are held in float32 whatever the checkpoint's ``dtype`` says: steps of RL are smaller
 than bfloat16 resolves, and log-probs would differ between batches. ``policy.precision=bf16`` computes in
 bfloat16 instead. What is saved is float32 and says so; the 4.0 billion parameters of π0 take 16 GB.
+
+π0-FAST: PaliGemma writes a chunk of actions as tokens, one after the other.
+
+LeRobot's `sample_actions_fast_kv_cache` runs without gradient and throws tokens and logits away, so its parts
+are driven here. Both ways to the logits start from one pass over the prefix: images, prompt (which holds the
+state), BOS, all attending to each other. `generate` goes on token by token with the key-value cache;
+`logits` shows the cache all tokens at once, each attending to those before it.
+
+*Layout.* LeRobot trains with BOS as the first of the causal tokens and samples with BOS inside the
+bidirectional prefix. Scored in the layout of training, log-probs would be those of another policy: here it is
+the layout of sampling, at both ends.
+
+*Decoding* is LeRobot's `detokenize_actions` on the tokens before the terminator ``|``. Tokens that mean
+nothing to FAST's tokeniser are skipped, missing coefficients are zeros, too many are cut off, and where
+decoding fails the chunk is zeros. Only the check that the text begins with ``Action:``, an assertion, is
+switched off in what is loaded and saved: a policy that explores will begin otherwise at times.
+
+Float32 weights as for π0, see `pi0`. Scoring takes a logit for each of the 257152 tokens of PaliGemma at each
+position: about 1 MB a token in float32, several times over for the gradient.
 """
 
 from __future__ import annotations
 
+import contextlib
+import json
+import logging
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.flow import FlowContext, FlowModel, flow_shape, refuse_options
+from accerl_lerobot.policies.tokens import Choose, TokenContext, TokenModel
 
 VLM = "model.paligemma_with_expert.paligemma."
 LANGUAGE_MODEL = f"{VLM}model.language_model."
@@ -95,3 +124,243 @@ class Pi0(Pi05):
 
     def _shown_to_expert(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         return {"state": self.policy.prepare_state(batch)}
+
+
+logger = logging.getLogger(__name__)
+
+END = "|"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FastTokenizer:
+    """FAST's action tokeniser (Pertsch et al., arXiv 2501.09747), with the methods that LeRobot calls.
+
+    A chunk is transformed along time (orthonormal DCT-II), scaled and rounded; the coefficients, row by row
+    of frequency, become characters, which byte-pair encoding merges into tokens. On the Hub such a tokeniser
+    comes as JSON beside a Python file, and LeRobot runs the newest version of that file with full rights. The
+    JSON is enough, so `data_only` has LeRobot use this class instead.
+    """
+
+    bpe_tokenizer: Any
+    """Merges characters into tokens, a `PreTrainedTokenizerFast`."""
+    scale: float
+    """By which coefficients are multiplied before they are rounded."""
+    min_token: int
+    """The coefficient that character 0 stands for."""
+    folder: Path
+    """Where its files are."""
+
+    @classmethod
+    def from_pretrained(cls, name: str, **options: Any) -> FastTokenizer:
+        """Reads a folder, or the JSON files of a Hub repository; no option changes that.
+
+        Raises:
+            OSError: it is neither, or has no tokeniser in it.
+        """
+        from huggingface_hub import snapshot_download
+        from transformers import PreTrainedTokenizerFast
+
+        from accerl_lerobot.hub.errors import guard_client
+
+        guard_client()
+        folder = Path(name)
+        if not folder.is_dir():
+            folder = Path(snapshot_download(name, allow_patterns=["*.json"]))
+        config = json.loads((folder / "processor_config.json").read_text())
+        return cls(
+            bpe_tokenizer=PreTrainedTokenizerFast.from_pretrained(folder),
+            scale=config["scale"],
+            min_token=config["min_token"],
+            folder=folder,
+        )
+
+    def __call__(self, chunks: Any) -> list[list[int]]:
+        """Tokens of each of the chunks (B, K, A)."""
+        chunks = np.asarray(chunks, dtype=np.float64)
+        coefficients = np.around(_dct(chunks.shape[-2]) @ chunks * self.scale)
+        characters = np.maximum(coefficients - self.min_token, 0).astype(int)
+        texts = ["".join(map(chr, each.flatten())) for each in characters]
+        return [self.bpe_tokenizer(text)["input_ids"] for text in texts]
+
+    def save_pretrained(self, directory: Path) -> None:
+        """Copies its files; code, where it lies beside them, for those who run it."""
+        directory.mkdir(parents=True, exist_ok=True)
+        for file in self.folder.iterdir():
+            if file.suffix in (".json", ".py") and not (directory / file.name).exists():
+                shutil.copyfile(file, directory / file.name)
+
+
+@contextlib.contextmanager
+def data_only() -> Iterator[None]:
+    """While it lasts, LeRobot reads the tokenisers of π0-FAST and runs no code that comes with them."""
+    from lerobot.policies.pi0_fast import modeling_pi0_fast
+    from lerobot.processor import tokenizer_processor
+
+    modules = (modeling_pi0_fast, tokenizer_processor)
+    kept = [(module.AutoProcessor, module.AutoTokenizer) for module in modules]
+    for module in modules:
+        module.AutoProcessor, module.AutoTokenizer = FastTokenizer, _TextTokenizer
+    try:
+        yield
+    finally:
+        for module, (processor, tokenizer) in zip(modules, kept, strict=True):
+            module.AutoProcessor, module.AutoTokenizer = processor, tokenizer
+
+
+class _TextTokenizer:
+    @staticmethod
+    def from_pretrained(name: str, **options: Any) -> Any:
+        from transformers import AutoTokenizer
+
+        return AutoTokenizer.from_pretrained(name, **options | {"trust_remote_code": False})
+
+
+def _dct(size: int) -> np.ndarray:
+    """Orthonormal DCT-II as a matrix (size, size): frequencies by times."""
+    times, frequencies = np.arange(size) + 0.5, np.arange(size)[:, None]
+    matrix = np.cos(np.pi / size * frequencies * times) * np.sqrt(2 / size)
+    matrix[0] /= np.sqrt(2)
+    return matrix
+
+
+class Pi0Fast(TokenModel):
+    """Drives LeRobot's `PI0FastPolicy`."""
+
+    parallel = False
+    rows = None
+    loading = staticmethod(data_only)
+
+    def __init__(self, policy: Any) -> None:
+        config, tokenizer = policy.config, policy._paligemma_tokenizer
+        refuse_options(config)
+        _refuse(config)
+        config.validate_action_token_prefix = False
+        self.policy = policy
+        self.length = config.max_decoding_steps
+        self.terminator = tokenizer.convert_tokens_to_ids(END)
+        paligemma = policy.model.paligemma_with_expert.paligemma
+        self.width = paligemma.model.language_model.config.hidden_size
+        if len(tokenizer) < paligemma.lm_head.out_features:
+            known = f"{len(tokenizer)} of the {paligemma.lm_head.out_features} tokens the policy writes"
+            raise InputError("policy.text_tokenizer_name", config.text_tokenizer_name, f"knows only {known}")
+
+    def encode(self, batch: dict[str, Tensor]) -> Encoded:
+        """The features are the prefix's: images, prompt, BOS."""
+        from lerobot.policies.common.vla_utils import clone_past_key_values, prepare_attention_masks_4d
+        from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
+
+        model, network = self.policy.model, self.policy.model.paligemma_with_expert
+        images, image_masks = self.policy._preprocess_images(batch)
+        prompt, known = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
+        bos = torch.full_like(prompt[:, :1], self.policy._paligemma_tokenizer.bos_token_id)
+        embedded, pad, att, _, _ = model.embed_prefix_fast(
+            images,
+            image_masks,
+            torch.cat([prompt, bos], 1),
+            torch.cat([known, torch.ones_like(known[:, :1])], 1),
+        )
+        (features, _), cache = network.forward(
+            attention_mask=prepare_attention_masks_4d(att, dtype=embedded.dtype),
+            position_ids=torch.cumsum(pad, dim=1) - 1,
+            past_key_values=None,
+            inputs_embeds=[embedded, None],
+            use_cache=True,
+        )
+
+        def follow(tokens: Tensor, cache: Any, first: int) -> Tensor:
+            """Hidden states (B, n, width) at the n positions from `first` on, whose tokens are (B, n)."""
+            last = first + tokens.shape[1]
+            places = torch.arange(first, last, device=tokens.device)
+            seen = torch.arange(last, device=tokens.device) <= places[:, None]
+            whole = pad[:, None].expand(-1, len(places), -1)
+            attends = torch.cat([whole, seen.expand(len(pad), -1, -1)], 2)
+            embedded = network.embed_language_tokens(tokens)
+            (hidden, _), _ = network.forward(
+                attention_mask=prepare_attention_masks_4d(attends, dtype=embedded.dtype),
+                position_ids=pad.sum(1, keepdim=True) + places,
+                past_key_values=cache,
+                inputs_embeds=[embedded, None],
+                use_cache=True,
+            )
+            states: Tensor = hidden
+            return states
+
+        def logits(tokens: Tensor) -> Tensor:
+            states = features[:, -1:]
+            if tokens.shape[1] > 1:
+                states = torch.cat([states, follow(tokens[:, :-1], clone_past_key_values(cache), 0)], 1)
+            scores: Tensor = network.paligemma.lm_head(states)
+            return scores
+
+        def generate(choose: Choose) -> None:
+            own, state = clone_past_key_values(cache), features[:, -1]
+            for position in range(self.length):
+                tokens = choose(network.paligemma.lm_head(state), position)
+                if position == self.length - 1 or bool((tokens == self.terminator).all()):
+                    return
+                state = follow(tokens[:, None], own, position)[:, 0]
+
+        return Encoded(features=features, mask=pad, context=TokenContext(logits=logits, generate=generate))
+
+    def chunk(self, tokens: Tensor) -> Tensor:
+        config = self.policy.config
+        with _undecodable_once():
+            chunk: Tensor = self.policy.detokenize_actions(
+                tokens, action_horizon=config.n_action_steps, action_dim=config.action_feature.shape[0]
+            )
+        return chunk
+
+    def stock(self, batch: dict[str, Tensor]) -> Tensor:
+        with _undecodable_once():
+            chunk: Tensor = self.policy.predict_action_chunk(batch)
+        return chunk
+
+    def stock_tokens(self, batch: dict[str, Tensor]) -> Tensor:
+        from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS
+
+        tokens: Tensor = self.policy.model.sample_actions_fast_kv_cache(
+            *self.policy._preprocess_images(batch),
+            batch[OBS_LANGUAGE_TOKENS],
+            batch[OBS_LANGUAGE_ATTENTION_MASK],
+            max_decoding_steps=self.length,
+        )
+        return tokens
+
+
+def _refuse(config: Any) -> None:
+    """Refuses settings under which LeRobot's own sampler is not what evaluation and the self-check need.
+
+    Raises:
+        InputError: it is not greedy, or decodes fewer rows than were encoded.
+    """
+    if config.temperature != 0:
+        remedy = "LeRobot's sampler has to be greedy here: set it to 0 in config.json; exploration has a "
+        raise InputError("policy.temperature", config.temperature, f"{remedy}policy.sampler.temperature")
+    if config.n_action_steps != config.chunk_size:
+        # The coefficients of K rows, read as those of fewer, are another, faster and larger movement.
+        remedy = f"LeRobot decodes so many rows from the coefficients of {config.chunk_size}; use all of them"
+        raise InputError("policy.n_action_steps", config.n_action_steps, remedy)
+
+
+class _Undecodable(logging.Filter):
+    """Passes LeRobot's complaint about a sequence it cannot decode once, in our words."""
+
+    warned = False
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        message = str(record.msg)
+        if message.startswith("Error decoding tokens") and not _Undecodable.warned:
+            _Undecodable.warned = True
+            logger.warning("tokens that FAST cannot decode were drawn; such a chunk is all zeros")
+        return not message.startswith(("Error decoding tokens", "Tokens: "))
+
+
+@contextlib.contextmanager
+def _undecodable_once() -> Iterator[None]:
+    """LeRobot writes two lines for each such sequence, and a policy that explores draws many."""
+    quiet = _Undecodable()
+    logging.root.addFilter(quiet)
+    try:
+        yield
+    finally:
+        logging.root.removeFilter(quiet)

@@ -4,8 +4,7 @@ go."""
 
 from __future__ import annotations
 
-from accerl_lerobot.replay.buffer import Replay, ReplayCounters
-from accerl_lerobot.replay.mixed import MixedReplay
+from accerl_lerobot.replay.buffer import MixedReplay, Replay, ReplayCounters
 from accerl_lerobot.replay.pacing import (
     Pace,
     ReplayConfig,

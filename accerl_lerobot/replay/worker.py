@@ -25,10 +25,9 @@ import numpy as np
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import REAL, Segment
 from accerl_lerobot.fault_points import fault_point
+from accerl_lerobot.replay.buffer import MixedReplay
 from accerl_lerobot.replay.journal import EPISODES, Journal
-from accerl_lerobot.replay.mixed import MixedReplay
-from accerl_lerobot.replay.pacing import ReplayConfig
-from accerl_lerobot.replay.turns import Schedule, Turns
+from accerl_lerobot.replay.pacing import ReplayConfig, Schedule, Turns
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, open_clock
 from accerl_lerobot.transport.contract import stopped
 from accerl_lerobot.transport.shared_memory import Address, serve_on_loop
@@ -61,7 +60,6 @@ class ReplayWorker:
         state: the ``training_state`` to go on from; None: begin.
         directory: of the run, for the journal; None: none is kept.
         timeline: folder of the timeline; None: none is kept.
-        imaginers: number of workers that imagine.
     """
 
     def __init__(
@@ -73,15 +71,12 @@ class ReplayWorker:
         state: Path | None = None,
         directory: Path | None = None,
         timeline: Path | None = None,
-        imaginers: int = 1,
     ) -> None:
         self._clock = open_clock(timeline, "replay")
         journal = None if directory is None else Journal(directory / EPISODES)
         self._replay = MixedReplay(config, imagined or ReplayConfig(), 0.0, patient, journal)
-        # Nothing is imagined until one of them says so.
+        # Nothing is imagined until the worker says so.
         self._replay.awaited = imagined is not None
-        self._mixes = [(0.0, imagined is not None)] * imaginers
-        """Last report of each of them: the share, and the chance of more later on."""
         self._real: deque[Segment] = deque(maxlen=IN_TRANSIT if imagined else 0)
         self._real_count = 0
         self._rng = np.random.default_rng(seed)
@@ -96,7 +91,7 @@ class ReplayWorker:
             saved = snapshot.load(state / "replay")
             self._replay.restore(saved["replay"])
             self._rng = saved["rng"]
-            # The workers that imagine were saved before, and may not have been told of the last ones.
+            # The worker that imagines was saved before, and may not have been told of the last ones.
             self._real.extend(self._replay.real.segments)
             self._real_count = saved["real_count"]
         self._clock.enter(WAIT_IN)
@@ -193,12 +188,10 @@ class ReplayWorker:
         segments = list(self._real)[len(self._real) - new :]
         return News(segments, self._real_count, self._replay.real_ended, self._closed)
 
-    async def mix(self, share: float, awaited: bool, who: int = 0) -> None:
-        """See `MixedReplay.mix`; imagined is what any of the workers imagines."""
+    async def mix(self, share: float, awaited: bool) -> None:
+        """See `MixedReplay.mix`."""
         async with self._changed:
-            self._mixes[who] = (share, awaited)
-            shares, hopes = zip(*self._mixes, strict=True)
-            self._replay.mix(max(shares), any(hopes))
+            self._replay.mix(share, awaited)
             self._changed.notify_all()
 
     async def hold(self, held: bool) -> None:

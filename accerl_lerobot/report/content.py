@@ -14,10 +14,21 @@ import yaml
 
 from accerl_lerobot.console import ABSENT, count, duration, number, percent, rate
 from accerl_lerobot.report.charts import COLOURS, Chart, Series, line, rates
-from accerl_lerobot.report.read import SUMMARY, VALIDATION, Record, Run, column, newest
-from accerl_lerobot.report.recipe import apart, commands, differences, lag_bound, unreadable
-from accerl_lerobot.timeline.states import ROLES, STATES
-from accerl_lerobot.world_model.validation.tables import dataset_rows, has_several, per_dataset
+from accerl_lerobot.report.read import (
+    SUMMARY,
+    VALIDATION,
+    Record,
+    Run,
+    apart,
+    column,
+    commands,
+    differences,
+    lag_bound,
+    newest,
+    unreadable,
+)
+from accerl_lerobot.timeline.clock import ROLES, STATES
+from accerl_lerobot.world_model.metrics import dataset_rows, has_several, per_dataset
 
 RECENT_S = 120.0
 """A run that has written something since is taken to be still going."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which episode a free world runs next: planned evaluations first, then exploring ones.
 
-An exploring episode is a task (`tasks.py`), a seed of this worker's own (`seeds.py`) and, where episodes are
+An exploring episode is a task (`groups.py`), a seed of this worker's own (`seeds.py`) and, where episodes are
 compared with each other, a place in a group (`groups.py`): the episodes of a group share task and seed, so
 they start alike, and their exploration noise differs.
 """
@@ -13,9 +13,8 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Any
 
-from accerl_lerobot.rollout.groups import Groups
+from accerl_lerobot.rollout.groups import Groups, TaskSampler
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
-from accerl_lerobot.rollout.tasks import TaskSampler
 from accerl_lerobot.seeds import train_seed
 
 STARTS_PER_INCARNATION = 1000

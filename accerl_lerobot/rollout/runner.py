@@ -5,6 +5,8 @@ A slot is one world. `start` resets it and `advance` executes a decision in it; 
 the next decision, and whoever drives the runner decides when that is answered: the Ray worker goes on with
 other slots meanwhile, the single-process mode answers at once. Segments of an episode that belongs to a group
 are held back until the group has ended.
+
+One world, and the episode in it.
 """
 
 from __future__ import annotations
@@ -20,11 +22,66 @@ from accerl_lerobot.config.ranges import NonNegative, Range, Section, Steps
 from accerl_lerobot.envs.base import ChunkResult, World
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Observation, Origin, Request, Segment
-from accerl_lerobot.rollout.groups import EpisodeOutcome, GroupAdvantage, GroupFilter, Groups, GroupSlot
+from accerl_lerobot.rollout.groups import (
+    EpisodeOutcome,
+    GroupAdvantage,
+    GroupFilter,
+    Groups,
+    GroupSlot,
+    TaskSampling,
+)
 from accerl_lerobot.rollout.segments import SegmentBuilder
-from accerl_lerobot.rollout.slot import Slot
-from accerl_lerobot.rollout.tasks import TaskSampling
 from accerl_lerobot.seeds import noise_seed
+
+_STATE = ("plan", "episode_return", "steps", "decisions", "versions", "frames", "chunks")
+
+
+@dataclass
+class Slot:
+    """State of one episode under way in `RolloutRunner`."""
+
+    world: World
+    plan: EpisodePlan | None = None
+    builder: SegmentBuilder | None = None
+    episode_return: float = 0.0
+    steps: int = 0
+    decisions: int = 0
+    versions: list[int] = field(default_factory=list)
+    frames: list[np.ndarray] = field(default_factory=list)
+    chunks: list[np.ndarray] = field(default_factory=list)
+    """All that was executed, by which `restore` brings the world back to where it was."""
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs; see `snapshot`."""
+        builder = None if self.plan is None or self.builder is None else self.builder.state()
+        return {name: getattr(self, name) for name in _STATE} | {"builder": builder}
+
+    def restore(self, state: dict[str, Any], segment_length: int) -> None:
+        """Goes on from what `state` gave: the world is brought back by doing again what was done in it.
+
+        Raises:
+            RuntimeError: it does not show then what it had shown.
+        """
+        plan: EpisodePlan | None = state["plan"]
+        if plan is None:
+            return
+        observation = self.world.reset(plan.seed, plan.task)
+        for chunk in state["chunks"]:
+            observation = self.world.step_chunk(chunk).observation
+        self.builder = SegmentBuilder(observation, segment_length, Origin(plan.task, plan.seed, decision=0))
+        self.builder.restore(state["builder"])
+        if not _equal(observation, self.builder.latest):
+            raise RuntimeError(
+                f"{plan.task} with seed {plan.seed} does not show again what it had shown after "
+                f"{len(state['chunks'])} decisions, so its episodes cannot be gone on with in the middle; "
+                "use launch.engine=ray, which begins them anew"
+            )
+        for name in _STATE:
+            setattr(self, name, state[name])
+
+
+def _equal(one: Observation, other: Observation) -> bool:
+    return one.keys() == other.keys() and all(np.array_equal(one[key], other[key]) for key in one)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,8 +163,9 @@ class EpisodePlan:
     """Which evaluation it belongs to."""
     place: GroupSlot | None = None
     """Its group of equal starts and which of them it is, where exploring episodes are compared."""
-    film: bool = False
-    """Record frames for people. Executes a chunk in parts, which changes nothing else."""
+    film: tuple[int, int] | None = None
+    """Side in pixels and env steps per frame of a video for people; None: none. It executes a chunk in parts,
+    which changes nothing else."""
 
 
 @kind
@@ -154,7 +212,6 @@ class RolloutRunner:
         name: unique per incarnation of a worker; the prefix of its segments' keys.
         on_segment: receives finished segments of exploring episodes; those of a group all at its end.
         on_episode: receives every finished episode.
-        film: (side in pixels, env steps per frame) of filmed episodes.
         groups: those that plans with a `place` belong to.
     """
 
@@ -166,7 +223,6 @@ class RolloutRunner:
         name: str,
         on_segment: Callable[[Segment], object],
         on_episode: Callable[[EpisodeResult], object],
-        film: tuple[int, int] = (240, 2),
         groups: Groups | None = None,
     ) -> None:
         self.config, self.name = config, name
@@ -175,7 +231,6 @@ class RolloutRunner:
         self._slots = [Slot(world) for world in worlds]
         self._next_plan, self._on_segment, self._on_episode = next_plan, on_segment, on_episode
         self._sequence = 0
-        self._film = film
 
     def __len__(self) -> int:
         return len(self._slots)
@@ -204,7 +259,7 @@ class RolloutRunner:
         state = self._slots[slot]
         plan, builder = state.plan, state.builder
         assert plan is not None and builder is not None
-        result = self._filmed(state, decision.chunk) if plan.film else state.world.step_chunk(decision.chunk)
+        result = self._execute(state, plan, decision.chunk)
         state.chunks.append(decision.chunk)
         self.counters.env_steps += result.steps
         self.counters.decisions += 1
@@ -267,9 +322,11 @@ class RolloutRunner:
         for state in self._slots:
             state.world.close()
 
-    def _filmed(self, state: Slot, actions: np.ndarray) -> ChunkResult:
-        """Executes a chunk part by part and keeps a frame of each."""
-        side, every = self._film
+    def _execute(self, state: Slot, plan: EpisodePlan, actions: np.ndarray) -> ChunkResult:
+        """Executes a chunk; if it is filmed, part by part, with a frame of each."""
+        if plan.film is None:
+            return state.world.step_chunk(actions)
+        side, every = plan.film
         rewards = []
         for i in range(0, len(actions), every):
             result = state.world.step_chunk(actions[i : i + every])

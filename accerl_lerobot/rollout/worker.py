@@ -64,6 +64,17 @@ class Report:
     away_why: str = ""
 
 
+@dataclass(frozen=True)
+class WorkerShare:
+    """One of several rollout workers, and its share of the episodes."""
+
+    index: int
+    incarnation: int = 0
+    """How often it has been restarted; part of the segments' keys, and of the seeds."""
+    budget: int | None = None
+    """Exploring episodes at most; None: no end."""
+
+
 class RolloutWorker:
     """Becomes a threaded Ray actor in `launch`: `run` on one thread, `report` on another.
 
@@ -72,11 +83,8 @@ class RolloutWorker:
         config: sizes.
         tasks: the training tasks.
         seed: the run's.
-        index: of this worker.
-        incarnation: how often it has been restarted; part of the segments' keys, and of the seeds.
-        film: see `RolloutRunner`.
+        share: which worker this is.
         history: env steps that an observation holds.
-        budget: exploring episodes at most; None: no end.
         timeline: folder of the timeline; None: none is kept.
     """
 
@@ -86,22 +94,19 @@ class RolloutWorker:
         config: RolloutConfig,
         tasks: tuple[str, ...],
         seed: int,
-        index: int,
-        incarnation: int,
-        film: tuple[int, int],
+        share: WorkerShare,
         history: int = 1,
-        budget: int | None = None,
         timeline: Path | None = None,
     ) -> None:
-        self._clock = open_clock(timeline, f"rollout {index}")
+        self._clock = open_clock(timeline, f"rollout {share.index}")
         self._plans = EpisodePlans(
             config,
             tasks,
             seed=seed,
             worlds=config.worlds,
-            worker=index,
-            incarnation=incarnation,
-            budget=budget,
+            worker=share.index,
+            incarnation=share.incarnation,
+            budget=share.budget,
         )
         self._spent = False
         self._at_the_door = AT_THE_DOOR
@@ -113,7 +118,7 @@ class RolloutWorker:
         self._outbox: list[Segment] = []
         self._deciding = ReconnectingClient("inference")
         worlds = [make_world(env, history) for _ in range(config.worlds)]
-        name = f"rollout{index}.{incarnation}"
+        name = f"rollout{share.index}.{share.incarnation}"
         self._runner = RolloutRunner(
             worlds,
             self._next,
@@ -121,7 +126,6 @@ class RolloutWorker:
             name,
             self._outbox.append,
             self._ended,
-            film,
             self._plans.groups,
         )
         self._clock.enter(WAIT_IN)

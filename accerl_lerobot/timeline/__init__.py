@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The timeline: every worker's activity over time, recorded by each, read and drawn afterwards."""
 
-from accerl_lerobot.timeline.clock import Clock, NoClock, open_clock
-from accerl_lerobot.timeline.states import (
+from accerl_lerobot.timeline.clock import (
     CHECKPOINT,
     COMPUTE,
     EVALUATION,
@@ -13,6 +12,9 @@ from accerl_lerobot.timeline.states import (
     WAIT_IN,
     WAIT_OUT,
     WEIGHT_SYNC,
+    Clock,
+    NoClock,
+    open_clock,
 )
 
 __all__ = [

@@ -9,6 +9,8 @@ calendar time at which a process began is noted too.
 8 bytes per entry, nanoseconds since the process began << 4 | state, little-endian. The newest two parts are
 kept. A part's first line has the totals before it, so those are exact although older parts are gone. Nothing
 is overwritten: a killed process leaves at worst half an entry, which is not read.
+
+The states of a worker, which is in exactly one at any time; see ``docs/performance.md``.
 """
 
 from __future__ import annotations
@@ -18,13 +20,36 @@ import os
 import threading
 import time
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from accerl_lerobot.fault_points import fault_point
-from accerl_lerobot.timeline.states import RECOVERY, STATES, role_of
+
+STATES = (
+    "compute", "wait_in", "wait_out", "transport", "weights", "checkpoint", "recovery", "training",
+    "evaluation",
+)  # fmt: skip
+"""Names, at the numbers that stand for them on disk: append only. The last two are the driver's."""
+(COMPUTE, WAIT_IN, WAIT_OUT, TRANSPORT, WEIGHT_SYNC, CHECKPOINT, RECOVERY, TRAINING, EVALUATION) = range(
+    len(STATES)
+)
+ROLES = ("driver", "local", "rollout", "imagination", "inference", "replay", "trainer", "world learning")
+"""In the order in which they are shown."""
+TIMELINE = "timeline"
+"""Name of the folder in a run's."""
+
+
+def role_of(worker: str) -> str:
+    """``rollout`` of ``rollout 3``."""
+    return worker.rstrip("0123456789").rstrip()
+
+
+def bubble(shares: Mapping[str, float]) -> float:
+    """Share of its time that a worker waits for others, of its shares by state."""
+    return shares.get("wait_in", 0.0) + shares.get("wait_out", 0.0)
+
 
 FORMAT = 1
 BITS = 4

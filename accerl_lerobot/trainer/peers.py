@@ -16,7 +16,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import ray
 from ray.exceptions import GetTimeoutError, RayActorError, RayError
@@ -31,8 +31,7 @@ from accerl_lerobot.trainer.config import TrainerConfig
 
 if TYPE_CHECKING:
     from accerl_lerobot.trainer.off_policy import OffPolicyUpdate
-    from accerl_lerobot.trainer.ranks import Ranks
-    from accerl_lerobot.trainer.rendezvous import Rendezvous
+    from accerl_lerobot.trainer.ranks import Ranks, Rendezvous
     from accerl_lerobot.trainer.update import Update
 
 LOAD_S = 600.0
@@ -47,33 +46,31 @@ class RankError(RuntimeError):
     """A rank is lost, or was not there in time."""
 
 
+class LearnerSettings(NamedTuple):
+    """Inputs of every rank's `Learner`."""
+
+    policy: PolicyConfig
+    """The checkpoint to start from."""
+    algorithm: AlgorithmConfig
+    trainer: TrainerConfig
+    seed: int
+    """Seed of torch's global generator."""
+    state: Path | None = None
+    """The ``training_state`` to resume from; None: begin."""
+    load: Load | None = None
+    """Makes the adapter; None: of LeRobot's checkpoint."""
+
+
 class Learner:
-    """A rank's policy, and the updates of it.
+    """A rank's policy, and the updates of it."""
 
-    Args:
-        policy: the checkpoint to start from.
-        algorithm: the objective.
-        config: the optimiser.
-        seed: of torch's global generator.
-        state: the ``training_state`` to go on from; None: begin.
-        load: makes the adapter; None: of LeRobot's checkpoint.
-    """
-
-    def __init__(
-        self,
-        policy: PolicyConfig,
-        algorithm: AlgorithmConfig,
-        config: TrainerConfig,
-        seed: int,
-        state: Path | None,
-        load: Load | None = None,
-    ) -> None:
+    def __init__(self, settings: LearnerSettings) -> None:
         import torch
 
-        torch.set_num_threads(config.num_threads)
-        torch.manual_seed(seed)
-        self._algorithm, self._config, self._state = algorithm, config, state
-        self.adapter: Any = loader(load)(policy)
+        torch.set_num_threads(settings.trainer.num_threads)
+        torch.manual_seed(settings.seed)
+        self._algorithm, self._config, self._state = settings.algorithm, settings.trainer, settings.state
+        self.adapter: Any = loader(settings.load)(settings.policy)
 
     def begin(self, ranks: Ranks) -> Update | OffPolicyUpdate:
         """The updates, from the state on; what ranks share out is shared out then."""
@@ -91,12 +88,12 @@ class TrainerRank:
 
     Args:
         rank: which one.
-        arguments: of its `Learner`.
+        settings: of its `Learner`.
     """
 
-    def __init__(self, rank: int, *arguments: Any) -> None:
-        self._rank, self._learner = rank, Learner(*arguments)
-        self._config: TrainerConfig = arguments[2]
+    def __init__(self, rank: int, settings: LearnerSettings) -> None:
+        self._rank, self._learner = rank, Learner(settings)
+        self._config = settings.trainer
 
     def ready(self) -> int:
         """Answers once the policy is loaded; returns this process's id."""
@@ -113,7 +110,7 @@ class TrainerRank:
     def join(self, rendezvous: Rendezvous) -> None:
         """Meets the others."""
         from accerl_lerobot.trainer import ranks
-        from accerl_lerobot.trainer.rendezvous import LOOPBACK, join, use_only
+        from accerl_lerobot.trainer.ranks import LOOPBACK, join, use_only
 
         config = self._config
         here = rendezvous.address == LOOPBACK
@@ -158,7 +155,7 @@ class Peers:
     def begin(self, learner: Learner) -> Update | OffPolicyUpdate:
         """Meets them, once they have loaded their policies."""
         from accerl_lerobot.trainer import ranks
-        from accerl_lerobot.trainer.rendezvous import LOOPBACK, create, use_only
+        from accerl_lerobot.trainer.ranks import LOOPBACK, create, use_only
 
         if not self._actors:
             return learner.begin(ranks.Ranks())

@@ -41,9 +41,8 @@ from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.adapter import PolicyAdapter
 from accerl_lerobot.trainer.batch import Batch, Part, collate, pick, turns
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.frozen_policies import CRITIC, FrozenPolicies
+from accerl_lerobot.trainer.frozen_policies import CRITIC, FrozenPolicies, Probe
 from accerl_lerobot.trainer.nonfinite import NonFiniteError
-from accerl_lerobot.trainer.probe import Probe
 from accerl_lerobot.trainer.ranks import Ranks
 from accerl_lerobot.trainer.sharding import arrange, synchronise
 

@@ -20,16 +20,13 @@ from typing import Any
 
 import ray
 
-from accerl_lerobot.algorithms import AlgorithmConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.fault_points import fault_point
-from accerl_lerobot.policies.config import Load, PolicyConfig
-from accerl_lerobot.replay.turns import ASYNCHRONOUS, Schedule
+from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
-from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.nonfinite import keeping
-from accerl_lerobot.trainer.peers import Learner, Peers
+from accerl_lerobot.trainer.peers import Learner, LearnerSettings, Peers
 from accerl_lerobot.weights.factory import CONNECT_S, WeightPublisher, make_publisher
 from accerl_lerobot.weights.publisher import PublishDelay
 
@@ -38,12 +35,7 @@ class TrainerWorker:
     """Becomes a threaded Ray actor in `launch`: `run` on one thread, everything else beside it.
 
     Args:
-        policy: the checkpoint to start from.
-        algorithm: the objective.
-        config: the optimiser.
-        seed: of torch's global generator.
-        state: the ``training_state`` to go on from; None: begin.
-        load: makes the adapter; None: of LeRobot's checkpoint.
+        settings: of the policy and its updates.
         timeline: folder of the timeline; None: none is kept.
         peers: handles of the other ranks.
         directory: of the run, for batches that nothing could be learnt from; None: they are not kept.
@@ -51,20 +43,15 @@ class TrainerWorker:
 
     def __init__(
         self,
-        policy: PolicyConfig,
-        algorithm: AlgorithmConfig,
-        config: TrainerConfig,
-        seed: int,
-        state: Path | None = None,
-        load: Load | None = None,
+        settings: LearnerSettings,
         timeline: Path | None = None,
         peers: Sequence[Any] = (),
         directory: Path | None = None,
     ) -> None:
         self._clock = open_clock(timeline, "trainer")
-        self._policy, self._config, self._directory = policy, config, directory
-        self._peers = Peers(peers, config)
-        self._update = self._peers.begin(Learner(policy, algorithm, config, seed, state, load))
+        self._policy, self._config, self._directory = settings.policy, settings.trainer, directory
+        self._peers = Peers(peers, self._config)
+        self._update = self._peers.begin(Learner(settings))
         self._lock = threading.Lock()
         self._kept: Any = None
         self._in_turn = False

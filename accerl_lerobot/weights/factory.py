@@ -15,8 +15,7 @@ from ray.exceptions import ActorDiedError, GetTimeoutError, RayError, RayTaskErr
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.transport.endpoint import FIELD, Transport
 from accerl_lerobot.transport.memfd import available
-from accerl_lerobot.weights.buffer import WeightBuffer
-from accerl_lerobot.weights.publisher import FLUSH_S, Publisher, wall_clock
+from accerl_lerobot.weights.publisher import FLUSH_S, Publisher, WeightBuffer, wall_clock
 from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
 
 logger = logging.getLogger(__name__)

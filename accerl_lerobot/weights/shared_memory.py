@@ -23,8 +23,15 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from accerl_lerobot.transport.memfd import listening, new_name, new_socket, same_user
-from accerl_lerobot.weights.buffer import BufferLayout, Tensors, TornSetError, WeightBuffer, digest
-from accerl_lerobot.weights.publisher import Publisher, WeightUpdate
+from accerl_lerobot.weights.publisher import (
+    BufferLayout,
+    Publisher,
+    Tensors,
+    TornSetError,
+    WeightBuffer,
+    WeightUpdate,
+    digest,
+)
 
 logger = logging.getLogger(__name__)
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 import draccus
 
-from accerl_lerobot.checkpoint.safety import check_remote_code
 from accerl_lerobot.config.dataset import DatasetConfig
 from accerl_lerobot.config.ranges import (
     Choice,
@@ -24,11 +23,10 @@ from accerl_lerobot.config.ranges import (
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.replay.pacing import ReplayConfig
 
-Objective = Literal["refiner", "edm", "flow"]
 PIXELS = "pixels"
 """The type of our own class of learned world models."""
 VIDEOS = "validation"
-"""Folder of a run with `OnlineLearnConfig.videos`."""
+"""Folder of a run with a video of each validation of its world model."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,32 +94,16 @@ class LearnableModelConfig(Section, draccus.ChoiceRegistry, section="world_model
 class PixelModelConfig(LearnableModelConfig):
     """Our own world model of images and robot state."""
 
-    make = "accerl_lerobot.world_model.model.pixels:PixelWorldModel"
+    make = "accerl_lerobot.world_model.pixels:PixelWorldModel"
 
-    objective: Objective = "refiner"
-    """refiner: predict the change, then refine it. edm: denoise the frame, as DIAMOND does. flow: rectified
-    flow of the change."""
-    steps: Annotated[int, Range("[1, 10000]")] = 1
-    """Network passes per chunk. One pass of the refiner is regression."""
     context_noise: NonNegative = 0.02
     """Largest standard deviation of the noise on context and anchor in training, in units of [−1, 1].
     Imagined frames are never as clean as the training data."""
-    refine_levels: tuple[Positive, Positive] = (0.2, 0.05)
-    """Noise of the first and last refinement, in usual changes; those between are spaced evenly in log."""
-    sigma_max: Annotated[float, Range("(0.002, inf)")] = 5.0
-    """Noise that edm sampling starts from."""
     heads: Annotated[int, Range("[2, 1000]")] = 3
     """Size of the ensemble that predicts the robot's state; its disagreement is the uncertainty."""
     state_weight: NonNegative = 1.0
     """Weight of the state's loss beside the image's."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.refine_levels[0] < self.refine_levels[1]:
-            raise InputError(
-                "world_model.model.refine_levels", self.refine_levels, "use two falling numbers > 0"
-            )
 
     @property
     def multiple(self) -> int:
@@ -216,33 +198,6 @@ class ValidationConfig(Section, section="world_model.validation"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExternalRewardModelConfig(Section, section="success"):
-    """A LeRobot reward model that classifies successes, see `external_reward_model.py`."""
-
-    path: str | None = None
-    """A folder, or an id on the Hub. None: the success model saved with the world model."""
-    revision: str | None = None
-    """Hub revision."""
-    trust_remote_code: bool = False
-    """True if Python code from a Hub repository that the model names, such as the backbone's of LeRobot's
-    classifier, is run with your rights. It needs `code_revision`."""
-    code_revision: str | None = None
-    """Commit of that repository, 40 hexadecimal digits: the one whose code you have read. No other is run."""
-    threshold: Share | None = None
-    """P above which a frame counts as a success. None: ``accerl world-model-eval`` chooses it on the
-    episodes, a run refuses."""
-    discover_packages_path: str | None = None
-    """Package to import that registers the model's type with LeRobot, where that is not LeRobot's own."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_remote_code(self.trust_remote_code, self.code_revision, "success")
-        if self.path is None and self.threshold is not None:
-            remedy = "it belongs to the model in success.path; the one beside the world model has its own"
-            raise InputError("success.threshold", self.threshold, remedy)
-
-
-@dataclass(frozen=True, kw_only=True)
 class WorldModelConfig(Section, section="world_model"):
     """A world model and its success model. The default has 1.8 million weights and trains on two cores."""
 
@@ -284,15 +239,13 @@ class ModelKind:
     """True if it is built from the world model in ``imagination.path``."""
     learns: bool = False
     """True if that world model can be trained on during a run."""
-    knows_success: bool = False
-    """True if it needs no success model, see `Prediction.success`."""
     needs_history: bool = False
     """True if it can start only where all actions since the reset are known, see `ActionHistory`."""
     min_rollouts: int = 1
     """Imagined rollouts that it must have at the same time, at least."""
 
 
-_REGISTRY = "accerl_lerobot.world_model.imagination.registry"
+_REGISTRY = "accerl_lerobot.world_model.registry"
 MODELS = {
     "learned": ModelKind(make=f"{_REGISTRY}:learned", what="the one in `path`.", learns=True),
     "shuffled": ModelKind(
@@ -306,7 +259,6 @@ MODELS = {
         make=f"{_REGISTRY}:oracle",
         what="a simulator, put where a rollout starts: the best there can be.",
         needs_path=False,
-        knows_success=True,
         needs_history=True,
     ),
 }
@@ -324,24 +276,12 @@ class OnlineLearnConfig(Section, section="imagination.learn"):
     them after four decisions, and 2 % after 100 steps on 64 episodes of that policy. So nothing is imagined
     before it has passed validation on the policy's own episodes.
     """
-    batch: Annotated[int, Range("[2, 65536]")] = 16
-    """Windows per gradient step."""
-    lr: LearningRate = 3e-4
-    """Constant after the first 50 steps."""
-    offline: Share = 0.5
-    """Share of windows from the pre-training data, where `dataset` and `online` name it."""
-    recent: Share = 0.7
-    """Share of the others from the newest quarter of episodes."""
-    failures: Share = 0.6
-    """Share of those from episodes that failed, as long as there are both kinds."""
     held_out: Annotated[float, Range("(0, 1)")] = 0.2
     """Share of real episodes held out for validation."""
     validate_every: Annotated[int, Range("[1, 1000000]")] = 16
     """Real episodes between two validations. Where real episodes are counted, no more are collected until
     the validation is over. Once all are in, it is repeated after as many steps as so many would have
-    brought, `final_validations` times at most."""
-    final_validations: Annotated[int, Range("[1, 1000000]")] = 5
-    """Validations after the last real episode; a model that has not passed by then is never used."""
+    brought, five times at most; a model that has not passed by then is never used."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """Dataset of the pre-training: the model trains on the episodes it already knows, and is validated on
     those that were held out. Of another dataset it trains on all episodes."""
@@ -354,11 +294,6 @@ class OnlineLearnConfig(Section, section="imagination.learn"):
     )
     """Checks that a model must pass to be used. A dozen held-out episodes say little; beyond that, `guard`
     watches."""
-    memory: Annotated[int, Range("[2, 1000000]")] = 400
-    """Real episodes kept for training."""
-    videos: Annotated[int, Range("[0, 1000000]")] = 1
-    """A video after every so many validations, in the run's folder ``validation``: the newest held-out
-    episode beside its prediction with the same actions. 0: none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -392,9 +327,6 @@ class ImaginationConfig(Section, section="imagination"):
     discover_packages_path: str | None = None
     """Package to import that registers the type of the world model in `path`, where that is not one of ours;
     every machine of the cluster needs it."""
-    success: ExternalRewardModelConfig = field(default_factory=ExternalRewardModelConfig)
-    """A reward model used in place of the success model in `path`; neither it nor the world model is trained
-    in the run."""
     threshold: Share | None = None
     """P above which an imagined frame counts as a success; an oracle knows. None: the threshold saved with
     the success model of `path`, which is chosen anew as that is trained on.
@@ -403,25 +335,16 @@ class ImaginationConfig(Section, section="imagination"):
     often: ``python -m benchmarks ranking`` says at which threshold it succeeds as often as in reality.
     Validation uses it too, so a strict one needs a lower `learn.validation.recall`.
     """
-    workers: Annotated[int, Range("[1, 1000]")] = 1
-    """Processes that imagine, each with a copy of the world model, its own random draws, and its part of
-    `rollouts`; they are assigned to inference replicas as rollout workers are, from the last one on."""
     rollouts: Annotated[int, Range("[1, 100000]")] = 32
-    """Imagined rollouts at a time, over all workers; each worker steps its part as one batch."""
+    """Imagined rollouts at a time, as one batch."""
     start_at_reset_prob: Share = 0.0
-    """Share of rollouts that start where an episode began; others may, too. The later one starts, the less
-    of it is imagined, and the truer is how it ends."""
-    start_at_high_td_prob: Share = 0.5
-    """Share of the others that start where the critic's TD error was large; the rest start anywhere."""
+    """Share of rollouts that start where an episode began; the others start anywhere. The later one starts,
+    the less of it is imagined, and the truer is how it ends."""
     max_uncertainty: Positive = 2.0
     """A rollout ends before a prediction with a higher uncertainty, where 1 is the 95th percentile on
     training data."""
     memory: Annotated[int, Range("[1, 10000000]")] = 4096
     """Newest real decisions that rollouts start at."""
-    record: Annotated[int, Range("[0, 1000000]")] = 0
-    """Newest imagined rollouts kept on disk, in the run's folder ``imagined``, of which
-    ``accerl export --source=imagined`` makes a LeRobotDataset; 0: none. Images are stored as they are:
-    0.2 MB for 15 decisions seen by one camera of 64×64. Of several workers the first one's are kept."""
     guard: GuardConfig = field(default_factory=GuardConfig)
     replay: ReplayConfig = field(
         default_factory=lambda: ReplayConfig(
@@ -433,32 +356,12 @@ class ImaginationConfig(Section, section="imagination"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.workers > self.rollouts:
-            remedy = f"use at most imagination.rollouts, {self.rollouts}: each worker needs one"
-            raise InputError("imagination.workers", self.workers, remedy)
-        if self.rollouts < (least := self.kind.min_rollouts * self.workers):
-            remedy = f"use at least {least}, or fewer imagination.workers"
-            why = f"{remedy}: {self.model} needs {self.kind.min_rollouts} in each"
-            raise InputError("imagination.rollouts", self.rollouts, why)
+        if self.rollouts < self.kind.min_rollouts:
+            remedy = f"use at least {self.kind.min_rollouts}: {self.model} needs them"
+            raise InputError("imagination.rollouts", self.rollouts, remedy)
         if self.share and self.path is None and self.kind.needs_path:
             remedy = "give the folder world_model that accerl world-model has written"
             raise InputError("imagination.path", None, remedy)
-        if self.threshold is not None and self.success.path is not None:
-            remedy = "with an external reward model, use imagination.success.threshold alone"
-            raise InputError("imagination.threshold", self.threshold, remedy)
-        if self.share and self.success.path is not None:
-            self._check_external_reward_model()
-
-    def _check_external_reward_model(self) -> None:
-        if self.success.threshold is None:
-            remedy = "say what counts as a success; accerl world-model-eval --success.path=… finds it"
-            raise InputError("imagination.success.threshold", None, remedy)
-        if self.kind.knows_success:
-            remedy = f"leave it out: the {self.model} knows what has succeeded"
-            raise InputError("imagination.success.path", self.success.path, remedy)
-        if self.learns:
-            remedy = "use 0 with imagination.success.path: an external reward model is not trained"
-            raise InputError("imagination.learn.steps_per_episode", self.learn.steps_per_episode, remedy)
 
     @property
     def kind(self) -> ModelKind:

@@ -27,7 +27,7 @@ from accerl_lerobot.experience import TASK, Observation
 if TYPE_CHECKING:
     from accerl_lerobot.config.dataset import DatasetConfig
     from accerl_lerobot.envs.base import WorldSpec
-    from accerl_lerobot.world_model.model.contract import WorldModelSpec
+    from accerl_lerobot.world_model.contract import WorldModelSpec
 
 SUCCESS = "next.success"
 

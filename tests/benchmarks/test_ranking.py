@@ -19,12 +19,12 @@ from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig, WorldModelConfig
-from accerl_lerobot.world_model.imagination.registry import ImaginationModels
-from accerl_lerobot.world_model.learning.learners import new_success_model
-from accerl_lerobot.world_model.learning.pretrain import world_spec
-from accerl_lerobot.world_model.model.contract import ActionHistory, Context, Prediction, State, WorldModel
-from accerl_lerobot.world_model.model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.model.store import save_world_model
+from accerl_lerobot.world_model.contract import ActionHistory, Context, Prediction, State, WorldModel
+from accerl_lerobot.world_model.learners import new_success_model
+from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.pretrain import world_spec
+from accerl_lerobot.world_model.registry import ImaginationModels
+from accerl_lerobot.world_model.store import save_world_model
 from benchmarks import paired_eval
 from benchmarks import ranking as bench
 from benchmarks.paired_eval import rollout_imagined, rollout_real

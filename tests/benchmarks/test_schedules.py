@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from accerl_lerobot.bench.blocks import Block
 from accerl_lerobot.bench.host import Processors, floors, host, spread
-from accerl_lerobot.bench.throughput import BenchThroughputConfig, bench_throughput, books
+from accerl_lerobot.bench.throughput import BenchThroughputConfig, Block, bench_throughput, books
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.errors import InputError

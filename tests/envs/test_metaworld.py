@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.demos.expert import make_expert
-from accerl_lerobot.envs import MetaWorld, MetaWorldConfig, gl, make_world
-from accerl_lerobot.envs.metaworld_tasks import all_tasks, description, expert_name, groups
+from accerl_lerobot.envs import MetaWorld, MetaWorldConfig, make_world
+from accerl_lerobot.envs import metaworld as gl
+from accerl_lerobot.envs.metaworld import all_tasks, description, expert_name, groups
 from accerl_lerobot.errors import InputError
 
 pytest.importorskip("metaworld")

@@ -12,7 +12,7 @@ import pytest
 
 from accerl_lerobot.demos.record import SIDECAR, DemosConfig, record_demos
 from accerl_lerobot.envs import MetaWorld, MetaWorldConfig
-from accerl_lerobot.envs.shift import ShiftConfig
+from accerl_lerobot.envs.metaworld import ShiftConfig
 
 pytest.importorskip("metaworld")
 TASK = "push-v3"

@@ -11,8 +11,14 @@ import random
 import pytest
 from rich.console import Console
 
-from accerl_lerobot.evaluation.config import evaluation_plans
-from accerl_lerobot.evaluation.stats import Rate, mean_interval, summarise, table, wilson_interval
+from accerl_lerobot.evaluation.stats import (
+    Rate,
+    evaluation_plans,
+    mean_interval,
+    summarise,
+    table,
+    wilson_interval,
+)
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seeds import DEMO_SEEDS, EVAL_SEEDS, TRAIN_SEEDS
 
@@ -182,7 +188,7 @@ class TestPlans:
         assert [sum(p.task == t for p in plans) for t in "abc"] == [3, 3, 2]
 
     def test_do_not_explore_and_are_filmed_first(self) -> None:
-        plans = evaluation_plans(("a",), 4, "x", film=2)
+        plans = evaluation_plans(("a",), 4, "x", filmed=2, film=(8, 2))
         assert not any(p.explore for p in plans)
-        assert [p.film for p in plans] == [True, True, False, False]
+        assert [p.film for p in plans] == [(8, 2), (8, 2), None, None]
         assert [p.index for p in plans] == [0, 1, 2, 3] and {p.group for p in plans} == {"x"}

@@ -126,7 +126,7 @@ def main(seed: int, scratch: Path, times: int) -> dict[str, Any]:
 
     from accerl_lerobot.config.parsing import consents, read_recipe
     from accerl_lerobot.hub import errors, pull
-    from accerl_lerobot.hub.artifact_types import PullConfig
+    from accerl_lerobot.hub.card import PullConfig
 
     errors.WINDOW_S, errors.SILENT_S, errors.SLOWEST = 0.5, 2.0, 1000
     constants.HF_HUB_ETAG_TIMEOUT = constants.HF_HUB_DOWNLOAD_TIMEOUT = 2

@@ -11,8 +11,7 @@ from huggingface_hub import ModelCard
 
 from accerl_lerobot.cli.verbs import CONFIGS
 from accerl_lerobot.engine.config import RunConfig, parse
-from accerl_lerobot.hub.artifact_types import PushConfig
-from accerl_lerobot.hub.card import MARK
+from accerl_lerobot.hub.card import MARK, PushConfig
 from accerl_lerobot.hub.push import stage
 from tests.hub.folders import write_json, write_policy_folder, write_run_folder
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.hub.artifact_types import PullConfig, PushConfig, read_json, recognise, repo_type
+from accerl_lerobot.hub.card import PullConfig, PushConfig, read_json, recognise, repo_type
 from tests.hub.folders import write_json, write_policy_folder, write_run_folder
 
 TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"

@@ -16,7 +16,7 @@ from accerl_lerobot import cli
 from accerl_lerobot.checkpoint.layout import defect, write_manifest
 from accerl_lerobot.cli import doctor
 from accerl_lerobot.hub import errors
-from accerl_lerobot.hub.artifact_types import MANIFEST
+from accerl_lerobot.hub.card import MANIFEST
 from tests.hub.folders import write_policy_folder, write_run_folder
 from tests.hub_server import STRANGER, Answer, Fault, HubServer
 

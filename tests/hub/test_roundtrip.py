@@ -21,7 +21,7 @@ from accerl_lerobot import cli
 from accerl_lerobot.checkpoint.layout import defect, save_checkpoint
 from accerl_lerobot.engine.config import LaunchConfig, encode
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.config import EvaluationConfig
+from accerl_lerobot.evaluation.stats import EvaluationConfig
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config
 from accerl_lerobot.policies.saving import save_pretrained
@@ -208,8 +208,8 @@ def test_a_dataset_is_one_that_lerobot_finds(hub: HubServer, tmp_path: Path):
 
 
 def test_world_models_and_success_models(hub: HubServer, tmp_path: Path):
-    from accerl_lerobot.world_model.learning.learners import new_success_model
-    from accerl_lerobot.world_model.model.store import (
+    from accerl_lerobot.world_model.learners import new_success_model
+    from accerl_lerobot.world_model.store import (
         Source,
         load_sources,
         load_world_model,

@@ -25,7 +25,6 @@ from accerl_lerobot.policies.config import (
     DiffusionSamplerConfig,
     FlowSamplerConfig,
     GaussianSamplerConfig,
-    NoiseSpaceSamplerConfig,
     SamplerConfig,
     TokenSamplerConfig,
 )
@@ -129,45 +128,17 @@ def slow_flow(
             return field(torch.from_numpy(x).float()[None], torch.tensor([t]).float())[0].double().numpy()
 
     shape, config = adapter.family.shape, adapter.family.sampler
-    stds = None
-    if config.noise == "learned":
-        weights = arrays(adapter.family.noise)
-        raw = [linear(layer_norm(features_of(adapter, r), weights, "norm"), weights, "out") for r in asked]
-        stds = bounded(np.stack(raw), config.noise_min, config.noise_max)
-        stds = stds.reshape(len(asked), shape.num_steps, shape.padded_dim)
-    index = np.asarray(latent["index"]) if "index" in latent else np.zeros(len(asked), int)
     path = np.full((len(asked), shape.num_steps + 1, shape.chunk_size, shape.padded_dim), np.nan)
     for b, stored in enumerate(latent["path"]):
-        places = {"all": slice(None), "last": [0, -1], "one": [index[b], index[b] + 1]}[config.stochastic]
+        places = slice(None) if config.stochastic == "all" else [0, -1]
         path[b, places] = stored
-    return oracle.log_prob(velocity or read, path, index, shape, config, stds)
+    return oracle.log_prob(velocity or read, path, shape, config)
 
 
 def stock_flow(
     adapter: LeRobotAdapter, batch: dict[str, Tensor], asked: list[Request], latent: Latent
 ) -> Tensor:
-    x0 = latent["path"][:, 0]
-    if adapter.family.sampler.stochastic == "one":  # the path's start is not stored
-        size = (adapter.family.shape.chunk_size, adapter.family.shape.padded_dim)
-        drawn = [np.random.default_rng(r.noise_seed).standard_normal(size, dtype=np.float32) for r in asked]
-        x0 = torch.from_numpy(np.stack(drawn))
-    return adapter.policy.predict_action_chunk(batch, noise=x0)
-
-
-def slow_noise_space(adapter: LeRobotAdapter, asked: list[Request], latent: Latent) -> list[float]:
-    weights, config, totals = arrays(adapter.family), adapter.family.sampler, []
-    for request, z in zip(asked, latent["z"].double().numpy(), strict=True):
-        x = linear(layer_norm(features_of(adapter, request), weights, "norm"), weights, "hidden").clip(0)
-        mean = config.bound * np.tanh(linear(x, weights, "mean") / config.bound)
-        std = bounded(linear(x, weights, "width"), config.std_min, config.std_max)
-        totals.append(sum(map(normal_log_prob, z.flatten(), mean, std)))
-    return totals
-
-
-def stock_noise_space(
-    adapter: LeRobotAdapter, batch: dict[str, Tensor], asked: list[Request], latent: Latent
-) -> Tensor:
-    return adapter.policy.predict_action_chunk(batch, noise=latent["z"].expand(-1, 5, -1))
+    return adapter.policy.predict_action_chunk(batch, noise=latent["path"][:, 0])
 
 
 # ---- Gaussian: ACT, gaussian_actor
@@ -181,11 +152,9 @@ def slow_act(adapter: LeRobotAdapter, asked: list[Request], latent: Latent) -> l
         mean = adapter.policy.predict_action_chunk(alone(adapter, request))[0].double().numpy()
         total = 0.0
         for row in range(3):
-            std = np.full(2, config.std)
-            if config.learn_std:
-                weights = arrays(adapter.family.std)
-                hidden = layer_norm(seen[-1][row, 0].numpy(), weights, "norm")
-                std = bounded(linear(hidden, weights, "out"), config.std_min, config.std_max)
+            weights = arrays(adapter.family.std)
+            hidden = layer_norm(seen[-1][row, 0].numpy(), weights, "norm")
+            std = bounded(linear(hidden, weights, "out"), config.std_min, config.std_max)
             total += sum(normal_log_prob(u[row, dim], mean[row, dim], std[dim]) for dim in range(2))
         totals.append(total)
     hook.remove()
@@ -332,12 +301,12 @@ def stock_tokens(
     return adapter.policy.predict_action_chunk(batch)
 
 
-LEVELS = {"euler": 0.2, "flow_sde": 0.5, "learned": 0.2}
+LEVELS = {"euler": 0.2, "flow_sde": 0.5}
 """Rounding of log ρ is over these."""
 FLOW = tuple(
     FlowSamplerConfig(stochastic=stochastic, noise=noise, noise_level=level)
     for noise, level in LEVELS.items()
-    for stochastic in ("last", "all", "one")
+    for stochastic in ("last", "all")
 )
 UNET = ("rgb_encoder", "down_modules", "mid_modules", "up_modules", "final_conv")
 
@@ -350,7 +319,6 @@ def _pi(kind: str, **fields: Any) -> Case:
         samplers=(
             FlowSamplerConfig(noise_level=0.4),
             FlowSamplerConfig(stochastic="all", noise="flow_sde", noise_level=0.5),
-            FlowSamplerConfig(stochastic="one", noise_level=0.4),
         ),
         slow=slow_flow,
         stock=stock_flow,
@@ -400,10 +368,7 @@ CASES = {
         kind="act",
         write=write_act,
         # Its ResNet rounds the chunk by up to 1e-6 from batch to batch, and log ρ by that over the std.
-        samplers=(
-            GaussianSamplerConfig(std=0.5, std_max=1.0),
-            GaussianSamplerConfig(std=0.5, learn_std=False),
-        ),
+        samplers=(GaussianSamplerConfig(std=0.5, std_max=1.0),),
         slow=slow_act,
         stock=stock_act,
         parts=("model.backbone", "model.encoder.", "model.decoder.", "action_head"),
@@ -426,7 +391,7 @@ CASES = {
     "diffusion": Case(
         kind="diffusion",
         write=lambda path: write_diffusion(path, image=40, n_obs_steps=2),
-        samplers=tuple(DiffusionSamplerConfig(std_min=0.5, last_steps=n) for n in (None, 2, 1)),
+        samplers=(DiffusionSamplerConfig(std_min=0.5),),
         slow=slow_diffusion,
         parts=UNET,
         image=40,  # below 33 pixels LeRobot's spatial softmax sees one cell, whatever is in it
@@ -439,18 +404,6 @@ CASES = {
 }
 """The eight types, by their names in LeRobot."""
 VARIANTS = {
-    "smolvla, noise space": Case(
-        kind="smolvla",
-        write=CASES["smolvla"].write,
-        samplers=tuple(
-            NoiseSpaceSamplerConfig(per_row=rows, deterministic_eval=False) for rows in (False, True)
-        ),
-        slow=slow_noise_space,
-        stock=stock_noise_space,
-        parts=("family.norm", "family.hidden", "family.mean", "family.width"),
-        prepare=lambda adapter: perturb(adapter, 0.5),
-        moved=0.3,
-    ),
     "diffusion, DDIM, one observation, batch norm": Case(
         kind="diffusion",
         write=lambda path: write_diffusion(
@@ -461,7 +414,7 @@ VARIANTS = {
             prediction_type="sample",
             num_inference_steps=3,
         ),
-        samplers=(DiffusionSamplerConfig(std_min=0.5), DiffusionSamplerConfig(std_min=0.1, last_steps=2)),
+        samplers=(DiffusionSamplerConfig(std_min=0.5), DiffusionSamplerConfig(std_min=0.1)),
         slow=slow_diffusion,
         parts=UNET,
         image=40,

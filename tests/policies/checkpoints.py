@@ -169,7 +169,7 @@ def write_bins(
     """A smolvla_bins of some 30 k parameters that fits ``SimulatedConfig()``, its backbone beside it."""
     import torch
 
-    from accerl_lerobot.policies.registry import register_policies
+    from accerl_lerobot.policies.config import register_policies
 
     register_policies()
     low, high = (torch.full((2,), bound) for bound in action_range)

@@ -45,16 +45,15 @@ def counts(k: int, row: int, dim: int, shape: FlowShape) -> bool:
     return True
 
 
-def drawn(config: FlowSamplerConfig, n: int, index: int) -> list[int]:
-    """The stochastic steps of one sample."""
-    return {"all": list(range(n)), "last": [n - 1], "one": [index]}[config.stochastic]
+def drawn(config: FlowSamplerConfig, n: int) -> list[int]:
+    """The stochastic steps."""
+    return list(range(n)) if config.stochastic == "all" else [n - 1]
 
 
 def paths(
     velocity: SlowVelocity,
     x0: np.ndarray,
     eps: np.ndarray,
-    index: np.ndarray,
     shape: FlowShape,
     config: FlowSamplerConfig,
 ) -> np.ndarray:
@@ -70,7 +69,7 @@ def paths(
             for i in range(shape.chunk_size):
                 for j in range(shape.padded_dim):
                     following[i, j] = x[i, j] - v[i, j] / n
-                    if k in drawn(config, n, index[b]):
+                    if k in drawn(config, n):
                         noise = std(k, n, config) * eps[b, k, i, j]
                         following[i, j] = mean(x[i, j], v[i, j], k, n, config) + noise
             x = result[b, k + 1] = following
@@ -80,20 +79,14 @@ def paths(
 def log_prob(
     velocity: SlowVelocity,
     path: np.ndarray,
-    index: np.ndarray,
     shape: FlowShape,
     config: FlowSamplerConfig,
-    stds: np.ndarray | None = None,
 ) -> np.ndarray:
-    """(B,) from whole paths (B, N + 1, K, D), of which under ``last`` only the two ends are read.
-
-    Args:
-        stds: (B, N, D), where they are learned.
-    """
+    """(B,) from whole paths (B, N + 1, K, D), of which under ``last`` only the two ends are read."""
     n = shape.num_steps
     result = np.zeros(len(path))
     for b in range(len(path)):
-        for k in drawn(config, n, int(index[b])):
+        for k in drawn(config, n):
             start = path[b, k].astype(np.float64)
             if config.stochastic == "last":
                 start = path[b, 0].astype(np.float64)
@@ -104,6 +97,6 @@ def log_prob(
                 for j in range(shape.padded_dim):
                     if counts(k, i, j, shape):
                         centre = mean(start[i, j], v[i, j], k, n, config)
-                        scale = std(k, n, config) if stds is None else stds[b, k, j]
+                        scale = std(k, n, config)
                         result[b] += density(path[b, k + 1, i, j], centre, scale)
     return result

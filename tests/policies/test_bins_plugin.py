@@ -22,8 +22,7 @@ from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig, run_sft, sft_command
 from accerl_lerobot.engine.preflight import check_sft_policy
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.policies.config import PolicyConfig
-from accerl_lerobot.policies.registry import PLUGINS, discovery, register_policies
+from accerl_lerobot.policies.config import PLUGINS, PolicyConfig, discovery, register_policies
 from accerl_lerobot.policies.saving import save_pretrained
 from tests.policies.checkpoints import write_bins
 from tests.policies.tiny import adapter_at, requests

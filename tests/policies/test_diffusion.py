@@ -18,7 +18,7 @@ from accerl_lerobot.engine import run
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.config import EvaluationConfig
+from accerl_lerobot.evaluation.stats import EvaluationConfig
 from accerl_lerobot.experience import TASK, Request
 from accerl_lerobot.policies import diffusion
 from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations
@@ -28,7 +28,7 @@ from accerl_lerobot.policies.family import standard_normal
 from accerl_lerobot.policies.loading import load_adapter
 from accerl_lerobot.policies.saving import save_pretrained
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.rollout.worker import RolloutWorker
+from accerl_lerobot.rollout.worker import RolloutWorker, WorkerShare
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.policies.cases import slow_diffusion
 from tests.policies.checkpoints import edit_config, stock_chunk, write_diffusion
@@ -37,7 +37,7 @@ from tests.rounding import assert_close
 from tests.runs import tiny_run
 from tests.transport.played import played
 
-ALL, LAST_TWO, LAST = (DiffusionSamplerConfig(std_min=0.5, last_steps=n) for n in (None, 2, 1))
+ALL = DiffusionSamplerConfig(std_min=0.5)
 
 
 def ask(count: int, **options: bool) -> list[Request]:
@@ -105,7 +105,7 @@ def test_not_exploring_is_lerobot_s_sampler_to_the_bit(
 @pytest.mark.parametrize(
     ("fields", "config"),
     [
-        ({}, LAST_TWO),
+        ({}, ALL),
         ({"prediction_type": "sample", "clip_sample": False}, DiffusionSamplerConfig(std_min=0.02)),
         ({"noise_scheduler_type": "DDIM"}, ALL),
     ],
@@ -193,46 +193,24 @@ def test_weighted_samples_of_mu_are_samples_of_pi(scheduler: str):
     assert deviation(product, new) < EXACT
 
 
-@pytest.mark.parametrize("scheduler", ["DDPM", "DDIM"])
-def test_the_last_steps_weight_towards_those_steps_alone(scheduler: str):
-    config = DiffusionSamplerConfig(std_min=0.3, last_steps=1)
-    ratio, product = weighted(scheduler, config)
-
-    def only_the_last_is_new(x: Tensor, timestep: int) -> Tensor:
-        return PI(x, timestep) if timestep == 0 else MU(x, timestep)
-
-    assert deviation(ratio, torch.ones(2)) < EXACT
-    assert deviation(product, payoff(act(only_the_last_is_new, scheduler, config, 12)[0])) < EXACT
-    assert deviation(product, payoff(act(PI, scheduler, config, 12)[0])) > WRONG, "not π: the rest is μ's"
-
-
-def test_exploration_keeps_to_the_last_steps_and_to_the_least_std():
-    config = DiffusionSamplerConfig(std_min=0.4, last_steps=2)
+def test_exploration_keeps_to_the_least_std():
+    config = DiffusionSamplerConfig(std_min=0.4)
     x, eps = torch.zeros(1, 3, 1), torch.ones(1, 3, 3, 1)
     plan = schedule("DDPM")
     _, path, _ = diffusion.sample(MU, x, eps, torch.tensor([True]), SHAPE, plan, config)
-    mean, std = plan.step(0, x, MU(x, 12))
-    assert torch.equal(path[:, 0], mean + std), "the first step is LeRobot's own"
-    for k, timestep in ((1, 6), (2, 0)):
-        mean, std = plan.step(k, path[:, k - 1], MU(path[:, k - 1], timestep))
-        assert_close(path[:, k], mean + max(float(std), 0.4))
+    for k, timestep in enumerate((12, 6, 0)):
+        mean, std = plan.step(k, path[:, k], MU(path[:, k], timestep))
+        assert_close(path[:, k + 1], mean + max(float(std), 0.4))
     assert float(plan.step(1, x, x)[1]) < 0.4 and float(plan.step(2, x, x)[1]) == 0
 
 
 def test_entropy_is_the_mean_surprise_of_what_is_sampled():
-    for config in (DiffusionSamplerConfig(std_min=0.3), DiffusionSamplerConfig(std_min=0.3, last_steps=1)):
-        logp = act(MU, "DDPM", config, 1)[2]
-        entropy = diffusion.entropy(SHAPE, schedule("DDPM"), config)
-        assert deviation(-logp, torch.full((2,), entropy)) < EXACT
+    config = DiffusionSamplerConfig(std_min=0.3)
+    logp = act(MU, "DDPM", config, 1)[2]
+    assert deviation(-logp, torch.full((2,), diffusion.entropy(SHAPE, schedule("DDPM"), config))) < EXACT
 
 
 # ---- loading and saving
-
-
-@pytest.mark.parametrize(("last", "points"), [(None, 5), (2, 3), (1, 2)])
-def test_the_latent_is_as_small_as_re_scoring_allows(path: Path, last: int | None, points: int):
-    decision = adapter_at(path, DiffusionSamplerConfig(last_steps=last)).decide(ask(1), 0)[0]
-    assert decision.latent["path"].shape == (points, 8, 2)
 
 
 def test_a_saved_checkpoint_is_stock_lerobot_s(path: Path, tmp_path: Path):
@@ -256,10 +234,9 @@ def test_a_saved_checkpoint_is_stock_lerobot_s(path: Path, tmp_path: Path):
         ({}, {"num_steps": 21}, "policy.num_steps=21: use at most 20, as many as it was trained with"),
         (
             {},
-            {"sampler": DiffusionSamplerConfig(last_steps=5)},
-            "policy.sampler.last_steps=5: use at most 4, the policy's denoising steps",
+            {"n_action_steps": 9},
+            "policy.n_action_steps=9: use 1 to 8, the chunk the policy predicts",
         ),
-        ({}, {"n_action_steps": 9}, "policy.n_action_steps=9: use 1 to 8, the chunk the policy predicts"),
         (
             {"n_obs_steps": 2},
             {"n_action_steps": 8},
@@ -351,7 +328,7 @@ def test_a_world_without_a_history_is_refused_in_words(looking: Path):
 
 
 def test_a_rollout_process_asks_with_the_history():
-    worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), ("match",), 0, 0, 0, (8, 2), OBSERVED)
+    worker = RolloutWorker(WORLD, RolloutConfig(worlds=1), ("match",), 0, WorkerShare(0), OBSERVED)
     asked: list[Request] = []
 
     def decide(due: list[Request]) -> list[Request]:

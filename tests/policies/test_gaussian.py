@@ -144,14 +144,13 @@ def test_entropy_moves_with_the_std():
     assert it.std.out.bias.grad.min() > 0, "a wider std is more entropy"
 
 
-@pytest.mark.parametrize("deterministic", [True, False])
 @pytest.mark.parametrize("own_std", [False, True])
-def test_evaluation(deterministic: bool, own_std: bool):
-    it = family(False, own_std, GaussianSamplerConfig(deterministic_eval=deterministic))
+def test_evaluation(own_std: bool):
+    it = family(False, own_std)
     encoded = it.model.under(0.0, 4)
     still, moving = it.act(encoded, asked(4, explore=False)), it.act(encoded, asked(4))
     assert not still.log_prob.any() and still.chunk.shape == (4, 2, 2)
-    if own_std and not deterministic:  # a policy that has a std of its own samples in LeRobot too
+    if own_std:  # a policy that has a std of its own samples in LeRobot too
         assert torch.equal(still.chunk, moving.chunk)
     else:
         assert torch.equal(still.chunk, encoded.context.mean[:, :2])
@@ -164,9 +163,3 @@ def test_the_learned_std_does_not_shape_the_features():
     encoded.context.rows.requires_grad_()
     it.score(encoded, it.act(encoded, asked(4)).latent).log_prob.sum().backward()
     assert encoded.context.rows.grad is None and it.std.out.weight.grad.abs().max() > 0
-
-
-def test_a_constant_std_is_no_parameter():
-    it = GaussianFamily(Small(), GaussianSamplerConfig(std=0.3, learn_std=False))
-    assert not list(it.parameters())
-    assert torch.equal(it._gaussian(it.model.under(0.0, 2))[1], torch.full((2, 2, 2), 0.3))

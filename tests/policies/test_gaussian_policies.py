@@ -67,13 +67,12 @@ def test_temporal_ensembling_is_refused(act: Path, tmp_path: Path):
         adapter_at(copied)
 
 
-@pytest.mark.parametrize("learn_std", [True, False])
-def test_a_checkpoint_without_a_std_of_its_own_starts_one(act: Path, tmp_path: Path, learn_std: bool):
-    config = GaussianSamplerConfig(learn_std=learn_std)
+def test_a_checkpoint_without_a_std_of_its_own_starts_one(act: Path, tmp_path: Path):
+    config = GaussianSamplerConfig()
     adapter = adapter_at(act, config)
     saved = tmp_path / "saved"
     save_pretrained(adapter, saved, PolicyConfig(path=str(act), device="cpu", sampler=config))
-    assert (saved / "family.safetensors").is_file() == learn_std
+    assert (saved / "family.safetensors").is_file()
     assert json.loads((saved / "accerl.json").read_text())["sampler"]["type"] == "gaussian"
 
 
@@ -109,10 +108,6 @@ def test_not_exploring_is_lerobot_s_sampler(path: Path, adapter: LeRobotAdapter)
         stock = adapter.processing.unnormalise(adapter.policy.select_action(batch)).numpy()
     chunks = np.stack([d.chunk[0] for d in adapter.decide(asked, 0)])
     assert_close(chunks, stock)  # LeRobot takes the square root by a Cholesky decomposition
-    resting = adapter_at(path, GaussianSamplerConfig(deterministic_eval=True))
-    mean = np.tanh(adapter.policy(batch)["action_mean"].detach().numpy()) * 2  # the world's actions are ±2
-    assert_close(np.stack([d.chunk[0] for d in resting.decide(asked, 0)]), mean)
-    assert np.abs(mean - stock).max() > 0.1, "so the mean is another policy than LeRobot's"
 
 
 def test_log_prob_is_lerobot_s_where_that_is_finite(adapter: LeRobotAdapter):

@@ -20,15 +20,15 @@ from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.engine.contract import Engine
 from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.evaluation.config import evaluation_plans
+from accerl_lerobot.evaluation.stats import evaluation_plans
 from accerl_lerobot.policies.config import (
+    POLICIES,
     DiffusionSamplerConfig,
     FlowSamplerConfig,
     GaussianSamplerConfig,
     PolicyConfig,
     SamplerConfig,
 )
-from accerl_lerobot.policies.registry import POLICIES
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig

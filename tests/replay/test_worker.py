@@ -162,21 +162,6 @@ def test_news_is_real_experience_alone():
     play(scene)
 
 
-def test_imagined_is_what_any_of_several_who_dream_imagines():
-    async def main() -> None:
-        worker = ReplayWorker(CONFIG, seed=0, imagined=CONFIG, imaginers=2)
-        mixed = worker._replay
-        assert (mixed.share, mixed.awaited) == (0.0, True)
-        await worker.mix(0.0, False, 0)  # the other has not said anything yet
-        assert (mixed.share, mixed.awaited) == (0.0, True)
-        await worker.mix(0.5, True, 1)
-        assert (mixed.share, mixed.awaited) == (0.5, True)
-        await worker.mix(0.0, False, 1)  # switched off, and so is the first
-        assert (mixed.share, mixed.awaited) == (0.0, False)
-
-    asyncio.run(main())
-
-
 def test_episodes_are_averaged_since_the_last_question():
     async def scene(worker: ReplayWorker) -> None:
         totals = [{"return": 1.0, "success": 1.0}, {"return": 0.0, "success": 0.0}]

@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 
 from accerl_lerobot.algorithms import PPOConfig
-from accerl_lerobot.cli.configs import WorldModelRun
+from accerl_lerobot.cli.verbs import WorldModelRun
 from accerl_lerobot.config.dataset import DatasetConfig
 from accerl_lerobot.engine.config import RunConfig, encode
 from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig

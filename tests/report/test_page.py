@@ -21,12 +21,11 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.engine import run
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig, parse
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.config import EvaluationConfig
+from accerl_lerobot.evaluation.stats import EvaluationConfig
 from accerl_lerobot.report import ReportConfig, write_report
 from accerl_lerobot.report.charts import Chart
 from accerl_lerobot.report.content import evaluated, exploring
-from accerl_lerobot.report.read import read_run
-from accerl_lerobot.report.recipe import commands
+from accerl_lerobot.report.read import commands, read_run
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import VIDEOS
 from tests.report.folders import (

@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 
 from accerl_lerobot.algorithms import PPOConfig
-from accerl_lerobot.cli.configs import WorldModelEvalRun
 from accerl_lerobot.cli.doctor import pace
+from accerl_lerobot.cli.verbs import WorldModelEvalRun
 from accerl_lerobot.config.parsing import read_recipe
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engine.config import RunConfig, encode, parse
-from accerl_lerobot.report.recipe import apart, differences, flat, lag_bound, unreadable
+from accerl_lerobot.report.read import apart, differences, flat, lag_bound, unreadable
 from tests.report.folders import run_config
 
 ROOT = Path(__file__).parents[2]

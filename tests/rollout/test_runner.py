@@ -173,7 +173,7 @@ def test_noise_depends_on_episode_and_decision_and_on_nothing_else():
 def simulated_episode(film: bool, seed: int, tolerance: float) -> EpisodeResult:
     """One evaluation episode with actions drawn from the requests' own seeds."""
     world = make_world(SimulatedConfig(max_steps=20, tolerance=tolerance))
-    plan = EpisodePlan(task="match", seed=seed, explore=False, film=film)
+    plan = EpisodePlan(task="match", seed=seed, explore=False, film=(8, 2) if film else None)
     recorder = Recorder([world], [plan], CONFIG)
     request: Request | None = recorder.runner.start(0)
     while request is not None:

@@ -35,7 +35,7 @@ class Fleet:
         self.plans = EpisodePlans(config, worlds[0].spec.tasks, seed=0, worlds=len(worlds))
         self.runner = RolloutRunner(
             worlds, lambda: self.plans.next(self.exploring), config, "r0.0",
-            self.segments.append, self.results.append, (8, 2), self.plans.groups,
+            self.segments.append, self.results.append, self.plans.groups,
         )  # fmt: skip
         self.due: dict[int, Request | None] = dict.fromkeys(range(len(worlds)))
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from accerl_lerobot.rollout.tasks import TaskSampler
+from accerl_lerobot.rollout.groups import TaskSampler
 
 TASKS = ("easy", "middling", "hard")
 CHI_SQUARE_99_9 = 13.82

@@ -96,7 +96,7 @@ class Recorder:
         self.results: list[EpisodeResult] = []
         self.runner = RolloutRunner(
             worlds, lambda: self.plans.pop(0) if self.plans else None, config, name,
-            self.segments.append, self.results.append, film=(8, 2),
+            self.segments.append, self.results.append,
         )  # fmt: skip
 
     def play(self, version: int = 0) -> list[list[Request]]:

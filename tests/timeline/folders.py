@@ -6,8 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from accerl_lerobot.timeline.clock import Clock, Moment
-from accerl_lerobot.timeline.states import TIMELINE
+from accerl_lerobot.timeline.clock import TIMELINE, Clock, Moment
 
 SECOND = 10**9
 UP = 10**15

@@ -19,9 +19,8 @@ from accerl_lerobot.timeline import (
     WAIT_IN,
     WAIT_OUT,
 )  # fmt: skip
-from accerl_lerobot.timeline.clock import Moment
+from accerl_lerobot.timeline.clock import Moment, bubble
 from accerl_lerobot.timeline.read import ABSENT, Watch, read_timeline, shares
-from accerl_lerobot.timeline.states import bubble
 from tests.timeline.folders import SECOND, UP, a_clock, write_worker
 
 

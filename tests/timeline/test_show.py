@@ -17,18 +17,18 @@ from rich.console import Console
 from accerl_lerobot.cli import main
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.timeline import COMPUTE, RECOVERY, TRAINING, WAIT_IN
-from accerl_lerobot.timeline.read import read_timeline
-from accerl_lerobot.timeline.show import (
+from accerl_lerobot.timeline.clock import STATES
+from accerl_lerobot.timeline.read import (
     COLOURS,
     COLUMNS,
     TimelineConfig,
     choose_window,
     columns,
+    read_timeline,
     show_timelines,
     timeline_table,
     trace,
 )
-from accerl_lerobot.timeline.states import STATES
 from tests.timeline.folders import write_worker
 
 

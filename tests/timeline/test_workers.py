@@ -23,10 +23,11 @@ from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.replay.worker import ReplayWorker
 from accerl_lerobot.rollout import worker as rollout
 from accerl_lerobot.rollout.runner import RolloutConfig
+from accerl_lerobot.timeline.clock import STATES, TIMELINE
 from accerl_lerobot.timeline.read import read_timeline
-from accerl_lerobot.timeline.states import STATES, TIMELINE
 from accerl_lerobot.trainer import worker as trainer
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.peers import LearnerSettings
 from accerl_lerobot.transport.contract import Client
 from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.weights import factory
@@ -51,9 +52,8 @@ def test_the_trainer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(factory, "ray", Local)
     monkeypatch.setattr(loading, "load_adapter", lambda policy: LinearAdapter())
     config = TrainerConfig(updates=2, batch_decisions=7, warmup_updates=0, value_warmup_updates=0)
-    worker = trainer.TrainerWorker(
-        PolicyConfig(path="nowhere"), GIPOConfig(), config, 0, timeline=tmp_path / TIMELINE
-    )
+    settings = LearnerSettings(PolicyConfig(path="nowhere"), GIPOConfig(), config, 0)
+    worker = trainer.TrainerWorker(settings, timeline=tmp_path / TIMELINE)
     replay = Handle(
         sample=lambda decisions, version: make_segments((4, 3), seed=version), learnt=lambda: None
     )
@@ -121,7 +121,7 @@ def collect(tmp_path: Path) -> Callable[..., list[str]]:
     def run(door: Endpoint, decide: Callable[[list[Request]], Any]) -> list[str]:
         worker = rollout.RolloutWorker(
             SimulatedConfig(max_steps=8, tolerance=0.05), RolloutConfig(worlds=1, segment_length=1),
-            ("match",), 0, 0, 0, (8, 2), timeline=tmp_path / TIMELINE,
+            ("match",), 0, rollout.WorkerShare(0), timeline=tmp_path / TIMELINE,
         )  # fmt: skip
         worker.report(True, [])
         with pytest.raises(StoppedError):

@@ -21,7 +21,7 @@ from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import Evaluation, PolicyAdapter
 from accerl_lerobot.trainer import ranks
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.rendezvous import LOOPBACK, Rendezvous, create, join, use_only
+from accerl_lerobot.trainer.ranks import LOOPBACK, Rendezvous, create, join, use_only
 from accerl_lerobot.trainer.update import Update
 from tests.trainer.linear import STATE, STD, LinearAdapter, make_segments
 

@@ -119,7 +119,7 @@ def test_a_lone_rank_waits_for_nobody():
 
 
 def test_ranks_talk_over_the_interface_that_has_the_address(monkeypatch: pytest.MonkeyPatch):
-    from accerl_lerobot.trainer import rendezvous
+    from accerl_lerobot.trainer import ranks as rendezvous
 
     for name in ("GLOO_SOCKET_IFNAME", "NCCL_SOCKET_IFNAME"):
         monkeypatch.setenv(name, "")

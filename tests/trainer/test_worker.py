@@ -19,6 +19,7 @@ from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.trainer import worker as module
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.nonfinite import NonFiniteError
+from accerl_lerobot.trainer.peers import LearnerSettings
 from accerl_lerobot.trainer.worker import TrainerWorker
 from accerl_lerobot.weights import factory
 from tests.local_ray import Handle, Local
@@ -50,13 +51,9 @@ class Stage:
         )
         self._batches = batches
         defaults = {"updates": 6, "batch_decisions": 7, "warmup_updates": 0, "value_warmup_updates": 0}
-        self.worker = TrainerWorker(
-            PolicyConfig(path="nowhere"),
-            GIPOConfig(),
-            TrainerConfig(**{**defaults, **config}),
-            seed=0,
-            directory=directory,
-        )
+        trainer = TrainerConfig(**{**defaults, **config})
+        settings = LearnerSettings(PolicyConfig(path="nowhere"), GIPOConfig(), trainer, 0)
+        self.worker = TrainerWorker(settings, directory=directory)
 
     def run(self) -> int:
         return self.worker.run(self.replay, [self.reader])

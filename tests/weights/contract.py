@@ -20,7 +20,7 @@ from typing import Protocol
 import numpy as np
 import pytest
 
-from accerl_lerobot.weights.buffer import Tensors
+from accerl_lerobot.weights.publisher import Tensors
 
 
 class WeightChannel(Protocol):

@@ -11,9 +11,8 @@ from typing import Any
 import pytest
 import ray
 
-from accerl_lerobot.weights.buffer import Tensors
 from accerl_lerobot.weights.factory import RayPublisher
-from accerl_lerobot.weights.publisher import Publisher
+from accerl_lerobot.weights.publisher import Publisher, Tensors
 from tests.light_workers import light_ray
 from tests.weights.contract import CHECKS, Check, filled, values_of
 

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.weights import shared_memory
-from accerl_lerobot.weights.buffer import BufferLayout, Tensors, TornSetError, WeightBuffer, digest
+from accerl_lerobot.weights.publisher import BufferLayout, Tensors, TornSetError, WeightBuffer, digest
 from accerl_lerobot.weights.shared_memory import Received, SharedMemoryPublisher, SharedMemoryReader
 from tests.weights.contract import CHECKS, Check, filled, values_of
 

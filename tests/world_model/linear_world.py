@@ -14,8 +14,7 @@ from torch import Tensor, nn
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model.config import LearnableModelConfig
-from accerl_lerobot.world_model.data import Windows
-from accerl_lerobot.world_model.model.contract import (
+from accerl_lerobot.world_model.contract import (
     ActionHistory,
     Context,
     LearnableWorldModel,
@@ -23,6 +22,7 @@ from accerl_lerobot.world_model.model.contract import (
     State,
     WorldModelSpec,
 )
+from accerl_lerobot.world_model.data import Windows
 
 
 @LearnableModelConfig.register_subclass("linear")

@@ -10,7 +10,7 @@ import numpy as np
 from accerl_lerobot.envs import SimulatedConfig, World, make_world
 from accerl_lerobot.experience import Decision, Origin, Segment
 from accerl_lerobot.rollout.segments import SegmentBuilder
-from accerl_lerobot.world_model.model.contract import WorldModelSpec
+from accerl_lerobot.world_model.contract import WorldModelSpec
 
 K = 4
 WORLD = SimulatedConfig(max_steps=16, image_size=16, hold=6, tolerance=0.2)

@@ -16,6 +16,7 @@ from accerl_lerobot.engine.config import DatasetConfig
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.world_model import data as module
+from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.data import (
     Episode,
     WindowStart,
@@ -26,7 +27,6 @@ from accerl_lerobot.world_model.data import (
     split_episodes,
     window_starts,
 )
-from accerl_lerobot.world_model.model.contract import WorldModelSpec
 
 K = 3
 

@@ -12,11 +12,11 @@ import pytest
 import torch
 
 from accerl_lerobot import cli
-from accerl_lerobot.console import Console
 from accerl_lerobot.demos.dataset_files import open_metadata
 from accerl_lerobot.engine.config import DatasetConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model import validation as evaluate
 from accerl_lerobot.world_model.config import (
     NetworkConfig,
     PixelModelConfig,
@@ -24,12 +24,17 @@ from accerl_lerobot.world_model.config import (
     WorldModelConfig,
 )
 from accerl_lerobot.world_model.data import fingerprint
-from accerl_lerobot.world_model.learning.learners import new_success_model
-from accerl_lerobot.world_model.learning.pretrain import world_spec
-from accerl_lerobot.world_model.model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.model.store import Source, save_world_model
-from accerl_lerobot.world_model.validation import evaluate
-from accerl_lerobot.world_model.validation.evaluate import HELD_OUT, ONLINE, open_datasets, validate_datasets
+from accerl_lerobot.world_model.learners import new_success_model
+from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.pretrain import world_spec
+from accerl_lerobot.world_model.store import Source, save_world_model
+from accerl_lerobot.world_model.validation import (
+    HELD_OUT,
+    ONLINE,
+    DatasetRoles,
+    open_datasets,
+    validate_datasets,
+)
 from tests.runs import replacing
 from tests.world_model.test_pretrain import moved, recorded
 
@@ -160,9 +165,8 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> Tried:
 
 def validated(tmp_path: Path, of: dict[str, Any], **options: Any) -> tuple[dict[str, Any], float]:
     success: Any = SimpleNamespace(config=SimpleNamespace(threshold=SAVED))
-    found = validate_datasets(
-        None, of, ValidationConfig(), success, tmp_path, Console(), **options  # type: ignore[arg-type]
-    )  # fmt: skip
+    roles = DatasetRoles(**options)
+    found = validate_datasets(None, of, ValidationConfig(), success, tmp_path, roles)  # type: ignore[arg-type]
     return found, success.config.threshold
 
 

@@ -12,17 +12,18 @@ import torch
 
 from accerl_lerobot.world_model.config import LearnConfig, PixelModelConfig, SuccessLearnConfig
 from accerl_lerobot.world_model.data import Episode, Windows
-from accerl_lerobot.world_model.learning.learners import (
+from accerl_lerobot.world_model.learners import (
     HELD_OUT_SAMPLES,
     Examples,
+    HeldOut,
     SuccessLearner,
     as_floats,
     held_out_success_metrics,
     new_success_model,
     train_from_scratch,
 )
-from accerl_lerobot.world_model.model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.validation.metrics import skill, squared_errors
+from accerl_lerobot.world_model.metrics import skill, squared_errors
+from accerl_lerobot.world_model.pixels import PixelWorldModel
 from tests.world_model.test_pixels import NETWORK, SIZE, SPEC, K, awake, dots, model, rollout, windows
 from tests.world_model.test_validate import Deterministic, with_successes
 
@@ -44,7 +45,7 @@ def learn(held_out: list[Episode], **changes: Any) -> tuple[dict[str, torch.Tens
     learner = train_from_scratch(
         awake(model()), dots(6), replace(CONFIG, **changes), 3,
         on_step=lambda step, metrics: steps.append((step, metrics)),
-        held_out=held_out, on_held_out=lambda step, metrics: told.append((step, metrics)),
+        held_out=HeldOut(held_out, lambda step, metrics: told.append((step, metrics))),
     )  # fmt: skip
     weights = {f"{name}.{k}": v for name in ("model", "serving") for k, v in learner.state()[name].items()}
     return weights, steps, told
@@ -105,7 +106,14 @@ def test_a_placebo_is_looked_at_with_true_actions(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(PixelWorldModel, "loss", loss)
     held_out = darker(dots(3, seed=5))
-    train_from_scratch(model(), dots(6), replace(CONFIG, steps=5), 3, shuffle=True, held_out=held_out)
+    train_from_scratch(
+        model(),
+        dots(6),
+        replace(CONFIG, steps=5),
+        3,
+        shuffle=True,
+        held_out=HeldOut(held_out, lambda step, metrics: None),
+    )
     *_, windows = seen
     made = {e.state[t].tobytes(): e.actions[t : t + K] for e in held_out for t in range(len(e))}
     whole = np.flatnonzero(windows.steps[:, 0] == K)

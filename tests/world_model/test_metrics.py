@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from accerl_lerobot.world_model.validation.metrics import (
+from accerl_lerobot.world_model.metrics import (
     auroc,
     auroc_estimate,
     bootstrap,

@@ -12,22 +12,24 @@ import torch
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import IMAGINED, Segment
+from accerl_lerobot.world_model import online
 from accerl_lerobot.world_model.config import (
+    ImaginationConfig,
     NetworkConfig,
     OnlineLearnConfig,
     PixelModelConfig,
     ValidationConfig,
 )
 from accerl_lerobot.world_model.data import model_arrays
-from accerl_lerobot.world_model.learning import online
-from accerl_lerobot.world_model.learning.learners import new_success_model
-from accerl_lerobot.world_model.learning.online import (
+from accerl_lerobot.world_model.learners import new_success_model
+from accerl_lerobot.world_model.online import (
     OnlineLearner,
+    PretrainingEpisodes,
     UnfinishedEpisodes,
     episode_from_segments,
     episode_weights,
 )
-from accerl_lerobot.world_model.model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.pixels import PixelWorldModel
 from tests.world_model.real_segments import SPEC, K, real_episode
 
 NETWORK = NetworkConfig(space_to_depth=2, channels=(8, 8), condition=8, planes=2)
@@ -35,14 +37,13 @@ NETWORK = NetworkConfig(space_to_depth=2, channels=(8, 8), condition=8, planes=2
 
 def learner(**config: Any) -> OnlineLearner:
     torch.manual_seed(0)
-    options = {k: config.pop(k) for k in ("offline", "held_out_offline", "threshold") if k in config}
-    options = {k.removesuffix("_offline"): v for k, v in options.items()}
-    fields = {"steps_per_episode": 2.0, "batch": 4, "validate_every": 4, "held_out": 0.25}
+    known = PretrainingEpisodes(config.pop("offline", []), config.pop("held_out_offline", []))
+    threshold = config.pop("threshold", None)
+    fields = {"steps_per_episode": 2.0, "validate_every": 4, "held_out": 0.25}
+    learn = OnlineLearnConfig(**(fields | config), validation=ValidationConfig(depth=2))
     model = PixelWorldModel(SPEC, PixelModelConfig(network=NETWORK))
-    made = OnlineLearner(
-        model, new_success_model(K), OnlineLearnConfig(**(fields | config)), ValidationConfig(depth=2),
-        seed=0, **options,
-    )  # fmt: skip
+    imagination = ImaginationConfig(learn=learn, threshold=threshold)
+    made = OnlineLearner(model, new_success_model(K), imagination, known, seed=0)
     made.given = model  # type: ignore[attr-defined]
     return made
 
@@ -139,26 +140,23 @@ def test_without_a_success_only_the_world_is_learnt():
 
 def test_a_share_of_every_batch_is_from_the_dataset_it_began_with():
     offline = [episode_from_segments([s], SPEC) for s in episodes(False, True)]
-    made = learner(offline=offline, batch=8)
+    made = learner(offline=offline)
     assert {p.episode for p in made._draw()} <= {0, 1}, "nothing else is known yet"
     for segment in episodes(*[False] * 4):
         made.add(segment)
     for _ in range(20):
         drawn = [p.episode for p in made._draw()]
-        assert sum(e < 2 for e in drawn) == 4 and max(drawn) < 2 + 3
+        assert sum(e < 2 for e in drawn) == 8 and max(drawn) < 2 + 3
 
 
 def test_new_and_failed_episodes_are_drawn_more_often():
-    config = OnlineLearnConfig(recent=0.7, failures=0.6)
-    weights = episode_weights([True, False] * 4, config)
+    weights = episode_weights([True, False] * 4)
     assert weights.sum() == pytest.approx(1) and len(weights) == 8
     assert weights[1::2].sum() == pytest.approx(0.6)
     assert weights[6:].sum() == pytest.approx(0.7), "the newest quarter"
     assert weights[0] == pytest.approx(0.4 * 0.3 / 3) and weights[6] == pytest.approx(0.4 * 0.7)
-    assert episode_weights([False] * 4, config).tolist() == pytest.approx([0.1, 0.1, 0.1, 0.7])
-    assert episode_weights([True], config).tolist() == [1]
-    old_only = OnlineLearnConfig(recent=0.0)
-    assert episode_weights([False], old_only).tolist() == [1], "there is nothing but the newest"
+    assert episode_weights([False] * 4).tolist() == pytest.approx([0.1, 0.1, 0.1, 0.7])
+    assert episode_weights([True]).tolist() == [1]
 
 
 def passes(monkeypatch: pytest.MonkeyPatch, *outcomes: bool) -> list[list[str]]:
@@ -212,7 +210,8 @@ def test_a_threshold_that_was_named_stays(
 
 
 def test_after_the_last_episode_it_learns_on_until_it_passes_or_is_given_up(monkeypatch: pytest.MonkeyPatch):
-    made = learner(final_validations=3)
+    made = learner()
+    monkeypatch.setattr(online, "FINAL_VALIDATIONS", 3)
     passes(monkeypatch, False, False, False)
     for segment in episodes(False, True, False, False):
         made.add(segment)

@@ -15,21 +15,21 @@ from safetensors.torch import load_file, save_file
 
 from accerl_lerobot import cli, console
 from accerl_lerobot.checkpoint import isolation
-from accerl_lerobot.cli.configs import WorldModelEvalRun, WorldModelRun
+from accerl_lerobot.cli.verbs import WorldModelEvalRun, WorldModelRun
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.engine.config import DatasetConfig, RunConfig, parse
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model import learners, pretrain
+from accerl_lerobot.world_model import validation as evaluate
 from accerl_lerobot.world_model.config import WorldModelConfig
-from accerl_lerobot.world_model.learning import learners, pretrain
-from accerl_lerobot.world_model.learning.learners import new_success_model
-from accerl_lerobot.world_model.model.store import (
+from accerl_lerobot.world_model.learners import new_success_model
+from accerl_lerobot.world_model.store import (
     load_sources,
     load_world_model,
     rehearse_world_model,
     save_world_model,
 )
-from accerl_lerobot.world_model.validation import evaluate
 from tests.runs import replacing
 from tests.world_model.test_pixels import awake, dots, model, rollout, windows
 

@@ -23,19 +23,12 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED
 from accerl_lerobot.world_model.config import (
     MODELS,
-    ExternalRewardModelConfig,
     ImaginationConfig,
     ModelKind,
     NetworkConfig,
     PixelModelConfig,
 )
-from accerl_lerobot.world_model.data import model_arrays
-from accerl_lerobot.world_model.imagination.guard import worker_config
-from accerl_lerobot.world_model.imagination.registry import CopyModel, OracleModel, ShuffledModel, make_models
-from accerl_lerobot.world_model.imagination.rollouts import Imagination, RolloutSettings
-from accerl_lerobot.world_model.imagination.starts import Start, StartPool
-from accerl_lerobot.world_model.learning.learners import new_success_model
-from accerl_lerobot.world_model.model.contract import (
+from accerl_lerobot.world_model.contract import (
     ActionHistory,
     BuildInputs,
     Context,
@@ -43,8 +36,12 @@ from accerl_lerobot.world_model.model.contract import (
     State,
     WorldModel,
 )
-from accerl_lerobot.world_model.model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.model.store import save_world_model
+from accerl_lerobot.world_model.data import model_arrays
+from accerl_lerobot.world_model.learners import new_success_model
+from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.registry import CopyModel, OracleModel, ShuffledModel, make_models
+from accerl_lerobot.world_model.rollouts import Imagination, RolloutSettings, Start, StartPool
+from accerl_lerobot.world_model.store import save_world_model
 from tests.test_imagination import imagining, run_locally
 from tests.world_model import real_segments as real
 from tests.world_model.real_segments import SPEC, WORLD, real_episode
@@ -60,7 +57,7 @@ def begun(model: WorldModel, starts: list[Start]) -> State:
 
 
 def starts_of(*seeds: int, solve_at: int = 99) -> tuple[list[Start], dict[int, object]]:
-    pool = StartPool(SPEC, ImaginationConfig(memory=1000, start_at_high_td_prob=0.0))
+    pool = StartPool(SPEC, ImaginationConfig(memory=1000))
     segments = {seed: real_episode(seed, solve_at=solve_at)[0] for seed in seeds}
     for segment in segments.values():
         pool.add(segment)
@@ -166,7 +163,7 @@ class Snow(WorldModel):
         )
 
 
-SNOW = ModelKind(make=f"{__name__}:Snow", what="a blizzard.", needs_path=False, knows_success=True)
+SNOW = ModelKind(make=f"{__name__}:Snow", what="a blizzard.", needs_path=False)
 
 
 @pytest.fixture
@@ -199,21 +196,14 @@ def test_what_is_asked_of_a_config_replaces_the_table(monkeypatch: pytest.Monkey
         parse(RunConfig, ["--imagination.model=magic"])
     config = ImaginationConfig(share=0.5, model="snow")
     assert not config.learns
-    judge = ExternalRewardModelConfig(path="somewhere", threshold=0.5)
-    with pytest.raises(InputError, match=r"^imagination\.success\.path=.* the snow knows what has succeeded"):
-        replace(config, success=judge)
-    told(knows_success=False)
-    replace(config, success=judge)
     told(needs_path=True)
     with pytest.raises(InputError, match=r"^imagination\.path=None"):
         replace(config)
     told(needs_path=True, learns=True)
     assert replace(config, path="x").learns and not replace(config, path="x", share=0.0).learns
     told(min_rollouts=3)
-    with pytest.raises(
-        InputError, match=r"^imagination\.rollouts=5: use at least 6, or fewer .*: snow needs 3"
-    ):
-        replace(config, rollouts=5, workers=2)
+    with pytest.raises(InputError, match=r"^imagination\.rollouts=2: use at least 3: snow needs them"):
+        replace(config, rollouts=2)
 
 
 def test_the_table_is_read_without_torch():
@@ -241,8 +231,7 @@ def test_entries_of_the_table_are_true(name: str, made: type, tmp_path: Path):
         path = str(tmp_path / "world")
     config = ImaginationConfig(share=0.5, model=name, path=path)
     model, success = make_models(config, real.WORLD, world.spec, real.K, "cpu")
-    assert type(model) is made and (success is None) is kind.knows_success
-    assert ("success" in model.spec.provides) is kind.knows_success
+    assert type(model) is made and (success is None) is ("success" in model.spec.provides)
     learnt = model.model if isinstance(model, ShuffledModel) else model
     assert isinstance(learnt, PixelWorldModel) is kind.learns is config.learns
     frames = torch.zeros(1, real.SPEC.context, 1, 16, 16, 3, dtype=torch.uint8)
@@ -257,16 +246,9 @@ def test_entries_of_the_table_are_true(name: str, made: type, tmp_path: Path):
 
 
 def test_rollouts_with_other_actions_are_never_alone():
-    for workers in range(1, 6):
-        for rollouts in range(workers, 16):
-            fields: dict[str, Any] = {"share": 0.5, "path": "x", "rollouts": rollouts, "workers": workers}
-            least = min(worker_config(ImaginationConfig(**fields), i).rollouts for i in range(workers))
-            if least >= 2:
-                config = ImaginationConfig(model="shuffled", **fields)
-                assert all(worker_config(config, i).rollouts >= 2 for i in range(workers))
-                continue
-            with pytest.raises(InputError, match=rf"^imagination\.rollouts={rollouts}: .* {2 * workers}, or"):
-                ImaginationConfig(model="shuffled", **fields)
+    ImaginationConfig(share=0.5, path="x", model="shuffled", rollouts=2)
+    with pytest.raises(InputError, match=r"^imagination\.rollouts=1: use at least 2: shuffled needs them"):
+        ImaginationConfig(share=0.5, path="x", model="shuffled", rollouts=1)
 
 
 @pytest.mark.parametrize("whole", [True, False])
@@ -277,7 +259,7 @@ def test_rollouts_start_only_where_their_model_can(whole: bool, monkeypatch: pyt
     world = make_world(real.WORLD)
     models = make_models(config, real.WORLD, world.spec, real.K, "cpu")
     world.close()
-    settings = RolloutSettings(decision_cost=0.0, time_limit_fails=True, seed=0, name="imagination")
+    settings = RolloutSettings(decision_cost=0.0, time_limit_fails=True, seed=0)
     rollouts = Imagination(models, world.spec, config, settings, print)
     _, later = real.real_episode(1, length=2)
     rollouts.remember(later)  # what came before is not known

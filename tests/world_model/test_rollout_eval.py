@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 import torch
 
+from accerl_lerobot.world_model import learners, rollout_eval
 from accerl_lerobot.world_model.config import ValidationConfig
 from accerl_lerobot.world_model.data import Episode, WindowStart
-from accerl_lerobot.world_model.learning import learners
-from accerl_lerobot.world_model.learning.learners import Examples, ImaginedPairs
-from accerl_lerobot.world_model.validation import rollout_eval
-from accerl_lerobot.world_model.validation.rollout_eval import (
+from accerl_lerobot.world_model.learners import Examples, ImaginedPairs
+from accerl_lerobot.world_model.rollout_eval import (
     Scores,
     choose_threshold,
     outcome_metrics,

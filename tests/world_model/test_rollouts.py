@@ -16,17 +16,17 @@ from torch import Tensor
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Decision, Request, Segment
+from accerl_lerobot.world_model import rollouts
 from accerl_lerobot.world_model.config import GuardConfig, ImaginationConfig, OnlineLearnConfig
-from accerl_lerobot.world_model.imagination import rollouts
-from accerl_lerobot.world_model.imagination.registry import (
+from accerl_lerobot.world_model.contract import ActionHistory, Context, Prediction, State, WorldModel
+from accerl_lerobot.world_model.online import Promotion
+from accerl_lerobot.world_model.registry import (
     ImaginationModels,
     OracleModel,
     ShuffledModel,
     check_fit,
 )
-from accerl_lerobot.world_model.imagination.rollouts import Imagination, RolloutSettings
-from accerl_lerobot.world_model.learning.online import Promotion
-from accerl_lerobot.world_model.model.contract import ActionHistory, Context, Prediction, State, WorldModel
+from accerl_lerobot.world_model.rollouts import Imagination, RolloutSettings
 from tests.world_model.real_segments import SPEC, WORLD, K, decided, real_episode
 
 WORLD_SPEC = make_world(WORLD).spec
@@ -91,7 +91,7 @@ def imagination(
         "learn": OnlineLearnConfig(steps_per_episode=0),
     }  # fmt: skip
     made: list[Segment] = []
-    settings = RolloutSettings(decision_cost=0.01, time_limit_fails=fails, seed=0, name="imagination")
+    settings = RolloutSettings(decision_cost=0.01, time_limit_fails=fails, seed=0)
     models = ImaginationModels(model, success)
     batch = Imagination(models, world, ImaginationConfig(**(fields | config)), settings, made.append)
     return batch, made
@@ -216,7 +216,6 @@ def test_rollouts_that_succeed_too_often_are_switched_off_until_a_promotion(brig
         bright,
         rollouts=4,
         guard=GuardConfig(window=4, min_real_episodes=4, max_gap=0.5),
-        start_at_high_td_prob=0.0,
         world=ENDLESS,
     )
     for seed in range(8):

@@ -26,11 +26,11 @@ from accerl_lerobot.world_model.config import (
     WorldModelConfig,
 )
 from accerl_lerobot.world_model.data import fingerprint
-from accerl_lerobot.world_model.learning.learners import new_success_model
-from accerl_lerobot.world_model.learning.online import Promotion
-from accerl_lerobot.world_model.learning.pretrain import world_spec
-from accerl_lerobot.world_model.model.pixels import PixelWorldModel
-from accerl_lerobot.world_model.model.store import OWN_RUN, Source, load_sources, save_world_model
+from accerl_lerobot.world_model.learners import new_success_model
+from accerl_lerobot.world_model.online import Promotion
+from accerl_lerobot.world_model.pixels import PixelWorldModel
+from accerl_lerobot.world_model.pretrain import world_spec
+from accerl_lerobot.world_model.store import OWN_RUN, Source, load_sources, save_world_model
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 from tests.runs import tiny_run
 
@@ -96,7 +96,7 @@ def test_what_is_promoted_says_what_it_has_learned_from(
     config = run(
         tiny_checkpoint, tmp_path / "model", OnlineLearnConfig(dataset=demos, online=rollouts), [source]
     )
-    imagination = make_imagination(config, "rollout", lambda segment: None)
+    imagination = make_imagination(config, lambda segment: None)
     model, success = imagination.models
     assert isinstance(model, PixelWorldModel) and isinstance(success, SuccessPairsRewardModel)
     imagination.swap(Promotion(model, success, 7, {}))

@@ -8,18 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from accerl_lerobot.world_model import rollouts as starts_module
 from accerl_lerobot.world_model.config import ImaginationConfig
+from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.data import model_arrays
-from accerl_lerobot.world_model.imagination import starts as starts_module
-from accerl_lerobot.world_model.imagination.starts import StartPool
-from accerl_lerobot.world_model.model.contract import WorldModelSpec
+from accerl_lerobot.world_model.rollouts import StartPool
 from tests.rounding import assert_close
 from tests.world_model.real_segments import SPEC, K, real_episode
 
 
 def pool(spec: WorldModelSpec = SPEC, **options: object) -> StartPool:
     """Starts anywhere; an oracle's need their history."""
-    defaults = {"memory": 1000, "start_at_high_td_prob": 0.0}
+    defaults = {"memory": 1000}
     return StartPool(spec, ImaginationConfig(**(defaults | options)))  # type: ignore[arg-type]
 
 
@@ -93,7 +93,7 @@ def test_what_led_to_a_segment_is_kept_over_several_and_when_a_pool_is_left(monk
 
 
 def test_some_begin_where_episodes_began():
-    held = pool(start_at_reset_prob=0.5, start_at_high_td_prob=0.0)
+    held = pool(start_at_reset_prob=0.5)
     for seed in range(3):
         held.add(real_episode(seed)[0])
     held.add(real_episode(9, length=2)[1])  # a later part
@@ -103,7 +103,7 @@ def test_some_begin_where_episodes_began():
     assert set(first) == {0, 1, 2} and sum(first.values()) == pytest.approx(
         4000 * (0.5 + 0.5 * 3 / 13), abs=150
     )
-    only = pool(start_at_reset_prob=1.0, start_at_high_td_prob=1.0)
+    only = pool(start_at_reset_prob=1.0)
     for seed in range(3):
         only.add(real_episode(seed)[0])
     assert {s.origin.decision for s in only.draw(100, np.random.default_rng(0))} == {0}
@@ -131,26 +131,6 @@ def test_to_the_end_it_is_how_the_episode_ended_that_counts():
     for segment in (first, second, failure):
         short.add(segment)
     assert found(short) == {(6, False)} and set(short._outcomes) == {("match", 6)}
-
-
-def test_high_td_starts_are_where_the_critic_was_surprised():
-    [segment] = real_episode(3)
-    # V says 0, 0, 1, 1: it is surprised at the second decision, and at the end, after which comes nothing.
-    segment = replace(
-        segment, value=np.array([0, 0, 1, 1], np.float32), reward=np.zeros(4, np.float32), terminated=True,
-        truncated=False,
-    )  # fmt: skip
-    held = pool(start_at_high_td_prob=1.0)
-    held.add(segment)
-    counts = Counter(s.origin.decision for s in held.draw(1000, np.random.default_rng(0)))
-    assert set(counts) == {1, 3} and abs(counts[1] - 500) < 80
-    even = pool(start_at_high_td_prob=0.5)
-    even.add(segment)
-    counts = Counter(s.origin.decision for s in even.draw(4000, np.random.default_rng(0)))
-    assert counts[0] == pytest.approx(500, abs=90) and counts[1] == pytest.approx(1500, abs=140)
-    still = pool(start_at_high_td_prob=1.0)
-    still.add(replace(segment, value=np.zeros(4, np.float32)))
-    assert len({s.origin.decision for s in still.draw(100, np.random.default_rng(0))}) == 4
 
 
 def test_the_newest_are_kept():

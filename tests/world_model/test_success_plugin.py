@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.world_model.metrics import auroc
 from accerl_lerobot.world_model.success_plugin import SuccessPairsConfig
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
-from accerl_lerobot.world_model.validation.metrics import auroc
 from tests.rounding import assert_close
 
 ROOT = Path(__file__).parents[2]

@@ -19,7 +19,7 @@ import torch
 from torch import nn
 
 from accerl_lerobot import cli, console
-from accerl_lerobot.cli.configs import WorldModelEvalRun, WorldModelRun
+from accerl_lerobot.cli.verbs import WorldModelEvalRun, WorldModelRun
 from accerl_lerobot.config.parsing import encode
 from accerl_lerobot.engine.config import parse
 from accerl_lerobot.envs import SimulatedConfig
@@ -32,11 +32,11 @@ from accerl_lerobot.world_model.config import (
     PixelModelConfig,
     WorldModelConfig,
 )
-from accerl_lerobot.world_model.imagination.registry import make_models
-from accerl_lerobot.world_model.learning.learners import Learner, new_success_model
-from accerl_lerobot.world_model.learning.pretrain import world_spec
-from accerl_lerobot.world_model.model.contract import LearnableWorldModel, learnable_class, new_learnable
-from accerl_lerobot.world_model.model.store import load_world_model, save_world_model
+from accerl_lerobot.world_model.contract import LearnableWorldModel, learnable_class, new_learnable
+from accerl_lerobot.world_model.learners import Learner, new_success_model
+from accerl_lerobot.world_model.pretrain import world_spec
+from accerl_lerobot.world_model.registry import make_models
+from accerl_lerobot.world_model.store import load_world_model, save_world_model
 from benchmarks.ranking import BenchRankingConfig
 from tests.runs import drive, replacing
 from tests.test_imagination import LOOSE, decisions, imagining, run_locally
@@ -133,7 +133,7 @@ def test_its_fields_are_fields_of_the_command_line():
 
 def test_a_recipe_of_one_class_is_gone_on_with_as_another(tmp_path: Path):
     recipe = tmp_path / "config.yaml"
-    recipe.write_text(json.dumps(encode(parse(WorldModelRun, ["--world_model.model.steps=3"]))))
+    recipe.write_text(json.dumps(encode(parse(WorldModelRun, ["--world_model.model.heads=5"]))))
     other = parse(WorldModelRun, [f"--config_path={recipe}", *NAMED, "--world_model.model.context=3"])
     assert other.world_model.model == linear(context=3)
     written = encode(other)
@@ -149,8 +149,8 @@ def test_a_recipe_of_one_class_is_gone_on_with_as_another(tmp_path: Path):
 
 
 def test_ours_are_one_type_of_several():
-    assert parse(WorldModelRun, ["--world_model.model.steps=2"]).world_model.model == PixelModelConfig(
-        steps=2
+    assert parse(WorldModelRun, ["--world_model.model.heads=2"]).world_model.model == PixelModelConfig(
+        heads=2
     )
     for value, said in (("spiral", "'spiral'"), ("[linear]", r"\['linear'\]"), ("{a: 1}", "{'a': 1}")):
         with pytest.raises(InputError, match=rf"^world_model.model.type={said}: .*pixels"):
@@ -221,7 +221,7 @@ class BareConfig(LearnableModelConfig):
         (None, "its config's make is '', which cannot be imported"),
         (f"{__name__}:Nothing", "cannot be imported .module .* has no attribute 'Nothing'"),
         (
-            "accerl_lerobot.world_model.model.contract:LearnableWorldModel",
+            "accerl_lerobot.world_model.contract:LearnableWorldModel",
             "lacks begin, fit_statistics, loss, step",
         ),
     ],
@@ -243,9 +243,7 @@ def test_classes_that_are_none(
 
 
 def test_it_goes_on_learning_in_a_run_and_is_saved_when_promoted(tiny_checkpoint: Path, tmp_path: Path):
-    learn = OnlineLearnConfig(
-        steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE, batch=4
-    )
+    learn = OnlineLearnConfig(steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE)
     path = str(saved(tmp_path / "w", gain=3.0))
     config = imagining(tiny_checkpoint, path=path, discover_packages_path=PACKAGE, learn=learn, episodes=24)
     history, batches, engine = run_locally(config)
@@ -264,9 +262,7 @@ def test_it_goes_on_learning_in_a_run_and_is_saved_when_promoted(tiny_checkpoint
 def test_in_processes_of_their_own_they_find_it_too(tiny_checkpoint: Path, tmp_path: Path):
     from accerl_lerobot.engine.launch import RayEngine
 
-    learn = OnlineLearnConfig(
-        steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE, batch=4
-    )
+    learn = OnlineLearnConfig(steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE)
     named = {"path": str(saved(tmp_path / "w")), "discover_packages_path": PACKAGE}
     config = imagining(tiny_checkpoint, learn=learn, episodes=24, **named)
     engine = RayEngine(replace(config, output_dir=str(tmp_path / "run")), ("match",))

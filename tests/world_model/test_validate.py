@@ -15,11 +15,11 @@ from torch import Tensor
 
 from accerl_lerobot.evaluation.pictures import GAP
 from accerl_lerobot.world_model.config import SuccessLearnConfig, ValidationConfig
+from accerl_lerobot.world_model.contract import ActionHistory, Context, Prediction, State, WorldModel
 from accerl_lerobot.world_model.data import Episode
-from accerl_lerobot.world_model.learning.learners import Examples, SuccessLearner, new_success_model
-from accerl_lerobot.world_model.model.contract import ActionHistory, Context, Prediction, State, WorldModel
-from accerl_lerobot.world_model.validation.rollout_eval import match_cut_lengths, predict
-from accerl_lerobot.world_model.validation.validate import (
+from accerl_lerobot.world_model.learners import Examples, SuccessLearner, new_success_model
+from accerl_lerobot.world_model.rollout_eval import match_cut_lengths, predict
+from accerl_lerobot.world_model.validation import (
     SCALE,
     arm_actions,
     comparison_video,

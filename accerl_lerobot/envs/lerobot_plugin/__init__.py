@@ -24,9 +24,15 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import freeze_after_episode_end
 
-from accerl_lerobot.envs.metaworld import ACTION_DIM, FPS, STATE_DIM, MetaWorld, MetaWorldConfig
-from accerl_lerobot.envs.metaworld_tasks import description
-from accerl_lerobot.envs.shift import ShiftConfig
+from accerl_lerobot.envs.metaworld import (
+    ACTION_DIM,
+    FPS,
+    STATE_DIM,
+    MetaWorld,
+    MetaWorldConfig,
+    ShiftConfig,
+    description,
+)
 from accerl_lerobot.experience import Observation
 
 VIDEO_SIZE = 256

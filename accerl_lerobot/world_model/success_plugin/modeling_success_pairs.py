@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 from lerobot.rewards.pretrained import PreTrainedRewardModel
 from torch import Tensor, nn
@@ -128,3 +129,23 @@ class SuccessPairsRewardModel(PreTrainedRewardModel):
         first, second = both.clamp(0, 1).unflatten(1, (-1, 3)).chunk(2, 1)
         alone = torch.rand(b, 1, 1, 1, 1, generator=generator) < self.config.alone
         return torch.where(alone.to(both.device), second, first), second
+
+
+# For frames as world models have them.
+
+
+def as_floats(frames: np.ndarray, device: torch.device) -> Tensor:
+    """uint8 (B, V, H, W, 3) to float (B, V, 3, H, W) in [0, 1], the input of a success model."""
+    return torch.from_numpy(frames).movedim(-1, 2).to(device).float() / 255
+
+
+def probabilities(
+    success: SuccessPairsRewardModel, before: np.ndarray, after: np.ndarray, batch: int = 64
+) -> np.ndarray:
+    """float32 (M,): P that the second frames show a success; frames uint8 (M, V, H, W, 3)."""
+    device = success.out.weight.device
+    parts = [
+        success.probability(as_floats(before[i : i + batch], device), as_floats(after[i : i + batch], device))
+        for i in range(0, len(before), batch)
+    ]
+    return torch.cat(parts).cpu().numpy() if parts else np.zeros(0, np.float32)

@@ -8,19 +8,15 @@ the same policy, a policy that improves does not trip the switch.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 from accerl_lerobot.checkpoint.snapshot import kind
-from accerl_lerobot.errors import InputError
-from accerl_lerobot.inference.pool import dealt
-from accerl_lerobot.world_model.config import ImaginationConfig
 
 IMAGINATION = "imagination"
-"""Name of the state of the first worker that imagines; those of others have a number behind it."""
-COUNTS = ("rollouts", "decisions", "successes", "uncertain")
+"""Name of the worker that imagines, and of its state."""
+WORLD_LEARNING = "world learning"
+"""Name of the worker that trains the world model."""
 
 
 @kind
@@ -97,34 +93,3 @@ class KillSwitch:
     def shares(self) -> tuple[float, float]:
         """Success rates, imagined and real, at the same times; NaN before there are any."""
         return self._imagined, self._real
-
-
-# Several workers, each with its part of the rollouts, its own draws and its own kill switch.
-
-
-def worker_config(config: ImaginationConfig, index: int) -> ImaginationConfig:
-    """Config of one of several workers."""
-    return replace(config, workers=1, rollouts=dealt(config.rollouts, config.workers)[index])
-
-
-def combine_metrics(metrics: Sequence[dict[str, float]]) -> dict[str, float]:
-    """Combines the metrics of all workers: sums of counts, the oldest version, whether any imagines, and
-    means of shares; empty before all have reported."""
-    if len(metrics) < 2 or not all(metrics):
-        return dict(metrics[0]) if len(metrics) == 1 else {}
-    combined = {name: sum(m[name] for m in metrics) for name in metrics[0]}
-    combined |= {name: total / len(metrics) for name, total in combined.items() if name not in COUNTS}
-    return combined | {"version": min(m["version"] for m in metrics), "on": max(m["on"] for m in metrics)}
-
-
-def check_workers(state: Path, workers: int) -> None:
-    """Refuses to resume from a ``training_state`` of another number of workers.
-
-    Raises:
-        InputError: names the number in the state.
-    """
-    before = 1
-    while (state / f"{IMAGINATION}{before}.json").is_file():
-        before += 1
-    if before != workers:
-        raise InputError("imagination.workers", workers, f"this run has {before}; leave the field out")

@@ -14,29 +14,34 @@ import copy
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from accerl_lerobot.experience import REAL, Segment
-from accerl_lerobot.world_model.config import (
-    LearnConfig,
-    OnlineLearnConfig,
-    SuccessLearnConfig,
-    ValidationConfig,
-)
+from accerl_lerobot.world_model.config import ImaginationConfig, LearnConfig, SuccessLearnConfig
+from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModelSpec
 from accerl_lerobot.world_model.data import Episode, WindowStart, executed_actions, model_arrays
-from accerl_lerobot.world_model.learning.learners import Examples, Learner, SuccessLearner
-from accerl_lerobot.world_model.model.contract import LearnableWorldModel, WorldModelSpec
-from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
-from accerl_lerobot.world_model.validation.rollout_eval import (
+from accerl_lerobot.world_model.learners import Examples, Learner, SuccessLearner
+from accerl_lerobot.world_model.rollout_eval import (
     Scores,
     choose_threshold,
     concatenate,
     score_episodes,
 )
-from accerl_lerobot.world_model.validation.validate import fit_uncertainty_scale, validate
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
+from accerl_lerobot.world_model.validation import fit_uncertainty_scale, validate
 
+BATCH, LEARNING_RATE = 16, 3e-4
+"""Windows per gradient step, and the learning rate after the first steps."""
+OFFLINE, RECENT, FAILURES = 0.5, 0.7, 0.6
+"""Share of windows from the pre-training data; of the others, from the newest quarter of episodes; and of
+those, from failures."""
+MEMORY = 400
+"""Real episodes kept for training."""
+FINAL_VALIDATIONS = 5
+"""Validations after the last real episode, at most."""
 MAX_VALIDATION_S = 3600.0
 """A validation in progress counts as progress of the run for so long, see `launch`."""
 ENDLESS = 10**9
@@ -105,6 +110,13 @@ class Promotion(NamedTuple):
     """See `validate`."""
 
 
+class PretrainingEpisodes(NamedTuple):
+    """Episodes that the world model was trained on before the run, and those that were held out."""
+
+    learnt: list[Episode]
+    held_out: list[Episode]
+
+
 class OnlineLearner:
     """Trains as real segments come in.
 
@@ -118,12 +130,9 @@ class OnlineLearner:
     Args:
         model: start of the training; not changed.
         success: the same.
-        config: of the training.
-        validation: what a model must pass.
-        offline: episodes of the pre-training.
-        held_out: episodes held out in the pre-training.
+        config: of the run's imagination.
+        pretraining: episodes of the pre-training.
         longest: chunks of a rollout at most.
-        threshold: of the success model; None: it is chosen on the policy's episodes.
         seed: of everything random.
         on_validation: see there.
     """
@@ -132,17 +141,15 @@ class OnlineLearner:
         self,
         model: LearnableWorldModel,
         success: SuccessPairsRewardModel,
-        config: OnlineLearnConfig,
-        validation: ValidationConfig,
-        *,
-        offline: Sequence[Episode] = (),
-        held_out: Sequence[Episode] = (),
+        config: ImaginationConfig,
+        pretraining: PretrainingEpisodes | None = None,
         longest: int = 15,
-        threshold: float | None = None,
         seed: int = 0,
         on_validation: OnValidation | None = None,
     ) -> None:
-        self.config, self.validation, self._threshold = config, validation, threshold
+        self.config, self._threshold = config.learn, config.threshold
+        validation = self.config.validation
+        self.validation = replace(validation, depth=min(validation.depth, longest))
         self._on_validation = on_validation
         self.pending_steps = 0.0
         """Gradient steps that are due."""
@@ -150,13 +157,13 @@ class OnlineLearner:
         self._seed = seed
         self.result: dict[str, Any] = {}
         """Result of the last validation."""
-        learn = LearnConfig(steps=ENDLESS, batch=config.batch, lr=config.lr, anchors=longest)
+        learn = LearnConfig(steps=ENDLESS, batch=BATCH, lr=LEARNING_RATE, anchors=longest)
         self._learner = Learner(_trainable(model), learn, seed)
-        success_learn = SuccessLearnConfig(steps=ENDLESS, lr=config.lr, depth=longest)
+        success_learn = SuccessLearnConfig(steps=ENDLESS, lr=LEARNING_RATE, depth=longest)
         self._success = SuccessLearner(_trainable(success), success_learn, seed)
-        self._offline, self._held_offline = list(offline), list(held_out)
-        self._learnt: deque[Episode] = deque(maxlen=config.memory)
-        self._held: deque[Episode] = deque(maxlen=max(1, round(config.memory * config.held_out)))
+        self._offline, self._held_offline = pretraining or PretrainingEpisodes([], [])
+        self._learnt: deque[Episode] = deque(maxlen=MEMORY)
+        self._held: deque[Episode] = deque(maxlen=max(1, round(MEMORY * self.config.held_out)))
         self._rng = np.random.default_rng((seed, 4))
         self._unfinished = UnfinishedEpisodes()
         self._examples: Examples | None = None
@@ -178,7 +185,7 @@ class OnlineLearner:
             return False
         if not last:
             return self._since >= self.config.validate_every
-        left = self._final_validations < self.config.final_validations
+        left = self._final_validations < FINAL_VALIDATIONS
         return (self._since > 0 or not self.promoted) and left
 
     def may_promote(self, last: bool) -> bool:
@@ -262,7 +269,7 @@ class OnlineLearner:
             self._on_validation(model, success, held[-1], number, result["passed"])
         if not result["passed"]:
             self.rejected += 1
-            if last and self._final_validations < self.config.final_validations:
+            if last and self._final_validations < FINAL_VALIDATIONS:
                 self.pending_steps += self.config.validate_every * self.config.steps_per_episode
             self._unserved = {}
             return None
@@ -330,27 +337,27 @@ class OnlineLearner:
 
     def _draw(self) -> list[WindowStart]:
         """Draws a batch from the pre-training episodes, which have the first indices, and the policy's."""
-        count, known = self.config.batch, len(self._offline)
-        share = self.config.offline if self._learnt else 1.0
+        count, known = BATCH, len(self._offline)
+        share = OFFLINE if self._learnt else 1.0
         offline = round(share * count) if known else 0
         chosen = self._rng.integers(known, size=offline).tolist() if offline else []
         if count > offline:
-            weights = episode_weights([e.success for e in self._learnt], self.config)
+            weights = episode_weights([e.success for e in self._learnt])
             chosen += (known + self._rng.choice(len(weights), size=count - offline, p=weights)).tolist()
         episodes = self._offline + list(self._learnt)
         return [WindowStart(e, int(self._rng.integers(len(episodes[e].frames) - 1))) for e in chosen]
 
 
-def episode_weights(successes: Sequence[bool], config: OnlineLearnConfig) -> np.ndarray:
+def episode_weights(successes: Sequence[bool]) -> np.ndarray:
     """Probability of drawing each of the policy's episodes, oldest first."""
     count = len(successes)
     newest = np.arange(count) >= count - max(1, count // 4)
-    weights = np.where(newest, config.recent / newest.sum(), 0.0)
+    weights = np.where(newest, RECENT / newest.sum(), 0.0)
     old = ~newest
-    weights[old] += (1 - config.recent) / max(1, old.sum())
+    weights[old] += (1 - RECENT) / max(1, old.sum())
     failed = ~np.asarray(successes, bool)
     if failed.any() and not failed.all():
-        for which, share in ((failed, config.failures), (~failed, 1 - config.failures)):
+        for which, share in ((failed, FAILURES), (~failed, 1 - FAILURES)):
             weights[which] *= share / weights[which].sum() if weights[which].sum() else 0.0
     total = weights.sum()
     return np.asarray(weights / total if total else np.full(count, 1 / count))

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Our learned world model: frames by one of three objectives, the robot's state by a small ensemble.
+"""Our learned world model: frames by regression, the robot's state by a small ensemble.
 
-For ``refiner`` and ``flow`` the image that is made is the change from the newest frame to the one after the
-chunk, in units of its usual size; for ``edm`` it is the frame itself, as in DIAMOND. It is conditioned on the
-context, and on the anchor, the real frame where the rollout started.
+The network predicts the change from the newest frame to the one after the chunk, in units of its usual size.
+It sees the context, and the anchor, the real frame where the rollout started.
 
 The state is predicted apart from the image, by several heads from state, chunk and a coarse view of the
 frame; their disagreement is the uncertainty.
@@ -13,6 +12,7 @@ Shapes: see `contract.py`; C = 3·V channels, R chunks of a window.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -21,10 +21,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.world_model.config import PixelModelConfig
-from accerl_lerobot.world_model.data import Windows
-from accerl_lerobot.world_model.model import network
-from accerl_lerobot.world_model.model.contract import (
+from accerl_lerobot.world_model.config import NetworkConfig, PixelModelConfig
+from accerl_lerobot.world_model.contract import (
     ActionHistory,
     Context,
     LearnableWorldModel,
@@ -32,9 +30,8 @@ from accerl_lerobot.world_model.model.contract import (
     State,
     WorldModelSpec,
 )
+from accerl_lerobot.world_model.data import Windows
 
-SIGMA_FRAME = 0.5
-"""Standard deviation of frames in [−1, 1], EDM's σ_data of natural images."""
 COARSE = 8
 """Side of the coarse view that the state heads get."""
 
@@ -55,7 +52,7 @@ class PixelWorldModel(LearnableWorldModel):
             raise InputError("world_model.image_size", spec.image_size, remedy)
         channels = 3 * len(spec.cameras)
         chunk = spec.chunk * (spec.action_dim * spec.context + 1) + spec.action_dim + spec.state_dim
-        self.network = network.Denoiser(
+        self.network = FrameNetwork(
             channels, (spec.context + 1) * channels, chunk, spec.state_dim, config.network
         )
         inputs = spec.state_dim * spec.context + chunk + channels * COARSE * COARSE
@@ -98,7 +95,7 @@ class PixelWorldModel(LearnableWorldModel):
         actions = actions.to(self.change.device)
         steps = torch.full(actions.shape[:1], self.spec.chunk, device=actions.device)
         chunk = self._chunk(state, actions, self._executed(steps))
-        image = self._sample(state, chunk, self._noise(seeds, state["frames"]), self.config.steps)
+        image = self._image(state, chunk)
         frames = _to_bytes(image, len(self.spec.cameras))
         robot, disagreement = self._robot(state, chunk)
         # After rounding to bytes a NaN looks like any other pixel.
@@ -138,7 +135,7 @@ class PixelWorldModel(LearnableWorldModel):
             robots.append(self._robot_loss(state, chunk, tensors["state"][:, length + r]))
             weights.append(tensors["valid"][:, r].float())
             if r + 1 < chunks:
-                state = self._predicted(state, chunk, actions, generator)
+                state = self._predicted(state, chunk, actions)
         weight = torch.stack(weights)
         total = weight.sum().clamp(min=1)
         image, robot = ((torch.stack(part) * weight).sum() / total for part in (images, robots))
@@ -151,38 +148,17 @@ class PixelWorldModel(LearnableWorldModel):
     # Frames.
 
     def _image_loss(self, state: State, chunk: Tensor, target: Tensor, generator: torch.Generator) -> Tensor:
-        b = len(target)
-        newest, net = _to_floats(state["frames"][:, -1]), self._network(state, chunk, generator)
-        noise = torch.randn(target.shape, generator=generator).to(target)
-        spread = torch.randn(b, generator=generator).to(target)
-        if self.config.objective == "edm":
-            return network.edm_loss(net, target, noise, (1.2 * spread - 0.4).exp(), SIGMA_FRAME)
-        residual = (target - newest) / self.change
-        if self.config.objective == "flow":
-            # Sampling starts at t = 1, so some rows of the training do.
-            t = torch.rand(b, generator=generator).mul(1.1).clamp(max=1).to(target)
-            return network.flow_loss(net, residual, noise, t)
-        # A model of one pass never refines; others spend half of the training on each.
-        alone = 0.5 if self.config.steps > 1 else 1.0
-        predict = (torch.rand(b, generator=generator) < alone).to(target.device)
-        return network.refiner_loss(net, residual, noise, (spread - 2.0).exp(), predict, 1.0)
+        """Mean squared error of the change, (B,)."""
+        change = (target - _to_floats(state["frames"][:, -1])) / self.change
+        return (self._change(state, chunk, generator) - change).square().mean((1, 2, 3))
 
-    def _sample(self, state: State, chunk: Tensor, noise: Tensor, steps: int) -> Tensor:
-        """The frame after the chunk, (B, C, H, W) in [−1, 1]; noise (B, steps, C, H, W)."""
-        net = self._network(state, chunk, None)
-        if self.config.objective == "edm":
-            levels = network.edm_levels(steps, 0.002, self.config.sigma_max)
-            return network.edm_sample(net, noise[:, 0], levels, SIGMA_FRAME).clamp(-1, 1)
+    def _image(self, state: State, chunk: Tensor) -> Tensor:
+        """The frame after the chunk, (B, C, H, W) in [−1, 1]."""
         newest = _to_floats(state["frames"][:, -1])
-        if self.config.objective == "flow":
-            residual = network.flow_sample(net, noise[:, 0], steps)
-        else:
-            levels = np.geomspace(*self.config.refine_levels, max(1, steps - 1))[: steps - 1].tolist()
-            residual = network.refiner_sample(net, noise[:, : steps - 1], levels, 1.0)
-        return (newest + self.change * residual).clamp(-1, 1)
+        return (newest + self.change * self._change(state, chunk)).clamp(-1, 1)
 
-    def _network(self, state: State, chunk: Tensor, generator: torch.Generator | None) -> network.Network:
-        """The network with all but image and label bound; with a generator, its context is noisy."""
+    def _change(self, state: State, chunk: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """The change in usual changes, (B, C, H, W); with a generator, the context is noisy."""
         frames = _to_floats(torch.cat([state["frames"], state["anchor"][:, None]], 1).flatten(1, 2))
         if generator is not None and self.config.context_noise:
             level = self.config.context_noise * torch.rand(len(frames), 1, 1, 1, generator=generator)
@@ -190,24 +166,15 @@ class PixelWorldModel(LearnableWorldModel):
         robot = None
         if self.spec.state_dim:
             robot = (state["robot"][:, -1] - self.robot_mean) / self.robot_std
-        return lambda x, label: self.network(x, label, frames, chunk, robot)
+        change: Tensor = self.network(frames, chunk, robot)
+        return change
 
-    def _predicted(self, state: State, chunk: Tensor, actions: Tensor, generator: torch.Generator) -> State:
+    def _predicted(self, state: State, chunk: Tensor, actions: Tensor) -> State:
         """State after the model's own prediction of a chunk, without gradient."""
         with torch.no_grad():
-            b, side = len(chunk), state["frames"].shape[3:5]
-            noise = torch.randn(b, 1, 3 * len(self.spec.cameras), *side, generator=generator).to(chunk)
-            frames = _to_bytes(self._sample(state, chunk, noise, 1), len(self.spec.cameras))
+            frames = _to_bytes(self._image(state, chunk), len(self.spec.cameras))
             robot, _ = self._robot(state, chunk)
         return _advance(state, frames, robot, actions)
-
-    def _noise(self, seeds: Sequence[int], frames: Tensor) -> Tensor:
-        """(B, steps, C, H, W), each row from its own seed."""
-        size = (self.config.steps, 3 * len(self.spec.cameras), *frames.shape[3:5])
-        if self.config.objective == "refiner" and self.config.steps == 1:
-            return frames.new_zeros(len(frames), *size, dtype=torch.float32)
-        rows = [np.random.default_rng(seed).standard_normal(size, dtype=np.float32) for seed in seeds]
-        return torch.from_numpy(np.stack(rows)).to(frames.device)
 
     # The robot's state.
 
@@ -283,3 +250,134 @@ def _to_floats(frames: Tensor) -> Tensor:
 def _to_bytes(image: Tensor, cameras: int) -> Tensor:
     """Inverse of `_to_floats`, rounded."""
     return ((image + 1) * 127.5).round().clamp(0, 255).byte().unflatten(1, (cameras, 3)).movedim(2, -1)
+
+
+# The network.
+
+
+class FrameNetwork(nn.Module):
+    """(frames, chunk, state) → image: a small U-Net.
+
+    Space-to-depth keeps it cheap on a CPU: pixels move into channels before the first convolution, so no
+    layer works at full resolution. The chunk enters twice, through adaptive norms and as planes beside the
+    frames. The last layers start at zero, so an untrained model predicts no change.
+
+    Args:
+        image: channels of the image that is made.
+        frames: channels of the frames it is conditioned on.
+        action: numbers that describe a chunk.
+        state: S; 0: none.
+        config: size of the network.
+    """
+
+    def __init__(self, image: int, frames: int, action: int, state: int, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config, width = config, config.condition
+        pixels = config.space_to_depth**2
+        self.chunk = nn.Sequential(nn.Linear(action, width), nn.SiLU(), nn.Linear(width, width))
+        self.state = nn.Linear(state, width) if state else None
+        self.mix = nn.Sequential(nn.SiLU(), nn.Linear(width, width), nn.SiLU())
+        self.plane = nn.Linear(action, config.planes) if config.planes else None
+        first = config.channels[0]
+        self.enter = nn.Conv2d(frames * pixels + config.planes, first, 3, padding=1)
+        self.down, self.up = nn.ModuleList(), nn.ModuleList()
+        here = first
+        for level, there in enumerate(config.channels):
+            steps = nn.ModuleList()
+            if level:
+                steps.append(nn.Conv2d(here, there, 3, stride=2, padding=1))
+            steps.extend(Block(there, there, width) for _ in range(config.blocks))
+            self.down.append(steps)
+            here = there
+        self.middle = nn.ModuleList([Block(here, here, width), Attention(here), Block(here, here, width)])
+        for level, there in reversed(list(enumerate(config.channels))):
+            steps = nn.ModuleList([Block(here + there, there, width)])
+            steps.extend(Block(there, there, width) for _ in range(config.blocks - 1))
+            if level:
+                steps.append(nn.Conv2d(there, config.channels[level - 1], 3, padding=1))
+            self.up.append(steps)
+            here = config.channels[level - 1] if level else there
+        self.leave = nn.Sequential(_norm(first), nn.SiLU(), nn.Conv2d(first, image * pixels, 3, padding=1))
+        _zero(self.leave[-1])
+
+    def forward(self, frames: Tensor, chunk: Tensor, state: Tensor | None) -> Tensor:
+        """(B, image, H, W), zero everywhere before training.
+
+        Args:
+            frames: (B, frames, H, W).
+            chunk: (B, action).
+            state: (B, S), if the network was built for one.
+        """
+        condition = self.chunk(chunk)
+        if self.state is not None and state is not None:
+            condition = condition + self.state(state)
+        condition = self.mix(condition)
+        h = functional.pixel_unshuffle(frames, self.config.space_to_depth)
+        if self.plane is not None:
+            planes = self.plane(chunk)[:, :, None, None].expand(-1, -1, *h.shape[2:])
+            h = torch.cat([h, planes], 1)
+        h = self.enter(h)
+        kept = []
+        for level in self.down:
+            for step in level:
+                h = step(h, condition) if isinstance(step, Block) else step(h)
+            kept.append(h)
+        for step in self.middle:
+            h = step(h, condition) if isinstance(step, Block) else step(h)
+        for level in self.up:
+            h = torch.cat([h, kept.pop()], 1)
+            for step in level:
+                if isinstance(step, Block):
+                    h = step(h, condition)
+                else:
+                    h = step(functional.interpolate(h, scale_factor=2.0, mode="nearest"))
+        return functional.pixel_shuffle(self.leave(h), self.config.space_to_depth)
+
+
+class Block(nn.Module):
+    """Two convolutions with adaptive group norms and a skip connection; starts as the identity."""
+
+    def __init__(self, into: int, out: int, condition: int) -> None:
+        super().__init__()
+        self.skip = nn.Conv2d(into, out, 1) if into != out else nn.Identity()
+        self.norms = nn.ModuleList([_norm(into, affine=False), _norm(out, affine=False)])
+        self.convs = nn.ModuleList([nn.Conv2d(i, out, 3, padding=1) for i in (into, out)])
+        self.adapt = nn.ModuleList([nn.Linear(condition, 2 * i) for i in (into, out)])
+        _zero(self.convs[1])
+
+    def forward(self, x: Tensor, condition: Tensor) -> Tensor:
+        """(B, into, H, W) to (B, out, H, W)."""
+        h = x
+        for norm, conv, adapt in zip(self.norms, self.convs, self.adapt, strict=True):
+            scale, shift = adapt(condition)[:, :, None, None].chunk(2, 1)
+            h = conv(functional.silu(norm(h) * (1 + scale) + shift))
+        return self.skip(x) + h
+
+
+class Attention(nn.Module):
+    """Self-attention over positions, in heads of 32 channels or fewer."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.heads = max(1, width // 32)
+        while width % self.heads:
+            self.heads -= 1
+        self.norm = _norm(width)
+        self.into, self.out = nn.Conv2d(width, 3 * width, 1), nn.Conv2d(width, width, 1)
+        _zero(self.out)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, width, H, W) to the same."""
+        b, c, h, w = x.shape
+        parts = self.into(self.norm(x)).view(b, 3, self.heads, c // self.heads, h * w).transpose(3, 4)
+        mixed = functional.scaled_dot_product_attention(*parts.unbind(1))
+        return x + self.out(mixed.transpose(2, 3).reshape(b, c, h, w))
+
+
+def _norm(channels: int, *, affine: bool = True) -> nn.GroupNorm:
+    return nn.GroupNorm(math.gcd(channels, 8), channels, affine=affine)
+
+
+def _zero(layer: nn.Module) -> None:
+    for parameter in layer.parameters():
+        nn.init.zeros_(parameter)

@@ -31,11 +31,11 @@ from accerl_lerobot.checkpoint.safety import (
     read_tensors,
     safe_join,
 )
-from accerl_lerobot.config.imports import DISCOVER, discover
+from accerl_lerobot.config.parsing import DISCOVER, discover
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.guard import Unfilled, guarded, input_error
 from accerl_lerobot.world_model.config import LearnableModelConfig
-from accerl_lerobot.world_model.model.contract import (
+from accerl_lerobot.world_model.contract import (
     Context,
     LearnableWorldModel,
     WorldModelSpec,

@@ -15,7 +15,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,13 +23,16 @@ import torch
 from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.checkpoint.tensors import copied, optimizer_state, restore_optimizer
 from accerl_lerobot.world_model.config import LearnConfig, SuccessLearnConfig
+from accerl_lerobot.world_model.contract import LearnableWorldModel, WorldModel, WorldModelSpec
 from accerl_lerobot.world_model.data import Episode, Windows, WindowStart, cut_windows, window_starts
-from accerl_lerobot.world_model.model.contract import LearnableWorldModel, WorldModel, WorldModelSpec
-from accerl_lerobot.world_model.model.external_reward_model import as_floats, probabilities
+from accerl_lerobot.world_model.metrics import shuffle_across_groups
+from accerl_lerobot.world_model.rollout_eval import replay
 from accerl_lerobot.world_model.success_plugin import SuccessPairsConfig
-from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
-from accerl_lerobot.world_model.validation.metrics import shuffle_across_groups
-from accerl_lerobot.world_model.validation.rollout_eval import replay
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import (
+    SuccessPairsRewardModel,
+    as_floats,
+    probabilities,
+)
 
 STATISTICS_WINDOWS = 2048
 """Windows from which normalisation statistics are taken."""
@@ -98,7 +101,7 @@ class Learner:
         if not bool(torch.isfinite(norm)):
             raise FloatingPointError(
                 f"the world model's loss or gradient is not finite at step {self.count + 1}; "
-                "lower world_model.learn.lr, or imagination.learn.lr in a run"
+                "lower world_model.learn.lr; in a run, use imagination.learn.steps_per_episode=0"
             )
         self._optimizer.step()
         self._average()
@@ -154,6 +157,13 @@ class HeldOutLoss:
         return metrics | {"loss": loss.item()}
 
 
+class HeldOut(NamedTuple):
+    """Episodes on which losses are taken during the training, and what receives these."""
+
+    episodes: Sequence[Episode]
+    on_losses: OnStep
+
+
 def train_from_scratch(
     model: LearnableWorldModel,
     episodes: Sequence[Episode],
@@ -162,24 +172,23 @@ def train_from_scratch(
     *,
     shuffle: bool = False,
     on_step: OnStep = lambda step, metrics: None,
-    held_out: Sequence[Episode] = (),
-    on_held_out: OnStep = lambda step, metrics: None,
+    held_out: HeldOut | None = None,
 ) -> Learner:
     """Fits the statistics of a new model and trains it.
 
-    `on_held_out` gets the losses on `held_out`, every `LearnConfig.validate_every` steps, see `HeldOutLoss`.
+    Losses on `held_out` are taken every `LearnConfig.validate_every` steps, see `HeldOutLoss`.
     """
     at = window_starts(episodes)
     learner = Learner(model, config, seed, shuffle)
     model.fit_statistics(learner.draw(episodes, at, min(STATISTICS_WINDOWS, 4 * len(at))))
     learner.serving.load_state_dict(model.state_dict())
     held_out_loss = None
-    if config.validate_every and window_starts(held_out):
-        held_out_loss = HeldOutLoss(held_out, model.spec, config, seed)
+    if config.validate_every and held_out is not None and window_starts(held_out.episodes):
+        held_out_loss = HeldOutLoss(held_out.episodes, model.spec, config, seed)
     for step in range(1, config.steps + 1):
         on_step(step, learner.step(learner.draw(episodes, at)))
-        if held_out_loss is not None and step % config.validate_every == 0:
-            on_held_out(step, held_out_loss(learner.serving))
+        if held_out is not None and held_out_loss is not None and step % config.validate_every == 0:
+            held_out.on_losses(step, held_out_loss(learner.serving))
     return learner
 
 
@@ -365,7 +374,7 @@ class SuccessLearner:
         if not bool(torch.isfinite(norm)):
             raise FloatingPointError(
                 f"the success model's loss or gradient is not finite at step {self._count}; "
-                "lower world_model.success.lr, or imagination.learn.lr in a run"
+                "lower world_model.success.lr; in a run, use imagination.learn.steps_per_episode=0"
             )
         self._optimizer.step()
         return metrics

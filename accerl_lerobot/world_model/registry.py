@@ -18,15 +18,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from accerl_lerobot.config.imports import imported
+from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.envs.base import ChunkResult, World, WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK
 from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model.config import ImaginationConfig
-from accerl_lerobot.world_model.data import model_arrays
-from accerl_lerobot.world_model.model.contract import (
+from accerl_lerobot.world_model.contract import (
     ActionHistory,
     BuildInputs,
     Context,
@@ -36,12 +35,9 @@ from accerl_lerobot.world_model.model.contract import (
     WorldModel,
     WorldModelSpec,
 )
-from accerl_lerobot.world_model.model.external_reward_model import (
-    SuccessModel,
-    load_external_reward_model,
-    rehearse_external_reward_model,
-)
-from accerl_lerobot.world_model.model.store import load_world_model, rehearse_world_model
+from accerl_lerobot.world_model.data import model_arrays
+from accerl_lerobot.world_model.store import load_world_model, rehearse_world_model
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
 
 SECTION = "imagination"
 SHOWN = 4
@@ -52,7 +48,7 @@ class ImaginationModels(NamedTuple):
     """A world model, and the success model beside it, where it needs one."""
 
     model: WorldModel
-    success: SuccessModel | None
+    success: SuccessPairsRewardModel | None
 
 
 def make_models(
@@ -89,13 +85,6 @@ def make_models(
     spec = _spec_of(world, executed) if learned_model is None else learned_model.spec
     inputs = BuildInputs(config, spec, learned_model, lambda: make_world(env), where)
     model: WorldModel = imported(kind.make)(inputs)
-    if config.success.path is not None:
-        section = f"{SECTION}.success"
-        if first:
-            rehearse_external_reward_model(config.success, model.spec, section)
-        return ImaginationModels(
-            model, load_external_reward_model(config.success, model.spec, section, where)
-        )
     if success is not None:
         success.config.device = str(where)
         if config.threshold is not None:

@@ -16,7 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from accerl_lerobot.world_model import metrics
 from accerl_lerobot.world_model.config import ValidationConfig
+from accerl_lerobot.world_model.contract import Context, WorldModel, select_rows
 from accerl_lerobot.world_model.data import (
     Episode,
     Windows,
@@ -25,9 +27,10 @@ from accerl_lerobot.world_model.data import (
     hold_last_action,
     longest_rollout,
 )
-from accerl_lerobot.world_model.model.contract import Context, WorldModel, select_rows
-from accerl_lerobot.world_model.model.external_reward_model import SuccessModel, probabilities
-from accerl_lerobot.world_model.validation import metrics
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import (
+    SuccessPairsRewardModel,
+    probabilities,
+)
 
 BATCH = 64
 """Rollouts at once."""
@@ -201,7 +204,7 @@ class Scores(NamedTuple):
 
 def score_episodes(
     model: WorldModel,
-    success: SuccessModel,
+    success: SuccessPairsRewardModel,
     episodes: Sequence[Episode],
     config: ValidationConfig,
     seed: int,

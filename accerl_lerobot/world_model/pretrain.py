@@ -27,6 +27,12 @@ from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model.config import WorldModelConfig
+from accerl_lerobot.world_model.contract import (
+    LearnableWorldModel,
+    WorldModelSpec,
+    learnable_class,
+    new_learnable,
+)
 from accerl_lerobot.world_model.data import (
     Episode,
     count_episodes,
@@ -34,36 +40,32 @@ from accerl_lerobot.world_model.data import (
     load_episodes,
     split_episodes,
 )
-from accerl_lerobot.world_model.learning.learners import (
+from accerl_lerobot.world_model.learners import (
     Examples,
+    HeldOut,
     SuccessLearner,
     held_out_success_metrics,
     new_success_model,
     train_from_scratch,
 )
-from accerl_lerobot.world_model.model.contract import (
-    LearnableWorldModel,
-    WorldModelSpec,
-    learnable_class,
-    new_learnable,
-)
-from accerl_lerobot.world_model.model.store import SUCCESS, Source, save_world_model
+from accerl_lerobot.world_model.store import SUCCESS, Source, save_world_model
 from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import SuccessPairsRewardModel
-from accerl_lerobot.world_model.validation.evaluate import (
+from accerl_lerobot.world_model.validation import (
     DATASET,
     HELD_OUT,
     ONLINE,
     RESULT,
+    DatasetRoles,
     check_disjoint,
     dataset_sections,
+    fit_uncertainty_scale,
     name_section,
     open_datasets,
     validate_datasets,
 )
-from accerl_lerobot.world_model.validation.validate import fit_uncertainty_scale
 
 if TYPE_CHECKING:
-    from accerl_lerobot.cli.configs import WorldModelRun
+    from accerl_lerobot.cli.verbs import WorldModelRun
 
 LOG_EVERY = 20
 """Steps between two lines of training losses."""
@@ -135,10 +137,9 @@ def pretrain(run: WorldModelRun, directory: Path, console: Console) -> dict[str,
     save_world_model(directory / "world_model", serving, None, [part.source for part in parts.values()])
     # The threshold is chosen on the policy's failures, where there are any, as demonstrations fail otherwise.
     *_, fresh = held_out
-    result = validate_datasets(
-        serving, held_out, config.validation, success, directory, console,
-        trained_on=held_out, fresh=fresh, keep_threshold=True, seed=seed,
-    )  # fmt: skip
+    roles = DatasetRoles(trained_on=held_out, fresh=fresh, keep_threshold=True)
+    with console.stage("validation"):
+        result = validate_datasets(serving, held_out, config.validation, success, directory, roles, seed)
     result |= {
         "seconds": seconds,
         "learnt": count_episodes(learn),
@@ -184,7 +185,7 @@ def _train(
 
             serving = train_from_scratch(
                 model, learn, config.learn, seed, shuffle=config.shuffle_actions,
-                on_step=on_step, held_out=held_out, on_held_out=on_held_out,
+                on_step=on_step, held_out=HeldOut(held_out, on_held_out),
             ).serving  # fmt: skip
         fit_uncertainty_scale(serving, learn, config.validation, seed)
         success = new_success_model(config.chunk).to(device)

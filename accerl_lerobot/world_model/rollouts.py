@@ -7,11 +7,16 @@ stands for the rest. Nothing that follows a success is imagined.
 
 No process is known here: the caller asks for `requests`, has them decided, and hands the decisions to
 `advance`.
+
+Start states of imagined rollouts: real observations, drawn at resets or anywhere.
+
+Shapes: see `contract.py`; T decisions of a segment.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -20,26 +25,199 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import torch
 
+from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.checkpoint.tensors import copied
 from accerl_lerobot.envs.base import WorldSpec
-from accerl_lerobot.experience import IMAGINED, Decision, Observation, Request, Segment
+from accerl_lerobot.experience import IMAGINED, Decision, Observation, Origin, Request, Segment
 from accerl_lerobot.rollout.segments import SegmentBuilder
 from accerl_lerobot.world_model.config import ImaginationConfig
-from accerl_lerobot.world_model.data import policy_observation
-from accerl_lerobot.world_model.imagination.guard import ImaginationCounters, KillSwitch
-from accerl_lerobot.world_model.imagination.registry import (
+from accerl_lerobot.world_model.contract import (
+    ActionHistory,
+    Context,
+    Prediction,
+    State,
+    WorldModel,
+    WorldModelSpec,
+    replace_rows,
+)
+from accerl_lerobot.world_model.data import executed_actions, model_arrays, policy_observation
+from accerl_lerobot.world_model.guard import IMAGINATION, ImaginationCounters, KillSwitch
+from accerl_lerobot.world_model.registry import (
     ImaginationModels,
     OracleModel,
     ShuffledModel,
     learned_part,
 )
-from accerl_lerobot.world_model.imagination.starts import Start, StartPool
-from accerl_lerobot.world_model.model.contract import Context, Prediction, State, WorldModel, replace_rows
-from accerl_lerobot.world_model.model.external_reward_model import device_of, probabilities
-from accerl_lerobot.world_model.model.store import Source, save_world_model
+from accerl_lerobot.world_model.store import Source, save_world_model
+from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import probabilities
 
 if TYPE_CHECKING:
-    from accerl_lerobot.world_model.learning.online import Promotion
+    from accerl_lerobot.world_model.online import Promotion
+
+
+EpisodeName = tuple[str, int]
+"""Task and seed."""
+MAX_UNFINISHED = 1024
+"""Episodes that may go on in another segment; of more, such as those of a worker that died, the oldest are
+dropped."""
+
+
+@kind
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """A real observation, and what led there."""
+
+    frames: np.ndarray
+    """uint8 (L, V, H, W, 3), of the model's size, the newest last."""
+    robot: np.ndarray
+    """float32 (L, S)."""
+    actions: np.ndarray
+    """float32 (L − 1, K, A), executed between these."""
+    commanded_sum: np.ndarray
+    """float32 (A,), see `Context`."""
+    initial_state: np.ndarray
+    """float32 (S,), see `Context`."""
+    task: str
+    """The instruction."""
+    origin: Origin
+    history: ActionHistory | None
+    """None: the segment began in mid-episode, and what came before is not known."""
+    achieved: bool | None
+    """True if the real episode achieved the task; None: not known, or not yet."""
+
+
+@kind
+class _Lead(NamedTuple):
+    """Summary of the observations before a segment, which may begin in mid-episode."""
+
+    decision: int
+    """The segment's first."""
+    commanded_sum: np.ndarray
+    initial_state: np.ndarray
+
+
+class StartPool:
+    """The newest real decisions; `ImaginationConfig` says how many, and where rollouts start."""
+
+    def __init__(self, spec: WorldModelSpec, config: ImaginationConfig) -> None:
+        self.spec, self.config = spec, config
+        self._held: deque[_Held] = deque()
+        self._leads: dict[EpisodeName, _Lead] = {}
+        """Leads to the next segment of episodes that have not ended; the oldest first."""
+        self._outcomes: dict[EpisodeName, bool] = {}
+        """Outcomes of episodes that have ended, and of which something is held."""
+        self._count = 0
+
+    def __len__(self) -> int:
+        """Decisions to start at."""
+        return self._count
+
+    def add(self, segment: Segment) -> None:
+        """Takes a real segment; the oldest ones leave."""
+        held = _Held(segment, self.spec)
+        self._link(held)
+        usable = not self.config.kind.needs_history and len(segment) >= self.spec.context
+        if not segment.origin.decision or usable:
+            self._held.append(held)
+            self._count += len(segment)
+        names = [held.name for held in self._held]
+        if (segment.terminated or segment.truncated) and held.name in names:
+            self._outcomes[held.name] = segment.terminated and segment.success
+        while self._held and self._count - len(self._held[0].segment) >= self.config.memory:
+            gone = self._held.popleft()
+            self._count -= len(gone.segment)
+            names.pop(0)
+            if gone.name not in names:
+                self._outcomes.pop(gone.name, None)
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs; see `snapshot`."""
+        held = [(held.segment, held.lead) for held in self._held]
+        return {"held": held, "leads": dict(self._leads), "outcomes": dict(self._outcomes)}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continues from a `state`."""
+        self._held.extend(_Held(segment, self.spec, lead) for segment, lead in state["held"])
+        self._leads.update(state["leads"])
+        self._count = sum(len(held.segment) for held in self._held)
+        self._outcomes = state["outcomes"]
+
+    def _link(self, held: _Held) -> None:
+        """Sets the segment's lead, and keeps the lead to the next one."""
+        segment, name = held.segment, held.name
+        lead = self._leads.pop(name, None)
+        if lead is not None and lead.decision == segment.origin.decision:
+            held.lead = lead
+        if segment.terminated or segment.truncated:
+            return
+        total = held.lead.commanded_sum + executed_actions(segment.actions, segment.steps).sum(0)
+        self._leads[name] = _Lead(segment.origin.decision + len(segment), total, held.lead.initial_state)
+        if len(self._leads) > MAX_UNFINISHED:
+            self._leads.pop(next(iter(self._leads)))
+
+    def draw(self, count: int, rng: np.random.Generator) -> list[Start]:
+        """Draws starts, with repetition.
+
+        Raises:
+            ValueError: there are none yet.
+        """
+        if not self._count:
+            raise ValueError("no real experience to start from yet")
+        lengths = np.array([len(h.segment) for h in self._held])
+        allowed = np.concatenate([h.allowed for h in self._held])
+        weights = allowed / max(1, allowed.sum())
+        first = np.concatenate([h.first for h in self._held])
+        if first.any():
+            reset = self.config.start_at_reset_prob
+            weights = reset * first / first.sum() + (1 - reset) * weights
+        drawn = rng.choice(self._count, size=count, p=weights / weights.sum())
+        ends = np.cumsum(lengths)
+        of = np.searchsorted(ends, drawn, side="right")
+        return [
+            self._start(self._held[s], int(i - ends[s] + lengths[s])) for s, i in zip(of, drawn, strict=True)
+        ]
+
+    def _start(self, held: _Held, t: int) -> Start:
+        segment, spec = held.segment, self.spec
+        context = [max(0, t - back) for back in range(spec.context - 1, -1, -1)]
+        history, actions = None, executed_actions(segment.actions[:t], segment.steps[:t])
+        if not segment.origin.decision:
+            history = ActionHistory(segment.origin.task, segment.origin.seed, actions)
+        return Start(
+            frames=held.frames[context],
+            robot=held.robot[context],
+            actions=_chunks_before(segment, t, spec.context),
+            commanded_sum=held.lead.commanded_sum + actions.sum(0),
+            initial_state=held.lead.initial_state,
+            task=segment.task,
+            origin=segment.origin._replace(decision=segment.origin.decision + t),
+            history=history,
+            achieved=self._outcomes.get(held.name),
+        )
+
+
+def _chunks_before(segment: Segment, t: int, context: int) -> np.ndarray:
+    """Chunks of the decisions before the t-th, zero before the segment began."""
+    chunks = np.zeros((context - 1, *segment.actions.shape[1:]), np.float32)
+    known = min(t, context - 1)
+    if known:
+        chunks[-known:] = segment.actions[t - known : t]
+    return chunks
+
+
+class _Held:
+    """A segment as arrays of the model; without a `lead` its episode begins with it, as far as is known."""
+
+    def __init__(self, segment: Segment, spec: WorldModelSpec, lead: _Lead | None = None) -> None:
+        self.segment, self.name = segment, segment.origin[:2]
+        self.first = segment.origin.decision + np.arange(len(segment)) == 0
+        self.frames, self.robot = model_arrays(segment.observations, spec)
+        nothing = np.zeros(spec.action_dim, np.float32)
+        self.lead = lead or _Lead(segment.origin.decision, nothing, self.robot[0])
+        # In mid-episode, the context of the first decisions of a segment is not known.
+        self.allowed = np.ones(len(segment), bool)
+        if segment.origin.decision:
+            self.allowed[: spec.context - 1] = False
 
 
 class RolloutSettings(NamedTuple):
@@ -50,8 +228,6 @@ class RolloutSettings(NamedTuple):
     time_limit_fails: bool
     """True if the time limit is a failure, False if it truncates; see `RolloutConfig.time_limit`."""
     seed: int
-    name: str
-    """Prefix of the segments' keys."""
 
 
 @dataclass(kw_only=True)
@@ -79,7 +255,6 @@ class Imagination:
         config: of imagination.
         run: settings of the run.
         on_segment: receives the imagined segments.
-        index: of several workers with the same seed.
         sources: datasets that a promoted model was trained on, beside the run's own episodes.
     """
 
@@ -90,8 +265,6 @@ class Imagination:
         config: ImaginationConfig,
         run: RolloutSettings,
         on_segment: Callable[[Segment], object],
-        *,
-        index: int = 0,
         sources: Sequence[Source] = (),
     ) -> None:
         self.config, self.counters = config, ImaginationCounters()
@@ -107,7 +280,7 @@ class Imagination:
         self._sources = tuple(sources)
         self._run, self._on_segment = run, on_segment
         self._starts = StartPool(models.model.spec, config)
-        self._rng = np.random.default_rng((run.seed, 3, index))
+        self._rng = np.random.default_rng((run.seed, 3))
         self._rows: list[_Row | None] = [None] * config.rollouts
         self._state: State | None = None
         self._sequence = self._uncertain_in_a_row = 0
@@ -129,7 +302,7 @@ class Imagination:
         self._rows, self._state = [None] * len(self._rows), None
         self._uncertain_in_a_row = 0
         assert self._success is not None  # or there would be nothing to promote
-        device = device_of(self._success)
+        device = self._success.out.weight.device
         model: WorldModel = promotion.model.to(device)
         self._model = ShuffledModel(model) if isinstance(self._model, ShuffledModel) else model
         self._success = promotion.success.to(device)
@@ -170,7 +343,7 @@ class Imagination:
         if isinstance(self._model, OracleModel):
             self._model.tasks = state["tasks"]
         if state["model_state"] is not None:
-            device = "cpu" if self._success is None else device_of(self._success)
+            device = "cpu" if self._success is None else self._success.out.weight.device
             self._state = {name: tensor.to(device) for name, tensor in state["model_state"].items()}
         for i, row in enumerate(state["rows"]):
             if row is not None:
@@ -278,7 +451,7 @@ class Imagination:
             return
         self._sequence += 1
         segment = row.builder.cut(
-            f"{self._run.name}.{self._sequence}", terminated, truncated and not terminated, success
+            f"{IMAGINATION}.{self._sequence}", terminated, truncated and not terminated, success
         )
         segment.world_version = self.version
         self._on_segment(segment)

@@ -6,7 +6,7 @@
 
 A learned one has a `loss` too; `pixels.py` has ours, and ``docs/world_model.md`` says how to add another.
 `config.MODELS` lists what a run can imagine with. Success is classified by another model, see
-`learning/learners.py`.
+`learners.py`.
 
 States are dicts of tensors with the batch in front, so that rows can be selected and replaced.
 
@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from accerl_lerobot.checkpoint.safety import brief
 from accerl_lerobot.checkpoint.snapshot import kind
-from accerl_lerobot.config.imports import imported
+from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.errors import InputError
 
 if TYPE_CHECKING:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The episodes of a run as a LeRobotDataset: real ones, or imagined ones, see `recorder.write_dataset`.
+"""The exploring episodes of a run as a LeRobotDataset.
 
     accerl export --path=RUN --root=outputs/rollouts
 
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -22,7 +22,7 @@ import numpy as np
 from accerl_lerobot.checkpoint.layout import CONFIG
 from accerl_lerobot.checkpoint.safety import Origin, check_folder
 from accerl_lerobot.config.parsing import decode, drop_consents, read_recipe
-from accerl_lerobot.config.ranges import Choice, DatasetName, NewFolder, Range, Section, Steps
+from accerl_lerobot.config.ranges import DatasetName, NewFolder, Range, Section, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.expert import Episode
 from accerl_lerobot.demos.record import features, frames
@@ -37,12 +37,9 @@ from accerl_lerobot.demos.writing import (
 )
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.envs import make_world
-from accerl_lerobot.envs.base import World
-from accerl_lerobot.envs.config import EnvConfig
+from accerl_lerobot.envs.base import EnvConfig, World
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import IMAGINED, REAL
 from accerl_lerobot.replay.journal import EPISODES, Done, read_journal, whole_episodes
-from accerl_lerobot.world_model.imagination.recorder import FOLDER, read_imagined, write_dataset
 
 SIDECAR = Path("meta") / "accerl_rollouts.json"
 """File of the dataset: its origin, and how many episodes it has."""
@@ -58,10 +55,6 @@ class ExportConfig(Section):
 
     path: str | None = None
     """Folder of an ``accerl train`` run."""
-    source: Annotated[str, Choice((REAL, IMAGINED))] = REAL
-    """real: exploring episodes, with a picture at every env step. imagined: imagined rollouts that
-    ``imagination.record`` has kept, with a picture at every decision. Never both, as the time between two
-    frames differs."""
     root: NewFolder = "outputs/rollouts"
     """Folder to create; must not exist."""
     repo_id: DatasetName = "accerl/rollouts"
@@ -95,9 +88,7 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
         raise InputError("path", str(run), f"no run in it: there is no {CONFIG}")
     check_folder(run, Origin("path", str(run)))
     settings = _settings(run, config.hub_path)
-    if config.source == IMAGINED:
-        return _export_imagined(settings, config, run, root, console)
-    chosen = _picked(whole_episodes(read_journal(run / EPISODES)), lambda parts: parts[-1].success, config)
+    chosen = _picked(whole_episodes(read_journal(run / EPISODES)), config)
     if not chosen:
         raise InputError(
             "path", str(run), f"no whole episode in its {EPISODES} of those asked for ({config.pick})"
@@ -131,20 +122,6 @@ def _settings(run: Path, hub_path: str | None) -> RunConfig:
     return settings
 
 
-def _export_imagined(
-    settings: RunConfig, config: ExportConfig, run: Path, root: Path, console: Console
-) -> dict[str, Any]:
-    chosen = _picked(read_imagined(run / FOLDER), lambda episode: episode.success, config)
-    if not chosen:
-        raise InputError(
-            "path", str(run), f"no imagined rollout in its {FOLDER}/ of those asked for ({config.pick})"
-        )
-    with appearing(root) as partial:
-        tally = write_dataset(chosen, partial, config.repo_id, settings.env.type, console)
-        _write_sidecar(config, run, settings, tally, partial)
-    return tally
-
-
 def _write_sidecar(
     config: ExportConfig, run: Path, settings: RunConfig, tally: dict[str, Any], root: Path
 ) -> None:
@@ -152,10 +129,9 @@ def _write_sidecar(
     (root / SIDECAR).write_text(json.dumps(about, indent=2) + "\n")
 
 
-def _picked[Item](
-    items: Iterable[Item], succeeded: Callable[[Item], bool], config: ExportConfig
-) -> list[Item]:
-    picked = (i for i in items if config.pick == "all" or succeeded(i) is (config.pick == "successes"))
+def _picked(episodes: Iterable[list[Done]], config: ExportConfig) -> list[list[Done]]:
+    wanted = config.pick == "successes"
+    picked = (parts for parts in episodes if config.pick == "all" or parts[-1].success is wanted)
     return list(deque(picked, maxlen=config.last or None))
 
 
