@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from accerl_lerobot.algorithms import AlgorithmConfig, RatioConfig
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.contract import Engine, Progress
 from accerl_lerobot.envs import SimulatedConfig
@@ -18,6 +19,10 @@ from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 
 HANGS_S = 240.0
+ALGORITHMS = [
+    name for name, kind in AlgorithmConfig.get_known_choices().items() if issubclass(kind, RatioConfig)
+]
+"""Names of the algorithms with a likelihood ratio."""
 
 
 def replacing(arguments: list[str], *more: str) -> list[str]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.algorithms import ALGORITHMS, AlgorithmConfig, GIPOConfig, PPOConfig
+from accerl_lerobot.algorithms import AlgorithmConfig, GIPOConfig, PPOConfig
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Engine, Progress
 from accerl_lerobot.engine.local import LocalEngine
@@ -19,7 +19,7 @@ from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
-from tests.runs import collect, drive, tiny_run
+from tests.runs import ALGORITHMS, collect, drive, tiny_run
 
 
 def train(config: RunConfig) -> tuple[list[Progress], dict[str, np.ndarray]]:

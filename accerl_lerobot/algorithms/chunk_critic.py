@@ -31,6 +31,8 @@ class ChunkCriticConfig(OffPolicyConfig):
     more than a likelihood ratio could. Needs ``env.environment_state``.
     """
 
+    update = "accerl_lerobot.trainer.chunk_critic:ChunkCriticUpdate"
+
     gamma: Share = 0.98
     """Discount per decision."""
     n_step: Annotated[int, Range("[1, 1000]")] = 4

@@ -6,8 +6,8 @@ Shape letters: N decisions of a batch, L log-prob factors of one decision, as it
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import draccus
 
@@ -16,6 +16,8 @@ from accerl_lerobot.errors import InputError
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+    from accerl_lerobot.algorithms.objective import LossOutput
 
 Level = Literal["token", "action", "chunk"]
 
@@ -29,6 +31,12 @@ class AlgorithmConfig(Section, draccus.ChoiceRegistry, section="algorithm"):
         'gipo'
     """
 
+    update: ClassVar[str]
+    """``module:class`` of the trainer's updates: made from adapter, algorithm and `TrainerConfig`, and, of a
+    `RatioConfig`, the ranks; with the methods of `trainer.update.Update`."""
+
+    discover_packages_path: str | None = field(default=None, metadata={"registers": True})
+    """Package to import that registers ``algorithm.type``, where that is not one of ours."""
     gamma: Share = 0.99
     """Discount per decision (not per env step)."""
 
@@ -41,6 +49,8 @@ class AlgorithmConfig(Section, draccus.ChoiceRegistry, section="algorithm"):
 @dataclass(frozen=True, kw_only=True)
 class RatioConfig(AlgorithmConfig):
     """Base of the objectives that weight decisions by their likelihood under new and old weights."""
+
+    update = "accerl_lerobot.trainer.update:Update"
 
     lam: Share = 0.95
     """λ of GAE per decision: 0 trusts the critic, 1 the observed rewards."""
@@ -68,10 +78,16 @@ class RatioConfig(AlgorithmConfig):
         """For how many updates the weights behind `LossInputs.log_prob_proximal` are kept; 0: not used."""
         return 0
 
+    def loss(self, inputs: LossInputs) -> LossOutput:
+        """The objective, with its diagnostics; `objective.assemble` adds the shared terms."""
+        raise NotImplementedError
+
 
 @dataclass(frozen=True, kw_only=True)
 class OffPolicyConfig(AlgorithmConfig):
     """Base of the algorithms that learn from a memory of all episodes and need no likelihood."""
+
+    update = "accerl_lerobot.trainer.off_policy:OffPolicyUpdate"
 
     policy_steps: NonNegative = 0.3
     """Gradient steps of the policy for each new decision, after ``trainer.value_warmup_updates``."""

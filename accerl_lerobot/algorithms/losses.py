@@ -102,6 +102,9 @@ class GIPOConfig(RatioConfig):
     kl_coef: NonNegative = 0.1
     """Weight of KL(μ‖π), the distance from the behaviour policy."""
 
+    def loss(self, inputs: LossInputs) -> LossOutput:
+        return gipo_loss(inputs, self)
+
 
 def trust_weight(log_ratio: Tensor, advantage: Tensor, config: GIPOConfig) -> Tensor:
     """ω in [0, 1], (N, F), without gradient.
@@ -135,6 +138,9 @@ class ImportanceConfig(RatioConfig):
     cap: Annotated[float, Range("[1, inf)")] | None = None
     """Largest weight of a sample; None: unbounded."""
 
+    def loss(self, inputs: LossInputs) -> LossOutput:
+        return importance_loss(inputs, self)
+
 
 def importance_loss(inputs: LossInputs, config: ImportanceConfig) -> LossOutput:
     """See the top of the file. E is the mean over all ratios of all decisions."""
@@ -163,6 +169,9 @@ class SAPOConfig(RatioConfig):
     tau_negative: Positive = 1.05
     """Temperature where Â ≤ 0."""
 
+    def loss(self, inputs: LossInputs) -> LossOutput:
+        return sapo_loss(inputs, self)
+
 
 def sapo_loss(inputs: LossInputs, config: SAPOConfig) -> LossOutput:
     """See the top of the file. E is the mean over all ratios of all decisions."""
@@ -189,6 +198,9 @@ class AWRConfig(RatioConfig):
     """Temperature in standard deviations of the advantage; ``inf`` weighs all samples alike."""
     cap: Annotated[float, Range("[1, inf)")] = 20.0
     """Largest weight of a sample; an average one has 1."""
+
+    def loss(self, inputs: LossInputs) -> LossOutput:
+        return awr_loss(inputs, self)
 
 
 def awr_loss(inputs: LossInputs, config: AWRConfig) -> LossOutput:
@@ -217,6 +229,9 @@ class PPOConfig(RatioConfig):
     """How far ρ may fall below 1 before a sample with Â < 0 stops counting."""
     clip_high: Annotated[float, Range("(0, inf]")] = 0.28
     """How far ρ may rise above 1 before a sample with Â > 0 stops counting."""
+
+    def loss(self, inputs: LossInputs) -> LossOutput:
+        return ppo_loss(inputs, self)
 
 
 def clipped_surrogate(rho: Tensor, advantage: Tensor, config: PPOConfig) -> tuple[Tensor, Tensor]:
@@ -260,6 +275,9 @@ class DecoupledConfig(PPOConfig):
     @property
     def proximal_updates(self) -> int:
         return self.proximal_every
+
+    def loss(self, inputs: LossInputs) -> LossOutput:
+        return decoupled_loss(inputs, self)
 
 
 def decoupled_loss(inputs: LossInputs, config: DecoupledConfig) -> LossOutput:

@@ -249,7 +249,3 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         else:
             self.skip(f"a step of the {name}", float(loss.detach()), norm)
         return norm
-
-
-OFF_POLICY: dict[str, Any] = {"chunk_critic": ChunkCriticUpdate, "self_imitation": OffPolicyUpdate}
-"""Name of an algorithm → its update."""

@@ -27,15 +27,14 @@ from torch import Tensor
 from accerl_lerobot.algorithms import (
     AlgorithmConfig,
     LossInputs,
-    OffPolicyConfig,
     RatioConfig,
     check_level,
-    compute_loss,
 )
 from accerl_lerobot.algorithms.advantages import decision_mask, gae, moments, normalise
 from accerl_lerobot.algorithms.diagnostics import lag_metrics
 from accerl_lerobot.algorithms.ratio import present
 from accerl_lerobot.checkpoint.tensors import optimizer_state, restore_optimizer, whole
+from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.adapter import PolicyAdapter
@@ -54,12 +53,9 @@ def make_update(
     adapter: Any, algorithm: AlgorithmConfig, config: TrainerConfig, ranks: Ranks | None = None
 ) -> Update | OffPolicyUpdate:
     """The updates that belong to an algorithm; see `Update` for the arguments."""
-    if isinstance(algorithm, OffPolicyConfig):
-        from accerl_lerobot.trainer.chunk_critic import OFF_POLICY
-
-        return OFF_POLICY[algorithm.type](adapter, algorithm, config)
-    assert isinstance(algorithm, RatioConfig)
-    return Update(adapter, algorithm, config, ranks)
+    shared = [ranks] if isinstance(algorithm, RatioConfig) else []
+    update: Update | OffPolicyUpdate = imported(algorithm.update)(adapter, algorithm, config, *shared)
+    return update
 
 
 class Update:
@@ -240,7 +236,7 @@ class Update:
                 log_prob_reference=reference,
                 log_prob_proximal=proximal,
             )
-            output = compute_loss(inputs, self.algorithm)
+            output = self.algorithm.loss(inputs)
             share = len(rows) / len(batch) if turn.own else 0.0
             synchronise(self.adapter, number == len(parts))
             loss = output.loss * share * self.ranks.size  # a gradient is the mean over ranks

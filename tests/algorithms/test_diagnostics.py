@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.algorithms import GIPOConfig, PPOConfig, compute_loss
+from accerl_lerobot.algorithms import GIPOConfig, PPOConfig
 from accerl_lerobot.algorithms.diagnostics import (
     approx_kl,
     clip_fraction,
@@ -67,7 +67,7 @@ def test_lag() -> None:
 
 @pytest.mark.parametrize("config", [GIPOConfig(), PPOConfig()], ids=["gipo", "ppo"])
 def test_on_policy_batches_look_on_policy(config: GIPOConfig | PPOConfig) -> None:
-    metrics = {k: v.item() for k, v in compute_loss(make_inputs(spread=0.0), config).metrics.items()}
+    metrics = {k: v.item() for k, v in config.loss(make_inputs(spread=0.0)).metrics.items()}
     for name in ("approx_kl", "kl", "clip_fraction", "low_weight", "ratio_max_dev", "log_ratio_p50"):
         assert metrics[name] == 0.0, name
     assert metrics["ess"] == pytest.approx(1.0) and metrics["decisions"] == 12.0
@@ -76,5 +76,5 @@ def test_on_policy_batches_look_on_policy(config: GIPOConfig | PPOConfig) -> Non
 def test_gipo_keeps_more_effective_samples_than_plain_importance_sampling() -> None:
     inputs = make_inputs(n=4000, factors=1, spread=1.5)
     wide, narrow = GIPOConfig(sigma=math.inf), GIPOConfig(sigma=0.5)
-    ess = [compute_loss(inputs, c).metrics["ess"].item() for c in (wide, narrow)]
+    ess = [c.loss(inputs).metrics["ess"].item() for c in (wide, narrow)]
     assert ess[1] > 2 * ess[0]

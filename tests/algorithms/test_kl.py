@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.algorithms import GIPOConfig, compute_loss
+from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.algorithms.ratio import (
     KL_LINEAR_ABOVE,
     LOG_RATIO_CLAMP,
@@ -96,10 +96,10 @@ def test_the_logged_kl_to_the_reference_has_no_jump_and_is_never_negative() -> N
 
 def test_the_reference_needs_its_log_probs() -> None:
     with pytest.raises(ValueError, match="log_prob_reference is needed"):
-        compute_loss(make_inputs(log_prob_reference=None), GIPOConfig(reference_coef=0.1))
-    assert compute_loss(make_inputs(log_prob_reference=None), GIPOConfig()).loss.isfinite()
+        GIPOConfig(reference_coef=0.1).loss(make_inputs(log_prob_reference=None))
+    assert GIPOConfig().loss(make_inputs(log_prob_reference=None)).loss.isfinite()
 
 
 def test_an_unused_reference_changes_nothing() -> None:
-    expected = compute_loss(make_inputs(log_prob_reference=None), GIPOConfig())
-    assert torch.equal(compute_loss(make_inputs(), GIPOConfig()).loss, expected.loss)
+    expected = GIPOConfig().loss(make_inputs(log_prob_reference=None))
+    assert torch.equal(GIPOConfig().loss(make_inputs()).loss, expected.loss)

@@ -10,17 +10,16 @@ import pytest
 import torch
 
 from accerl_lerobot.algorithms import (
-    ALGORITHMS,
     AlgorithmConfig,
     GIPOConfig,
     LossInputs,
     check_level,
-    compute_loss,
 )
 from accerl_lerobot.algorithms.objective import mean_over_ratios
 from accerl_lerobot.algorithms.ratio import at_level, present
 from accerl_lerobot.errors import InputError
 from tests.algorithms.inputs import gradient, make_inputs
+from tests.runs import ALGORITHMS
 
 X = torch.tensor([[1.0, 2.0, 4.0, 8.0, 16.0, 32.0]])
 FACTORS = torch.tensor([[True, True, True, True, False, False]])
@@ -87,7 +86,7 @@ def test_what_does_not_exist_is_never_looked_at(config: AlgorithmConfig, level: 
     holes = {n: getattr(clean, n).detach().masked_fill(~factors, torch.nan) for n in names}
     holes["log_prob_new"].requires_grad_()
     dirty = replace(clean, **holes)
-    expected, got = compute_loss(clean, config), compute_loss(dirty, config)
+    expected, got = config.loss(clean), config.loss(dirty)
     torch.testing.assert_close(got.loss, expected.loss)
     for name, metric in expected.metrics.items():
         torch.testing.assert_close(got.metrics[name], metric, msg=name)
@@ -103,24 +102,24 @@ def test_micro_batches_add_up(config: AlgorithmConfig, level: Any) -> None:
     config = replace(config, level=level)
     factors = torch.arange(4) < torch.tensor([4, 4, 1, 2, 1, 3, 1])[:, None]
     whole = replace(make_inputs(n=7, factors=4, actions=2), factors=factors)
-    expected = gradient(whole, compute_loss(whole, config).loss)
+    expected = gradient(whole, config.loss(whole).loss)
     each = present(factors, level, 2).sum().item() / 7
     total = torch.zeros_like(expected)
     for rows in (slice(0, 2), slice(2, 7)):
         fields = {k: v[rows] for k, v in vars(whole).items() if isinstance(v, torch.Tensor)}
         part = replace(whole, **fields, ratios_per_decision=each)
         share = len(part.value) / 7
-        total += gradient(whole, compute_loss(part, config).loss * share)
+        total += gradient(whole, config.loss(part).loss * share)
     torch.testing.assert_close(total, expected)
 
 
 def test_a_ratio_per_action_needs_actions() -> None:
     for level in ("token", "chunk"):
         check_level(level, None)
-        assert compute_loss(make_inputs(actions=None), GIPOConfig(level=level)).loss.isfinite()
+        assert GIPOConfig(level=level).loss(make_inputs(actions=None)).loss.isfinite()
     check_level("action", 3)
     with pytest.raises(InputError, match="algorithm.level='action': use token or chunk") as caught:
         check_level("action", None)
     assert caught.value.field == "algorithm.level"
     with pytest.raises(InputError, match="algorithm.level"):
-        compute_loss(make_inputs(actions=None), GIPOConfig())
+        GIPOConfig().loss(make_inputs(actions=None))

@@ -18,7 +18,6 @@ from accerl_lerobot.algorithms import (
     PPOConfig,
     SAPOConfig,
     awr_loss,
-    compute_loss,
     decoupled_loss,
     importance_loss,
     ppo_loss,
@@ -32,7 +31,7 @@ RATIOS = [0.01, 0.5, 0.9, 1.0, 1.1, 2.0, 8.0]
 def pull(config: AlgorithmConfig, rho: float, advantage: float = 1.0, proximal: float | None = None) -> float:
     """−∂L/∂log π of one decision, at π/μ = `rho` and π_prox/μ = `proximal`."""
     inputs = one(math.log(rho), advantage, None if proximal is None else math.log(proximal))
-    return -gradient(inputs, compute_loss(inputs, config).loss).item()
+    return -gradient(inputs, config.loss(inputs).loss).item()
 
 
 # ---- decoupled PPO

@@ -20,10 +20,9 @@ from accerl_lerobot.algorithms import (
     LossInputs,
     LossOutput,
     PPOConfig,
-    compute_loss,
+    RatioConfig,
 )
 from accerl_lerobot.policies.adapter import Evaluation
-from accerl_lerobot.trainer import update as module
 from accerl_lerobot.trainer.batch import Part, collate
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.frozen_policies import FrozenPolicies
@@ -150,16 +149,18 @@ class Recorder:
         self.inputs: list[LossInputs] = []
         self.taken: list[tuple[str, int]] = []
         take = FrozenPolicies.take
+        losses = {kind: kind.loss for kind in (GIPOConfig, DecoupledConfig)}
 
-        def compute(inputs: LossInputs, config: AlgorithmConfig) -> LossOutput:
+        def recorded(config: RatioConfig, inputs: LossInputs) -> LossOutput:
             self.inputs.append(inputs)
-            return compute_loss(inputs, config)
+            return losses[type(config)](config, inputs)
 
         def counted(frozen: FrozenPolicies, name: str, version: int) -> None:
             self.taken.append((name, version))
             take(frozen, name, version)
 
-        monkeypatch.setattr(module, "compute_loss", compute)
+        for kind in losses:
+            monkeypatch.setattr(kind, "loss", recorded)
         monkeypatch.setattr(FrozenPolicies, "take", counted)
 
 
