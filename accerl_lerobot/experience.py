@@ -25,9 +25,9 @@ are raw: scaling and normalisation belong to the policy's own LeRobot processors
 
 TASK = "task"
 ENVIRONMENT_STATE = "observation.environment_state"
-SUCCESS = "next.success"
-"""LeRobot's names of dataset features."""
 """LeRobot's name for what a simulator says of itself. Ours end it with the share of the time limit gone."""
+REWARD, SUCCESS = "next.reward", "next.success"
+"""LeRobot's names for what an env step led to."""
 REAL, IMAGINED = "real", "imagined"
 """Which worlds a segment can be from."""
 

@@ -24,7 +24,7 @@ from typing import Annotated, Any, Literal
 from accerl_lerobot.checkpoint.layout import displaced, relocate
 from accerl_lerobot.checkpoint.safety import Origin, check_remote_code, read_json
 from accerl_lerobot.config.dataset import DatasetConfig
-from accerl_lerobot.config.ranges import LearningRate, Range, Section, Share, Steps, Threads
+from accerl_lerobot.config.ranges import LearningRate, Range, Section, Steps, Threads
 from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
 from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.experience import SUCCESS
@@ -62,7 +62,7 @@ class SFTConfig(Section, section="sft"):
     """Without effect on a policy type whose preset has no warm-up, such as act."""
     pick: Literal["all", "successes", "failures"] = "all"
     """Episodes that are imitated, by their ``next.success``; the others stay in the dataset."""
-    held_out: Share = 0.0
+    held_out: Annotated[float, Range("[0, 1)")] = 0.0
     """Share of each task's episodes that is not trained on: the checkpoint, one of ten, that predicts these
     actions best is used; 0: all are trained on, and the last checkpoint is used."""
     cache: bool = True
@@ -215,7 +215,9 @@ def run_sft(
             raise InputError(*json.loads(last.removeprefix(REFUSED)))
         tail = "".join(log.read_text().splitlines(keepends=True)[-15:])
         raise RuntimeError(f"lerobot-train ended with exit code {code}; the end of {log}:\n{tail}")
-    return _best(log.read_text(), output_dir / "checkpoints") / "pretrained_model"
+    checkpoints = output_dir / "checkpoints"
+    best = _best(log.read_text(), checkpoints) if config.held_out else checkpoints / "last"
+    return best / "pretrained_model"
 
 
 def picked(dataset: DatasetConfig, pick: str) -> list[int] | None:
@@ -236,7 +238,7 @@ def picked(dataset: DatasetConfig, pick: str) -> list[int] | None:
     with checked(origin_of(dataset)):
         data = LeRobotDataset(meta.repo_id, root=meta.root, revision=meta.revision, video_backend="pyav")
         columns = data.hf_dataset.with_format("numpy", columns=["episode_index", SUCCESS])[:]
-    succeeded = set(columns["episode_index"][columns[SUCCESS]].tolist())
+    succeeded = set(columns["episode_index"][columns[SUCCESS].astype(bool).reshape(-1)].tolist())
     wanted = [i for i in range(meta.total_episodes) if (i in succeeded) is (pick == "successes")]
     if not wanted:
         raise InputError("sft.pick", pick, f"none of the dataset's {meta.total_episodes} episodes; use all")
@@ -244,13 +246,15 @@ def picked(dataset: DatasetConfig, pick: str) -> list[int] | None:
 
 
 def _best(log: str, checkpoints: Path) -> Path:
-    """The checkpoint with the lowest loss on held-out episodes, the last one where none were held out."""
+    """The checkpoint with the lowest loss on held-out episodes; the last one, if none has a finite loss."""
     losses = {int(step): float(loss) for step, loss in HELD_OUT.findall(log)}
-    if not losses:
+    saved = {int(path.name): path for path in checkpoints.iterdir() if path.name.isdecimal()}
+    found = {step: losses[step] for step in saved if math.isfinite(losses.get(step, math.nan))}
+    if not found:
         return checkpoints / "last"
-    best = min(losses, key=losses.__getitem__)
+    best = min(found, key=found.__getitem__)
     logger.info("loss on held-out episodes: %s; step %d is used", losses, best)
-    return next(path for path in checkpoints.iterdir() if path.name.isdecimal() and int(path.name) == best)
+    return saved[best]
 
 
 def _with_backbone_in_place(config: SFTConfig, copy: Path) -> SFTConfig:

@@ -119,6 +119,7 @@ def check_start(config: RunConfig) -> int:
     spec = check_world(config.env)
     if isinstance(config.algorithm, OffPolicyConfig):
         _check_off_policy(config, spec, policy)
+        _check_demonstrations(config, spec)
     renames, offered = config.policy.rename_map, env_features(spec)
     if config.policy.path is not None:
         check_features(policy_features(policy), offered, renames, "policy.path", config.policy.path)
@@ -126,6 +127,25 @@ def check_start(config: RunConfig) -> int:
         check_training_data(config.sft, config.dataset, policy, spec, renames)
     check_disk(config.output_dir, disk_bytes(config, spec, int(policy.n_obs_steps)))
     return int(policy.n_obs_steps)
+
+
+def _check_demonstrations(config: RunConfig, spec: WorldSpec) -> None:
+    """Opens the dataset that a memory is to begin with, and says if it cannot.
+
+    Raises:
+        InputError: there is no such dataset.
+    """
+    from accerl_lerobot.demos.dataset_files import open_metadata
+    from accerl_lerobot.trainer.demonstrations import unlike
+
+    if config.dataset.repo_id is None:
+        return
+    wanted: dict[str, tuple[int, ...]] = {STATE: (spec.state_dim,), ACTION: (spec.action_dim,)}
+    wanted |= spec.images
+    if config.env.state_size:
+        wanted[ENV_STATE] = (config.env.state_size,)
+    if (why := unlike(open_metadata(config.dataset), wanted)) is not None:
+        logger.warning("%s does not join the memory: %s", config.dataset.repo_id, why)
 
 
 def check_training_data(

@@ -97,7 +97,7 @@ def make_engine(
     if isinstance(config.algorithm, OffPolicyConfig) and (dataset := demonstrations_of(config)) is not None:
         from accerl_lerobot.trainer.demonstrations import WithDemonstrations
 
-        load = WithDemonstrations(loader(load), dataset)
+        load = WithDemonstrations(loader(load), dataset, config.rollout.decision_cost)
     if config.launch.engine == "local":
         from accerl_lerobot.engine.local import LocalEngine
 
@@ -111,7 +111,8 @@ def make_engine(
 def demonstrations_of(config: RunConfig) -> DatasetConfig | None:
     """The dataset that the run was given, or has recorded; None without one."""
     if config.dataset.repo_id is not None:
-        return config.dataset
+        root = config.dataset.root
+        return replace(config.dataset, root=None if root is None else str(Path(root).expanduser().absolute()))
     own = None if config.output_dir is None else Path(config.output_dir).absolute() / DEMOS
     if own is None or not own.is_dir():
         return None

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,7 +29,7 @@ from accerl_lerobot.policies.family import Encoded, Family, Model, pooled
 from accerl_lerobot.policies.teacher import PREFIX, Teacher
 
 if TYPE_CHECKING:
-    from accerl_lerobot.config.dataset import DatasetConfig
+    from accerl_lerobot.experience import Segment
 
 
 class ValueHead(nn.Module):
@@ -270,7 +270,7 @@ class LeRobotAdapter(PolicyAdapter):
         self.policy.eval()
         self.teacher: Teacher | None = None
         """Acts in its place in part of the exploring episodes; given by `teacher.WithTeacher`."""
-        self.demonstrations: DatasetConfig | None = None
+        self.demonstrations: Callable[[Segment], Iterator[Segment]] | None = None
         """Remembered by off-policy learning from the start; given by `demonstrations.WithDemonstrations`."""
 
     def encode(self, observations: dict[str, np.ndarray], tasks: Sequence[str]) -> Encoded:

@@ -47,6 +47,8 @@ LAST = 50
 """Exploring episodes that ``teacher_success`` and ``policy_success`` are of."""
 FIRST_STEPS = 2000
 """Steps in which the teacher learns what was done before it may act."""
+MOST_FIRST = 5000
+"""Most steps of the critic before the teacher's first along it."""
 MARGIN = 0.05
 """Share of the explored range of actions that the teacher may go beyond it."""
 SMALLEST_SCALE = 0.02
@@ -184,7 +186,7 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             loss = (self.teacher(self.tensor("state", rows)) - self.tensor("chunk", rows)).square().mean()
             self._descend("teacher", loss)
         # Or the teacher would at once climb a critic that knows nothing.
-        for _ in range(len(self.memory)):
+        for _ in range(min(len(self.memory), MOST_FIRST)):
             self._critic_step(self._bounds())
         with torch.no_grad():
             self.teacher.ready.fill_(1)

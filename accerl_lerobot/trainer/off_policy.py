@@ -23,7 +23,6 @@ from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.teacher import PREFIX
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.demonstrations import demonstrations
 from accerl_lerobot.trainer.frozen_policies import CRITIC
 from accerl_lerobot.trainer.memory import Memory
 from accerl_lerobot.trainer.nonfinite import NonFiniteError
@@ -75,7 +74,7 @@ class OffPolicyUpdate:
             NonFiniteError: see `update.Update.step`.
         """
         if not self.memory.total and self.adapter.demonstrations is not None:
-            for demonstration in demonstrations(self.adapter.demonstrations, segments[0]):
+            for demonstration in self.adapter.demonstrations(segments[0]):
                 self._remember(demonstration)
         for segment in segments:
             if not segment.truncated:  # the simulator diverged: nothing follows, and nothing failed

@@ -24,7 +24,12 @@ NAMED = [f"--algorithm.discover_packages_path={PACKAGE}", f"--algorithm.type={NA
 
 @pytest.fixture(autouse=True)
 def unheard_of() -> Iterator[None]:
+    forget()
     yield
+    forget()
+
+
+def forget() -> None:
     AlgorithmConfig.get_known_choices().pop(NAME, None)
     sys.modules.pop(PACKAGE, None)
 

@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from accerl_lerobot.algorithms import ChunkCriticConfig
+from accerl_lerobot.algorithms import AlgorithmConfig, ChunkCriticConfig, SelfImitationConfig
 from accerl_lerobot.config.dataset import DatasetConfig
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.demos.sft import SFTConfig, run_sft
+from accerl_lerobot.engine.preflight import check_start
 from accerl_lerobot.envs import SimulatedConfig, make_world
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, Origin, Segment
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.loading import load_adapter
@@ -25,9 +27,11 @@ from accerl_lerobot.trainer import demonstrations as module
 from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.demonstrations import WithDemonstrations, demonstrations
+from tests.runs import tiny_run
+from tests.trainer.test_chunk_critic import ROOMS
 
 ENV = SimulatedConfig(max_steps=16, environment_state=True)
-K = 4
+K, COST = 4, 0.25
 
 
 @pytest.fixture(scope="module")
@@ -70,13 +74,16 @@ def test_decisions_are_the_frames_from_every_step_on(dataset: DatasetConfig, lik
         zip(data.meta.episodes["dataset_from_index"], data.meta.episodes["dataset_to_index"], strict=True)
     )
     episodes = [[data[i] for i in range(first, last)] for first, last in ends]
-    read = list(demonstrations(dataset, like))
+    read = list(demonstrations(dataset, COST, like))
     expected = [(e, phase) for e in range(4) for phase in range(min(K, len(episodes[e])))]
     assert len(read) == len(expected)
     for segment, (e, phase) in zip(read, expected, strict=True):
         frames = episodes[e]
         won = any(bool(frame["next.success"]) for frame in frames)
-        assert segment.success is won and segment.reward.sum() == won == segment.reward[-1]
+        assert segment.success is won
+        rewards = np.zeros(len(segment))
+        rewards[-1] = won
+        np.testing.assert_allclose(segment.reward, rewards - COST)
         for t in range(len(segment)):
             at = phase + K * t
             for name in ("observation.state", ENVIRONMENT_STATE):
@@ -96,7 +103,7 @@ def test_of_a_long_dataset_only_a_part_is_read(
 ):
     frames = LeRobotDataset("a/b", root=dataset.root).meta.total_frames
     monkeypatch.setattr(module, "ROWS", frames // K // 2)
-    read = list(demonstrations(dataset, like))
+    read = list(demonstrations(dataset, COST, like))
     assert len(read) == 2 and sum(map(len, read)) <= frames // K // 2 + 2
 
 
@@ -105,18 +112,18 @@ def test_a_dataset_of_something_else_is_left_out(
 ):
     like = replace(like, actions=np.zeros((1, K, 7), np.float32))
     with caplog.at_level(logging.WARNING):
-        assert not list(demonstrations(dataset, like))
+        assert not list(demonstrations(dataset, COST, like))
     assert "does not join the memory: the dataset's action has shape" in caplog.text
 
 
 def test_the_memory_begins_with_them_and_is_restored_without(
     dataset: DatasetConfig, like: Segment, tiny_checkpoint: Path
 ):
-    load = WithDemonstrations(WithTeacher(load_adapter, ENV.state_size, share=0.5, noise=0.1), dataset)
+    load = WithDemonstrations(WithTeacher(load_adapter, ENV.state_size, share=0.5, noise=0.1), dataset, COST)
     adapter = load(PolicyConfig(path=str(tiny_checkpoint), device="cpu"))
     config = TrainerConfig(value_warmup_updates=100)
     update = ChunkCriticUpdate(adapter, ChunkCriticConfig(), config)
-    rows = sum(map(len, demonstrations(dataset, like)))
+    rows = sum(map(len, demonstrations(dataset, COST, like)))
     assert update.step([like])["memory_decisions"] == rows + 1
     assert update.memory["success"][:-1].any() and not update.memory["success"][-1]
     again = ChunkCriticUpdate(adapter, ChunkCriticConfig(), config)
@@ -132,3 +139,22 @@ def test_a_policy_of_images_does_not_read_the_simulators_state(dataset: DatasetC
     path = run_sft(config, dataset, tmp_path / "sft", seed=0)
     inputs = json.loads((path / "config.json").read_text())["input_features"]
     assert "observation.state" in inputs and ENVIRONMENT_STATE not in inputs
+
+
+@pytest.mark.parametrize("algorithm", [ChunkCriticConfig(), SelfImitationConfig()], ids=lambda a: a.type)
+def test_they_are_looked_at_before_the_run_begins(
+    algorithm: AlgorithmConfig,
+    dataset: DatasetConfig,
+    tiny_checkpoint: Path,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+):
+    rooms = ROOMS | {"algorithm": algorithm, "env": ENV, "dataset": dataset}
+    config = tiny_run(tiny_checkpoint, **rooms)
+    with caplog.at_level(logging.WARNING):
+        check_start(config)
+        assert "does not join" not in caplog.text
+        check_start(replace(config, env=replace(ENV, image_size=48)))
+    assert "does not join the memory: the dataset's observation.images.front has shape" in caplog.text
+    with pytest.raises(InputError, match=r"^dataset\.root="):
+        check_start(replace(config, dataset=DatasetConfig(repo_id="a/b", root=str(tmp_path))))
