@@ -157,9 +157,7 @@ def test_a_run_that_was_left_goes_on_as_if_it_had_not(
     model: str, left_at: float, tiny_checkpoint: Path, world_model: Path, tmp_path: Path
 ):
     """Rollouts, world model and success model included."""
-    learn = OnlineLearnConfig(
-        steps_per_episode=1.0, validate_every=8, held_out=0.5, validation=LOOSE, batch=4
-    )
+    learn = OnlineLearnConfig(steps_per_episode=1.0, validate_every=8, held_out=0.5, validation=LOOSE)
     chosen: dict[str, Any] = {"model": model, "start_at_reset_prob": 0.5, "window": 4, "max_gap": 2.0}
     chosen["min_real_episodes"] = 2
     if model != "oracle":
