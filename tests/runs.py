@@ -31,8 +31,8 @@ def replacing(arguments: list[str], *more: str) -> list[str]:
     return [a for a in arguments if a.partition("=")[0] not in names] + list(more)
 
 
-def tiny_run(checkpoint: Path, **rooms: Any) -> RunConfig:
-    """A run on the simulated world from `checkpoint`; `rooms` replaces whole sections."""
+def tiny_run(checkpoint: Path, **sections: Any) -> RunConfig:
+    """A run on the simulated world from `checkpoint`; `sections` replaces whole sections."""
     defaults: dict[str, Any] = {
         "env": SimulatedConfig(max_steps=16),
         "policy": PolicyConfig(path=str(checkpoint), device="cpu"),
@@ -42,7 +42,7 @@ def tiny_run(checkpoint: Path, **rooms: Any) -> RunConfig:
         "evaluation": EvaluationConfig(episodes=6, videos=1, video_size=32),
         "launch": LaunchConfig(stall_s=120),
     }
-    return RunConfig(**{**defaults, **rooms})
+    return RunConfig(**{**defaults, **sections})
 
 
 def polls(engine: Engine) -> Iterator[Progress]:

@@ -176,8 +176,8 @@ class TestHuggingFaceDatasets:
 class TestResources:
     """Cores, memory, disk and pace against a recipe."""
 
-    def recipe(self, **rooms: dict[str, Any]) -> RunConfig:
-        config: RunConfig = decode(RunConfig, rooms)
+    def recipe(self, **sections: dict[str, Any]) -> RunConfig:
+        config: RunConfig = decode(RunConfig, sections)
         return config
 
     @pytest.fixture(autouse=True)

@@ -60,8 +60,8 @@ def engine(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
     monkeypatch.setattr(trainer_worker, "TrainerWorker", LightTrainer)
     made: list[RayEngine] = []
 
-    def make(**rooms: Any) -> RayEngine:
-        config = tiny_run(Path("nowhere"), **{"env": SLOW, **rooms})
+    def make(**sections: Any) -> RayEngine:
+        config = tiny_run(Path("nowhere"), **{"env": SLOW, **sections})
         made.append(RayEngine(config, ("match",)))
         return made[-1]
 

@@ -99,7 +99,7 @@ def success(engine: Engine, episodes: int = 128) -> float:
     return float(np.mean([r.success for r in collect(engine, "test", episodes)]))
 
 
-def learning_run(checkpoint: Path, **rooms: Any) -> RunConfig:
+def learning_run(checkpoint: Path, **sections: Any) -> RunConfig:
     """Two decisions an episode, and a reward at every step: about the easiest task with a future."""
     defaults: dict[str, Any] = {
         "env": SimulatedConfig(max_steps=8, tolerance=0.3, reward="dense", terminate_on_success=False),
@@ -113,7 +113,7 @@ def learning_run(checkpoint: Path, **rooms: Any) -> RunConfig:
             updates=100, batch_decisions=128, lr=2e-3, value_lr=3e-3, warmup_updates=3, value_warmup_updates=5
         ),
     }
-    return tiny_run(checkpoint, **{**defaults, **rooms})
+    return tiny_run(checkpoint, **{**defaults, **sections})
 
 
 def test_a_random_policy_learns_the_task(tiny_checkpoint: Path):

@@ -138,7 +138,7 @@ def test_nothing_shadows_hugging_face_datasets_or_the_standard_library() -> None
 
 
 def test_folders_below_tests_are_packages() -> None:
-    """Test files of equal name in two rooms would clash otherwise."""
+    """Test files of equal name in two folders would clash otherwise."""
     for folder in {p.parent for p in (ROOT / "tests").rglob("test_*.py")}:
         assert (folder / "__init__.py").is_file(), folder
 

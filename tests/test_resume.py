@@ -29,7 +29,7 @@ UPDATES = 14
 TIMES = ("wall_s", "wait_s", "update_s", "publish_s", "rl_s", "warm_start_s")
 
 
-def recipe(folder: Path, checkpoint: Path, **rooms: Any) -> Path:
+def recipe(folder: Path, checkpoint: Path, **sections: Any) -> Path:
     defaults: dict[str, Any] = {
         "env": SimulatedConfig(max_steps=12, tolerance=0.4),
         "evaluation": EvaluationConfig(
@@ -41,7 +41,7 @@ def recipe(folder: Path, checkpoint: Path, **rooms: Any) -> Path:
         "launch": LaunchConfig(engine="local"),
         "save_every_updates": 5,
     }
-    config = tiny_run(checkpoint, **{**defaults, **rooms})
+    config = tiny_run(checkpoint, **{**defaults, **sections})
     folder.mkdir(exist_ok=True)
     (folder / "recipe.yaml").write_text(yaml.safe_dump(encode(config)))
     return folder / "recipe.yaml"

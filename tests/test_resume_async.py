@@ -44,8 +44,8 @@ def engine(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
     monkeypatch.setattr(trainer_worker, "TrainerWorker", LightTrainer)
     made: list[RayEngine] = []
 
-    def make(state: Path | None = None, **rooms: Any) -> RayEngine:
-        made.append(RayEngine(run_of(**rooms), ("match",), state=state))
+    def make(state: Path | None = None, **sections: Any) -> RayEngine:
+        made.append(RayEngine(run_of(**sections), ("match",), state=state))
         return made[-1]
 
     yield make
@@ -53,14 +53,14 @@ def engine(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
         one.close()
 
 
-def run_of(**rooms: Any) -> RunConfig:
+def run_of(**sections: Any) -> RunConfig:
     defaults: dict[str, Any] = {
         "env": SimulatedConfig(max_steps=16, step_ms=1.0),
         "rollout": TWO,
         "replay": ReplayConfig(capacity=160, min_decisions=16, ahead=48, samples_per_insert=2.0, max_lag=40),
         "trainer": TrainerConfig(updates=UPDATES, batch_decisions=16),
     }
-    return tiny_run(Path("nowhere"), **{**defaults, **rooms})
+    return tiny_run(Path("nowhere"), **{**defaults, **sections})
 
 
 def until(one: RayEngine, version: int) -> list[Progress]:

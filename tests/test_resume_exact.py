@@ -56,10 +56,10 @@ CASES: dict[str, dict[str, Any]] = {
 
 
 def config_of(checkpoint: Path, case: str) -> RunConfig:
-    rooms = dict(CASES[case])
+    sections = dict(CASES[case])
     trainer: dict[str, Any] = {"updates": 14, "batch_decisions": 16, "lr": 1e-3, "advantage_memory": 0.5}
-    rooms["trainer"] = TrainerConfig(**trainer | {"warmup_updates": 2} | rooms.pop("trainer", {}))
-    return tiny_run(checkpoint, seed=3, **rooms)
+    sections["trainer"] = TrainerConfig(**trainer | {"warmup_updates": 2} | sections.pop("trainer", {}))
+    return tiny_run(checkpoint, seed=3, **sections)
 
 
 def weights(engine: LocalEngine) -> dict[str, np.ndarray]:

@@ -32,7 +32,7 @@ class Finished:
     summary: dict[str, Any]
 
 
-def local_run(checkpoint: Path, output_dir: Path | None, **rooms: Any) -> RunConfig:
+def local_run(checkpoint: Path, output_dir: Path | None, **sections: Any) -> RunConfig:
     defaults: dict[str, Any] = {
         "env": SimulatedConfig(max_steps=12, tolerance=0.4),
         "evaluation": EvaluationConfig(
@@ -43,7 +43,7 @@ def local_run(checkpoint: Path, output_dir: Path | None, **rooms: Any) -> RunCon
         "output_dir": None if output_dir is None else str(output_dir),
         "save_every_updates": 5,
     }
-    return tiny_run(checkpoint, **{**defaults, **rooms})
+    return tiny_run(checkpoint, **{**defaults, **sections})
 
 
 @pytest.fixture(scope="module")

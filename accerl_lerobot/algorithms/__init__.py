@@ -31,12 +31,6 @@ from accerl_lerobot.algorithms.losses import (
     ImportanceConfig,
     PPOConfig,
     SAPOConfig,
-    awr_loss,
-    decoupled_loss,
-    gipo_loss,
-    importance_loss,
-    ppo_loss,
-    sapo_loss,
 )
 from accerl_lerobot.algorithms.objective import LossOutput
 from accerl_lerobot.algorithms.self_imitation import SelfImitationConfig
@@ -56,11 +50,5 @@ __all__ = [
     "RatioConfig",
     "SAPOConfig",
     "SelfImitationConfig",
-    "awr_loss",
     "check_level",
-    "decoupled_loss",
-    "gipo_loss",
-    "importance_loss",
-    "ppo_loss",
-    "sapo_loss",
 ]

@@ -103,7 +103,12 @@ class GIPOConfig(RatioConfig):
     """Weight of KL(μ‖π), the distance from the behaviour policy."""
 
     def loss(self, inputs: LossInputs) -> LossOutput:
-        return gipo_loss(inputs, self)
+        """See the top of the file. E is the mean over all ratios of all decisions."""
+        advantage = advantage_column(inputs)
+        logs = at_level(inputs.log_prob_new - inputs.log_prob_old.detach(), inputs, self.level)
+        weight = trust_weight(logs, advantage, self)
+        policy_loss = -mean_over_ratios(weight * ratio(logs) * advantage, inputs, self.level)
+        return assemble(inputs, self, policy_loss=policy_loss, log_ratio=logs, weight=weight)
 
 
 def trust_weight(log_ratio: Tensor, advantage: Tensor, config: GIPOConfig) -> Tensor:
@@ -121,15 +126,6 @@ def trust_weight(log_ratio: Tensor, advantage: Tensor, config: GIPOConfig) -> Te
     return positive.where(advantage > 0.0, negative)
 
 
-def gipo_loss(inputs: LossInputs, config: GIPOConfig) -> LossOutput:
-    """See the top of the file. E is the mean over all ratios of all decisions."""
-    advantage = advantage_column(inputs)
-    logs = at_level(inputs.log_prob_new - inputs.log_prob_old.detach(), inputs, config.level)
-    weight = trust_weight(logs, advantage, config)
-    policy_loss = -mean_over_ratios(weight * ratio(logs) * advantage, inputs, config.level)
-    return assemble(inputs, config, policy_loss=policy_loss, log_ratio=logs, weight=weight)
-
-
 @AlgorithmConfig.register_subclass("is")
 @dataclass(frozen=True, kw_only=True)
 class ImportanceConfig(RatioConfig):
@@ -139,24 +135,20 @@ class ImportanceConfig(RatioConfig):
     """Largest weight of a sample; None: unbounded."""
 
     def loss(self, inputs: LossInputs) -> LossOutput:
-        return importance_loss(inputs, self)
-
-
-def importance_loss(inputs: LossInputs, config: ImportanceConfig) -> LossOutput:
-    """See the top of the file. E is the mean over all ratios of all decisions."""
-    logs = at_level(inputs.log_prob_new - inputs.log_prob_old.detach(), inputs, config.level)
-    rho = ratio(logs)
-    weighted = rho
-    if config.cap is not None:
-        # 1 + log ρ − log ρ̄ is 1 with the gradient ∇log π, also where `ratio` is clamped and has none.
-        weighted = rho.detach().clamp(max=config.cap) * (1.0 + logs - logs.detach())
-    return assemble(
-        inputs,
-        config,
-        policy_loss=-mean_over_ratios(weighted * advantage_column(inputs), inputs, config.level),
-        log_ratio=logs,
-        weight=weighted / rho,
-    )
+        """See the top of the file. E is the mean over all ratios of all decisions."""
+        logs = at_level(inputs.log_prob_new - inputs.log_prob_old.detach(), inputs, self.level)
+        rho = ratio(logs)
+        weighted = rho
+        if self.cap is not None:
+            # 1 + log ρ − log ρ̄ is 1 with the gradient ∇log π, also where `ratio` is clamped and has none.
+            weighted = rho.detach().clamp(max=self.cap) * (1.0 + logs - logs.detach())
+        return assemble(
+            inputs,
+            self,
+            policy_loss=-mean_over_ratios(weighted * advantage_column(inputs), inputs, self.level),
+            log_ratio=logs,
+            weight=weighted / rho,
+        )
 
 
 @AlgorithmConfig.register_subclass("sapo")
@@ -170,23 +162,19 @@ class SAPOConfig(RatioConfig):
     """Temperature where Â ≤ 0."""
 
     def loss(self, inputs: LossInputs) -> LossOutput:
-        return sapo_loss(inputs, self)
-
-
-def sapo_loss(inputs: LossInputs, config: SAPOConfig) -> LossOutput:
-    """See the top of the file. E is the mean over all ratios of all decisions."""
-    advantage = advantage_column(inputs)
-    logs = at_level(inputs.log_prob_new - inputs.log_prob_old.detach(), inputs, config.level)
-    tau = advantage.new_full(advantage.shape, config.tau_negative)
-    tau = tau.masked_fill(advantage > 0.0, config.tau_positive)
-    gate = (tau * (ratio(logs) - 1.0)).sigmoid()
-    return assemble(
-        inputs,
-        config,
-        policy_loss=-mean_over_ratios(4.0 / tau * gate * advantage, inputs, config.level),
-        log_ratio=logs,
-        weight=4.0 * gate * (1.0 - gate),
-    )
+        """See the top of the file. E is the mean over all ratios of all decisions."""
+        advantage = advantage_column(inputs)
+        logs = at_level(inputs.log_prob_new - inputs.log_prob_old.detach(), inputs, self.level)
+        tau = advantage.new_full(advantage.shape, self.tau_negative)
+        tau = tau.masked_fill(advantage > 0.0, self.tau_positive)
+        gate = (tau * (ratio(logs) - 1.0)).sigmoid()
+        return assemble(
+            inputs,
+            self,
+            policy_loss=-mean_over_ratios(4.0 / tau * gate * advantage, inputs, self.level),
+            log_ratio=logs,
+            weight=4.0 * gate * (1.0 - gate),
+        )
 
 
 @AlgorithmConfig.register_subclass("awr")
@@ -200,24 +188,20 @@ class AWRConfig(RatioConfig):
     """Largest weight of a sample; an average one has 1."""
 
     def loss(self, inputs: LossInputs) -> LossOutput:
-        return awr_loss(inputs, self)
-
-
-def awr_loss(inputs: LossInputs, config: AWRConfig) -> LossOutput:
-    """See the top of the file. E is the mean over all factors, actions or chunks of all decisions."""
-    log_prob = at_level(inputs.log_prob_new, inputs, config.level)
-    logs = at_level(inputs.log_prob_new - inputs.log_prob_old.detach(), inputs, config.level)
-    # Limited before the exponential, which would overflow at Â/β = 89.
-    weight = (advantage_column(inputs) / config.beta).clamp(max=math.log(config.cap)).exp()
-    weight = weight.expand_as(log_prob)
-    return assemble(
-        inputs,
-        config,
-        policy_loss=-mean_over_ratios(weight * log_prob, inputs, config.level),
-        log_ratio=logs,
-        weight=weight,
-        grad_weight=weight,
-    )
+        """See the top of the file. E is the mean over all factors, actions or chunks of all decisions."""
+        log_prob = at_level(inputs.log_prob_new, inputs, self.level)
+        logs = at_level(inputs.log_prob_new - inputs.log_prob_old.detach(), inputs, self.level)
+        # Limited before the exponential, which would overflow at Â/β = 89.
+        weight = (advantage_column(inputs) / self.beta).clamp(max=math.log(self.cap)).exp()
+        weight = weight.expand_as(log_prob)
+        return assemble(
+            inputs,
+            self,
+            policy_loss=-mean_over_ratios(weight * log_prob, inputs, self.level),
+            log_ratio=logs,
+            weight=weight,
+            grad_weight=weight,
+        )
 
 
 @AlgorithmConfig.register_subclass("ppo")
@@ -231,7 +215,17 @@ class PPOConfig(RatioConfig):
     """How far ρ may rise above 1 before a sample with Â > 0 stops counting."""
 
     def loss(self, inputs: LossInputs) -> LossOutput:
-        return ppo_loss(inputs, self)
+        """The loss at the top of the file. E is the mean over all ratios of all decisions."""
+        logs = at_level(inputs.log_prob_new - inputs.log_prob_old.detach(), inputs, self.level)
+        surrogate, dropped = clipped_surrogate(ratio(logs), advantage_column(inputs), self)
+        return assemble(
+            inputs,
+            self,
+            policy_loss=-mean_over_ratios(surrogate, inputs, self.level),
+            log_ratio=logs,
+            weight=(~dropped).to(logs.dtype),
+            clip=Clip(self.clip_low, self.clip_high),
+        )
 
 
 def clipped_surrogate(rho: Tensor, advantage: Tensor, config: PPOConfig) -> tuple[Tensor, Tensor]:
@@ -245,20 +239,6 @@ def clipped_surrogate(rho: Tensor, advantage: Tensor, config: PPOConfig) -> tupl
     low, high = 1.0 - config.clip_low, 1.0 + config.clip_high
     dropped = ((advantage > 0.0) & (rho > high)) | ((advantage < 0.0) & (rho < low))
     return (rho * advantage).minimum(rho.clamp(low, high) * advantage), dropped
-
-
-def ppo_loss(inputs: LossInputs, config: PPOConfig) -> LossOutput:
-    """The loss at the top of the file. E is the mean over all ratios of all decisions."""
-    logs = at_level(inputs.log_prob_new - inputs.log_prob_old.detach(), inputs, config.level)
-    surrogate, dropped = clipped_surrogate(ratio(logs), advantage_column(inputs), config)
-    return assemble(
-        inputs,
-        config,
-        policy_loss=-mean_over_ratios(surrogate, inputs, config.level),
-        log_ratio=logs,
-        weight=(~dropped).to(logs.dtype),
-        clip=Clip(config.clip_low, config.clip_high),
-    )
 
 
 @AlgorithmConfig.register_subclass("decoupled")
@@ -277,27 +257,23 @@ class DecoupledConfig(PPOConfig):
         return self.proximal_every
 
     def loss(self, inputs: LossInputs) -> LossOutput:
-        return decoupled_loss(inputs, self)
+        """See the top of the file. E is the mean over all ratios of all decisions, masked ones counted as 0.
 
-
-def decoupled_loss(inputs: LossInputs, config: DecoupledConfig) -> LossOutput:
-    """See the top of the file. E is the mean over all ratios of all decisions, masked ones counted as 0.
-
-    Raises:
-        ValueError: there are no proximal log-probs.
-    """
-    if inputs.log_prob_proximal is None:
-        raise ValueError("decoupled PPO: log_prob_proximal is needed")
-    proximal, old = inputs.log_prob_proximal.detach(), inputs.log_prob_old.detach()
-    moved = at_level(inputs.log_prob_new - proximal, inputs, config.level)
-    behaviour = ratio(at_level(proximal - old, inputs, config.level))
-    behaviour = behaviour.masked_fill(behaviour > config.behaviour_cap, 0.0)
-    surrogate, dropped = clipped_surrogate(ratio(moved), advantage_column(inputs), config)
-    return assemble(
-        inputs,
-        config,
-        policy_loss=-mean_over_ratios(behaviour * surrogate, inputs, config.level),
-        log_ratio=at_level(inputs.log_prob_new - old, inputs, config.level),
-        weight=(~dropped & (behaviour > 0.0)).to(moved.dtype),
-        clip=Clip(config.clip_low, config.clip_high, moved),
-    )
+        Raises:
+            ValueError: there are no proximal log-probs.
+        """
+        if inputs.log_prob_proximal is None:
+            raise ValueError("decoupled PPO: log_prob_proximal is needed")
+        proximal, old = inputs.log_prob_proximal.detach(), inputs.log_prob_old.detach()
+        moved = at_level(inputs.log_prob_new - proximal, inputs, self.level)
+        behaviour = ratio(at_level(proximal - old, inputs, self.level))
+        behaviour = behaviour.masked_fill(behaviour > self.behaviour_cap, 0.0)
+        surrogate, dropped = clipped_surrogate(ratio(moved), advantage_column(inputs), self)
+        return assemble(
+            inputs,
+            self,
+            policy_loss=-mean_over_ratios(behaviour * surrogate, inputs, self.level),
+            log_ratio=at_level(inputs.log_prob_new - old, inputs, self.level),
+            weight=(~dropped & (behaviour > 0.0)).to(moved.dtype),
+            clip=Clip(self.clip_low, self.clip_high, moved),
+        )

@@ -13,7 +13,7 @@ import contextlib
 import io
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -91,6 +91,37 @@ def open_metadata(dataset: DatasetConfig) -> Any:
         raise InputError("dataset.repo_id", name, remedy) from error
     except Exception as error:  # LeRobot may fail over anything in the files
         raise origin_of(dataset).refuse("meta", f"LeRobot cannot read it ({brief(error)})") from error
+
+
+@contextlib.contextmanager
+def opened(dataset: DatasetConfig, meta: Any, episodes: Sequence[int] | None = None) -> Iterator[Any]:
+    """A LeRobotDataset, whose files are checked as long as the context lasts.
+
+    Args:
+        dataset: on the Hub or in a folder.
+        meta: what `open_metadata` gave for it.
+        episodes: indices of those that are read; None: all.
+    """
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    chosen = None if episodes is None else list(episodes)
+    with checked(origin_of(dataset)):
+        # The default backend probes for FFmpeg's libraries, and prints their tracebacks where there are none.
+        yield LeRobotDataset(
+            meta.repo_id, root=meta.root, revision=meta.revision, episodes=chosen, video_backend="pyav"
+        )
+
+
+def frames_of(data: Any, index: int) -> Iterator[dict[str, Any]]:
+    """The items of an episode, one per env step, of a dataset that holds all episodes up to it."""
+    first, last = (int(data.meta.episodes[index][f"dataset_{end}_index"]) for end in ("from", "to"))
+    return (data[i] for i in range(first, last))
+
+
+def pixels_of(image: Any) -> np.ndarray:
+    """uint8 (h, w, 3) from LeRobot's float (3, h, w) in [0, 1]."""
+    pixels: np.ndarray = (image * 255).round().clamp(0, 255).byte().permute(1, 2, 0).numpy()
+    return pixels
 
 
 def origin_of(dataset: DatasetConfig) -> Origin:

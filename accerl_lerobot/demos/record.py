@@ -36,7 +36,7 @@ from accerl_lerobot.demos.writing import (
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import EnvConfig, World, WorldSpec
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import ENVIRONMENT_STATE
+from accerl_lerobot.experience import ENVIRONMENT_STATE, REWARD, SUCCESS
 from accerl_lerobot.seeds import demo_seed
 
 SIDECAR = Path("meta") / "accerl_demos.json"
@@ -154,9 +154,9 @@ def features(spec: WorldSpec, environment_state: int) -> dict[str, dict[str, Any
         vectors[ENVIRONMENT_STATE] = ("environment_state", environment_state)
     for key, (name, size) in vectors.items():
         table[key] = {"dtype": "float32", "shape": (size,), "names": [f"{name}_{i}" for i in range(size)]}
-    table["next.reward"] = {"dtype": "float32", "shape": (1,), "names": None}
+    table[REWARD] = {"dtype": "float32", "shape": (1,), "names": None}
     table["next.done"] = {"dtype": "bool", "shape": (1,), "names": None}
-    table["next.success"] = {"dtype": "bool", "shape": (1,), "names": None}
+    table[SUCCESS] = {"dtype": "bool", "shape": (1,), "names": None}
     return table
 
 
@@ -166,9 +166,9 @@ def frames(episode: Episode) -> Iterator[dict[str, Any]]:
         yield {
             **{key: rows[t] for key, rows in episode.observations.items()},
             "action": episode.actions[t],
-            "next.reward": episode.rewards[t : t + 1],
+            REWARD: episode.rewards[t : t + 1],
             "next.done": np.array([episode.done and t == len(episode) - 1]),
-            "next.success": np.array([episode.success and t >= episode.success_at]),
+            SUCCESS: np.array([episode.success and t >= episode.success_at]),
             "task": episode.task,
         }
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from accerl_lerobot.checkpoint.layout import displaced, relocate
+from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, displaced, relocate
 from accerl_lerobot.checkpoint.safety import Origin, check_remote_code, read_json
 from accerl_lerobot.config.dataset import DatasetConfig
 from accerl_lerobot.config.ranges import LearningRate, Range, Section, Steps, Threads
@@ -38,7 +38,7 @@ HELD_OUT = re.compile(r"\bstep (\d+): eval_loss=(\S+)")
 """LeRobot's report of a loss on held-out episodes."""
 REFUSED = "accerl refuses: "
 """Begins the last line of a trainer that met something it must not use; JSON follows."""
-CHECKPOINTS = 10
+CANDIDATES = 10
 """Checkpoints of which the best on held-out episodes is used."""
 LOG_EVERY = 25
 """Optimiser steps between two lines of progress."""
@@ -129,7 +129,7 @@ def sft_command(
     command += [f"--dataset.episodes={json.dumps(episodes)}"] if episodes is not None else []
     every = config.steps
     if config.held_out:
-        every = math.ceil(config.steps / CHECKPOINTS)
+        every = math.ceil(config.steps / CANDIDATES)
         command += [f"--dataset.eval_split={config.held_out}", f"--eval_steps={every}"]
     command += [
         f"--output_dir={output_dir}",
@@ -215,9 +215,9 @@ def run_sft(
             raise InputError(*json.loads(last.removeprefix(REFUSED)))
         tail = "".join(log.read_text().splitlines(keepends=True)[-15:])
         raise RuntimeError(f"lerobot-train ended with exit code {code}; the end of {log}:\n{tail}")
-    checkpoints = output_dir / "checkpoints"
-    best = _best(log.read_text(), checkpoints) if config.held_out else checkpoints / "last"
-    return best / "pretrained_model"
+    checkpoints = output_dir / CHECKPOINTS
+    best = _best(log.read_text(), checkpoints) if config.held_out else checkpoints / LAST
+    return best / PRETRAINED
 
 
 def picked(dataset: DatasetConfig, pick: str) -> list[int] | None:
@@ -228,15 +228,12 @@ def picked(dataset: DatasetConfig, pick: str) -> list[int] | None:
     """
     if pick == "all":
         return None
-    from accerl_lerobot.demos.dataset_files import checked, open_metadata, origin_of
+    from accerl_lerobot.demos.dataset_files import open_metadata, opened
 
     meta = open_metadata(dataset)
     if SUCCESS not in meta.features:
         raise InputError("sft.pick", pick, f"the dataset's episodes are not labelled by {SUCCESS}; use all")
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    with checked(origin_of(dataset)):
-        data = LeRobotDataset(meta.repo_id, root=meta.root, revision=meta.revision, video_backend="pyav")
+    with opened(dataset, meta) as data:
         columns = data.hf_dataset.with_format("numpy", columns=["episode_index", SUCCESS])[:]
     succeeded = set(columns["episode_index"][columns[SUCCESS].astype(bool).reshape(-1)].tolist())
     wanted = [i for i in range(meta.total_episodes) if (i in succeeded) is (pick == "successes")]
@@ -251,7 +248,7 @@ def _best(log: str, checkpoints: Path) -> Path:
     saved = {int(path.name): path for path in checkpoints.iterdir() if path.name.isdecimal()}
     found = {step: losses[step] for step in saved if math.isfinite(losses.get(step, math.nan))}
     if not found:
-        return checkpoints / "last"
+        return checkpoints / LAST
     best = min(found, key=found.__getitem__)
     logger.info("loss on held-out episodes: %s; step %d is used", losses, best)
     return saved[best]

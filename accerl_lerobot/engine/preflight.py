@@ -97,6 +97,7 @@ def check_start(config: RunConfig) -> int:
             ranks than GPUs, or no GPU to offload from; too little memory; no login to wandb; too little disk
             space; also what `check_sft_policy` raises.
     """
+    from accerl_lerobot.demos.dataset_files import open_metadata
     from accerl_lerobot.policies.loading import resolve_device
 
     if config.output_dir is not None and not config.resume:
@@ -117,34 +118,34 @@ def check_start(config: RunConfig) -> int:
     policy = policy_to_be(config)
     check_weights_fit(config)
     spec = check_world(config.env)
-    if isinstance(config.algorithm, OffPolicyConfig):
+    off_policy = isinstance(config.algorithm, OffPolicyConfig)
+    if off_policy:
         _check_off_policy(config, spec, policy)
-        _check_demonstrations(config, spec)
     renames, offered = config.policy.rename_map, env_features(spec)
     if config.policy.path is not None:
         check_features(policy_features(policy), offered, renames, "policy.path", config.policy.path)
+        # Off-policy learning remembers its episodes; others have no use for a dataset then.
+        remembered = off_policy and config.dataset.repo_id is not None
+        meta = open_metadata(config.dataset) if remembered else None
     else:
-        check_training_data(config.sft, config.dataset, policy, spec, renames)
-    check_disk(config.output_dir, disk_bytes(config, spec, int(policy.n_obs_steps)))
-    return int(policy.n_obs_steps)
+        meta = check_training_data(config.sft, config.dataset, policy, spec, renames)
+    history = int(policy.n_obs_steps)
+    if off_policy and meta is not None:
+        _say_if_unlike(config, spec, meta, history)
+    check_disk(config.output_dir, disk_bytes(config, spec, history))
+    return history
 
 
-def _check_demonstrations(config: RunConfig, spec: WorldSpec) -> None:
-    """Opens the dataset that a memory is to begin with, and says if it cannot.
-
-    Raises:
-        InputError: there is no such dataset.
-    """
-    from accerl_lerobot.demos.dataset_files import open_metadata
+def _say_if_unlike(config: RunConfig, spec: WorldSpec, meta: Any, history: int) -> None:
+    """Warns of a dataset whose episodes off-policy learning cannot remember."""
     from accerl_lerobot.trainer.demonstrations import unlike
 
-    if config.dataset.repo_id is None:
-        return
-    wanted: dict[str, tuple[int, ...]] = {STATE: (spec.state_dim,), ACTION: (spec.action_dim,)}
-    wanted |= spec.images
+    wanted: dict[str, tuple[int, ...]] = {STATE: (spec.state_dim,), **spec.images}
     if config.env.state_size:
         wanted[ENV_STATE] = (config.env.state_size,)
-    if (why := unlike(open_metadata(config.dataset), wanted)) is not None:
+    if history > 1:
+        wanted = {name: (history, *shape) for name, shape in wanted.items()}
+    if (why := unlike(meta, wanted | {ACTION: (spec.action_dim,)})) is not None:
         logger.warning("%s does not join the memory: %s", config.dataset.repo_id, why)
 
 

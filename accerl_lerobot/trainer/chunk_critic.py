@@ -110,9 +110,10 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         if self.version < self.config.value_warmup_updates or not len(won):
             return {}
         self._scale_states()
+        returns = self.memory["return"]
+        bounds = float(returns.min()), float(returns.max())
         if not self.teacher.ready:
-            self._begin(won)
-        bounds = self._bounds()
+            self._begin(won, bounds)
         metrics = mean(
             self._critic_step(bounds) for _ in self.steps("critic", self.algorithm.critic_steps, new)
         )
@@ -167,12 +168,7 @@ class ChunkCriticUpdate(OffPolicyUpdate):
         self.teacher.mean.copy_(torch.from_numpy(states.mean(0, dtype=np.float64)))
         self.teacher.std.copy_(torch.from_numpy(states.std(0, dtype=np.float64).clip(1e-3)))
 
-    def _bounds(self) -> tuple[float, float]:
-        """Smallest and largest return seen."""
-        returns = self.memory["return"]
-        return float(returns.min()), float(returns.max())
-
-    def _begin(self, won: np.ndarray) -> None:
+    def _begin(self, won: np.ndarray, bounds: tuple[float, float]) -> None:
         """The teacher learns to do what succeeded so far, or all that was done if that is little."""
         chunks = self.memory["chunk"]
         low, high = (torch.from_numpy(end) for end in (chunks.min((0, 1)), chunks.max((0, 1))))
@@ -187,7 +183,7 @@ class ChunkCriticUpdate(OffPolicyUpdate):
             self._descend("teacher", loss)
         # Or the teacher would at once climb a critic that knows nothing.
         for _ in range(min(len(self.memory), MOST_FIRST)):
-            self._critic_step(self._bounds())
+            self._critic_step(bounds)
         with torch.no_grad():
             self.teacher.ready.fill_(1)
 

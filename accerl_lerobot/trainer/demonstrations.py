@@ -8,11 +8,12 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.demos.dataset_files import frames_of, open_metadata, opened, pixels_of
 from accerl_lerobot.experience import REWARD, SUCCESS, Origin, Segment
 from accerl_lerobot.policies.config import Load, PolicyConfig
 
@@ -64,73 +65,69 @@ def demonstrations(dataset: DatasetConfig, decision_cost: float, like: Segment) 
         decision_cost: taken off each decision's reward, as of explored ones.
         like: an explored episode, of which names and shapes are taken.
     """
-    from accerl_lerobot.demos.dataset_files import checked, open_metadata, origin_of
-
     meta = open_metadata(dataset)
     wanted = {name: rows.shape[1:] for name, rows in like.observations.items()}
     wanted["action"] = like.actions.shape[2:]
     if (why := unlike(meta, wanted)) is not None:
         logger.warning("%s does not join the memory: %s", dataset.repo_id, why)
         return
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
     chunk = like.actions.shape[1]
     phases = min(chunk, max(1, ROWS * chunk // meta.total_frames))
     share = min(1.0, min(ROWS * chunk, FRAMES) / meta.total_frames)
-    episodes = math.ceil(share * meta.total_episodes)
-    with checked(origin_of(dataset)):
-        data = LeRobotDataset(
-            meta.repo_id,
-            root=meta.root,
-            revision=meta.revision,
-            episodes=list(range(episodes)),
-            video_backend="pyav",
-        )
-        for index in range(episodes):
-            first, last = (int(meta.episodes[index][f"dataset_{end}_index"]) for end in ("from", "to"))
-            frames = [data[i] for i in range(first, last)]
-            won = next((i for i, frame in enumerate(frames) if SUCCESS in frame and frame[SUCCESS]), None)
-            if won is not None:
-                frames = frames[: won + 1]
-            success = won is not None or SUCCESS not in meta.features
-            for phase in range(min(phases, len(frames))):
-                segment = _segment(frames, wanted, phase, chunk, success)
-                segment.reward -= np.float32(decision_cost)
-                yield segment
+    episodes = range(math.ceil(share * meta.total_episodes))
+    with opened(dataset, meta, episodes) as data:
+        for index in episodes:
+            episode = _episode(frames_of(data, index), wanted)
+            for phase in range(min(phases, len(episode.rewards))):
+                yield _segment(episode, phase, chunk, decision_cost)
 
 
-def _segment(
-    frames: list[Any], wanted: dict[str, tuple[int, ...]], phase: int, chunk: int, success: bool
-) -> Segment:
-    """The decisions of an episode of those frames, from env step `phase` on."""
-    end = len(frames)
+class _Episode(NamedTuple):
+    """An episode up to its first success, T env steps."""
+
+    columns: dict[str, np.ndarray]
+    """Observations and actions, each (T, ...)."""
+    rewards: np.ndarray
+    """float32 (T,)."""
+    success: bool
+    task: str
+
+
+def _episode(frames: Iterator[dict[str, Any]], wanted: dict[str, tuple[int, ...]]) -> _Episode:
+    rows: list[dict[str, np.ndarray]] = []
+    rewards: list[float] = []
+    for frame in frames:
+        rows.append({name: _array(frame[name], shape) for name, shape in wanted.items()})
+        rewards.append(float(frame.get(REWARD, 0.0)))
+        task, success = str(frame["task"]), bool(frame.get(SUCCESS, True))
+        if SUCCESS in frame and success:
+            break
+    if REWARD not in frame:
+        rewards[-1] = float(success)
+    columns = {name: np.stack([row[name] for row in rows]) for name in wanted}
+    return _Episode(columns, np.array(rewards, np.float32), success, task)
+
+
+def _segment(episode: _Episode, phase: int, chunk: int, decision_cost: float) -> Segment:
+    """The decisions of an episode from env step `phase` on."""
+    end = len(episode.rewards)
     starts = np.arange(phase, end, chunk)
-    actions = np.stack([frame["action"].numpy().reshape(wanted["action"]) for frame in frames])
-    steps = np.minimum(chunk, end - starts)
     t = len(starts)
-    rewards: np.ndarray = np.zeros(end, np.float32)
-    rewards[-1] = float(success)
-    if REWARD in frames[0]:
-        rewards = np.array([float(frame[REWARD]) for frame in frames], np.float32)
-    reward = np.add.reduceat(rewards, starts)
+    reward = np.add.reduceat(episode.rewards, starts)
     seen = [*starts, end - 1]
     return Segment(
-        observations={
-            name: np.stack([_array(frames[i][name], shape) for i in seen])
-            for name, shape in wanted.items()
-            if name != "action"
-        },
-        task=str(frames[0]["task"]),
+        observations={name: rows[seen] for name, rows in episode.columns.items() if name != "action"},
+        task=episode.task,
         latent={},
         log_prob=np.zeros((t, 0), np.float32),
         value=np.zeros(t, np.float32),
-        actions=actions.astype(np.float32)[np.minimum(starts[:, None] + np.arange(chunk), end - 1)],
-        reward=reward,
+        actions=episode.columns["action"][np.minimum(starts[:, None] + np.arange(chunk), end - 1)],
+        reward=reward - np.float32(decision_cost),
         version=np.zeros(t, np.int64),
-        steps=steps,
+        steps=np.minimum(chunk, end - starts),
         terminated=True,
         truncated=False,
-        success=success,
+        success=episode.success,
         key="demonstration",
         origin=Origin(task="", seed=0, decision=0),
         episode={"return": float(reward.sum()), "decisions": float(t)},
@@ -141,5 +138,4 @@ def _array(value: Any, shape: tuple[int, ...]) -> np.ndarray:
     """A frame's numbers, uint8 (H, W, C) of an image, as environments give them."""
     if len(shape) < 3:
         return np.asarray(value.numpy(), np.float32).reshape(shape)
-    pixels: np.ndarray = (value * 255).round().clamp(0, 255).byte().permute(1, 2, 0).numpy()
-    return pixels
+    return pixels_of(value)

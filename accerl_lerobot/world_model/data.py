@@ -20,16 +20,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from accerl_lerobot.checkpoint.snapshot import kind
-from accerl_lerobot.demos.dataset_files import checked, open_metadata, origin_of
+from accerl_lerobot.demos.dataset_files import frames_of, open_metadata, opened, pixels_of
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.experience import TASK, Observation
+from accerl_lerobot.experience import SUCCESS, TASK, Observation
 
 if TYPE_CHECKING:
     from accerl_lerobot.config.dataset import DatasetConfig
     from accerl_lerobot.envs.base import WorldSpec
     from accerl_lerobot.world_model.contract import WorldModelSpec
-
-SUCCESS = "next.success"
 
 
 @kind
@@ -326,13 +324,9 @@ def load_episodes(
     """
     meta = open_metadata(dataset)
     check_metadata(meta, dataset.repo_id or "", spec)
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
     indices = range(meta.total_episodes) if only is None else only
-    with checked(origin_of(dataset)):
-        # The default probes for FFmpeg's libraries, and prints their tracebacks where there are none.
-        data = LeRobotDataset(meta.repo_id, root=meta.root, revision=meta.revision, video_backend="pyav")
-        episodes = [_episode(data, meta, index, spec, source) for index in indices]
+    with opened(dataset, meta) as data:
+        episodes = [_episode(data, index, spec, source) for index in indices]
     remedies = {True: "add episodes that succeed", False: "add failures, see demos.failure_share"}
     for outcome, remedy in remedies.items() if both else ():
         if not any(e.success is outcome for e in episodes):
@@ -380,15 +374,14 @@ def check_metadata(meta: Any, name: str, spec: WorldModelSpec) -> None:
         raise refuse("a single episode; at least one to train on and one to hold out are needed")
 
 
-def _episode(data: Any, meta: Any, index: int, spec: WorldModelSpec, source: str) -> Episode:
-    first, last = (int(meta.episodes[index][f"dataset_{end}_index"]) for end in ("from", "to"))
-    items = [data[i] for i in range(first, last)]
+def _episode(data: Any, index: int, spec: WorldModelSpec, source: str) -> Episode:
+    items = list(frames_of(data, index))
     success = np.array([bool(item[SUCCESS]) for item in items])
     state = [item["observation.state"].numpy() if spec.state_dim else np.zeros(0) for item in items]
-    images = [np.stack([_bytes(item[camera]) for item in items]) for camera in spec.cameras]
+    images = [np.stack([pixels_of(item[camera]) for item in items]) for camera in spec.cameras]
     actions = np.stack([item["action"].numpy() for item in items])
     if not (np.isfinite(actions).all() and np.isfinite(np.stack(state)).all()):
-        raise InputError("dataset.repo_id", meta.repo_id, f"episode {index} has a NaN state or action")
+        raise InputError("dataset.repo_id", data.repo_id, f"episode {index} has a NaN state or action")
     return Episode(
         frames=np.stack([resize(frames, spec.image_size) for frames in images], 1),
         times=np.arange(len(items)),
@@ -398,9 +391,3 @@ def _episode(data: Any, meta: Any, index: int, spec: WorldModelSpec, source: str
         task=str(items[0]["task"]),
         source=source,
     )
-
-
-def _bytes(image: Any) -> np.ndarray:
-    """uint8 (h, w, 3) from LeRobot's float (3, h, w) in [0, 1]."""
-    bytes_: np.ndarray = (image * 255).round().clamp(0, 255).byte().permute(1, 2, 0).numpy()
-    return bytes_

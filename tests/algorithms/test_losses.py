@@ -19,8 +19,6 @@ from accerl_lerobot.algorithms import (
     LossInputs,
     PPOConfig,
     SAPOConfig,
-    gipo_loss,
-    ppo_loss,
 )
 from accerl_lerobot.algorithms.ratio import LOG_RATIO_CLAMP
 from tests.algorithms import oracle
@@ -111,12 +109,12 @@ def test_equals_the_oracle_for_tokens_of_which_some_do_not_exist(config: Algorit
 
 def test_gipo_by_hand() -> None:
     # ρ = 2: log ρ = 0.693147, ω = exp(−½·0.480453) = 0.786450, −ω·ρ·Â = −0.786450·2·3
-    loss = gipo_loss(one(math.log(2.0), 3.0), GIPOConfig(sigma=1.0, kl_coef=0.0)).loss
+    loss = GIPOConfig(sigma=1.0, kl_coef=0.0).loss(one(math.log(2.0), 3.0)).loss
     assert loss.item() == pytest.approx(-4.718699, abs=1e-6)
     # σ₋ = 0.5: ω = exp(−½·(1.386294)²) = 0.382546
     config = GIPOConfig(sigma=1.0, sigma_negative=0.5, kl_coef=0.0)
-    assert gipo_loss(one(math.log(2.0), -3.0), config).loss.item() == pytest.approx(2.295277, abs=1e-6)
-    assert gipo_loss(one(math.log(2.0), 3.0), config).loss.item() == pytest.approx(-4.718699, abs=1e-6)
+    assert config.loss(one(math.log(2.0), -3.0)).loss.item() == pytest.approx(2.295277, abs=1e-6)
+    assert config.loss(one(math.log(2.0), 3.0)).loss.item() == pytest.approx(-4.718699, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -131,7 +129,7 @@ def test_gipo_by_hand() -> None:
 )
 def test_ppo_by_hand(rho: float, advantage: float, expected: float, moves: bool) -> None:
     inputs = one(math.log(rho), advantage)
-    output = ppo_loss(inputs, PPOConfig())
+    output = PPOConfig().loss(inputs)
     assert output.loss.item() == pytest.approx(expected, abs=1e-12)
     assert (gradient(inputs, output.loss).abs().item() > 0) is moves
     assert output.metrics["low_weight"].item() == float(not moves)
@@ -152,7 +150,7 @@ def test_gipo_gradient_is_that_of_importance_sampling_with_the_weight_held_still
     parameter."""
     inputs = make_inputs(spread=0.6)
     config = GIPOConfig(level=level, sigma=0.7, sigma_negative=0.4, kl_coef=0.0, value_coef=0.0)
-    got = gradient(inputs, gipo_loss(inputs, config).loss)
+    got = gradient(inputs, config.loss(inputs).loss)
     advantage = inputs.advantage.numpy()[:, None]
     width = np.where(advantage > 0, 0.7, 0.4)
 
@@ -193,13 +191,13 @@ def test_only_the_value_term_moves_the_critic(config: AlgorithmConfig) -> None:
 
 def test_the_entropy_bonus_raises_entropy() -> None:
     inputs = make_inputs()
-    (slope,) = torch.autograd.grad(gipo_loss(inputs, GIPOConfig(entropy_coef=0.1)).loss, inputs.entropy)
+    (slope,) = torch.autograd.grad(GIPOConfig(entropy_coef=0.1).loss(inputs).loss, inputs.entropy)
     assert torch.allclose(slope, torch.full_like(slope, -0.1 / 12))
 
 
 def test_an_unused_entropy_may_be_undefined() -> None:
     inputs = make_inputs(entropy=torch.full((12,), torch.nan, dtype=torch.float64))
-    assert gipo_loss(inputs, GIPOConfig()).loss.isfinite()
+    assert GIPOConfig().loss(inputs).loss.isfinite()
 
 
 @each_config

@@ -17,11 +17,6 @@ from accerl_lerobot.algorithms import (
     ImportanceConfig,
     PPOConfig,
     SAPOConfig,
-    awr_loss,
-    decoupled_loss,
-    importance_loss,
-    ppo_loss,
-    sapo_loss,
 )
 from tests.algorithms.inputs import gradient, make_inputs, one
 
@@ -55,7 +50,7 @@ def test_decoupled_by_hand(
     rho: float, proximal: float, advantage: float, expected: float, kept: bool
 ) -> None:
     inputs = one(math.log(rho), advantage, math.log(proximal))
-    output = decoupled_loss(inputs, DecoupledConfig())
+    output = DecoupledConfig().loss(inputs)
     assert output.loss.item() == pytest.approx(expected, abs=1e-12)
     # What is kept has the gradient of importance sampling.
     assert pull(DecoupledConfig(), rho, advantage, proximal) == pytest.approx(rho * advantage * kept)
@@ -70,13 +65,13 @@ def test_decoupled_with_its_own_proximal_weights_is_the_weighted_policy_gradient
     w = torch.where(w > 2.0, 0.0, w)
     assert (w == 0.0).any()
     expected = gradient(inputs, -(w * inputs.log_prob_new * inputs.advantage[:, None]).mean())
-    torch.testing.assert_close(gradient(inputs, decoupled_loss(inputs, DecoupledConfig()).loss), expected)
+    torch.testing.assert_close(gradient(inputs, DecoupledConfig().loss(inputs).loss), expected)
 
 
 def test_decoupled_from_the_behaviour_policy_is_ppo() -> None:
     inputs = make_inputs(spread=0.5)
     inputs = make_inputs(spread=0.5, log_prob_proximal=inputs.log_prob_old)
-    expected, got = ppo_loss(inputs, PPOConfig()), decoupled_loss(inputs, DecoupledConfig())
+    expected, got = PPOConfig().loss(inputs), DecoupledConfig().loss(inputs)
     assert got.metrics["clip_fraction"] > 0
     for name, metric in expected.metrics.items():
         torch.testing.assert_close(got.metrics[name], metric, msg=name)
@@ -86,13 +81,13 @@ def test_the_proximal_policy_gets_no_gradient() -> None:
     inputs = make_inputs()
     assert inputs.log_prob_proximal is not None
     proximal = inputs.log_prob_proximal.clone().requires_grad_()
-    decoupled_loss(make_inputs(log_prob_proximal=proximal), DecoupledConfig()).loss.backward()
+    DecoupledConfig().loss(make_inputs(log_prob_proximal=proximal)).loss.backward()
     assert proximal.grad is None
 
 
 def test_the_clip_fraction_of_decoupled_ppo_is_of_what_it_clips() -> None:
-    near = decoupled_loss(one(math.log(1.9), 1.0, math.log(1.8)), DecoupledConfig()).metrics
-    far = decoupled_loss(one(math.log(1.9), 1.0, 0.0), DecoupledConfig()).metrics
+    near = DecoupledConfig().loss(one(math.log(1.9), 1.0, math.log(1.8))).metrics
+    far = DecoupledConfig().loss(one(math.log(1.9), 1.0, 0.0)).metrics
     assert near["clip_fraction"].item() == 0.0 and far["clip_fraction"].item() == 1.0
     assert near["ratio_max_dev"].item() == pytest.approx(0.9)  # the ratio to μ, in both
     assert far["ratio_max_dev"].item() == pytest.approx(0.9)
@@ -100,7 +95,7 @@ def test_the_clip_fraction_of_decoupled_ppo_is_of_what_it_clips() -> None:
 
 def test_decoupled_needs_proximal_log_probs() -> None:
     with pytest.raises(ValueError, match="log_prob_proximal is needed"):
-        decoupled_loss(make_inputs(log_prob_proximal=None), DecoupledConfig())
+        DecoupledConfig().loss(make_inputs(log_prob_proximal=None))
 
 
 def test_only_decoupled_asks_for_proximal_weights() -> None:
@@ -114,10 +109,10 @@ def test_only_decoupled_asks_for_proximal_weights() -> None:
 
 def test_sapo_by_hand() -> None:
     # ρ = 2, τ = 1: 4·σ(1) = 4·0.731059; times Â = 3
-    assert sapo_loss(one(math.log(2.0), 3.0), SAPOConfig()).loss.item() == pytest.approx(-8.772703, abs=1e-6)
+    assert SAPOConfig().loss(one(math.log(2.0), 3.0)).loss.item() == pytest.approx(-8.772703, abs=1e-6)
     # τ₋ = 2: (4/2)·σ(2) = 2·0.880797; times Â = −3
     config = SAPOConfig(tau_negative=2.0)
-    assert sapo_loss(one(math.log(2.0), -3.0), config).loss.item() == pytest.approx(5.284782, abs=1e-6)
+    assert config.loss(one(math.log(2.0), -3.0)).loss.item() == pytest.approx(5.284782, abs=1e-6)
 
 
 @pytest.mark.parametrize("tau", [0.5, 1.0, 4.0])
@@ -132,19 +127,17 @@ def test_sapo_gradient_weight(tau: float, advantage: float) -> None:
 
 
 def test_sapo_measures_its_gate() -> None:
-    metrics = sapo_loss(one(math.log(5.0), 1.0), SAPOConfig(tau_positive=1.0)).metrics
+    metrics = SAPOConfig(tau_positive=1.0).loss(one(math.log(5.0), 1.0)).metrics
     assert metrics["low_weight"].item() == 1.0  # 4·σ(4)·σ(−4) = 0.07
-    assert sapo_loss(one(math.log(4.0), 1.0), SAPOConfig()).metrics["low_weight"].item() == 0.0  # 0.18
+    assert SAPOConfig().loss(one(math.log(4.0), 1.0)).metrics["low_weight"].item() == 0.0  # 0.18
 
 
 # ---- importance sampling
 
 
 def test_importance_by_hand() -> None:
-    assert importance_loss(one(math.log(4.0), 3.0), ImportanceConfig()).loss.item() == pytest.approx(-12.0)
-    assert importance_loss(one(math.log(4.0), 3.0), ImportanceConfig(cap=1.5)).loss.item() == pytest.approx(
-        -4.5
-    )
+    assert ImportanceConfig().loss(one(math.log(4.0), 3.0)).loss.item() == pytest.approx(-12.0)
+    assert ImportanceConfig(cap=1.5).loss(one(math.log(4.0), 3.0)).loss.item() == pytest.approx(-4.5)
 
 
 @pytest.mark.parametrize("cap", [None, 1.0, 2.0])
@@ -155,7 +148,7 @@ def test_importance_gradient_weight(cap: float | None, advantage: float) -> None
     for rho in RATIOS:
         expected = min(rho, math.inf if cap is None else cap) * advantage
         assert pull(config, rho, advantage) == pytest.approx(expected, rel=1e-12)
-        loss = importance_loss(one(math.log(rho), advantage), config).loss.item()
+        loss = config.loss(one(math.log(rho), advantage)).loss.item()
         assert -loss == pytest.approx(expected, rel=1e-12)
 
 
@@ -169,9 +162,9 @@ def test_a_cap_reaches_samples_beyond_the_clamp() -> None:
 
 def test_awr_by_hand() -> None:
     # −min(exp(Â/β), cap)·log π, with log π = −0.5: exp(2/1) = 7.389056
-    assert awr_loss(one(-0.5, 2.0), AWRConfig()).loss.item() == pytest.approx(3.694528, abs=1e-6)
-    assert awr_loss(one(-0.5, 2.0), AWRConfig(beta=0.5)).loss.item() == pytest.approx(10.0)  # e⁴ is above 20
-    assert awr_loss(one(-0.5, -2.0), AWRConfig(beta=0.5)).loss.item() == pytest.approx(0.5 * math.exp(-4))
+    assert AWRConfig().loss(one(-0.5, 2.0)).loss.item() == pytest.approx(3.694528, abs=1e-6)
+    assert AWRConfig(beta=0.5).loss(one(-0.5, 2.0)).loss.item() == pytest.approx(10.0)  # e⁴ is above 20
+    assert AWRConfig(beta=0.5).loss(one(-0.5, -2.0)).loss.item() == pytest.approx(0.5 * math.exp(-4))
 
 
 def test_awr_gradient_weight_does_not_depend_on_the_ratio() -> None:
@@ -186,13 +179,13 @@ def test_awr_with_an_infinite_temperature_is_behaviour_cloning() -> None:
     for level, terms in (("action", inputs.log_prob_new.mean(1)), ("chunk", inputs.log_prob_new.sum(1))):
         config = AWRConfig(beta=math.inf, level=level)  # type: ignore[arg-type]
         expected = gradient(inputs, -terms.mean())
-        torch.testing.assert_close(gradient(inputs, awr_loss(inputs, config).loss), expected)
+        torch.testing.assert_close(gradient(inputs, config.loss(inputs).loss), expected)
 
 
 def test_awr_measures_its_own_weights() -> None:
     advantage = torch.tensor([math.log(3.0), 0.0, -3.0], dtype=torch.float64)
     inputs = make_inputs(n=3, factors=1, advantage=advantage)
-    metrics = awr_loss(inputs, AWRConfig()).metrics
+    metrics = AWRConfig().loss(inputs).metrics
     weights = np.array([3.0, 1.0, math.exp(-3.0)])
     assert metrics["ess"].item() == pytest.approx(weights.sum() ** 2 / (3 * (weights**2).sum()))
     assert metrics["low_weight"].item() == pytest.approx(1 / 3)

@@ -303,7 +303,7 @@ def test_an_episode_is_the_one_that_stock_lerobot_plays(looking: Path):
     assert steps == 13 and decisions == 5
 
 
-def config_for(path: Path, output_dir: Path, **rooms: object) -> RunConfig:
+def config_for(path: Path, output_dir: Path, **sections: object) -> RunConfig:
     defaults = {
         "env": WORLD,
         "policy": PolicyConfig(path=str(path), device="cpu", sampler=DiffusionSamplerConfig(std_min=0.3)),
@@ -312,7 +312,7 @@ def config_for(path: Path, output_dir: Path, **rooms: object) -> RunConfig:
         "evaluation": EvaluationConfig(episodes=4, videos=0, before=False),
         "output_dir": str(output_dir),
     }
-    return tiny_run(path, **(defaults | rooms))
+    return tiny_run(path, **(defaults | sections))
 
 
 def test_a_run_asks_the_policy_how_far_it_looks_back(looking: Path, tmp_path: Path):

@@ -403,7 +403,7 @@ def test_what_is_not_finite_is_skipped_and_ends_the_run(tiny_checkpoint: Path):
     assert all(np.array_equal(before[name], after[name]) for name in before if name.startswith("policy."))
 
 
-ROOMS: dict[str, Any] = {
+SECTIONS: dict[str, Any] = {
     "env": ENV,
     "algorithm": ChunkCriticConfig(),
     "rollout": RolloutConfig(worlds=4, segment_length=4),
@@ -412,7 +412,7 @@ ROOMS: dict[str, Any] = {
 
 
 @pytest.mark.parametrize(
-    ("rooms", "message"),
+    ("sections", "message"),
     [
         ({"env": SimulatedConfig()}, r"algorithm\.type='chunk_critic': .*add --env\.environment_state=true"),
         ({"replay": ReplayConfig(samples_per_insert=2.0)}, r"replay\.samples_per_insert=2\.0: .*use 1\.0"),
@@ -422,7 +422,7 @@ ROOMS: dict[str, Any] = {
         ({"rollout": RolloutConfig(segment_length=3)}, r"rollout\.segment_length=3: .*use at least 4"),
     ],
 )
-def test_what_it_cannot_learn_from_is_refused(tiny_checkpoint: Path, rooms: dict[str, Any], message: str):
+def test_what_it_cannot_learn_from_is_refused(tiny_checkpoint: Path, sections: dict[str, Any], message: str):
     policy = PolicyConfig(path=str(tiny_checkpoint), device="cpu")
     with pytest.raises(InputError, match=message):
-        check_start(tiny_run(tiny_checkpoint, **ROOMS | {"policy": policy} | rooms))
+        check_start(tiny_run(tiny_checkpoint, **SECTIONS | {"policy": policy} | sections))

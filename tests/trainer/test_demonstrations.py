@@ -14,9 +14,10 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from accerl_lerobot.algorithms import AlgorithmConfig, ChunkCriticConfig, SelfImitationConfig
 from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.demos.dataset_files import open_metadata
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.demos.sft import SFTConfig, run_sft
-from accerl_lerobot.engine.preflight import check_start
+from accerl_lerobot.engine.preflight import _say_if_unlike, check_start
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, Origin, Segment
@@ -28,7 +29,7 @@ from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.demonstrations import WithDemonstrations, demonstrations
 from tests.runs import tiny_run
-from tests.trainer.test_chunk_critic import ROOMS
+from tests.trainer.test_chunk_critic import SECTIONS
 
 ENV = SimulatedConfig(max_steps=16, environment_state=True)
 K, COST = 4, 0.25
@@ -149,12 +150,18 @@ def test_they_are_looked_at_before_the_run_begins(
     tmp_path: Path,
     caplog: pytest.LogCaptureFixture,
 ):
-    rooms = ROOMS | {"algorithm": algorithm, "env": ENV, "dataset": dataset}
-    config = tiny_run(tiny_checkpoint, **rooms)
+    sections = SECTIONS | {"algorithm": algorithm, "env": ENV, "dataset": dataset}
+    config = tiny_run(tiny_checkpoint, **sections)
     with caplog.at_level(logging.WARNING):
         check_start(config)
         assert "does not join" not in caplog.text
         check_start(replace(config, env=replace(ENV, image_size=48)))
-    assert "does not join the memory: the dataset's observation.images.front has shape" in caplog.text
+        assert "does not join the memory: the dataset's observation.images.front has shape" in caplog.text
+        meta, spec = open_metadata(dataset), make_world(ENV).spec
+        caplog.clear()
+        _say_if_unlike(config, spec, meta, history=1)
+        assert not caplog.text
+        _say_if_unlike(config, spec, meta, history=2)
+    assert "the dataset's observation.state has shape (4,), the environment's (2, 4)" in caplog.text
     with pytest.raises(InputError, match=r"^dataset\.root="):
         check_start(replace(config, dataset=DatasetConfig(repo_id="a/b", root=str(tmp_path))))
