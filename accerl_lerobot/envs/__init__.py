@@ -11,6 +11,7 @@ from typing import Any
 
 from accerl_lerobot.envs.base import ChunkResult, EnvConfig, HistoryWorld, World, WorldSpec
 from accerl_lerobot.envs.lerobot_env import LeRobotEnvConfig, LeRobotWorld
+from accerl_lerobot.envs.libero import LiberoConfig, LiberoWorld
 from accerl_lerobot.envs.metaworld import MetaWorld, MetaWorldConfig
 from accerl_lerobot.envs.simulated import SimulatedConfig, SimulatedWorld
 from accerl_lerobot.errors import InputError
@@ -21,6 +22,8 @@ __all__ = [
     "HistoryWorld",
     "LeRobotEnvConfig",
     "LeRobotWorld",
+    "LiberoConfig",
+    "LiberoWorld",
     "MetaWorld",
     "MetaWorldConfig",
     "SimulatedConfig",
@@ -32,6 +35,7 @@ __all__ = [
 
 _WORLDS: dict[type[EnvConfig], Callable[[Any], World]] = {
     LeRobotEnvConfig: LeRobotWorld,
+    LiberoConfig: LiberoWorld,
     MetaWorldConfig: MetaWorld,
     SimulatedConfig: SimulatedWorld,
 }

@@ -11,20 +11,16 @@ from __future__ import annotations
 
 import io
 import math
-import os
 import re
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
-from importlib.util import find_spec
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import yaml
 
-from accerl_lerobot.checkpoint.layout import write_atomically
 from accerl_lerobot.config.ranges import Range
 from accerl_lerobot.envs.base import ChunkResult, EnvConfig, World, WorldSpec, checked_actions
+from accerl_lerobot.envs.libero_tasks import configure
 from accerl_lerobot.envs.metaworld import close_at_exit, import_mujoco
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Observation
@@ -82,7 +78,7 @@ class LeRobotWorld(World):
         if config.name in _NEEDS_MUJOCO:
             import_mujoco()
         if config.name.startswith("libero"):
-            _configure_libero()
+            configure()
         from lerobot.envs.configs import EnvConfig as LeRobotConfig
         from lerobot.envs.factory import make_env
 
@@ -219,24 +215,6 @@ class LeRobotWorld(World):
             if isinstance(text := getattr(env, name, None), str) and text:
                 return text
         return self.config.task
-
-
-def _configure_libero() -> None:
-    """Writes the file without which the first import of LIBERO asks the terminal where its data is."""
-    given = Path(os.environ.get("LIBERO_CONFIG_PATH", "~/.libero")).expanduser()
-    if (given / "config.yaml").is_file() or find_spec("libero") is None:
-        return
-    package = find_spec("libero.libero")
-    assert package is not None and package.submodule_search_locations is not None
-    root = Path(package.submodule_search_locations[0])
-    folders = {"bddl_files": "bddl_files", "init_states": "init_files", "assets": "assets"}
-    paths = {"benchmark_root": str(root), "datasets": str(root.parent / "datasets")}
-    paths |= {key: str(root / folder) for key, folder in folders.items()}
-    ours = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "accerl-lerobot" / "libero"
-    ours.mkdir(parents=True, exist_ok=True)
-    if not (file := ours / "config.yaml").is_file() or yaml.safe_load(file.read_text()) != paths:
-        write_atomically(file, yaml.safe_dump(paths))
-    os.environ["LIBERO_CONFIG_PATH"] = str(ours)
 
 
 def _check_hub(config: LeRobotEnvConfig, hub_path: str | None) -> None:

@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""LIBERO (Liu et al., 2023), stepped a chunk at a time and rendered once per decision.
+
+Observations and actions are those of LeRobot's own environment: a policy that was trained on LeRobot's LIBERO
+datasets acts here as it is. Importing this file loads neither MuJoCo nor LIBERO.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Annotated, Literal
+
+import numpy as np
+
+from accerl_lerobot.config.ranges import Range
+from accerl_lerobot.envs.base import ChunkResult, EnvConfig, World, WorldSpec, checked_actions
+from accerl_lerobot.envs.libero_simulator import FPS, MAX_OBJECTS, OBJECT_NUMBERS, ROBOT_NUMBERS, Simulator
+from accerl_lerobot.envs.libero_tasks import instruction, resolve
+from accerl_lerobot.errors import InputError, expanded
+from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
+
+CAMERAS = {"agentview": "image", "robot0_eye_in_hand": "image2"}
+"""LeRobot's names of the two cameras that policies see."""
+STATE_DIM = 8
+ACTION_DIM = 7
+
+
+@EnvConfig.register_subclass("libero")
+@dataclass(frozen=True, kw_only=True)
+class LiberoConfig(EnvConfig):
+    """Which LIBERO tasks, seen how.
+
+    Evaluation begins at the 50 recorded states of a task, demonstrations and exploration at placements drawn
+    from the task's own regions, so that no evaluated start is trained on.
+
+    Example:
+        >>> LiberoConfig(task="libero_object/0,libero_object/3").tasks
+        ('libero_object/0', 'libero_object/3')
+    """
+
+    task: str = "libero_object"
+    """Suites (libero_spatial, libero_object, libero_goal, libero_10, libero_90), or single tasks such as
+    libero_object/3 with LIBERO's numbers, separated by commas."""
+    camera: str = "agentview,robot0_eye_in_hand"
+    """Camera names separated by commas. These two become ``observation.images.image`` and ``.image2``, as in
+    LeRobot, others ``observation.images.<name>``."""
+    image_size: Annotated[int, Range("[32, 480]")] = 256
+    """Height and width of every image in pixels."""
+    max_steps: Annotated[int, Range("[1, 1000]")] = 280
+    """Episode limit in env steps. LeRobot has 280 for libero_spatial and libero_object, 300 for libero_goal,
+    520 for libero_10, 400 for libero_90."""
+    rendering: Literal["stock", "fast"] = "stock"
+    """``stock`` (LeRobot's pixels) or ``fast`` (no shadows, reflections or multisampling, and coarser meshes:
+    several times faster in software)."""
+    assets: str = ""
+    """Folder of LIBERO's meshes and textures; if empty, the installed package's or, where it has none, a copy
+    of those on the Hub."""
+    environment_state: bool = False
+    """True if observations hold ``observation.environment_state``: joints and hand of the robot, poses of the
+    objects that the task is about, and the share of `max_steps` gone. For ``algorithm.type=chunk_critic``."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if find_spec("libero") is not None:
+            resolve(self.task)
+        if not self.cameras or len(set(self.cameras)) < len(self.cameras):
+            raise InputError("env.camera", self.camera, "name each camera once, separated by commas")
+        if self.assets and not (expanded(self.assets, "env.assets") / "scenes").is_dir():
+            raise InputError("env.assets", self.assets, "no folder of LIBERO's assets: it holds no scenes/")
+
+    @property
+    def state_size(self) -> int:
+        """See the base class."""
+        return ROBOT_NUMBERS + MAX_OBJECTS * OBJECT_NUMBERS + 1 if self.environment_state else 0
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """The tasks that `task` stands for, ``suite/number``."""
+        return resolve(self.task)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The camera names that `camera` stands for."""
+        return tuple(name.strip() for name in self.camera.split(",") if name.strip())
+
+
+def image_key(camera: str) -> str:
+    """Name under which observations hold a camera's image."""
+    return f"observation.images.{CAMERAS.get(camera, camera)}"
+
+
+class LiberoWorld(World):
+    """One LIBERO instance; its simulators are built on first use of a task, then kept.
+
+    Args:
+        config: What to simulate.
+    """
+
+    def __init__(self, config: LiberoConfig) -> None:
+        for package in ("libero", "mujoco"):
+            if find_spec(package) is None:
+                raise ModuleNotFoundError(f"No module named {package!r}", name=package)
+        self.config = config
+        size = config.image_size
+        self.spec = WorldSpec(
+            images={image_key(camera): (size, size, 3) for camera in config.cameras},
+            state_dim=STATE_DIM,
+            action_dim=ACTION_DIM,
+            action_low=np.full(ACTION_DIM, -1, np.float32),
+            action_high=np.full(ACTION_DIM, 1, np.float32),
+            fps=FPS,
+            max_steps=config.max_steps,
+            tasks=config.tasks,
+            instructions=tuple(map(instruction, config.tasks)),
+        )
+        self._simulators: dict[str, Simulator] = {}
+        self._task = ""
+        self._steps = 0
+        self._success = False
+        self._done = True
+
+    @property
+    def simulator(self) -> Simulator:
+        """That of the current task; for experts, not for policies."""
+        return self._simulators[self._task]
+
+    def reset(self, seed: int, task: str) -> Observation:
+        if task not in self.spec.tasks:
+            raise InputError("task", task, f"this world has: {', '.join(self.spec.tasks)}")
+        if not 0 <= seed < 2**32:
+            raise InputError("seed", seed, "use 0 to 2**32 - 1")
+        self._done = True  # until the new episode stands: an error below leaves a world that must be reset
+        if task not in self._simulators:
+            self._simulators[task] = Simulator(task, self.config.rendering, self.config.assets)
+        self._simulators[task].reset(seed)
+        self._task, self._steps, self._success, self._done = task, 0, False, False
+        return self._observe()
+
+    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
+        if self._done:
+            raise RuntimeError("the episode is over: call reset before step_chunk")
+        actions = checked_actions(actions, self.spec)
+        rewards, nonfinite = [], False
+        for action in actions:
+            succeeded = self.simulator.step(action)
+            self._steps += 1
+            nonfinite = not self.simulator.finite
+            succeeded &= not nonfinite
+            rewards.append(1.0 if succeeded and not self._success else 0.0)
+            self._success |= succeeded
+            truncated = not self._success and (nonfinite or self._steps >= self.config.max_steps)
+            self._done = self._success or truncated
+            if self._done:
+                break
+        return ChunkResult(
+            observation=self._observe(),
+            rewards=np.asarray(rewards, np.float32),
+            terminated=self._success,
+            truncated=truncated,
+            success=self._success,
+            info={"nonfinite": 1.0} if nonfinite else {},
+        )
+
+    def render(self, height: int, width: int) -> np.ndarray:
+        if not self._task:
+            raise RuntimeError("nothing to render: call reset first")
+        return self.simulator.render(self.config.cameras[0], height, width)
+
+    def close(self) -> None:
+        for simulator in self._simulators.values():
+            simulator.close()
+        self._simulators, self._task, self._done = {}, "", True
+
+    def _observe(self) -> Observation:
+        simulator, size = self.simulator, self.config.image_size
+        observation: Observation = {
+            image_key(camera): simulator.render(camera, size, size) for camera in self.config.cameras
+        }
+        observation["observation.state"] = simulator.state()
+        if self.config.environment_state:
+            late = self._steps / self.config.max_steps
+            observation[ENVIRONMENT_STATE] = np.append(simulator.everything(), late).astype(np.float32)
+        observation[TASK] = instruction(self._task)
+        return observation

@@ -1,0 +1,448 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One LIBERO task in MuJoCo: LIBERO builds the scene and judges success, the loop between is ours.
+
+robosuite computes in each simulation step three times what is needed once, and reads sensors that nobody
+looks at. Here it is done once, with the same numbers. Importing this file loads neither MuJoCo nor LIBERO.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import io
+import logging
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from accerl_lerobot.envs.libero_tasks import assets_folder, bddl_file, configure, recorded_states
+from accerl_lerobot.envs.metaworld import import_mujoco, new_renderer
+from accerl_lerobot.seeds import EVAL_SEEDS
+
+FPS = 20
+SETTLING = 10
+"""Env steps without motion before the first observation, as in LeRobot's own environment."""
+MAX_OBJECTS = 4
+"""Most objects that a task names as those it is about."""
+MAX_FACES = 2000
+"""Faces that ``rendering=fast`` keeps of a mesh."""
+ROBOT_NUMBERS, OBJECT_NUMBERS = 25, 8
+TIMESTEP = 0.002
+STILL = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
+
+
+class Arm(NamedTuple):
+    """What the controller reads of the simulation, as views of MuJoCo's arrays."""
+
+    jacobian: np.ndarray
+    """(2, 3, V): of the hand's position and rotation."""
+    packed_mass: np.ndarray
+    mass_entries: np.ndarray
+    """int (7, 7): where `packed_mass` has the arm's."""
+    bias: np.ndarray
+    qpos: np.ndarray
+    qvel: np.ndarray
+    dofs: np.ndarray
+    """int (7,): the arm's, equal for `qpos` and `qvel`, as it comes first."""
+    position: np.ndarray
+    rotation: np.ndarray
+    """(3, 3) of the hand."""
+
+
+class Aim(NamedTuple):
+    """Where the hand is to go, and how."""
+
+    position: np.ndarray
+    rotation: np.ndarray
+    rest: np.ndarray
+    """(7,) joint positions that are kept where the hand leaves a choice."""
+    gains: np.ndarray
+    """(2, 6): stiffness and damping."""
+
+
+class Simulator:
+    """One task: LIBERO's scene, with robosuite's operational space controller in a loop of our own.
+
+    What a policy sees is one simulation step old, as in robosuite, whose sensors read within a step.
+
+    Args:
+        task: ``suite/number``.
+        rendering: see `LiberoConfig`.
+        assets: folder of meshes; see there too.
+    """
+
+    def __init__(self, task: str, rendering: Literal["stock", "fast"], assets: str) -> None:
+        self._mujoco = import_mujoco()
+        self.env = _build(task, assets)
+        self.model, self.data = self.env.sim.model._model, self.env.sim.data._data
+        self._recorded = recorded_states(task).reshape(-1, 1 + self.model.nq + self.model.nv)
+        if rendering == "fast":
+            _make_cheap(self.model)
+        robot = self.env.robots[0]
+        self._dofs = np.array(robot._ref_joint_vel_indexes)
+        self._joints = np.array(robot._ref_joint_pos_indexes)
+        self._fingers = np.array(robot._ref_gripper_joint_pos_indexes)
+        self._finger_dofs = np.array(robot._ref_gripper_joint_vel_indexes)
+        self._motors = np.array(robot._ref_joint_actuator_indexes)
+        self._grip_motors = np.array(robot._ref_joint_gripper_actuator_indexes)
+        low, high = self.model.actuator_ctrlrange[self._grip_motors].T
+        self._grip_centre, self._grip_half = 0.5 * (high + low), 0.5 * (high - low)
+        self._site = robot.eef_site_id
+        self._hand = self.model.body(robot.robot_model.eef_name).id
+        self._mass_entries = _mass_entries(self.model, self._dofs)
+        self._jacobian = np.zeros((2, 3, self.model.nv))
+        self._renderers: dict[tuple[int, int], Any] = {}
+        data = self.data
+        self._position, self._rotation = data.site_xpos[self._site], data.site_xmat[self._site].reshape(3, 3)
+        self._ctrl, self._torques = data.ctrl, _compiled_torques()
+        self._arm = Arm(
+            self._jacobian, data.qM, self._mass_entries, data.qfrc_bias, data.qpos, data.qvel, self._dofs,
+            self._position, self._rotation,
+        )  # fmt: skip
+        # What is looked at: the data of the last reading of the sensors, without its velocities.
+        self._seen = self._mujoco.MjData(self.model)
+        self._fingers_seen = np.zeros(len(self._fingers))
+
+    def reset(self, seed: int) -> None:
+        """To the start that `seed` stands for, at rest."""
+        state = np.random.get_state()
+        np.random.seed(seed)  # the one generator that LIBERO and robosuite draw from
+        try:
+            with contextlib.redirect_stdout(io.StringIO()):
+                self._place()
+        finally:
+            np.random.set_state(state)
+        data, env = self.data, self.env
+        if seed in EVAL_SEEDS:
+            row = self._recorded[(seed - EVAL_SEEDS.start) % len(self._recorded)]
+            data.time, data.qpos[:], data.qvel[:] = (
+                row[0],
+                row[1 : 1 + self.model.nq],
+                row[1 + self.model.nq :],
+            )
+            self._mujoco.mj_forward(self.model, data)
+        env._check_success()
+        env._post_process()
+        env.robots[0].gripper.current_action = np.zeros(1)
+        self._fresh = True
+        self._clock = SensorClock(readings=2)
+        for _ in range(SETTLING):
+            self.step(STILL)
+
+    def step(self, action: np.ndarray) -> bool:
+        """One env step.
+
+        Args:
+            action: float32 (7,), within −1 and 1.
+
+        Returns:
+            True if the task's goal holds after it.
+        """
+        model, data, mujoco = self.model, self.data, self._mujoco
+        self._closing = np.array([-0.01, 0.01]) * np.sign(action[6])
+        for i in range(round(1 / FPS / TIMESTEP)):
+            mujoco.mj_step1(model, data)
+            # robosuite solves twice for the former torques before it has new ones; the solver starts there.
+            mujoco.mj_fwdActuation(model, data)
+            mujoco.mj_fwdAcceleration(model, data)
+            mujoco.mj_fwdConstraint(model, data)
+            mujoco.mj_fwdConstraint(model, data)
+            if self._fresh:
+                self._begin(action)
+            else:
+                self._control(action, i == 0)
+            reading = self._clock.tick()
+            if reading:
+                self._seen.qpos[:] = data.qpos
+            mujoco.mj_step2(model, data)
+            if reading:
+                self._fingers_seen[:] = data.qpos[self._fingers]
+        success = bool(self.env._check_success())
+        self.env._post_process()
+        return success
+
+    def _begin(self, action: np.ndarray) -> None:
+        """The first simulation step is robosuite's own: its controller has the pose before the start."""
+        robot = self.env.robots[0]
+        robot.control(action, policy_step=True)
+        controller = robot.controller
+        self._rest, self._gains = controller.initial_joint, np.stack([controller.kp, controller.kd])
+        self._limits = controller.actuator_min, controller.actuator_max
+        self._goal = np.array(controller.goal_pos), np.array(controller.goal_ori)
+        self._grip, self._fresh = robot.gripper.current_action, False
+
+    def _control(self, action: np.ndarray, decided: bool) -> None:
+        """Sets the motors for the current state."""
+        if decided:
+            self._goal = self._new_goal(action, self._position, self._rotation)
+        self._mujoco.mj_jacSite(self.model, self.data, *self._jacobian, self._site)
+        torques = self._torques(self._arm, Aim(*self._goal, self._rest, self._gains))
+        self._ctrl[self._motors] = np.clip(torques, *self._limits)
+        self._grip = np.clip(self._grip + self._closing, -1.0, 1.0)
+        self._ctrl[self._grip_motors] = self._grip_centre + self._grip_half * self._grip
+
+    @property
+    def finite(self) -> bool:
+        """False if MuJoCo has met numbers that are not, and has reset itself."""
+        warning = self._mujoco.mjtWarning
+        bad = (warning.mjWARN_BADQPOS, warning.mjWARN_BADQVEL, warning.mjWARN_BADQACC)
+        return not any(self.data.warning.number[kind] for kind in bad)
+
+    def state(self) -> np.ndarray:
+        """LeRobot's ``observation.state``, float32 (8,): hand's position and axis-angle, both fingers."""
+        self._look()
+        w, x, y, z = self._seen.xquat[self._hand].astype(np.float32)
+        w = np.clip(w, np.float32(-1), np.float32(1))
+        sine = np.sqrt(np.maximum(np.float32(1) - w * w, np.float32(0)))
+        axis = np.array([x, y, z]) / sine if sine > 1e-10 else np.zeros(3, np.float32)
+        turn = axis * (np.float32(2) * np.arccos(w))
+        parts = (self._seen.site_xpos[self._site], turn, self._fingers_seen)
+        return np.concatenate(parts).astype(np.float32)
+
+    def everything(self) -> np.ndarray:
+        """Robot and objects of interest, float64 (57,), as they are now; absent objects are zeros."""
+        data = self.data
+        robot = (
+            data.qpos[self._joints],
+            data.qvel[self._dofs],
+            data.site_xpos[self._site],
+            data.xquat[self._hand],
+            data.qpos[self._fingers],
+            data.qvel[self._finger_dofs],
+        )
+        numbers = np.zeros((MAX_OBJECTS, OBJECT_NUMBERS))
+        for row, name in zip(numbers, self.env.obj_of_interest, strict=False):
+            row[:3], row[3:7], row[7] = *self.pose(name), self.opening(name)
+        return np.concatenate([*robot, numbers.ravel()])
+
+    def pose(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Position (3,) and quaternion (4,), w first, of an object, a fixture or a region in the world."""
+        if name in self.env.obj_body_id:
+            body = self.env.obj_body_id[name]
+            return self.data.xpos[body].copy(), self.data.xquat[body].copy()
+        site = self.model.site(name).id
+        quaternion = np.zeros(4)
+        self._mujoco.mju_mat2Quat(quaternion, self.data.site_xmat[site])
+        return self.data.site_xpos[site].copy(), quaternion
+
+    def opening(self, name: str) -> float:
+        """Position of the joint of a drawer, door or knob; 0 for what has none."""
+        known = self.env.get_object(name)
+        names = [] if known is None else known.joints
+        hinges = [joint for joint in names if self.model.joint(joint).type[0] != 0]
+        return float(self.data.joint(hinges[0]).qpos[0]) if hinges else 0.0
+
+    def render(self, camera: str, height: int, width: int) -> np.ndarray:
+        """What a camera shows, uint8 (height, width, 3), turned as LeRobot's datasets have it."""
+        self._look()
+        renderer = self._renderers.get((height, width))
+        if renderer is None:
+            renderer = self._renderers[height, width] = new_renderer(self.model, height, width)
+        renderer.update_scene(self._seen, camera, self._visible)
+        return np.ascontiguousarray(renderer.render()[:, ::-1])
+
+    @functools.cached_property
+    def _visible(self) -> Any:
+        option = self._mujoco.MjvOption()
+        option.geomgroup[:2] = 0, 1  # visual meshes, not what collides
+        return option
+
+    def close(self) -> None:
+        for renderer in self._renderers.values():
+            renderer.close()
+        self.env.close()
+
+    def _look(self) -> None:
+        """Brings what is derived from the positions seen up to date."""
+        mujoco = self._mujoco
+        mujoco.mj_kinematics(self.model, self._seen)
+        mujoco.mj_comPos(self.model, self._seen)
+        mujoco.mj_camlight(self.model, self._seen)
+
+    def _place(self) -> None:
+        from robosuite.utils.errors import RandomizationError
+
+        while True:
+            with contextlib.suppress(RandomizationError):  # the objects did not fit: LIBERO draws again
+                self.env.reset()
+                return
+
+    def _new_goal(
+        self, action: np.ndarray, position: np.ndarray, rotation: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Pose to go to: what the action adds to the hand's own; without a turn, the former rotation."""
+        from robosuite.utils.control_utils import set_goal_orientation
+
+        delta = self.env.robots[0].controller.scale_action(action[:6])
+        turned = set_goal_orientation(delta[3:], rotation) if delta[3:].any() else self._goal[1]
+        return position + delta[:3], turned
+
+
+@functools.cache
+def _compiled_torques() -> Any:
+    """`operational_space_torques`, compiled with numba, which comes with robosuite."""
+    import numba
+
+    return numba.njit(cache=True)(operational_space_torques)
+
+
+def operational_space_torques(arm: Arm, aim: Aim) -> np.ndarray:
+    """Torques of operational space control (Khatib, 1987) with the settings of robosuite's OSC_POSE.
+
+    Position and rotation are uncoupled; what freedom is left to the joints goes to the pose of rest.
+
+    Returns:
+        float64 (7,), in Nm.
+    """
+    dofs = arm.dofs
+    n = len(dofs)
+    mass, joined, velocity = np.empty((n, n)), np.empty((6, n)), np.zeros(6)
+    for i in range(n):
+        for j in range(n):
+            mass[i, j] = arm.packed_mass[arm.mass_entries[i, j]]
+        for k in range(3):
+            joined[k, i] = arm.jacobian[0, k, dofs[i]]
+            joined[3 + k, i] = arm.jacobian[1, k, dofs[i]]
+    for i in range(n):
+        velocity += joined[:, i] * arm.qvel[dofs[i]]
+    error = np.zeros(6)
+    error[:3] = aim.position - arm.position
+    for k in range(3):
+        error[3:] += 0.5 * np.cross(arm.rotation[:, k], aim.rotation[:, k])
+    wanted = aim.gains[0] * error - aim.gains[1] * velocity
+    weighed = np.linalg.solve(mass, joined.T)
+    inertia = np.dot(joined, weighed)  # inverse of the hand's
+    free = np.empty(n)
+    for i in range(n):
+        free[i] = 10.0 * (aim.rest[i] - arm.qpos[dofs[i]]) - 2 * np.sqrt(10.0) * arm.qvel[dofs[i]]
+    wrench = -np.linalg.solve(inertia, np.dot(joined, free))
+    wrench[:3] += np.linalg.solve(np.ascontiguousarray(inertia[:3, :3]), wanted[:3])
+    wrench[3:] += np.linalg.solve(np.ascontiguousarray(inertia[3:, 3:]), wanted[3:])
+    torques = np.dot(joined.T, wrench) + np.dot(mass, free)
+    for i in range(n):
+        torques[i] += arm.bias[dofs[i]]
+    return torques
+
+
+class SensorClock:
+    """When robosuite's sensors read: once in each 50 ms, with its own sums of 2 ms.
+
+    Args:
+        readings: how many were forced since the reset.
+    """
+
+    def __init__(self, readings: int) -> None:
+        self._since = 0.0
+        for _ in range(readings):
+            self._since += TIMESTEP
+        self._read = True
+
+    def tick(self) -> bool:
+        """Whether they read in this simulation step."""
+        self._since += TIMESTEP
+        reading = not self._read and self._since <= 1 / FPS
+        self._read |= reading
+        if self._since >= 1 / FPS:
+            reading |= not self._read
+            self._since %= 1 / FPS
+            self._read = False
+        return reading
+
+
+def _build(task: str, assets: str) -> Any:
+    """robosuite's environment of a task, which draws nothing."""
+    configure()
+    logging.getLogger("robosuite_logs").setLevel(logging.ERROR)  # asks for a file of macros that nobody needs
+    with contextlib.redirect_stdout(io.StringIO()):
+        import libero.libero as package
+        from libero.libero.envs.env_wrapper import ControlEnv
+
+        package._assets_path_cache = str(assets_folder(assets))
+        env = ControlEnv(str(bddl_file(task)), use_camera_obs=False, has_offscreen_renderer=False).env
+    env.hard_reset = False  # the scene is always the same: no need to compile it anew for each episode
+    return env
+
+
+def _mass_entries(model: Any, dofs: np.ndarray) -> np.ndarray:
+    """Where MuJoCo's packed mass matrix holds those of some joints that follow one another, int (n, n)."""
+    entries = np.zeros((len(dofs), len(dofs)), int)
+    for row in range(len(dofs)):
+        dof, address = int(dofs[row]), int(model.dof_Madr[dofs[row]])
+        while dof >= 0:
+            if dof in dofs:
+                column = int(np.flatnonzero(dofs == dof)[0])
+                entries[row, column] = entries[column, row] = address
+            dof, address = int(model.dof_parentid[dof]), address + 1
+    return entries
+
+
+def _make_cheap(model: Any) -> None:
+    """No shadows, multisampling or reflections, and at most `MAX_FACES` faces of each mesh.
+
+    What collides is not touched: that are hulls of vertices, which all stay.
+    """
+    model.vis.quality.offsamples = 0
+    model.vis.quality.shadowsize = 0
+    model.light_castshadow[:] = 0
+    model.mat_reflectance[:] = 0
+    for mesh in range(model.nmesh):
+        at, count = int(model.mesh_faceadr[mesh]), int(model.mesh_facenum[mesh])
+        if count <= MAX_FACES:
+            continue
+        faces, first = model.mesh_face[at : at + count], int(model.mesh_vertadr[mesh])
+        vertices = model.mesh_vert[first : first + int(model.mesh_vertnum[mesh])]
+        kept, merged = coarser(vertices, faces, MAX_FACES)
+        corners = model.mesh_facetexcoord[at : at + count][kept] + model.mesh_texcoordadr[mesh]
+        if model.mesh_texcoordnum[mesh] == 3 * count:  # each corner has its own place in the texture
+            places = model.mesh_texcoord[corners]
+            model.mesh_texcoord[corners] = moved_texture(vertices[faces[kept]], vertices[merged], places)
+        for array in (model.mesh_facenormal, model.mesh_facetexcoord):
+            array[at : at + len(kept)] = array[at : at + count][kept]
+        model.mesh_face[at : at + len(kept)] = merged
+        model.mesh_facenum[mesh] = len(kept)
+
+
+def coarser(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Fewer faces for a mesh, between vertices that it has (vertex clustering, Rossignac and Borrel, 1993).
+
+    Vertices in the same cell of a grid become the one that is nearest to their mean; faces that this leaves
+    without an area go. The grid is the finest of some that leaves at most so many faces.
+
+    Args:
+        vertices: (V, 3).
+        faces: int (F, 3).
+        most: faces wanted, at most; exceeded if the coarsest grid has more.
+
+    Returns:
+        Which faces stay, int (f,), and their vertices now, int (f, 3).
+    """
+    extent = float(np.ptp(vertices, axis=0).max())
+    for cells in (96, 64, 48, 36, 27, 20, 15, 11, 8, 6):
+        grid = np.floor((vertices - vertices.min(0)) / (extent / cells)).astype(np.int64)
+        _, cell = np.unique(grid @ np.array([1, 1000, 1000000]), return_inverse=True)
+        counts = np.bincount(cell)
+        means = np.stack([np.bincount(cell, axis) / counts for axis in vertices.T], 1)
+        order = np.lexsort((((vertices - means[cell]) ** 2).sum(1), cell))
+        middle = order[np.searchsorted(cell[order], np.arange(len(counts)))]
+        merged = middle[cell[faces]]
+        a, b, c = merged.T
+        kept = np.flatnonzero((a != b) & (b != c) & (c != a))
+        if len(kept) <= most:
+            break
+    return kept, merged[kept]
+
+
+def moved_texture(before: np.ndarray, after: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Places in the texture of faces whose corners have moved, so that the picture on them does not.
+
+    Args:
+        before: corners, (f, 3, 3).
+        after: the same corners now.
+        places: of the corners in the texture, (f, 3, 2).
+
+    Returns:
+        (f, 3, 2), each face's own affine map continued.
+    """
+    edges = (before[:, 1:] - before[:, :1]).astype(np.float64)
+    slope = np.linalg.pinv(edges, rcond=1e-4) @ (places[:, 1:] - places[:, :1])
+    return np.clip(places[:, :1] + (after - before[:, :1]) @ slope, places.min(), places.max())
