@@ -35,10 +35,11 @@ RESOLVED = "--resolved="
 DISTRIBUTION = "accerl-lerobot"
 
 GIB = 2**30
-POLICY_PROCESS_GIB, ROLLOUT_PROCESS_GIB, SIMULATOR_GIB, RAY_GIB = 1.2, 0.4, 0.17, 0.7
+POLICY_PROCESS_GIB, ROLLOUT_PROCESS_GIB, RAY_GIB = 1.2, 0.4, 0.7
+SIMULATOR_GIB = {"metaworld": 0.17, "libero": 0.17}
 """Resident memory without a policy's weights, for which see `preflight.policy_gib`: a process with torch and
-LeRobot, a rollout process without its worlds, each task of each MetaWorld (renderers included), Ray's own
-processes."""
+LeRobot, a rollout process without its worlds, Ray's own processes, and, by type of environment, the simulator
+of one task with its renderers."""
 DISK_GIB = 2.0
 """Space that demonstrations, checkpoints and videos of a run may need."""
 RENDER_TIMEOUT_S = 120
@@ -107,7 +108,7 @@ def machine(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
     yield hugging_face_datasets()
     yield ray_imports(joins=config is not None and config.launch.address is not None)
     yield cuda(config)
-    yield rendering(needed=config is None or config.env.type == "metaworld")
+    yield rendering(needed=config is None or config.env.type in SIMULATOR_GIB)
     yield from resources(config, history)
 
 
@@ -199,7 +200,7 @@ def rendering(*, needed: bool, script: str = DRAW) -> Check:
 
     bad = FAIL if needed else WARN
     if importlib.util.find_spec("mujoco") is None:
-        text = "MuJoCo is not installed; install the extra: accerl-lerobot[metaworld]"
+        text = "MuJoCo is not installed; install the extra: accerl-lerobot[metaworld] or [libero]"
         return Check("rendering", bad, text)
     command = [sys.executable, "-c", script]
     try:
@@ -290,7 +291,7 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
 
     rollout, films, local = config.rollout, config.evaluation, config.launch.engine == "local"
     tasks = len(getattr(config.env, "tasks", ("one",)))
-    simulator = tasks * SIMULATOR_GIB if config.env.type == "metaworld" else 0.0
+    simulator = tasks * SIMULATOR_GIB.get(config.env.type, 0.0)
     pictures = history * observation_bytes(config) / GIB
     frames = min(films.videos, films.episodes) * config.env.max_steps / films.video_every
     return {

@@ -94,7 +94,7 @@ LEROBOT = {
     **{
         f"env.type={name}": f"for LeRobot's {name} use env.type=lerobot --env.name={name}. Otherwise "
         for name in (
-            "aloha", "isaaclab_arena", "libero", "libero_plus", "pusht", "robocasa", "robomme", "robotwin",
+            "aloha", "isaaclab_arena", "libero_plus", "pusht", "robocasa", "robomme", "robotwin",
             "vlabench",
         )
     },

@@ -45,7 +45,9 @@ SIDECAR = Path("meta") / "accerl_demos.json"
 _logger = logging.getLogger(__name__)
 _MAX_EPISODES = 10_000
 _MAX_TRIES = 50
-_VERSIONS = ("lerobot", "metaworld", "mujoco", "numpy")
+_VERSIONS = {name: name for name in ("lerobot", "metaworld", "robosuite", "mujoco", "numpy")}
+_VERSIONS |= {"libero": "hf-libero"}
+"""Module → distribution."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +107,7 @@ def record_demos(env_config: EnvConfig, config: DemosConfig) -> Path:
             "env": draccus.encode(env_config, EnvConfig),
             "demos": {k: v for k, v in draccus.encode(config).items() if k not in ("root", "processes")},
             **tally,
-            "versions": {name: importlib.metadata.version(name) for name in _VERSIONS if find_spec(name)},
+            "versions": {k: importlib.metadata.version(v) for k, v in _VERSIONS.items() if find_spec(k)},
         }
         (partial / SIDECAR).write_text(json.dumps(sidecar, indent=2) + "\n")
     _logger.info("%s: %s", root, tally)

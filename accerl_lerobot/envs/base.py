@@ -15,10 +15,12 @@ one; all before them are passed without a picture, as always.
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from abc import ABC, abstractmethod
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 import draccus
 import numpy as np
@@ -158,6 +160,29 @@ class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
     def nominal(self) -> Self:
         """This config without deployment shift; an environment that has one overrides it."""
         return self
+
+
+_PLUGIN = "accerl_lerobot.envs.lerobot_plugin"
+_FIELDS_OF_PLUGIN = {
+    "metaworld": ("task", "camera", "image_size", "max_steps", "lighting"),
+    "libero": ("task", "camera", "image_size", "max_steps", "rendering"),
+}
+
+
+def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
+    """``--env.…`` of the stock ``lerobot-eval`` for an environment; none if LeRobot cannot have it.
+
+    Args:
+        env: a config's ``env``, as recipes and checkpoints hold it.
+    """
+    if (kind := env.get("type")) in _FIELDS_OF_PLUGIN:
+        fields: dict[str, Any] = {"discover_packages_path": _PLUGIN, "type": f"accerl_{kind}"}
+        fields |= {name: env[name] for name in _FIELDS_OF_PLUGIN[kind] if name in env}
+    elif kind == "lerobot":
+        fields = {"type": env.get("name"), **(env.get("kwargs") or {})}
+    else:
+        return []
+    return [f"--env.{name}={shlex.quote(str(value))}" for name, value in fields.items()]
 
 
 class HistoryWorld(World):

@@ -92,6 +92,7 @@ class Simulator:
         self._mass_entries = _mass_entries(self.model, self._dofs)
         self._jacobian = np.zeros((2, 3, self.model.nv))
         self._renderers: dict[tuple[int, int], Any] = {}
+        self._fixtures = _fixtures(self.env)
         data = self.data
         self._position, self._rotation = data.site_xpos[self._site], data.site_xmat[self._site].reshape(3, 3)
         self._ctrl, self._torques = data.ctrl, _compiled_torques()
@@ -262,6 +263,8 @@ class Simulator:
     def _place(self) -> None:
         from robosuite.utils.errors import RandomizationError
 
+        for body, pos, quat in self._fixtures:
+            self.model.body_pos[body], self.model.body_quat[body] = pos, quat
         while True:
             with contextlib.suppress(RandomizationError):  # the objects did not fit: LIBERO draws again
                 self.env.reset()
@@ -361,6 +364,22 @@ def _build(task: str, assets: str) -> Any:
         env = ControlEnv(str(bddl_file(task)), use_camera_obs=False, has_offscreen_renderer=False).env
     env.hard_reset = False  # the scene is always the same: no need to compile it anew for each episode
     return env
+
+
+def _fixtures(env: Any) -> list[tuple[int, np.ndarray, np.ndarray]]:
+    """Body, position and quaternion of each fixture in the scene's file.
+
+    An episode moves them a little, and objects that begin on one are placed where it stood before.
+    """
+    found = []
+    for fixture in env.fixtures_dict.values():
+        element = env.model.root.find(f".//body[@name='{fixture.root_body}']")
+        pos, quat = (
+            np.array(element.get(key, default).split(), np.float64)
+            for key, default in (("pos", "0 0 0"), ("quat", "1 0 0 0"))
+        )
+        found.append((env.sim.model.body_name2id(fixture.root_body), pos, quat))
+    return found
 
 
 def _mass_entries(model: Any, dofs: np.ndarray) -> np.ndarray:

@@ -26,6 +26,7 @@ from accerl_lerobot.checkpoint.layout import AWAY, BACKBONE, CHECKPOINTS, PREPRO
 from accerl_lerobot.checkpoint.layout import CONFIG as RECIPE
 from accerl_lerobot.config.parsing import DISCOVER
 from accerl_lerobot.config.ranges import NewFolder, Pattern, Section
+from accerl_lerobot.envs.base import lerobot_eval_arguments
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import discovery
 from accerl_lerobot.world_model.config import PIXELS
@@ -389,16 +390,9 @@ def _commands(repo_id: str, artifact: str, config: dict[str, Any], recipe: dict[
 
 def _stock(policy: str, config: Mapping[str, Any], env: Mapping[str, Any]) -> str | None:
     """The command of stock ``lerobot-eval``, where it has this environment."""
-    if env.get("type") == "metaworld":
-        options = {"discover_packages_path": "accerl_lerobot.envs.lerobot_plugin", "type": "accerl_metaworld"}
-        names = ("task", "camera", "image_size", "max_steps", "lighting")
-        options |= {name: env[name] for name in names if name in env}
-    elif env.get("type") == "lerobot":
-        options = {"type": str(env.get("name")), **(env.get("kwargs") or {})}
-    else:
+    if not (arguments := lerobot_eval_arguments(env)):
         return None
-    command = [f"lerobot-eval --policy.path={policy}", *discovery(config.get("type"))]
-    command += [f"--env.{name}={shlex.quote(str(value))}" for name, value in options.items()]
+    command = [f"lerobot-eval --policy.path={policy}", *discovery(config.get("type")), *arguments]
     return " \\\n  ".join([*command, "--eval.n_episodes=50 --eval.batch_size=5"])
 
 

@@ -34,6 +34,7 @@ from accerl_lerobot.config.parsing import (
 )
 from accerl_lerobot.engine.preflight import lag_limits
 from accerl_lerobot.engine.stopping import resume_command
+from accerl_lerobot.envs.base import lerobot_eval_arguments
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.metrics import METRICS
 from accerl_lerobot.world_model.config import VIDEOS
@@ -317,7 +318,6 @@ ABSENT = "–"
 """Stands where a recipe has no such field."""
 PLACES = ("output_dir", "job_name")
 """Fields that say where results go, which are never shown as differences."""
-PLUGIN = "accerl_lerobot.envs.lerobot_plugin"
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> Flat:
@@ -411,24 +411,11 @@ def commands(run: Run) -> list[tuple[str, str]]:
     episodes = run.section("evaluation").get("episodes", 100)
     evaluate = f"accerl eval --config_path={recipe} {policy} --evaluation.episodes={_quoted(episodes)}"
     lines.append(("Evaluate its policy on the seeds of this page", evaluate))
-    if env := _lerobot_env(run.section("env")):
-        stock = f"lerobot-eval {policy} {env} --eval.n_episodes=50 --eval.batch_size=5"
+    if env := lerobot_eval_arguments(run.section("env")):
+        stock = f"lerobot-eval {policy} {' '.join(env)} --eval.n_episodes=50 --eval.batch_size=5"
         lines.append(("Evaluate it with LeRobot itself", stock))
     share = f"accerl push --path={_quoted(run.checkpoint)} --repo_id=USER/NAME"
     return [*lines, ("Share it on the Hub", share)]
-
-
-def _lerobot_env(env: Mapping[str, Any]) -> str:
-    """Arguments of lerobot-eval that name this environment; empty if LeRobot does not have it."""
-    if env.get("type") == "metaworld":
-        names = ("task", "camera", "image_size", "max_steps")
-        fields: dict[str, Any] = {"discover_packages_path": PLUGIN, "type": "accerl_metaworld"}
-        fields |= {name: env[name] for name in names if name in env}
-    elif env.get("type") == "lerobot":
-        fields = {"type": env.get("name"), **env.get("kwargs", {})}
-    else:
-        return ""
-    return shlex.join(f"--env.{name}={value}" for name, value in fields.items())
 
 
 def _quoted(value: Any) -> str:

@@ -125,10 +125,10 @@ def test_stock_lerobot_sees_our_world(plugin):
 
 def test_the_expert_succeeds_through_the_plugin(plugin):
     from accerl_lerobot.demos.expert import make_expert
-    from accerl_lerobot.envs.lerobot_plugin import AccerlMetaWorldEnv
+    from accerl_lerobot.envs.lerobot_plugin import AccerlEnv
 
     config = MetaWorldConfig(task="handle-press-v3")
-    env = AccerlMetaWorldEnv(config, "handle-press-v3")
+    env = AccerlEnv(config, "handle-press-v3")
     env.reset(seed=0)
     expert, terminated = make_expert(config, env._world, "handle-press-v3"), False
     while not terminated:

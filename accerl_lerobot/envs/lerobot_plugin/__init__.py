@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Our MetaWorld inside stock LeRobot: ``lerobot-eval`` and ``lerobot-train`` on the world we train in.
+"""Our MetaWorld and LIBERO in stock LeRobot: ``lerobot-eval`` and ``lerobot-train`` on the world we train in.
 
 A package and not a module, because LeRobot's plugin loader looks for submodules.
 
@@ -14,6 +14,7 @@ Example:
 
 from __future__ import annotations
 
+import abc
 import functools
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -24,40 +25,34 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import freeze_after_episode_end
 
-from accerl_lerobot.envs.metaworld import (
-    ACTION_DIM,
-    FPS,
-    STATE_DIM,
-    MetaWorld,
-    MetaWorldConfig,
-    ShiftConfig,
-    description,
-)
+from accerl_lerobot.envs import EnvConfig as WorldConfig
+from accerl_lerobot.envs import LiberoConfig, MetaWorldConfig, make_world
+from accerl_lerobot.envs.libero_simulator import FPS as LIBERO_FPS
+from accerl_lerobot.envs.metaworld import FPS, ShiftConfig
 from accerl_lerobot.experience import Observation
 
 VIDEO_SIZE = 256
 
 
-class AccerlMetaWorldEnv(gym.Env):
-    """One task of our `MetaWorld` as a Gymnasium environment; it never resets itself.
+class AccerlEnv(gym.Env):
+    """One task of a `World` as a Gymnasium environment; it never resets itself.
 
     Args:
         config: What to simulate.
         task: One of the config's tasks.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}
     render_mode = "rgb_array"
 
-    def __init__(self, config: MetaWorldConfig, task: str) -> None:
-        self.task, self.task_description = task, description(task)
-        self._max_episode_steps = config.max_steps  # LeRobot's rollout asks for it under this name
-        self._world = MetaWorld(
-            config
-        )  # builds its simulator at the first reset, in whatever process that is
-        self._cameras = config.cameras
+    def __init__(self, config: WorldConfig, task: str) -> None:
+        # Builds its simulator at the first reset, in whatever process that is.
+        self._world = make_world(config)
         spec = self._world.spec
-        images = {name: gym.spaces.Box(0, 255, spec.images[_key(name)], np.uint8) for name in self._cameras}
+        self.task, self.task_description = task, spec.instructions[spec.tasks.index(task)]
+        self.metadata = self.metadata | {"render_fps": spec.fps}
+        self._max_episode_steps = config.max_steps  # LeRobot's rollout asks for it under this name
+        images = {_camera(key): gym.spaces.Box(0, 255, size, np.uint8) for key, size in spec.images.items()}
         self.observation_space = gym.spaces.Dict(
             {
                 "pixels": gym.spaces.Dict(images),
@@ -90,48 +85,33 @@ class AccerlMetaWorldEnv(gym.Env):
         self._world.close()
 
     def _format(self, observation: Observation) -> dict[str, Any]:
-        pixels = {name: observation[_key(name)] for name in self._cameras}
+        pixels = {_camera(key): observation[key] for key in self._world.spec.images}
         return {"pixels": pixels, "agent_pos": observation["observation.state"]}
 
 
-@EnvConfig.register_subclass("accerl_metaworld")
 @dataclass
-class AccerlMetaWorldEnvConfig(EnvConfig):
-    """`MetaWorldConfig` as LeRobot spells configs; see there for the meaning and range of each field."""
+class AccerlEnvConfig(EnvConfig):
+    """The fields that LeRobot needs of any world of ours."""
 
-    task: str | None = "drawer-open-v3"
-    fps: int = FPS
-    camera: str = "corner2"
-    image_size: int = 64
-    max_steps: int = 500
-    lighting: Literal["cheap", "default"] = "cheap"
-    shift: dict[str, Any] = field(default_factory=dict)
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.world_config  # noqa: B018 - refuses bad values now
-        size = self.image_size
+        spec = make_world(self.world_config).spec  # refuses bad values now
         self.features = {
-            "action": PolicyFeature(type=FeatureType.ACTION, shape=(ACTION_DIM,)),
-            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(STATE_DIM,)),
+            "action": PolicyFeature(type=FeatureType.ACTION, shape=(spec.action_dim,)),
+            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(spec.state_dim,)),
         }
         self.features_map = {"action": "action", "agent_pos": "observation.state"}
-        for name in self.world_config.cameras:
-            self.features[f"pixels/{name}"] = PolicyFeature(type=FeatureType.VISUAL, shape=(size, size, 3))
-            self.features_map[f"pixels/{name}"] = _key(name)
+        for key, size in spec.images.items():
+            name = f"pixels/{_camera(key)}"
+            self.features[name] = PolicyFeature(type=FeatureType.VISUAL, shape=size)
+            self.features_map[name] = key
 
     @property
-    def world_config(self) -> MetaWorldConfig:
+    @abc.abstractmethod
+    def world_config(self) -> WorldConfig:
         """The world behind every environment made from this config."""
-        return MetaWorldConfig(
-            task=self.task or "",
-            camera=self.camera,
-            image_size=self.image_size,
-            max_steps=self.max_steps,
-            lighting=self.lighting,
-            shift=ShiftConfig(**self.shift),
-        )
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
@@ -142,9 +122,9 @@ class AccerlMetaWorldEnvConfig(EnvConfig):
     ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """One vector environment per task, as ``{task: {0: vector}}``."""
         config, vectors = self.world_config, {}
-        for task in config.tasks:
+        for task in make_world(config).spec.tasks:
             # A finished environment waits for its batch without simulating an episode nobody sees.
-            make = freeze_after_episode_end(functools.partial(AccerlMetaWorldEnv, config, task))
+            make = freeze_after_episode_end(functools.partial(AccerlEnv, config, task))
             if use_async_envs and n_envs > 1:
                 vector = gym.vector.AsyncVectorEnv([make] * n_envs, context="forkserver")
             else:
@@ -153,5 +133,57 @@ class AccerlMetaWorldEnvConfig(EnvConfig):
         return vectors
 
 
-def _key(camera: str) -> str:
-    return f"observation.images.{camera}"
+@EnvConfig.register_subclass("accerl_metaworld")
+@dataclass
+class AccerlMetaWorldEnvConfig(AccerlEnvConfig):
+    """`MetaWorldConfig` as LeRobot spells configs; see there for the meaning and range of each field."""
+
+    task: str | None = "drawer-open-v3"
+    fps: int = FPS
+    camera: str = "corner2"
+    image_size: int = 64
+    max_steps: int = 500
+    lighting: Literal["cheap", "default"] = "cheap"
+    shift: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def world_config(self) -> MetaWorldConfig:
+        """See the base class."""
+        return MetaWorldConfig(
+            task=self.task or "",
+            camera=self.camera,
+            image_size=self.image_size,
+            max_steps=self.max_steps,
+            lighting=self.lighting,
+            shift=ShiftConfig(**self.shift),
+        )
+
+
+@EnvConfig.register_subclass("accerl_libero")
+@dataclass
+class AccerlLiberoEnvConfig(AccerlEnvConfig):
+    """`LiberoConfig` as LeRobot spells configs; see there for the meaning and range of each field."""
+
+    task: str | None = "libero_object"
+    fps: int = LIBERO_FPS
+    camera: str = "agentview,robot0_eye_in_hand"
+    image_size: int = 256
+    max_steps: int = 280
+    rendering: Literal["stock", "fast"] = "stock"
+    assets: str = ""
+
+    @property
+    def world_config(self) -> LiberoConfig:
+        """See the base class."""
+        return LiberoConfig(
+            task=self.task or "",
+            camera=self.camera,
+            image_size=self.image_size,
+            max_steps=self.max_steps,
+            rendering=self.rendering,
+            assets=self.assets,
+        )
+
+
+def _camera(key: str) -> str:
+    return key.removeprefix("observation.images.")
