@@ -1,28 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Speed of our MetaWorld next to LeRobot's: both step random actions, in turns, on the same machine.
+"""Speed of our MetaWorld or LIBERO next to LeRobot's: both step random actions, in turns, on one machine.
+
+    accerl bench world --env.type=libero --env.task=libero_object/0 --env.image_size=128 --env.rendering=fast
 
 Three arms: ``ours`` (a picture per decision), ``ours_every_step`` (chunks of one, so a picture per step) and
-``stock`` (LeRobot's own wrapper: 480 pixels, default lights, a picture per step). Blocks go forth and back
-(A B C C B A), so that a machine that slows down slows every arm.
+``stock`` (LeRobot's own environment, a picture per step: of MetaWorld 480 pixels with default lights, of
+LIBERO two of our size). Blocks go forth and back (A B C C B A), so that a machine that slows down slows every
+arm.
 """
 
 from __future__ import annotations
 
 import contextlib
+import io
 import itertools
 import os
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
+import draccus
 import numpy as np
 from rich.table import Table
 
 from accerl_lerobot.bench.host import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Section
 from accerl_lerobot.demos.writing import simulators
-from accerl_lerobot.envs.metaworld import ACTION_DIM, MetaWorld, MetaWorldConfig, import_mujoco
+from accerl_lerobot.envs import EnvConfig, LiberoConfig, MetaWorldConfig, make_world
+from accerl_lerobot.envs.libero_tasks import load_libero
+from accerl_lerobot.envs.metaworld import import_mujoco
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.seeds import train_seed
 
@@ -36,12 +43,10 @@ Decide = Callable[[], int]
 class BenchWorldConfig(Section):
     """Fields of ``accerl bench world``."""
 
-    task: str = "drawer-open-v3"
-    """One MetaWorld task."""
+    env: EnvConfig = field(default_factory=MetaWorldConfig)
+    """One task of ``env.type=metaworld`` or ``libero``."""
     chunk: Annotated[int, Range("[1, 500]")] = 10
     """Actions per decision."""
-    image_size: Annotated[int, Range("[64, 480]")] = 64
-    """Our pictures' height and width in pixels; LeRobot's wrapper always draws 480."""
     seconds: Positive = 4.0
     """Length of one block."""
     rounds: Repeats = 2
@@ -49,13 +54,16 @@ class BenchWorldConfig(Section):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not isinstance(self.env, MetaWorldConfig | LiberoConfig):
+            raise InputError("env.type", self.env.type, "use metaworld or libero")
         if len(self.env.tasks) != 1:
-            raise InputError("task", self.task, "name one task")
+            raise InputError("env.task", self.env.task, "name one task")
 
     @property
-    def env(self) -> MetaWorldConfig:
-        """Our world."""
-        return MetaWorldConfig(task=self.task, image_size=self.image_size)
+    def task(self) -> str:
+        """The task's name."""
+        assert isinstance(self.env, MetaWorldConfig | LiberoConfig)
+        return self.env.tasks[0]
 
 
 def bench_world(config: BenchWorldConfig) -> dict[str, Any]:
@@ -81,14 +89,15 @@ def bench_world(config: BenchWorldConfig) -> dict[str, Any]:
         arms[name] = {"env_steps_per_s": steps, "decisions_per_s": decisions}
     ours, stock = (arms[name]["env_steps_per_s"]["blocks"] for name in (OURS, STOCK))
     ratio = spread([own / other for own, other in zip(ours, stock, strict=True)])
-    return {"config": asdict(config), "arms": arms, "ratio": ratio, "host": machine}
+    chosen = {"task": config.task, "chunk": config.chunk, "env": draccus.encode(config.env, EnvConfig)}
+    return {"config": chosen, "arms": arms, "ratio": ratio, "host": machine}
 
 
 def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
     config, ratio = result["config"], result["ratio"]
     title = (
-        f"{config['task']}, chunk {config['chunk']}: {ranged(ratio, '.0f')} times the env steps of LeRobot's"
+        f"{config['task']}, chunk {config['chunk']}: {ranged(ratio, '.1f')} times the env steps of LeRobot's"
     )
     rows = [
         (name, *(ranged(rates[kind], ",.1f") for kind in ("env_steps_per_s", "decisions_per_s")))
@@ -107,14 +116,18 @@ def _start(arm: str, config: BenchWorldConfig) -> None:
     if arm == STOCK:
         del os.environ["LP_NUM_THREADS"]  # ours draws with one thread, LeRobot's by default with all
     chunk = config.chunk if arm == OURS else 1
-    actions = np.random.default_rng(0).uniform(-1, 1, (997, chunk, ACTION_DIM)).astype(np.float32)
-    _decide = _stock(config.task, actions) if arm == STOCK else _ours(config, actions)
+    actions = np.random.default_rng(0).uniform(-1, 1, (997, chunk, _action_dim(config.env)))
+    chunks = itertools.cycle(actions.astype(np.float32))
+    _decide = _stock(config, chunks) if arm == STOCK else _ours(config, chunks)
 
 
-def _ours(config: BenchWorldConfig, actions: np.ndarray) -> Decide:
-    world = MetaWorld(config.env)
+def _action_dim(env: EnvConfig) -> int:
+    return make_world(env).spec.action_dim  # no simulator is built before the first reset
+
+
+def _ours(config: BenchWorldConfig, chunks: Iterator[np.ndarray]) -> Decide:
+    world = make_world(config.env)
     seeds = (train_seed(0, 0, episode) for episode in itertools.count())
-    chunks = itertools.cycle(actions)
     world.reset(next(seeds), config.task)
 
     def decide() -> int:
@@ -126,20 +139,37 @@ def _ours(config: BenchWorldConfig, actions: np.ndarray) -> Decide:
     return decide
 
 
-def _stock(task: str, actions: np.ndarray) -> Decide:
-    from lerobot.envs.metaworld import MetaworldEnv
-
-    env = MetaworldEnv(task, obs_type="pixels_agent_pos")
-    chunks = itertools.cycle(actions)
+def _stock(config: BenchWorldConfig, chunks: Iterator[np.ndarray]) -> Decide:
+    env, left = _stock_env(config.env, config.task), config.env.max_steps
     env.reset(seed=0)
 
     def decide() -> int:
+        nonlocal left
         _, _, terminated, truncated, _ = env.step(next(chunks)[0])
-        if truncated and not terminated:  # it resets itself after a termination
-            env.reset()
+        left -= 1
+        if terminated or truncated or not left:
+            env.reset(seed=0)
+            left = config.env.max_steps
         return 1
 
     return decide
+
+
+def _stock_env(config: EnvConfig, task: str) -> Any:
+    """LeRobot's own environment of a task."""
+    if isinstance(config, LiberoConfig):
+        load_libero(config.assets)
+        from lerobot.envs.libero import LiberoEnv
+        from libero.libero import benchmark
+
+        suite, number = task.split("/")
+        size = {"observation_width": config.image_size, "observation_height": config.image_size}
+        with contextlib.redirect_stdout(io.StringIO()):  # LIBERO prints, and the result goes there
+            tasks = benchmark.get_benchmark_dict()[suite]()
+            return LiberoEnv(tasks, int(number), suite, obs_type="pixels_agent_pos", **size)
+    from lerobot.envs.metaworld import MetaworldEnv
+
+    return MetaworldEnv(task, obs_type="pixels_agent_pos")
 
 
 def _measure(seconds: float) -> tuple[float, float]:

@@ -10,12 +10,11 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
-import logging
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from accerl_lerobot.envs.libero_tasks import assets_folder, bddl_file, configure, recorded_states
+from accerl_lerobot.envs.libero_tasks import bddl_file, load_libero, recorded_states
 from accerl_lerobot.envs.metaworld import import_mujoco, new_renderer
 from accerl_lerobot.seeds import EVAL_SEEDS
 
@@ -354,13 +353,10 @@ class SensorClock:
 
 def _build(task: str, assets: str) -> Any:
     """robosuite's environment of a task, which draws nothing."""
-    configure()
-    logging.getLogger("robosuite_logs").setLevel(logging.ERROR)  # asks for a file of macros that nobody needs
-    with contextlib.redirect_stdout(io.StringIO()):
-        import libero.libero as package
-        from libero.libero.envs.env_wrapper import ControlEnv
+    load_libero(assets)
+    from libero.libero.envs.env_wrapper import ControlEnv
 
-        package._assets_path_cache = str(assets_folder(assets))
+    with contextlib.redirect_stdout(io.StringIO()):
         env = ControlEnv(str(bddl_file(task)), use_camera_obs=False, has_offscreen_renderer=False).env
     env.hard_reset = False  # the scene is always the same: no need to compile it anew for each episode
     return env

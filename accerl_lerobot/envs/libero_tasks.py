@@ -7,7 +7,10 @@ Read without importing LIBERO, which asks the terminal for folders and imports t
 from __future__ import annotations
 
 import ast
+import contextlib
 import functools
+import io
+import logging
 import os
 import pickletools
 import zipfile
@@ -126,3 +129,14 @@ def assets_folder(given: str) -> Path:
     except Exception as error:
         remedy = "LIBERO's meshes are not installed and the Hub does not answer; name a folder that has them"
         raise InputError("env.assets", given, f"{remedy} ({error})") from error
+
+
+def load_libero(assets: str) -> None:
+    """Imports LIBERO, which asks nothing and prints nothing, with the meshes of this folder; see above."""
+    configure()
+    logging.getLogger("robosuite_logs").setLevel(logging.ERROR)  # asks for a file of macros that nobody needs
+    with contextlib.redirect_stdout(io.StringIO()):
+        import libero.libero as package
+        import libero.libero.envs
+
+        package._assets_path_cache = str(assets_folder(assets))
