@@ -76,14 +76,6 @@ def eval_seed(run_seed: int, index: int) -> int:
     return EVAL_SEEDS.start + (run_seed * _EVALUATIONS_PER_RUN + index) % len(EVAL_SEEDS)
 
 
-def start_state(seed: int, count: int) -> int:
-    """Index of the recorded start state of an episode, below `count`; evaluation has the first half alone."""
-    first = (count + 1) // 2
-    if seed in EVAL_SEEDS or count == first:
-        return (seed - EVAL_SEEDS.start) % first
-    return first + seed % (count - first)
-
-
 def global_generators() -> dict[str, Any]:
     """The states of the generators that libraries share: Python's, NumPy's, and torch's if it is in use."""
     states: dict[str, Any] = {"python": random.getstate(), "numpy": np.random.get_state()}

@@ -66,7 +66,9 @@ class TestRecipe:
     def test_a_mistake_fails_with_its_line(self, capsys: pytest.CaptureFixture[str]) -> None:
         assert cli.main(["doctor", str(QUICKSTART), "--env.type=x"]) == 1
         out = capsys.readouterr().out
-        assert out.startswith("FAIL  recipe     env.type='x': use one of lerobot, metaworld, simulated\n")
+        assert out.startswith(
+            "FAIL  recipe     env.type='x': use one of lerobot, libero, metaworld, simulated\n"
+        )
         assert "ok    python" in out and "1 of 2 checks failed" in out
 
     @pytest.mark.parametrize(

@@ -192,6 +192,7 @@ def test_what_the_package_imports_is_pinned() -> None:
     pinned = {*pins(project["dependencies"])}
     pinned |= {name for extra in project["optional-dependencies"].values() for name in pins(extra)}
     distribution = {"PIL": "pillow", "yaml": "pyyaml", "huggingface_hub": "huggingface-hub"}
+    distribution |= {"libero": "hf-libero"}
     used = {name.split(".")[0] for path in sources() for name in imports(path)} - {"accerl_lerobot"}
     used = {distribution.get(name, name) for name in used - set(sys.stdlib_module_names)}
     assert used <= pinned

@@ -20,16 +20,14 @@ import numpy as np
 
 from accerl_lerobot.config.ranges import Range
 from accerl_lerobot.envs.base import ChunkResult, EnvConfig, World, WorldSpec, checked_actions
-from accerl_lerobot.envs.libero_tasks import configure
 from accerl_lerobot.envs.metaworld import close_at_exit, import_mujoco
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Observation
-from accerl_lerobot.seeds import start_state
 
 _STATE = "observation.state"
 _IMAGE = "observation.image"
 _PINNED = re.compile(r"[\w.-]+/[\w.-]+@[0-9a-f]{40}(:\w[\w./-]*\.py)?", re.ASCII)
-_NEEDS_MUJOCO = ("aloha", "libero", "libero_plus", "metaworld", "robocasa")
+_NEEDS_MUJOCO = ("aloha", "metaworld", "robocasa")
 
 
 @EnvConfig.register_subclass("lerobot")
@@ -62,6 +60,9 @@ class LeRobotEnvConfig(EnvConfig):
         super().__post_init__()
         if not self.name:
             raise InputError("env.name", self.name, "name one of LeRobot's environments, such as pusht")
+        if self.name.startswith("libero"):
+            remedy = "LeRobot takes its starts in turn and not from the seed; use env.type=libero"
+            raise InputError("env.name", self.name, remedy)
 
 
 class LeRobotWorld(World):
@@ -77,8 +78,6 @@ class LeRobotWorld(World):
     def __init__(self, config: LeRobotEnvConfig) -> None:
         if config.name in _NEEDS_MUJOCO:
             import_mujoco()
-        if config.name.startswith("libero"):
-            configure()
         from lerobot.envs.configs import EnvConfig as LeRobotConfig
         from lerobot.envs.factory import make_env
 
@@ -112,8 +111,6 @@ class LeRobotWorld(World):
             raise InputError("task", task, f"this world has: {', '.join(self._envs)}")
         self._done = True
         env = self._envs[task]
-        if (states := getattr(env, "_init_states", None)) is not None:
-            env.init_state_id = start_state(seed, len(states))  # or LeRobot takes the next one at each reset
         raw, _ = env.reset(seed=seed)
         self._task, self._steps, self._success, self._done = task, 0, False, False
         return self._observe(raw)

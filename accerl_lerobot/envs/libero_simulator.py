@@ -31,7 +31,7 @@ STILL = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
 
 
 class Arm(NamedTuple):
-    """What the controller reads of the simulation, as views of MuJoCo's arrays."""
+    """State that the controller reads, as views of MuJoCo's arrays."""
 
     jacobian: np.ndarray
     """(2, 3, V): of the hand's position and rotation."""
@@ -233,7 +233,7 @@ class Simulator:
         return float(self.data.joint(hinges[0]).qpos[0]) if hinges else 0.0
 
     def render(self, camera: str, height: int, width: int) -> np.ndarray:
-        """What a camera shows, uint8 (height, width, 3), turned as LeRobot's datasets have it."""
+        """Frame of a camera, uint8 (height, width, 3), turned as LeRobot's datasets have it."""
         self._look()
         renderer = self._renderers.get((height, width))
         if renderer is None:
@@ -340,7 +340,7 @@ class SensorClock:
         self._read = True
 
     def tick(self) -> bool:
-        """Whether they read in this simulation step."""
+        """True if they read in this simulation step."""
         self._since += TIMESTEP
         reading = not self._read and self._since <= 1 / FPS
         self._read |= reading

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What LIBERO's package has in files: names and texts of tasks, recorded starts, where the meshes are.
+"""Files of LIBERO's package: names and texts of tasks, recorded starts, where the meshes are.
 
 Read without importing LIBERO, which asks the terminal for folders and imports torch.
 """

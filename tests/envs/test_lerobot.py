@@ -3,16 +3,11 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-import yaml
 
 from accerl_lerobot.envs import LeRobotEnvConfig, LeRobotWorld, MetaWorldConfig, make_world
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.seeds import demo_seed, eval_seed, train_seed
 
 pytest.importorskip("lerobot")
 
@@ -195,102 +190,7 @@ def test_trust_that_nothing_needs(arena):
         make_world(LeRobotEnvConfig(name="pusht", trust_remote_code=True))
 
 
-LIBERO = {
-    # As hf-libero does: the first import asks the terminal where its data is to be.
-    "libero/__init__.py": """
-import os
-folder = os.environ.get("LIBERO_CONFIG_PATH", os.path.expanduser("~/.libero"))
-if not os.path.exists(os.path.join(folder, "config.yaml")):
-    os.makedirs(folder, exist_ok=True)
-    input("Do you want to specify a custom path for the dataset folder? (Y/N): ")
-
-def get_libero_path(key):
-    import yaml
-    return yaml.safe_load(open(os.path.join(folder, "config.yaml")))[key]
-""",
-    "libero/benchmark.py": """
-from types import SimpleNamespace
-
-class Suite:
-    tasks = [SimpleNamespace(name="lift", language="lift the cup", problem_folder="p", bddl_file="b.bddl",
-                             init_states_file="lift.pruned_init")]
-    def get_task(self, i):
-        return self.tasks[i]
-
-def get_benchmark_dict():
-    return {"libero_10": Suite}
-""",
-    "libero/envs.py": """
-import numpy as np
-from types import SimpleNamespace
-
-class OffScreenRenderEnv:
-    def __init__(self, camera_heights, camera_widths, **options):
-        self.size, self.at = (camera_heights, camera_widths, 3), np.zeros(3)
-        self.robots = [SimpleNamespace(controller=SimpleNamespace(ee_ori_mat=np.eye(3), use_delta=True))]
-    def seed(self, seed):
-        pass
-    def reset(self):
-        return self.look()
-    def set_init_state(self, state):
-        self.at = np.array(state)
-        return self.look()
-    def step(self, action):
-        return self.look(), 0.0, False, {}
-    def check_success(self):
-        return False
-    def close(self):
-        pass
-    def look(self):
-        image = np.zeros(self.size, np.uint8)
-        return {
-            "agentview_image": image, "robot0_eye_in_hand_image": image, "robot0_eef_pos": self.at,
-            "robot0_eef_quat": np.array([0.0, 0, 0, 1]), "robot0_gripper_qpos": np.zeros(2),
-            "robot0_gripper_qvel": np.zeros(2), "robot0_joint_pos": np.zeros(7),
-            "robot0_joint_vel": np.zeros(7),
-        }
-""",
-}
-
-
-@pytest.fixture
-def libero(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A stand-in for the package, with 50 start states; nothing of it is left behind."""
-    pytest.importorskip("mujoco")
-    import torch
-
-    root = tmp_path / "packages" / "libero"
-    (root / "libero" / "init_files" / "p").mkdir(parents=True)
-    (root / "__init__.py").touch()
-    for name, text in LIBERO.items():
-        (root / name).write_text(text)
-    states = np.arange(50.0)[:, None].repeat(3, 1)
-    torch.save(states, root / "libero" / "init_files" / "p" / "lift.pruned_init")
-    for name in ("LIBERO_CONFIG_PATH", "XDG_CACHE_HOME"):
-        monkeypatch.setenv(name, "")  # so that it is as it was afterwards
-        monkeypatch.delenv(name)
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.syspath_prepend(str(root.parent))
-    before = set(sys.modules)
-    world = make_world(LeRobotEnvConfig(name="libero", kwargs={"observation_height": 8}))
-    yield world
-    world.close()
-    for name in set(sys.modules) - before:
-        if name.partition(".")[0] == "libero" or name == "lerobot.envs.libero":
-            del sys.modules[name]
-
-
-def test_libero_asks_nobody_and_starts_where_the_seed_says(libero: LeRobotWorld, tmp_path: Path):
-    assert not (tmp_path / ".libero").exists()
-    written = yaml.safe_load((tmp_path / ".cache" / "accerl-lerobot" / "libero" / "config.yaml").read_text())
-    assert written["init_states"] == str(tmp_path / "packages" / "libero" / "libero" / "init_files")
-    assert libero.spec.instructions == ("lift the cup",)
-
-    def start(seed: int) -> int:
-        return int(libero.reset(seed, libero.spec.tasks[0])["observation.state"][0])
-
-    evaluated = [start(eval_seed(3, i)) for i in range(30)]
-    assert evaluated == [*range(25), *range(5)], "as LeRobot evaluates, in the half that is kept for it"
-    assert [start(eval_seed(3, i)) for i in (7, 7, 3)] == [7, 7, 3]
-    trained = {start(train_seed(1, 2, i)) for i in range(60)} | {start(demo_seed(0, i)) for i in range(60)}
-    assert trained == set(range(25, 50))
+@pytest.mark.parametrize("name", ["libero", "libero_plus"])
+def test_libero_has_a_type_of_its_own(name: str):
+    with pytest.raises(InputError, match=f"env.name='{name}': .* use env.type=libero"):
+        LeRobotEnvConfig(name=name)
