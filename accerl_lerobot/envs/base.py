@@ -18,7 +18,7 @@ import dataclasses
 import shlex
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Self
 
@@ -160,6 +160,11 @@ class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
     def nominal(self) -> Self:
         """This config without deployment shift; an environment that has one overrides it."""
         return self
+
+
+def task_code(tasks: Sequence[str], task: str) -> np.ndarray:
+    """Part of ``observation.environment_state`` that tells tasks apart: one-hot, or empty for one task."""
+    return np.eye(len(tasks))[tasks.index(task)] if len(tasks) > 1 else np.zeros(0)
 
 
 _PLUGIN = "accerl_lerobot.envs.lerobot_plugin"

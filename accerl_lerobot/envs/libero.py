@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from accerl_lerobot.config.ranges import Range
-from accerl_lerobot.envs.base import ChunkResult, EnvConfig, World, WorldSpec, checked_actions
+from accerl_lerobot.envs.base import ChunkResult, EnvConfig, World, WorldSpec, checked_actions, task_code
 from accerl_lerobot.envs.libero_simulator import FPS, MAX_OBJECTS, OBJECT_NUMBERS, ROBOT_NUMBERS, Simulator
 from accerl_lerobot.envs.libero_tasks import instruction, resolve
 from accerl_lerobot.errors import InputError, expanded
@@ -58,7 +58,8 @@ class LiberoConfig(EnvConfig):
     of those on the Hub."""
     environment_state: bool = False
     """True if observations hold ``observation.environment_state``: joints and hand of the robot, poses of the
-    objects that the task is about, and the share of `max_steps` gone. For ``algorithm.type=chunk_critic``."""
+    objects that the task is about, the share of `max_steps` gone, and which of several tasks it is. For
+    ``algorithm.type=chunk_critic``."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -72,7 +73,9 @@ class LiberoConfig(EnvConfig):
     @property
     def state_size(self) -> int:
         """See the base class."""
-        return ROBOT_NUMBERS + MAX_OBJECTS * OBJECT_NUMBERS + 1 if self.environment_state else 0
+        if not self.environment_state:
+            return 0
+        return ROBOT_NUMBERS + MAX_OBJECTS * OBJECT_NUMBERS + 1 + len(task_code(self.tasks, self.tasks[0]))
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -180,6 +183,7 @@ class LiberoWorld(World):
         observation["observation.state"] = simulator.state()
         if self.config.environment_state:
             late = self._steps / self.config.max_steps
-            observation[ENVIRONMENT_STATE] = np.append(simulator.everything(), late).astype(np.float32)
+            state = simulator.everything(), [late], task_code(self.spec.tasks, self._task)
+            observation[ENVIRONMENT_STATE] = np.concatenate(state).astype(np.float32)
         observation[TASK] = instruction(self._task)
         return observation

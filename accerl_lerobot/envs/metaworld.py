@@ -40,7 +40,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 
 from accerl_lerobot.config.ranges import Positive, Range, Section
-from accerl_lerobot.envs.base import ChunkResult, EnvConfig, World, WorldSpec, checked_actions
+from accerl_lerobot.envs.base import ChunkResult, EnvConfig, World, WorldSpec, checked_actions, task_code
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 
@@ -296,8 +296,8 @@ class MetaWorldConfig(EnvConfig):
     """``success`` (1.0 at the first success, else 0.0) or ``dense`` (MetaWorld's own, 0 to 10 a step)."""
     environment_state: bool = False
     """True if observations hold ``observation.environment_state``: MetaWorld's own 39 numbers, objects and
-    goal included, and the share of `max_steps` gone. For ``algorithm.type=chunk_critic``; a policy that was
-    trained without it never reads it."""
+    goal included, the share of `max_steps` gone, and which of several tasks it is. For
+    ``algorithm.type=chunk_critic``; a policy that was trained without it never reads it."""
     shift: ShiftConfig = field(default_factory=ShiftConfig)
 
     def __post_init__(self) -> None:
@@ -311,7 +311,7 @@ class MetaWorldConfig(EnvConfig):
     @property
     def state_size(self) -> int:
         """See the base class."""
-        return RAW_DIM + 1 if self.environment_state else 0
+        return RAW_DIM + 1 + len(task_code(self.tasks, self.tasks[0])) if self.environment_state else 0
 
     def nominal(self) -> MetaWorldConfig:
         """See the base class."""
@@ -467,7 +467,8 @@ class MetaWorld(World):
         observation["observation.state"] = self._raw[:STATE_DIM].astype(np.float32)
         if self.config.environment_state:
             late = self._steps / self.config.max_steps
-            observation[ENVIRONMENT_STATE] = np.append(self._raw, late).astype(np.float32)
+            state = self._raw, [late], task_code(self.spec.tasks, self._task)
+            observation[ENVIRONMENT_STATE] = np.concatenate(state).astype(np.float32)
         observation[TASK] = description(self._task)
         return observation
 

@@ -216,6 +216,7 @@ def test_chunks_give_the_states_of_single_steps(world: LiberoWorld):
     assert at_once["observation.state"].shape == (8,) and at_once[IMAGE].shape == (64, 64, 3)
     assert at_once["observation.environment_state"].shape == (world.config.state_size,)
     assert at_once["task"].startswith("pick up the black bowl")
+    assert list(at_once["observation.environment_state"][-3:]) == pytest.approx([10 / 280, 0, 1])
 
 
 @needs_assets
