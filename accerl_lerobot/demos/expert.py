@@ -11,7 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from accerl_lerobot.demos.libero_expert import libero_expert
 from accerl_lerobot.envs.base import EnvConfig, World
+from accerl_lerobot.envs.libero import LiberoConfig
 from accerl_lerobot.envs.metaworld import MetaWorld, MetaWorldConfig, expert_name, import_mujoco
 from accerl_lerobot.envs.simulated import SimulatedConfig, SimulatedWorld
 from accerl_lerobot.errors import InputError
@@ -133,6 +135,7 @@ def _simulated_expert(world: World, task: str) -> Expert:
 
 
 _EXPERTS: dict[type[EnvConfig], Callable[[World, str], Expert]] = {
+    LiberoConfig: libero_expert,
     MetaWorldConfig: _metaworld_expert,
     SimulatedConfig: _simulated_expert,
 }

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
+import itertools
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -224,6 +225,27 @@ class Simulator:
         quaternion = np.zeros(4)
         self._mujoco.mju_mat2Quat(quaternion, self.data.site_xmat[site])
         return self.data.site_xpos[site].copy(), quaternion
+
+    @property
+    def hand(self) -> tuple[np.ndarray, np.ndarray]:
+        """Position (3,) and rotation (3, 3) of the point between the fingertips, as views."""
+        return self._position, self._rotation
+
+    def extent(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corner, (3,) each, of the box around what collides of an object."""
+        model, data = self.model, self.data
+        root, corners = self.env.obj_body_id[name], []
+        for geom in np.flatnonzero(model.geom_contype):
+            body = model.geom_bodyid[geom]
+            while body not in (0, root):
+                body = model.body_parentid[body]
+            if body == root:
+                centre, half = np.split(model.geom_aabb[geom], 2)
+                signs = np.array(list(itertools.product((-1, 1), repeat=3)))
+                turned = (centre + signs * half) @ data.geom_xmat[geom].reshape(3, 3).T
+                corners.append(data.geom_xpos[geom] + turned)
+        every = np.concatenate(corners)
+        return every.min(0), every.max(0)
 
     def opening(self, name: str) -> float:
         """Position of the joint of a drawer, door or knob; 0 for what has none."""
