@@ -322,3 +322,31 @@ def test_observations_are_lerobots(task: str):
         assert np.abs(their["observation.state"] - our["observation.state"]).max() < 1e-6
         assert our["task"] == text
     world.close()
+
+
+@needs_assets
+def test_stock_lerobot_sees_our_world(world: LiberoWorld):
+    from lerobot.configs.parser import load_plugin
+    from lerobot.envs.factory import make_env, make_env_config
+    from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features, preprocess_observation
+
+    load_plugin("accerl_lerobot.envs.lerobot_plugin")
+    fields = {"task": "libero_object/0", "image_size": 64, "rendering": "fast", "assets": ASSETS}
+    config = make_env_config("accerl_libero", max_steps=3, **fields)
+    assert {key: tuple(value.shape) for key, value in env_to_policy_features(config).items()} == {
+        "action": (7,),
+        "observation.state": (8,),
+        IMAGE: (3, 64, 64),
+        WRIST: (3, 64, 64),
+    }
+    vector = make_env(config, n_envs=1)["libero_object/0"][0]
+    seed = eval_seed(0, 0)
+    seen = preprocess_observation(vector.reset(seed=[seed], options={NEW_ROLLOUT_OPTION: True})[0])
+    ours = world.reset(seed, "libero_object/0")
+    picture = (seen[IMAGE][0] * 255).round().byte().permute(1, 2, 0).numpy()
+    assert np.array_equal(picture, ours[IMAGE])
+    assert np.array_equal(seen["observation.state"][0].numpy(), ours["observation.state"])
+    assert vector.call("task_description") == (ours["task"],)
+    ended = [vector.step(np.zeros((1, 7), np.float32))[3].all() for _ in range(3)]
+    assert ended == [False, False, True]
+    vector.close()
