@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import shutil
 import sys
 from collections.abc import Callable
 from contextlib import redirect_stdout
@@ -174,7 +173,7 @@ def train(arguments: list[str], load: Load | None = None) -> int:
             summary = run.train(config, directory, console, wanted, load)
     except InputError:
         if begun is None:
-            _discard_unused(directory)
+            run.discard_unused(directory)
         raise
     except StoppedError as stopped:
         console.say(str(stopped))
@@ -256,26 +255,13 @@ def evaluate(arguments: list[str]) -> int:
     if out is not None:
         check_absent(out)
     from accerl_lerobot.engine import run
-    from accerl_lerobot.engine.loop import run_plans
-    from accerl_lerobot.engine.preflight import check_machine
-    from accerl_lerobot.evaluation.stats import evaluation_plans, summarise, table
+    from accerl_lerobot.evaluation.stats import summarise, table
 
     sections = ("seed", "env", "policy", "rollout", "inference", "evaluation", "launch")
     whole = RunConfig(**{name: getattr(config, name) for name in sections})
-    check_machine(whole)
-    filmed = config.evaluation.videos if out else 0
     console = Console()
     with redirect_stdout(sys.stderr):
-        spec = run.check_world(whole.env)
-        tasks, history = spec.tasks, run.check_policy(whole, spec)
-        engine = run.make_engine(whole, tasks, history)
-        try:
-            episodes = config.evaluation.episodes
-            film = config.evaluation.film
-            engine.plan(evaluation_plans(tasks, episodes, "eval", seed=config.seed, filmed=filmed, film=film))
-            results = run_plans(engine, config.evaluation.episodes, "eval", console)
-        finally:
-            engine.close()
+        results = run.evaluate(whole, console, config.evaluation.videos if out else 0)
     summary: dict[str, Any] = summarise(results) | {"policy": config.policy.path}
     console.say(f"{config.policy.path}, LeRobot's sampler")
     console.rich.print(table(summary, "evaluation"))
@@ -307,7 +293,7 @@ def _validated(
     config: WorldModelRun | WorldModelEvalRun, work: Callable[[Path, Console], dict[str, Any]]
 ) -> int:
     """Does the work in a new folder and shows the validation that it ends with."""
-    from accerl_lerobot.engine.run import make_output_dir
+    from accerl_lerobot.engine.run import discard_unused, make_output_dir
     from accerl_lerobot.world_model.metrics import (
         check_lines,
         datasets_table,
@@ -323,7 +309,7 @@ def _validated(
         with redirect_stdout(sys.stderr), kept_traceback(directory):
             found = work(directory, console)
     except InputError:
-        _discard_unused(directory)
+        discard_unused(directory)
         raise
     console.rich.print(depth_table(found))
     if has_several(found):
@@ -442,11 +428,3 @@ def _write_evaluation(out: Path, summary: dict[str, Any], results: list[EpisodeR
             outcome = "success" if result.success else "failure"
             name = f"{result.plan.task.replace('/', '-')}_{result.plan.seed}_{outcome}.mp4"
             write_video(out / name, [[result.frames]], fps=20)
-
-
-def _discard_unused(directory: Path) -> None:
-    """Removes the folder of a run that was refused before it did anything, so that its name is free again."""
-    from accerl_lerobot.engine.stopping import LOCK
-
-    if {path.name for path in directory.iterdir()} <= {CONFIG, LOCK}:
-        shutil.rmtree(directory)

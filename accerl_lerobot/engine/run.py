@@ -44,13 +44,21 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.engine import ray_session
 from accerl_lerobot.engine.config import RunConfig, encode, timeline_folder
 from accerl_lerobot.engine.contract import Engine, WorkerError, pause_s
-from accerl_lerobot.engine.loop import Loop, Outputs, Times
-from accerl_lerobot.engine.preflight import check_placement, check_policy, check_start, check_world
-from accerl_lerobot.engine.stopping import Stopping, raise_if_stopped
+from accerl_lerobot.engine.loop import Loop, Outputs, Times, run_plans
+from accerl_lerobot.engine.preflight import (
+    check_machine,
+    check_placement,
+    check_policy,
+    check_start,
+    check_world,
+)
+from accerl_lerobot.engine.stopping import LOCK, Stopping, raise_if_stopped
 from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, make_folder
+from accerl_lerobot.evaluation.stats import evaluation_plans
 from accerl_lerobot.metrics import METRICS, MetricsLog
 from accerl_lerobot.policies.config import Load, loader
 from accerl_lerobot.replay.journal import EPISODES
+from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.timeline import RECOVERY, open_clock
 
 if TYPE_CHECKING:
@@ -78,6 +86,29 @@ def make_output_dir(config: Any) -> Path:
     check_absent(path)
     make_folder(path, "output_dir")
     return path
+
+
+def discard_unused(directory: Path) -> None:
+    """Remove the folder of a run that was refused before it did anything, so that its name is free again."""
+    if {path.name for path in directory.iterdir()} <= {CONFIG, LOCK}:
+        shutil.rmtree(directory)
+
+
+def evaluate(config: RunConfig, console: Console, filmed: int = 0) -> list[EpisodeResult]:
+    """Play the evaluation episodes of a run with LeRobot's sampler, on seeds that are never trained on.
+
+    Args:
+        config: of which the sections of algorithms and training do not matter.
+        console: progress for people.
+        filmed: episodes whose frames are kept.
+    """
+    check_machine(config)
+    spec = check_world(config.env)
+    engine = make_engine(config, spec.tasks, check_policy(config, spec))
+    with contextlib.closing(engine):
+        count, film = config.evaluation.episodes, config.evaluation.film
+        engine.plan(evaluation_plans(spec.tasks, count, "eval", seed=config.seed, filmed=filmed, film=film))
+        return run_plans(engine, count, "eval", console)
 
 
 def make_engine(
@@ -147,7 +178,7 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
             task_texts(meta),
             on_step=lambda step, loss: stage.update(step, f"loss {loss:.3f}"),
         )
-    return _improving(config, path)
+    return improving(config, path)
 
 
 def train(
@@ -294,13 +325,13 @@ def _warm_started(config: RunConfig, directory: Path, console: Console) -> RunCo
         write_atomically(note, json.dumps({"policy": str(path)}) + "\n")
         return warm
     path = directory / json.loads(note.read_text())["policy"]
-    return _improving(config, path)
+    return improving(config, path)
 
 
 def _resumed(config: RunConfig, directory: Path, checkpoint: Path, console: Console) -> RunConfig:
     """The run from its checkpoint on, which holds everything, whatever has become of its start."""
     if config.policy.tuning.mode != "lora":
-        return _improving(config, checkpoint / PRETRAINED)
+        return improving(config, checkpoint / PRETRAINED)
     # A checkpoint has low-rank adapters merged; apart from what they adapt they are in the training state.
     start = _start(config, directory)
     if start is None:
@@ -310,7 +341,7 @@ def _resumed(config: RunConfig, directory: Path, checkpoint: Path, console: Cons
 
             with console.stage("the policy it began from is not here: reconstructing it, up to rounding"):
                 reconstruct_base(config.policy, checkpoint, directory / BASE)
-    return _improving(config, start)
+    return improving(config, start)
 
 
 def _start(config: RunConfig, directory: Path) -> str | None:
@@ -336,6 +367,6 @@ def _check_imagination(config: RunConfig, resuming: bool) -> None:
         check_imagination(config)
 
 
-def _improving(config: RunConfig, path: Path | str) -> RunConfig:
+def improving(config: RunConfig, path: Path | str) -> RunConfig:
     """The run as one that improves a checkpoint."""
     return replace(config, policy=replace(config.policy, path=str(path)), sft=replace(config.sft, steps=0))

@@ -11,6 +11,7 @@ import contextlib
 import functools
 import io
 import itertools
+import re
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -26,6 +27,8 @@ MAX_OBJECTS = 4
 """Most objects that a task names as those it is about."""
 MAX_FACES = 2000
 """Faces that ``rendering=fast`` keeps of a mesh."""
+ARENA = "64M"
+"""Memory of a simulation's contacts and constraints; some 6 MB are used."""
 ROBOT_NUMBERS, OBJECT_NUMBERS = 25, 8
 TIMESTEP = 0.002
 STILL = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
@@ -377,9 +380,16 @@ def _build(task: str, assets: str) -> Any:
     """robosuite's environment of a task, which draws nothing."""
     load_libero(assets)
     from libero.libero.envs.env_wrapper import ControlEnv
+    from robosuite.utils.binding_utils import MjSim
 
-    with contextlib.redirect_stdout(io.StringIO()):
-        env = ControlEnv(str(bddl_file(task)), use_camera_obs=False, has_offscreen_renderer=False).env
+    compiled = MjSim.from_xml_string
+    # Room for 5,000 contacts is 1.3 GB of addresses for each simulation, with which no process can be forked.
+    MjSim.from_xml_string = lambda xml: compiled(re.sub(r"<size [^>]*>", f'<size memory="{ARENA}"/>', xml))
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            env = ControlEnv(str(bddl_file(task)), use_camera_obs=False, has_offscreen_renderer=False).env
+    finally:
+        MjSim.from_xml_string = compiled
     env.hard_reset = False  # the scene is always the same: no need to compile it anew for each episode
     return env
 
