@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The Python interface does what the command line does, and gives objects."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import accerl_lerobot
+from accerl_lerobot import RunConfig, evaluate, load_config, load_policy, resume, train
+from accerl_lerobot.envs import make_world
+from accerl_lerobot.errors import InputError
+from tests.test_run import local_run
+
+EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
+
+
+def test_the_package_loads_nothing_until_it_is_used():
+    code = (
+        "import sys, accerl_lerobot; assert 'torch' not in sys.modules and 'numpy' not in sys.modules;"
+        "from accerl_lerobot import RunConfig, train; assert 'lerobot.policies' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    with pytest.raises(AttributeError, match="no attribute 'practise'"):
+        accerl_lerobot.practise  # noqa: B018
+
+
+def test_settings_are_those_of_the_command_line():
+    changes = {
+        "env.task": "drawer-open-v3",
+        "seed": 3,
+        "evaluation.before": False,
+        "trainer.betas": [0.9, 0.99],
+    }
+    config = load_config("recipes/quickstart.yaml", changes)
+    assert isinstance(config, RunConfig)
+    assert config.env.tasks == ("drawer-open-v3",) and config.seed == 3  # type: ignore[attr-defined]
+    assert not config.evaluation.before and config.trainer.betas == (0.9, 0.99)
+    assert load_config(changes={"policy.revision": None}).policy.revision is None
+    with pytest.raises(InputError, match=r"trainer\.update=3: no such field; did you mean trainer\.updates"):
+        load_config(changes={"trainer.update": 3})
+
+
+def test_train_evaluate_resume_act(tiny_checkpoint: Path, tmp_path: Path):
+    config = local_run(tiny_checkpoint, tmp_path / "run")
+    result = train(config)
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert result.summary == summary and result.directory == tmp_path / "run"
+    assert result.before is not None and result.before.n == result.after.n == 8
+    assert result.after.value == summary["success_after"]
+
+    found = evaluate(config, policy=result.policy, episodes=8)
+    assert found.success == result.after, "the same policy on the same starts"
+    assert list(found.tasks) == ["match"] and len(found.episodes) == 8
+
+    further = resume(tmp_path / "run", {"trainer.updates": 14})
+    assert further.summary["updates"] == 14 and further.directory == result.directory
+
+    policy, world = load_policy(further.policy), make_world(config.env)
+    observation = world.reset(3, "match")
+    chunk = policy.act(observation)
+    assert chunk.shape[1] == world.spec.action_dim and np.isfinite(chunk).all()
+    assert not np.array_equal(chunk, policy.act(observation)), "a flow policy samples"
+    assert np.array_equal(chunk, load_policy(further.policy).act(observation))
+
+
+def test_a_refused_run_leaves_no_folder(tiny_checkpoint: Path, tmp_path: Path):
+    config = local_run(tmp_path / "nowhere", tmp_path / "run")
+    with pytest.raises(InputError, match=r"policy\.path"):
+        train(config)
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(InputError, match="resume=True: use accerl_lerobot.resume"):
+        train(local_run(tiny_checkpoint, tmp_path / "run", resume=True))
+    with pytest.raises(InputError, match="no such file"):
+        resume(tmp_path)
+
+
+@pytest.mark.slow
+def test_the_notebook_runs_from_top_to_bottom(tmp_path: Path):
+    """Its cells one after another, as Jupyter runs them."""
+    cells = json.loads((EXAMPLES / "improve_a_policy.ipynb").read_text())["cells"]
+    code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    script = tmp_path / "notebook.py"
+    # The recorder's workers import the main module again.
+    script.write_text("if __name__ == '__main__':\n" + "".join(f"    {line}\n" for line in code.splitlines()))
+    shutil.copy(EXAMPLES / "simulated.yaml", tmp_path)
+    command = [sys.executable, str(script)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stderr
+    assert "before" in done.stdout and "one more episode" in done.stdout
