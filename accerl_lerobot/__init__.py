@@ -17,7 +17,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from accerl_lerobot.api import evaluate, load_config, load_policy, resume, train
+    from accerl_lerobot.engine.api import evaluate, load_config, load_policy, resume, train
     from accerl_lerobot.engine.config import RunConfig
 
 __version__ = "0.1.0"
@@ -28,5 +28,5 @@ def __getattr__(name: str) -> Any:
     # At first use: workers and `accerl --help` import this package too, and need none of it.
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = "engine.config" if name == "RunConfig" else "api"
+    module = "engine.config" if name == "RunConfig" else "engine.api"
     return getattr(importlib.import_module(f"{__name__}.{module}"), name)

@@ -128,7 +128,7 @@ def draw(path: Path, result: dict[str, Any]) -> None:
                     axes.scatter([x] * len(success), success, s=10, color="black", zorder=3)
         axes.set_xticks(range(len(tasks)), [t.removesuffix("-v3") for t in tasks], rotation=20, ha="right")
         axes.set(ylabel="success", ylim=(0, 1.02))
-        axes.legend()
+        axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=2)
 
 
 def _row(of: dict[str, Any], seed: int, start: dict[str, Any], summary: dict[str, Any]) -> dict[str, Any]:
