@@ -27,13 +27,11 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.demos.expert import Episode
 from accerl_lerobot.demos.record import features, frames
 from accerl_lerobot.demos.writing import (
-    Start,
     appearing,
     check_free,
     in_order,
     new_dataset,
     simulators,
-    write_starts,
 )
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.envs import make_world
@@ -146,7 +144,6 @@ def _write(
         VERSION: {"dtype": "int64", "shape": (1,), "names": None}
     }
     cost = settings.rollout.decision_cost
-    starts: list[Start] = []
     with (
         console.stage("replaying episodes", total=len(chosen)) as stage,
         simulators(config.processes, _start, settings.env, cost) as pool,
@@ -161,11 +158,9 @@ def _write(
                 for frame in _versioned(episode, parts):
                     dataset.add_frame(frame)
                 dataset.save_episode()
-                starts.append((parts[0].origin.task, parts[0].origin.seed))
                 tally["episodes"] += 1
                 tally["frames"] += len(episode)
                 tally["successes"] += episode.success
-    write_starts(root, starts)
     if tally["unlike"]:
         console.say(f"{tally['unlike']} of {len(chosen)} episodes differed from the run and are left out")
     return tally

@@ -25,13 +25,11 @@ from rich.progress import Progress
 from accerl_lerobot.config.ranges import DatasetName, NewFolder, Range, Section, Seed, Share
 from accerl_lerobot.demos.expert import Episode, make_expert, play
 from accerl_lerobot.demos.writing import (
-    Start,
     appearing,
     check_free,
     in_order,
     new_dataset,
     simulators,
-    write_starts,
 )
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.envs.base import EnvConfig, World, WorldSpec
@@ -116,7 +114,6 @@ def record_demos(env_config: EnvConfig, config: DemosConfig) -> Path:
 
 def _write(env_config: EnvConfig, config: DemosConfig, spec: WorldSpec, root: Path) -> dict[str, Any]:
     tally = {"episodes": 0, "frames": 0, "successes": 0, "discarded": 0}
-    starts: list[Start] = []
     with (
         simulators(config.processes, _start, env_config, config) as pool,
         Progress(transient=True) as progress,
@@ -130,13 +127,11 @@ def _write(env_config: EnvConfig, config: DemosConfig, spec: WorldSpec, root: Pa
                 for frame in frames(episode):
                     dataset.add_frame(frame)
                 dataset.save_episode()
-                starts.append((spec.tasks[len(starts) % len(spec.tasks)], episode.seed))
                 tally["episodes"] += 1
                 tally["frames"] += len(episode)
                 tally["successes"] += episode.success
                 tally["discarded"] += discarded
                 progress.advance(bar)
-    write_starts(root, starts)
     return tally
 
 

@@ -5,25 +5,16 @@ from __future__ import annotations
 
 import collections
 import concurrent.futures
-import json
 import multiprocessing
 import shutil
 import signal
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from accerl_lerobot import guardian
-from accerl_lerobot.checkpoint.safety import Origin, read_json, safe_join
 from accerl_lerobot.errors import check_absent, expanded
-from accerl_lerobot.seeds import EVAL_SEEDS
-
-Start = tuple[str, int]
-"""Task and seed of `World.reset`."""
-
-STARTS = Path("meta") / "accerl_starts.json"
-"""Inside a dataset of ``accerl demos`` or ``accerl export``."""
 
 
 def check_free(root: str, prefix: str = "") -> Path:
@@ -119,26 +110,3 @@ def new_dataset(
     dataset.finalize()
     # The pictures are inside the parquet files; LeRobot leaves the folders they were collected in.
     shutil.rmtree(root / "images", ignore_errors=True)
-
-
-def write_starts(root: Path, starts: Sequence[Start]) -> None:
-    """Writes, in order, how each episode of a dataset began, so that it can be played again."""
-    (root / STARTS).write_text(json.dumps({"starts": starts}) + "\n")
-
-
-def read_starts(root: Path, episodes: int, origin: Origin) -> list[Start]:
-    """Reads the file of `write_starts`; one that does not have all `episodes` is refused."""
-    path = safe_join(root, STARTS.as_posix(), origin)
-    if not path.is_file():
-        remedy = "is missing: nobody knows how its episodes began; record it with accerl demos or export"
-        raise origin.refuse(STARTS.as_posix(), remedy)
-    starts = read_json(path, origin).get("starts")
-    if not isinstance(starts, list) or len(starts) != episodes or not all(map(_is_start, starts)):
-        raise origin.refuse(STARTS.as_posix(), f"{episodes} pairs of a task and a seed are wanted")
-    return [(task, seed) for task, seed in starts]
-
-
-def _is_start(value: object) -> bool:
-    if not isinstance(value, list) or len(value) != 2 or not isinstance(value[0], str):
-        return False
-    return type(value[1]) is int and 0 <= value[1] < EVAL_SEEDS.stop

@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from accerl_lerobot.checkpoint.safety import Origin
 from accerl_lerobot.demos.expert import make_expert, play
 from accerl_lerobot.demos.record import SIDECAR, DemosConfig, record_demos
-from accerl_lerobot.demos.writing import STARTS, read_starts
 from accerl_lerobot.envs import EnvConfig, LeRobotEnvConfig, MetaWorldConfig, SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
+from accerl_lerobot.seeds import demo_seed
 from tests.rounding import assert_close
 
 TINY = Path(__file__).parents[2] / "datasets" / "metaworld_tiny"
@@ -67,9 +66,7 @@ def test_the_expert_succeeds_at_the_last_frame_of_each_episode(recorded: Path):
 def test_frames_are_what_the_world_showed_when_the_action_was_chosen(recorded: Path):
     data = rows(recorded)
     world = make_world(MetaWorldConfig(task=TASKS))
-    task, seed = read_starts(recorded, 2, Origin("dataset.root", str(recorded)))[0]
-    assert task == "handle-press-v3"
-    observation = world.reset(seed, task)
+    observation = world.reset(demo_seed(0, 0), "handle-press-v3")
     for row in data[:10]:
         stored = (row["observation.images.corner2"] * 255).round().astype(np.uint8).transpose(1, 2, 0)
         assert np.array_equal(stored, observation["observation.images.corner2"])
@@ -155,27 +152,6 @@ def test_an_environment_without_experts_is_refused(tmp_path: Path):
     pytest.importorskip("gym_pusht")
     with pytest.raises(InputError, match="env.type='lerobot'"):
         record_demos(LeRobotEnvConfig(name="pusht"), DemosConfig(root=str(tmp_path / "x")))
-
-
-def test_a_dataset_that_does_not_say_how_it_began(tmp_path: Path):
-    origin, recorded = Origin("dataset.root", "here"), tmp_path / "recorded"
-    demos = DemosConfig(episodes=8, failure_share=0.5, processes=1, root=str(recorded), repo_id="a/b")
-    record_demos(SimulatedConfig(max_steps=60, hold=25, image_size=16), demos)
-    assert {task for task, _ in read_starts(recorded, 8, origin)} == {"match"}
-    with pytest.raises(InputError, match="8 pairs|7 pairs"):
-        read_starts(recorded, 7, origin)
-    with pytest.raises(InputError, match=r"accerl_starts.json: is missing: nobody knows how its episodes"):
-        read_starts(tmp_path, 8, origin)
-    (tmp_path / "meta").mkdir()
-    for content in (
-        '{"starts": [["match", -1]]}',
-        '{"starts": [["match", true]]}',
-        '{"starts": [[1, 1]]}',
-        "{}",
-    ):
-        (tmp_path / STARTS).write_text(content)
-        with pytest.raises(InputError, match="1 pairs of a task and a seed"):
-            read_starts(tmp_path, 1, origin)
 
 
 def test_its_size_and_place():
