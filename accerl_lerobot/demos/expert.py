@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from accerl_lerobot.demos.libero_expert import libero_expert
 from accerl_lerobot.envs.base import EnvConfig, World
 from accerl_lerobot.envs.libero import LiberoConfig
 from accerl_lerobot.envs.metaworld import MetaWorld, MetaWorldConfig, expert_name, import_mujoco
@@ -129,13 +128,19 @@ def _metaworld_expert(world: World, task: str) -> Expert:
     return lambda: policy.get_action(world.raw_observation)
 
 
+def _libero_expert(world: World, task: str) -> Expert:
+    from accerl_lerobot.demos.libero_expert import libero_expert  # imports SciPy
+
+    return libero_expert(world, task)
+
+
 def _simulated_expert(world: World, task: str) -> Expert:
     assert isinstance(world, SimulatedWorld)
     return lambda: world.solution
 
 
 _EXPERTS: dict[type[EnvConfig], Callable[[World, str], Expert]] = {
-    LiberoConfig: libero_expert,
+    LiberoConfig: _libero_expert,
     MetaWorldConfig: _metaworld_expert,
     SimulatedConfig: _simulated_expert,
 }

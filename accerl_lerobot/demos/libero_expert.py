@@ -1,185 +1,268 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scripted experts for LIBERO: pick an object up from above and put it down where the task wants it.
+"""Scripted experts for LIBERO that read the simulator's own state.
 
-They read the simulator's state. A grasp that has slipped, or that something was in the way of, is noticed and
-tried again from another side.
+A script is a generator of actions. It reads the simulation before each action, and grasps a lost object
+again. Positions are in metres in the world's frame, rotations in radians.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Generator
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from accerl_lerobot.demos.libero_grasp import DOWN, Grasp, Scene
 from accerl_lerobot.envs.base import World
 from accerl_lerobot.envs.libero import LiberoWorld
 from accerl_lerobot.envs.libero_simulator import Simulator
 from accerl_lerobot.errors import InputError
 
-REACH = 0.045
-"""Metres that an object may stand out above the fingertips before it touches the palm."""
-PALM = 0.08
-"""Metres from the fingertips to the palm, which reaches `PALM_HALF` to each side along the fingers' axis."""
-PALM_HALF = 0.1
-STEP = 0.05
-"""Metres of a full Cartesian action."""
-TURN = 0.5
-"""Radians of a full turning action."""
-CLOSING = 9
-"""Env steps that the fingers take."""
-STUCK = 50
-"""Env steps after which something must be in the way."""
-RIM = 0.05
-"""Metres from the middle of a bowl to its rim."""
+Script = Generator[np.ndarray, None, bool]
+"""Yields actions, float64 (7,); returns True if the movement was completed."""
+
+SUITES = ("libero_object", "libero_spatial", "libero_goal")
+UNSOLVED = "libero_goal/3"
+"""The task without an expert: open the top drawer and put the bowl inside."""
+REACH, TURN = 0.05, 0.5
+"""Movement in m and rad for an action of 1."""
+GRIP_STEPS = 10
+"""Env steps in which the fingers open or close."""
+OFFSETS = {
+    "basket": (0, 0, -0.055),
+    "cook_region": (0, 0, 0.035),
+    "wine_rack": (0, -0.01, 0.008),
+    "bowl": (0, 0, 0.03),
+}
+"""Target of an object's lowest point, relative to the position of the object or region it is placed on."""
+HANDLE = np.array([-0.002, -0.1015, 0.1105])
+"""Centre of the handle of the cabinet's middle drawer, in the cabinet's frame."""
+KNOB = 0.038
+"""Height of the grasp above the origin of the stove's knob."""
+PRESS = 0.008
+"""Height of the fingers above a plate's origin while they push it."""
 
 
-class PickAndPlace:
-    """One episode's expert; call it for the next action, float32 (7,).
+class Hand:
+    """Movements of the robot's hand.
 
     Args:
-        simulator: at the start of the episode.
+        scene: where it moves.
+        rng: for the differences between episodes.
     """
 
-    def __init__(self, simulator: Simulator) -> None:
-        self.sim = simulator
-        (_, self.object, self.place), *_ = simulator.env.parsed_problem["goal_state"]
-        self.bowl = self.object.startswith("akita")
-        self.rotation = simulator.hand[1].copy()
-        position = simulator.pose(self.object)[0]
-        # Varied from episode to episode, and the same for equal starts.
-        seed = np.concatenate([position, simulator.pose(self.place)[0]]) * 1e6
-        rng = np.random.default_rng(np.abs(seed).astype(int))
-        self.above, self.gain = rng.uniform(0.07, 0.11), rng.uniform(0.8, 1.2)
-        self.shift = rng.normal(0, 0.003, 2)
-        self.phase, self.waited = "above", 0
-        self.bottom = position[2]
-        # Directions from the object's middle in which it is grasped, and the turns of the hand for that.
-        sides = np.array([0, np.pi, -np.pi / 2, np.pi / 2] if self.bowl else [0, 0.45, -0.45])
-        room = np.array([min(self._room(position, side), 0.04) for side in sides])
-        room += 1e-3 * rng.random(len(sides))
-        self.sides = list(sides[np.argsort(-room)])
+    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
+        self.scene, self.simulator, self.rng = scene, scene.simulator, rng
+        self.speed = rng.uniform(0.85, 1)
+        self.grip = -1.0
+        self.held = np.zeros(3)
+        """Offset of the grasped object from the hand."""
+        self.turn: Callable[[np.ndarray], np.ndarray] = lambda at: DOWN
+        """Maps the hand's position to its wanted orientation (3, 3)."""
 
-    def __call__(self) -> np.ndarray:
-        hand, _ = self.sim.hand
-        position, target = self.sim.pose(self.object)[0], self.sim.pose(self.place)[0]
-        grasp, height = self._grasp(position), self._carry(hand)
-        held = np.linalg.norm((hand - grasp)[:2]) < 0.04 and hand[2] - grasp[2] < 0.04
-        over = target + (hand - position) * np.array([1, 1, 0])
-        self.waited += 1
-        if self.phase in ("lift", "over", "lower") and not held:
-            self._try_another_side()
-        if self.phase == "above":
-            goal = grasp + np.array([0, 0, self.above])
-            if np.linalg.norm(goal[:2] - hand[:2]) > 0.06:  # on the way there nothing may be in the way
-                goal[2] = max(goal[2], hand[2])
-            elif np.linalg.norm(goal[:2] - hand[:2]) < 0.015 and hand[2] < goal[2] + 0.03:
-                self._go("down")
-            if self.waited > STUCK:
-                self._try_another_side()
-        if self.phase == "down":
-            goal = grasp
-            if np.linalg.norm(goal[:2] - hand[:2]) > 0.03:
-                self._go("above")
-            elif hand[2] - goal[2] < 0.008 or self.waited > 20:  # the palm or the floor may be in the way
-                self._go("close")
-        if self.phase == "close":
-            goal = grasp
-            if self.waited > CLOSING:
-                self._go("lift")
-        if self.phase == "lift":
-            goal = np.array([*hand[:2], height])
-            if hand[2] > height - 0.02:
-                self._go("over")
-        if self.phase == "over":
-            goal = np.array([*over[:2], height])
-            if np.linalg.norm(goal[:2] - hand[:2]) < 0.012:
-                self._go("lower")
-        if self.phase == "lower":
-            goal = np.array([*over[:2], self._release(hand, position, target)])
-            if hand[2] < goal[2] + 0.01 or self.waited > STUCK:
-                self._go("open")
-        if self.phase == "open":
-            goal = hand
-            if self.waited > CLOSING:
-                self._go("away")
-        if self.phase == "away":
-            goal = np.array([*hand[:2], height])
-            if hand[2] > height - 0.02:
-                self._go("above")
-        return self._action(goal, closed=self.phase in ("close", "lift", "over", "lower"))
+    def toward(self, goal: np.ndarray) -> np.ndarray:
+        """Action toward a position and the wanted orientation."""
+        delta = (goal - self.simulator.hand[0]) / REACH
+        turn = self.rotation_error().as_rotvec() / TURN
+        action = [part * min(1.0, self.speed / max(np.abs(part).max(), 1e-9)) for part in (delta, turn)]
+        return np.concatenate([*action, [self.grip]])
 
-    def _go(self, phase: str) -> None:
-        self.phase, self.waited = phase, 0
+    def rotation_error(self) -> Rotation:
+        """Rotation from the hand's current orientation to the wanted one."""
+        position, rotation = self.simulator.hand
+        return Rotation.from_matrix(self.turn(position) @ rotation.T)
 
-    def _try_another_side(self) -> None:
-        self.sides.append(self.sides.pop(0))
-        self._go("away")
+    def move(
+        self,
+        goal: Callable[[], np.ndarray],
+        within: float = 0.012,
+        steps: int = 60,
+        given: Callable[[], bool] = lambda: True,
+    ) -> Script:
+        """Moves straight to a goal that may itself move, for at most `steps` and while `given` is true."""
+        lag: np.ndarray = np.zeros(3)
+        for _ in range(steps):
+            if not given():
+                return False
+            error = goal() - self.simulator.hand[0]
+            distance = np.linalg.norm(error)
+            if distance < within and self.rotation_error().magnitude() < 0.2:
+                return True
+            if distance < 0.03:  # the controller has no integral part, and a stretched arm lags behind
+                lag = np.clip(lag + 0.1 * error, -0.03, 0.03)
+            yield self.toward(goal() + lag)
+        return True
 
-    def _grasp(self, position: np.ndarray, side: float | None = None) -> np.ndarray:
-        """Goal of the fingertips: the rim of a bowl, else the middle, as deep as the palm allows."""
-        side = self.sides[0] if side is None else side
-        if self.bowl:
-            return position + np.array([-np.sin(side) * RIM, np.cos(side) * RIM, 0.03])
-        low, high = self.sim.extent(self.object)
-        centre = (low + high) / 2
-        return np.array([*(centre[:2] + self.shift), max(centre[2], high[2] - REACH)])
+    def set_grip(self, grip: float, place: np.ndarray, steps: int = GRIP_STEPS) -> Script:
+        """Opens (-1) or closes (1) the fingers at a place."""
+        self.grip = grip
+        for _ in range(steps):
+            yield self.toward(place)
+        return True
 
-    def _room(self, position: np.ndarray, side: float) -> float:
-        """Metres between the palm and what stands around, where the hand grasps from this side."""
-        grasp = self._grasp(position, side)
-        along = np.linspace(-PALM_HALF, PALM_HALF, 9)[:, None] * np.array([-np.sin(side), np.cos(side)])
-        room = np.inf
-        for name in {**self.sim.env.objects_dict, **self.sim.env.fixtures_dict}:
-            if name == self.object or name not in self.sim.env.obj_body_id:
-                continue
-            low, high = self.sim.extent(name)
-            if high[2] > grasp[2] + PALM:
-                points = grasp[:2] + along
-                outside = np.maximum(np.maximum(low[:2] - points, points - high[:2]), 0)
-                room = min(room, float(np.linalg.norm(outside, axis=1).min()))
-        return room
+    def rise(self, height: float, steps: int) -> Script:
+        """Moves straight up."""
+        up = self.simulator.hand[0] + [0, 0, height]
+        return (yield from self.move(lambda: up, steps=steps))
 
-    def _carry(self, hand: np.ndarray) -> float:
-        """Height of the hand at which the object passes over everything."""
-        if self.bowl:
-            return max(1.12, self.bottom + 0.12)
-        low, _ = self.sim.extent(self.object)
-        return 0.18 + np.clip(hand[2] - low[2], 0.02, 0.1)
+    def over(self, goal: Callable[[], np.ndarray], height: float, given: Callable[[], bool]) -> Script:
+        """Moves to `height` above a goal: up first, then sideways."""
 
-    def _release(self, hand: np.ndarray, position: np.ndarray, target: np.ndarray) -> float:
-        """Height of the hand at which the fingers open."""
-        if self.bowl:
-            return target[2] + 0.012 + hand[2] - position[2]
-        return max(0.13, 0.05 + hand[2] - self.sim.extent(self.object)[0][2])
+        def waypoint() -> np.ndarray:
+            position, aim = self.simulator.hand[0], goal()
+            late = np.clip((height - position[2]) / 0.03 - 0.3, 0, 1)  # 1: stay above the current place
+            aim = aim + late * (position - aim)
+            return np.array([*aim[:2], height])
 
-    def _action(self, goal: np.ndarray, closed: bool) -> np.ndarray:
-        """Towards `goal`, with the hand turned to the side of the grasp."""
-        hand, rotation = self.sim.hand
-        # The palm is symmetric: half a turn is none.
-        yaw = (self.sides[0] + np.pi / 2) % np.pi - np.pi / 2
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        wrong = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ self.rotation @ rotation.T
-        turn = np.array([wrong[2, 1] - wrong[1, 2], wrong[0, 2] - wrong[2, 0], wrong[1, 0] - wrong[0, 1]]) / 2
-        move = self.gain * (goal - hand) / STEP
-        action = np.concatenate([move, turn / TURN, [1.0 if closed else -1.0]])
-        return np.clip(action, -1, 1).astype(np.float32)
+        return (yield from self.move(waypoint, within=0.02, given=given))
+
+    def pick(self, name: str, place: Callable[[], np.ndarray]) -> Script:
+        """Grasps an object and lifts it a little; repeats until it holds the object."""
+        scene, simulator = self.scene, self.simulator
+        while True:
+            if self.grip > 0:  # the object was lost
+                yield from self.set_grip(-1.0, simulator.hand[0], 5)
+                yield from self.rise(0.08, 12)
+            grasp = scene.grasp(name, place(), self.rng)
+            self.turn = functools.partial(scene.turn, grasp)
+            hand = simulator.hand[0]
+
+            def goal(offset: np.ndarray = grasp.offset) -> np.ndarray:
+                return simulator.pose(name)[0] + offset
+
+            clear = max(scene.height(name, hand, goal()) + 0.03, goal()[2] + self.rng.uniform(0.04, 0.08))
+            yield from self.over(goal, clear, lambda: True)
+            yield from self.move(goal, within=0.008, steps=25)
+            yield from self.set_grip(1.0, goal())
+            self.held = simulator.pose(name)[0] - simulator.hand[0]
+            yield from self.rise(0.06, 8)
+            if self.holds(name):
+                return True
+
+    def holds(self, name: str) -> bool:
+        """True if the object has hardly moved relative to the hand since the grasp."""
+        offset = self.simulator.pose(name)[0] - self.simulator.hand[0]
+        return bool(np.linalg.norm(offset - self.held) < 0.05)
+
+
+def pick_and_place(hand: Hand, name: str, place: Callable[[], np.ndarray]) -> Script:
+    """Carries an object to a place and releases it; repeats until the episode ends."""
+    scene, simulator = hand.scene, hand.simulator
+
+    def goal() -> np.ndarray:
+        position = simulator.hand[0]
+        return place() + position - simulator.pose(name)[0]
+
+    while True:
+        yield from hand.pick(name, place)
+        position = simulator.hand[0]
+        below = position[2] - scene.corners(name)[..., 2].min()
+        clear = scene.height(name, position, goal()) + below + hand.rng.uniform(0.02, 0.04)
+        if not (yield from hand.over(goal, clear, lambda: hand.holds(name))):
+            continue
+        if not (yield from hand.move(goal, given=lambda: hand.holds(name))):
+            continue
+        yield from hand.set_grip(-1.0, simulator.hand[0])
+        yield from hand.rise(0.1, 15)
+
+
+def slide_plate(hand: Hand, name: str, place: Callable[[], np.ndarray]) -> Script:
+    """Slides a plate to a place with closed fingers that push its rim from inside."""
+    simulator = hand.simulator
+
+    def ahead(distance: float, height: float) -> np.ndarray:
+        position = simulator.pose(name)[0]
+        way = (place() - position)[:2]
+        return position + [*(distance * way / max(np.linalg.norm(way), 1e-6)), height]
+
+    def follows() -> bool:
+        return bool(np.linalg.norm(simulator.hand[0] - simulator.pose(name)[0]) < 0.075)
+
+    hand.grip = 1.0
+    while True:
+        yield from hand.move(lambda: ahead(0.02, 0.08), within=0.02)
+        yield from hand.move(lambda: ahead(0.02, PRESS), steps=25)
+        yield from hand.move(lambda: ahead(0.065, PRESS), steps=80, given=follows)
+        yield from hand.rise(0.08, 12)
+
+
+def open_drawer(hand: Hand, region: str) -> Script:
+    """Opens the middle drawer: grasps the handle from the front and pulls."""
+    simulator, cabinet = hand.simulator, region.rsplit("_", 2)[0]
+    position, quaternion = simulator.pose(cabinet)
+    turn = Rotation.from_quat(quaternion, scalar_first=True)
+    front = turn.apply([0, -1.0, 0])
+    drawer = simulator.data.body(region.replace("middle_region", "cabinet_middle"))
+    closed = drawer.xpos.copy()
+    hand.turn = lambda at: Rotation.from_rotvec(1.4 * np.cross([0, 0, 1], front)).as_matrix() @ DOWN
+
+    def handle(ahead: float = 0.0) -> np.ndarray:
+        return position + turn.apply(HANDLE) + drawer.xpos - closed + ahead * front
+
+    def holds() -> bool:
+        return bool(np.linalg.norm(handle() - simulator.hand[0]) < 0.03)
+
+    while True:
+        yield from hand.move(lambda: handle(0.1), within=0.02)
+        yield from hand.move(handle, steps=30)
+        yield from hand.set_grip(1.0, handle())
+        yield from hand.move(functools.partial(lambda to: to, handle(0.2)), steps=40, given=holds)
+        yield from hand.set_grip(-1.0, simulator.hand[0], 5)
+
+
+def turn_knob(hand: Hand, name: str) -> Script:
+    """Turns on a stove: grasps its knob from above and turns the hand."""
+    simulator = hand.simulator
+    knob = simulator.data.body(f"{name}_button").xpos + [0, 0, KNOB]
+    while True:
+        for height, steps in ((0.08, 60), (0.0, 25)):
+            yaw = simulator.opening(name)
+            hand.turn = functools.partial(hand.scene.turn, Grasp(np.zeros(3), yaw, 0.0))
+            yield from hand.move(functools.partial(lambda up: knob + [0, 0, up], height), steps=steps)
+        yield from hand.set_grip(1.0, knob)
+        hand.turn = functools.partial(hand.scene.turn, Grasp(np.zeros(3), yaw + 1.2, 0.0))
+        yield from hand.set_grip(1.0, knob, 15)
+        yield from hand.set_grip(-1.0, knob)
+        yield from hand.rise(0.08, 12)
+
+
+def script(simulator: Simulator) -> Script:
+    """The script of an episode; equal starts give equal scripts."""
+    rng = np.random.default_rng(simulator.data.qpos.view(np.uint32))
+    scene = Scene(simulator)
+    hand = Hand(scene, rng)
+    ((verb, *names),) = simulator.env.parsed_problem["goal_state"]
+    if verb == "open":
+        return open_drawer(hand, names[0])
+    if verb == "turnon":
+        return turn_knob(hand, names[0])
+    name, where = names
+    heights = scene.corners(name)[..., 2] - simulator.pose(name)[0][2]
+    offset = next((offset for part, offset in OFFSETS.items() if part in where), (0, 0, 0.01))
+    up = offset[2] - heights.min()
+    if "basket" in where:  # the palm stays above the basket's rim
+        up = max(up, 0.045 - heights.max())
+    if "stove_front" in where:
+        return slide_plate(hand, name, lambda: simulator.pose(where)[0])
+    return pick_and_place(hand, name, lambda: simulator.pose(where)[0] + [*offset[:2], up])
 
 
 def libero_expert(world: World, task: str) -> Callable[[], np.ndarray]:
-    """An expert for one episode; its plan is made at the first call, when the episode has begun.
+    """The expert of a task; it plans at its first call, when the episode has begun.
 
     Raises:
-        InputError: there is none for `task`.
+        InputError: there is none for this task.
     """
     assert isinstance(world, LiberoWorld)
-    if not task.startswith(("libero_object/", "libero_spatial/")):
-        remedy = "scripted experts exist for libero_object and libero_spatial; else name a dataset.repo_id"
-        raise InputError("env.task", task, remedy)
-    plan: list[PickAndPlace] = []
+    if task.split("/")[0] not in SUITES or task == UNSOLVED:
+        known = f"{', '.join(SUITES)}, except {UNSOLVED}"
+        raise InputError("env.task", task, f"scripted experts exist for {known}; name other tasks")
+    actions: list[Script] = []
 
     def act() -> np.ndarray:
-        if not plan:
-            plan.append(PickAndPlace(world.simulator))
-        return plan[0]()
+        if not actions:
+            actions.append(script(world.simulator))
+        return next(actions[0])
 
     return act

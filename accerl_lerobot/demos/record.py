@@ -97,7 +97,8 @@ def record_demos(env_config: EnvConfig, config: DemosConfig) -> Path:
         env_config = env_config.nominal()
     world = make_world(env_config)
     spec = world.spec
-    make_expert(env_config, world, spec.tasks[0])  # refuses an environment without experts before any work
+    for task in spec.tasks:
+        make_expert(env_config, world, task)  # refuses a task without an expert before any work
     world.close()
     with appearing(root) as partial:
         tally = _write(env_config, config, spec, partial)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import io
-import itertools
 import re
 from typing import Any, Literal, NamedTuple
 
@@ -231,24 +230,8 @@ class Simulator:
 
     @property
     def hand(self) -> tuple[np.ndarray, np.ndarray]:
-        """Position (3,) and rotation (3, 3) of the point between the fingertips, as views."""
-        return self._position, self._rotation
-
-    def extent(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corner, (3,) each, of the box around what collides of an object."""
-        model, data = self.model, self.data
-        root, corners = self.env.obj_body_id[name], []
-        for geom in np.flatnonzero(model.geom_contype):
-            body = model.geom_bodyid[geom]
-            while body not in (0, root):
-                body = model.body_parentid[body]
-            if body == root:
-                centre, half = np.split(model.geom_aabb[geom], 2)
-                signs = np.array(list(itertools.product((-1, 1), repeat=3)))
-                turned = (centre + signs * half) @ data.geom_xmat[geom].reshape(3, 3).T
-                corners.append(data.geom_xpos[geom] + turned)
-        every = np.concatenate(corners)
-        return every.min(0), every.max(0)
+        """Position (3,) in m and rotation (3, 3) of the point between the fingertips, as they are now."""
+        return self._position.copy(), self._rotation.copy()
 
     def opening(self, name: str) -> float:
         """Position of the joint of a drawer, door or knob; 0 for what has none."""

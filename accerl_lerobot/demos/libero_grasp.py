@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Grasps for LIBERO's objects, found from the geometry of the scene.
+
+Positions are in metres in the world's frame, turns in radians.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from accerl_lerobot.envs.libero_simulator import Simulator
+
+WIDEST = 0.068
+"""Widest object that fits between the open fingers with some room, in m."""
+DEPTH = 0.015
+"""Distance of the grip site below an object's top; the palm is 2.4 cm above the grip site."""
+EASY_REACH = 0.72
+"""Distance from the robot's base that a hand pointing straight down reaches easily, in m."""
+DOWN = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
+"""Rotation of a hand that points down; its fingers close along the world's y axis."""
+_CORNERS = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+_FINGERS = itertools.product((-0.053, -0.043, 0.043, 0.053), (-0.01, 0.01), (0.008, -0.02))
+_PALM = itertools.product(
+    np.linspace(-0.1, 0.1, 11), np.linspace(-0.034, 0.034, 5), np.arange(-0.026, -0.11, -0.016)
+)
+HAND = np.array([*_FINGERS, *_PALM])
+"""Points of the open hand in its own frame, (P, 3): along the fingers' axis, across it, and ahead."""
+
+
+class Grasp(NamedTuple):
+    """Pose of the hand that takes an object."""
+
+    offset: np.ndarray
+    """(3,) of the grip site from the object's position."""
+    yaw: float
+    """Turn of the hand about the vertical."""
+    lean: float
+    """Tilt of the hand toward the robot, which extends its reach."""
+
+
+class Scene:
+    """Collision geometry of the objects and fixtures, as boxes.
+
+    Args:
+        simulator: at the start of an episode.
+    """
+
+    def __init__(self, simulator: Simulator) -> None:
+        self.simulator = simulator
+        model = simulator.model
+        self.base = simulator.data.body("robot0_base").xpos[:2].copy()
+        self._root = model.body_rootid[model.geom_bodyid]
+        self._solid = (model.geom_contype > 0) & np.isin(self._root, list(simulator.env.obj_body_id.values()))
+
+    def _geoms(self, name: str, others: bool) -> np.ndarray:
+        own = self._root == self.simulator.env.obj_body_id[name]
+        return np.flatnonzero(self._solid & (own != others))
+
+    def corners(self, name: str, others: bool = False) -> np.ndarray:
+        """Corners (G, 8, 3) of the boxes of one object, or of all others."""
+        geoms, data = self._geoms(name, others), self.simulator.data
+        middle, half = np.split(self.simulator.model.geom_aabb[geoms][:, None], 2, axis=-1)
+        turn = data.geom_xmat[geoms].reshape(-1, 3, 3)
+        return (middle + _CORNERS * half) @ turn.transpose(0, 2, 1) + data.geom_xpos[geoms][:, None]
+
+    def collisions(self, name: str, points: np.ndarray, margin: float = 0.004) -> np.ndarray:
+        """Number of points (..., P, 3) that are inside an object other than `name`, int (...)."""
+        geoms, data = self._geoms(name, others=True), self.simulator.data
+        middle, half = np.split(self.simulator.model.geom_aabb[geoms], 2, axis=-1)
+        turn = data.geom_xmat[geoms].reshape(-1, 3, 3)
+        local = np.einsum("...pgi,gij->...pgj", points[..., None, :] - data.geom_xpos[geoms], turn)
+        return (np.abs(local - middle) < half + margin).all(-1).any(-1).sum(-1)
+
+    def height(self, name: str, start: np.ndarray, goal: np.ndarray, margin: float = 0.08) -> float:
+        """Highest point of the objects that are, seen from above, within `margin` of a line."""
+        corners = self.corners(name, others=True)
+        low, high = corners.min(1), corners.max(1)
+        way = start[:2] + np.linspace(0, 1, 12)[:, None] * (goal - start)[:2]
+        gap = np.maximum(low[:, :2] - way[:, None], way[:, None] - high[:, :2]).max(-1)
+        return float(high[(gap < margin).any(0), 2].max(initial=self.corners(name)[..., 2].min()))
+
+    def turn(self, grasp: Grasp, at: np.ndarray) -> np.ndarray:
+        """Rotation (3, 3) of a hand at position `at` that holds a grasp."""
+        away = (at[:2] - self.base) / np.linalg.norm(at[:2] - self.base)
+        lean = Rotation.from_rotvec(grasp.lean * np.array([away[1], -away[0], 0]))
+        return (lean * Rotation.from_euler("z", grasp.yaw)).as_matrix() @ DOWN
+
+    def grasp(self, name: str, goal: np.ndarray, rng: np.random.Generator) -> Grasp:
+        """Choose a grasp from above: across the narrow side, or at the rim of an object that is too wide.
+
+        Args:
+            name: of the object.
+            goal: (3,), position where the object is to be placed; the hand must fit there too.
+            rng: chooses among grasps of similar cost.
+        """
+        corners, position = self.corners(name), self.simulator.pose(name)[0]
+        low, high = corners[..., 2].min(), corners[..., 2].max()
+        height = max(high - DEPTH, (high + low) / 2)
+        flat = corners.reshape(-1, 3)[:, :2]
+        yaws = np.radians(np.arange(-90, 90, 7.5))
+        axes = np.stack([-np.sin(yaws), np.cos(yaws)], -1)
+        if np.ptp(flat @ axes.T, axis=0).min() < WIDEST:  # across it, in the middle or toward an end
+            level = np.abs(corners[..., 2] - height).min(1) < 0.005
+            level |= (corners[..., 2].min(1) < height) & (corners[..., 2].max(1) > height)
+            flat = corners[level].reshape(-1, 3)[:, :2]
+            width, length = np.ptp(flat @ axes.T, axis=0), np.ptp(flat @ (axes[:, ::-1] * [1, -1]).T, axis=0)
+            cost = np.where(width < WIDEST, 40 * (width - width.min()), np.inf)
+            along = axes[:, ::-1] * [1, -1] * np.maximum(length / 2 - 0.022, 0)[:, None]
+            middle = (flat.min(0) + flat.max(0)) / 2
+            points = np.concatenate([middle + 0 * along, middle + along, middle - along])
+            cost = np.concatenate([cost, cost + 0.5, cost + 0.5])
+        else:
+            middle = (flat.min(0) + flat.max(0)) / 2
+            radius = np.ptp(flat @ axes.T, axis=0)[:, None] / 2 - 0.012
+            points = np.concatenate([middle + radius * axes, middle - radius * axes])
+            cost = np.zeros(len(points))
+        yaws = np.tile(yaws, len(points) // len(yaws))
+        hands = np.concatenate([points, np.full((len(points), 1), height)], -1)
+        ways = points - self.base, points - position[:2] + goal[:2] - self.base
+        far = np.maximum(np.linalg.norm(ways, axis=-1).max(0) - EASY_REACH, 0)
+        leans = np.minimum(3 * far, 0.35)
+        grasps = [Grasp(*each) for each in zip(hands - position, yaws, leans, strict=True)]
+        turns = np.stack([self.turn(grasp, position) for grasp in grasps])
+        spread = hands[:, None] + HAND @ turns.transpose(0, 2, 1)
+        cost += self.collisions(name, spread) + self.collisions(name, spread + goal - position)
+        cost += 30 * far + 0.7 * np.abs(yaws) + rng.normal(0, 0.3, len(yaws))
+        return grasps[np.argmin(cost)]

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""LIBERO's scripted experts: they solve their tasks, in equal episodes for equal seeds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from accerl_lerobot.demos.expert import Episode, make_expert, play
+from accerl_lerobot.demos.record import DemosConfig, record_demos
+from accerl_lerobot.envs import make_world
+from accerl_lerobot.envs.libero import LiberoConfig
+from accerl_lerobot.errors import InputError
+from tests.envs.libero_assets import ASSETS, needs_assets
+
+TASKS = [
+    "libero_object/1",
+    pytest.param("libero_spatial/7", marks=pytest.mark.slow),
+    pytest.param("libero_goal/7", marks=pytest.mark.slow),
+]
+STARTS = (2_000_000_000, 5)
+"""A recorded start, and a drawn one."""
+
+pytest.importorskip("libero", reason="LIBERO is not installed")
+
+
+def config(task: str) -> LiberoConfig:
+    return LiberoConfig(task=task, assets=ASSETS, image_size=32, camera="agentview", rendering="fast")
+
+
+def episode(settings: LiberoConfig, world, seed: int) -> Episode:
+    (task,) = settings.tasks
+    expert = make_expert(settings, world, task)
+    return play(world, expert, task=task, seed=seed, noise=0.1, push=0, fail=False)
+
+
+@needs_assets
+@pytest.mark.parametrize("task", TASKS)
+def test_the_expert_solves_recorded_and_drawn_starts(task: str):
+    settings = config(task)
+    world = make_world(settings)
+    try:
+        assert all(episode(settings, world, seed).success for seed in STARTS)
+    finally:
+        world.close()
+
+
+@needs_assets
+def test_equal_seeds_give_equal_episodes_of_one_world():
+    settings = config("libero_goal/7")
+    world = make_world(settings)
+    try:
+        first, _, again = (episode(settings, world, seed) for seed in (5, 6, 5))
+    finally:
+        world.close()
+    assert np.array_equal(first.actions, again.actions)
+
+
+@needs_assets
+def test_a_drawn_object_stands_on_its_fixture_in_every_episode():
+    settings = config("libero_spatial/7")
+    world = make_world(settings)
+    try:
+        for seed in (5, 6):
+            world.reset(seed, settings.tasks[0])
+            bowl = world.simulator.pose("akita_black_bowl_1")[0]
+            burner = world.simulator.pose("flat_stove_1_cook_region")[0]
+            assert np.linalg.norm((bowl - burner)[:2]) < 0.05
+    finally:
+        world.close()
+
+
+@pytest.mark.parametrize("task", ["libero_10/0", "libero_goal"])
+def test_a_task_without_an_expert_is_refused_before_any_work(task: str, tmp_path: Path):
+    with pytest.raises(InputError, match="libero_object, libero_spatial, libero_goal") as caught:
+        record_demos(LiberoConfig(task=task), DemosConfig(root=str(tmp_path / "demos")))
+    assert caught.value.field == "env.task" and "\n" not in str(caught.value)
+    assert not (tmp_path / "demos").exists()
