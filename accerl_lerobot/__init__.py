@@ -6,27 +6,51 @@ Example:
 
         from accerl_lerobot import evaluate, load_config, load_policy, train
 
-        config = load_config("recipes/quickstart.yaml", {"env.task": "drawer-open-v3", "seed": 1})
-        result = train(config)
-        print(result.before, "→", result.after)
-        print(evaluate(config, policy=result.policy, episodes=50).success)
-        chunk = load_policy(result.policy).act(observation)
+        if __name__ == "__main__":  # processes are started, which import this file again
+            config = load_config("recipes/quickstart.yaml", {"env.task": "drawer-open-v3", "seed": 1})
+            result = train(config)
+            print(result.before, "→", result.after)
+            print(evaluate(config, policy=result.policy, episodes=50).success)
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from accerl_lerobot.engine.api import evaluate, load_config, load_policy, resume, train
+    from accerl_lerobot.engine.api import (
+        ActingPolicy,
+        EvaluationResult,
+        TrainResult,
+        evaluate,
+        load_config,
+        load_policy,
+        resume,
+        train,
+    )
     from accerl_lerobot.engine.config import RunConfig
+    from accerl_lerobot.engine.stopping import StoppedError
+    from accerl_lerobot.errors import InputError
 
 __version__ = "0.1.0"
-__all__ = ["RunConfig", "evaluate", "load_config", "load_policy", "resume", "train"]
+__all__ = [
+    "ActingPolicy",
+    "EvaluationResult",
+    "InputError",
+    "RunConfig",
+    "StoppedError",
+    "TrainResult",
+    "evaluate",
+    "load_config",
+    "load_policy",
+    "resume",
+    "train",
+]
+_ELSEWHERE = {"RunConfig": "engine.config", "StoppedError": "engine.stopping", "InputError": "errors"}
 
 
 def __getattr__(name: str) -> Any:
     # At first use: workers and `accerl --help` import this package too, and need none of it.
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = "engine.config" if name == "RunConfig" else "engine.api"
-    return getattr(importlib.import_module(f"{__name__}.{module}"), name)
+    module = importlib.import_module(f"{__name__}.{_ELSEWHERE.get(name, 'engine.api')}")
+    return getattr(module, name)

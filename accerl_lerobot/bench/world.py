@@ -147,7 +147,9 @@ def _stock(config: BenchWorldConfig, chunks: Iterator[np.ndarray]) -> Decide:
         nonlocal left
         _, _, terminated, truncated, _ = env.step(next(chunks)[0])
         left -= 1
-        if terminated or truncated or not left:
+        if terminated and not isinstance(config.env, LiberoConfig):  # LeRobot's MetaWorld has reset itself
+            left = config.env.max_steps
+        elif terminated or truncated or not left:
             env.reset(seed=0)
             left = config.env.max_steps
         return 1

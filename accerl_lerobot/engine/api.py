@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The Python interface: what ``accerl train`` and ``accerl eval`` do, with results as objects.
 
-Everything is imported from `accerl_lerobot` itself. Progress goes to the standard error. A mistake in the
-settings raises `InputError` before any work begins: one line with the field, its value and the remedy.
+Everything is imported from `accerl_lerobot` itself. Recording and Ray start processes that import the main
+module again, so a script calls `train` under ``if __name__ == "__main__":``. Progress goes to the standard
+error. A mistake in the settings raises `InputError` before any work begins: one line with the field, its
+value and the remedy.
 """
 
 from __future__ import annotations
@@ -67,6 +69,7 @@ class ActingPolicy:
 
     def __init__(self, adapter: LeRobotAdapter) -> None:
         self.adapter = adapter
+        self.history: int = adapter.policy.config.n_obs_steps
         self._decisions = 0
 
     def act(self, observation: Observation) -> np.ndarray:
@@ -74,7 +77,8 @@ class ActingPolicy:
 
         Args:
             observation: ``observation.images.<camera>`` uint8 (H, W, 3), ``observation.state`` float32 (S,)
-                and ``task``, the instruction.
+                and ``task``, the instruction. For a policy with ``n_obs_steps`` above 1 each array begins
+                with that dimension, oldest first, as ``make_world(config, policy.history)`` gives them.
 
         Returns:
             float32 (K, A): the next K actions, in the environment's units.
@@ -132,7 +136,10 @@ def resume(directory: str | Path, changes: Mapping[str, Any] | None = None) -> T
 
 
 def evaluate(
-    config: RunConfig, policy: str | Path | None = None, episodes: int | None = None
+    config: RunConfig,
+    policy: str | Path | None = None,
+    episodes: int | None = None,
+    revision: str | None = None,
 ) -> EvaluationResult:
     """Success of a policy with LeRobot's own sampler, on starts that no run of this seed trains on.
 
@@ -140,9 +147,11 @@ def evaluate(
         config: its environment, seed and workers are used.
         policy: a LeRobot checkpoint, on disk or the Hub; None: ``config.policy.path``.
         episodes: how many; None: ``config.evaluation.episodes``.
+        revision: commit of `policy` on the Hub.
     """
     if policy is not None:
         config = run.improving(config, policy)
+        config = replace(config, policy=replace(config.policy, revision=revision))
     if episodes is not None:
         config = replace(config, evaluation=replace(config.evaluation, episodes=episodes))
     with redirect_stdout(sys.stderr):

@@ -27,6 +27,7 @@ import numpy as np
 
 from accerl_lerobot.config.ranges import Range, Section
 from accerl_lerobot.experience import Observation
+from accerl_lerobot.seeds import EVAL_SEEDS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,7 +176,7 @@ _FIELDS_OF_PLUGIN = {
 
 
 def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
-    """``--env.…`` of the stock ``lerobot-eval`` for an environment; none if LeRobot cannot have it.
+    """``--env.…`` and seed of the stock ``lerobot-eval`` for an environment; none if LeRobot cannot have it.
 
     Args:
         env: a config's ``env``, as recipes and checkpoints hold it.
@@ -187,7 +188,8 @@ def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
         fields = {"type": env.get("name"), **(env.get("kwargs") or {})}
     else:
         return []
-    return [f"--env.{name}={shlex.quote(str(value))}" for name, value in fields.items()]
+    seed = f"--seed={EVAL_SEEDS.start}"  # the starts of our evaluation of a run with seed 0
+    return [*(f"--env.{name}={shlex.quote(str(value))}" for name, value in fields.items()), seed]
 
 
 class HistoryWorld(World):

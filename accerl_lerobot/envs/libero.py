@@ -8,7 +8,6 @@ datasets acts here as it is. Importing this file loads neither MuJoCo nor LIBERO
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.util import find_spec
 from typing import Annotated, Literal
 
 import numpy as np
@@ -63,8 +62,7 @@ class LiberoConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if find_spec("libero") is not None:
-            resolve(self.task)
+        resolve(self.task)
         if not self.cameras or len(set(self.cameras)) < len(self.cameras):
             raise InputError("env.camera", self.camera, "name each camera once, separated by commas")
         if self.assets and not (expanded(self.assets, "env.assets") / "scenes").is_dir():
@@ -101,9 +99,6 @@ class LiberoWorld(World):
     """
 
     def __init__(self, config: LiberoConfig) -> None:
-        for package in ("libero", "mujoco"):
-            if find_spec(package) is None:
-                raise ModuleNotFoundError(f"No module named {package!r}", name=package)
         self.config = config
         size = config.image_size
         self.spec = WorldSpec(

@@ -11,6 +11,7 @@ import contextlib
 import functools
 import io
 import re
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -108,13 +109,9 @@ class Simulator:
 
     def reset(self, seed: int) -> None:
         """To the start that `seed` stands for, at rest."""
-        state = np.random.get_state()
-        np.random.seed(seed)  # the one generator that LIBERO and robosuite draw from
-        try:
-            with contextlib.redirect_stdout(io.StringIO()):
-                self._place()
-        finally:
-            np.random.set_state(state)
+        for body, pos, quat in self._fixtures:
+            self.model.body_pos[body], self.model.body_quat[body] = pos, quat
+        _placed(self.env.reset, seed)
         data, env = self.data, self.env
         if seed in EVAL_SEEDS:
             row = self._recorded[(seed - EVAL_SEEDS.start) % len(self._recorded)]
@@ -267,16 +264,6 @@ class Simulator:
         mujoco.mj_comPos(self.model, self._seen)
         mujoco.mj_camlight(self.model, self._seen)
 
-    def _place(self) -> None:
-        from robosuite.utils.errors import RandomizationError
-
-        for body, pos, quat in self._fixtures:
-            self.model.body_pos[body], self.model.body_quat[body] = pos, quat
-        while True:
-            with contextlib.suppress(RandomizationError):  # the objects did not fit: LIBERO draws again
-                self.env.reset()
-                return
-
     def _new_goal(
         self, action: np.ndarray, position: np.ndarray, rotation: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -359,18 +346,35 @@ class SensorClock:
         return reading
 
 
+def _placed[Result](make: Callable[[], Result], seed: int) -> Result:
+    """Result of LIBERO's code that places objects, which draws from NumPy's global generator; silent."""
+    from robosuite.utils.errors import RandomizationError
+
+    state = np.random.get_state()
+    np.random.seed(seed)
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            while True:
+                with contextlib.suppress(RandomizationError):  # the objects did not fit: it draws again
+                    return make()
+    finally:
+        np.random.set_state(state)
+
+
 def _build(task: str, assets: str) -> Any:
     """robosuite's environment of a task, which draws nothing."""
     load_libero(assets)
     from libero.libero.envs.env_wrapper import ControlEnv
     from robosuite.utils.binding_utils import MjSim
 
+    def build() -> Any:
+        return ControlEnv(str(bddl_file(task)), use_camera_obs=False, has_offscreen_renderer=False).env
+
     compiled = MjSim.from_xml_string
     # Room for 5,000 contacts is 1.3 GB of addresses for each simulation, with which no process can be forked.
     MjSim.from_xml_string = lambda xml: compiled(re.sub(r"<size [^>]*>", f'<size memory="{ARENA}"/>', xml))
     try:
-        with contextlib.redirect_stdout(io.StringIO()):
-            env = ControlEnv(str(bddl_file(task)), use_camera_obs=False, has_offscreen_renderer=False).env
+        env = _placed(build, 0)
     finally:
         MjSim.from_xml_string = compiled
     env.hard_reset = False  # the scene is always the same: no need to compile it anew for each episode

@@ -30,7 +30,8 @@ def package() -> Path:
     """Folder of the installed ``libero.libero``, found without importing it: that would ask the terminal."""
     spec = find_spec("libero")
     if spec is None or not spec.submodule_search_locations:
-        raise ModuleNotFoundError("No module named 'libero'", name="libero")
+        remedy = "the package libero is not installed; pip install 'accerl-lerobot[libero]'"
+        raise InputError("env.type", "libero", remedy)
     return Path(next(iter(spec.submodule_search_locations))) / "libero"
 
 
@@ -125,7 +126,10 @@ def assets_folder(given: str) -> Path:
     from libero.libero.utils.download_utils import download_assets_from_huggingface
 
     try:
-        return Path(download_assets_from_huggingface())
+        folder = Path(download_assets_from_huggingface())
+        if not (folder / "scenes").is_dir():
+            raise FileNotFoundError(f"{folder} is incomplete: remove it, and it is fetched again")
+        return folder
     except Exception as error:
         remedy = "LIBERO's meshes are not installed and the Hub does not answer; name a folder that has them"
         raise InputError("env.assets", given, f"{remedy} ({error})") from error
