@@ -70,9 +70,13 @@ class Scene:
     def collisions(self, name: str, points: np.ndarray, margin: float = 0.004) -> np.ndarray:
         """Number of points (..., P, 3) that are inside an object other than `name`, int (...)."""
         geoms, data = self._geoms(name, others=True), self.simulator.data
+        corners, every = self.corners(name, others=True), tuple(range(points.ndim - 1))
+        low, high = points.min(every) - 2 * margin, points.max(every) + 2 * margin
+        geoms = geoms[((corners.min(1) < high) & (corners.max(1) > low)).all(-1)]  # the others are too far
         middle, half = np.split(self.simulator.model.geom_aabb[geoms], 2, axis=-1)
         turn = data.geom_xmat[geoms].reshape(-1, 3, 3)
-        local = np.einsum("...pgi,gij->...pgj", points[..., None, :] - data.geom_xpos[geoms], turn)
+        middle = middle + np.einsum("gi,gij->gj", data.geom_xpos[geoms], turn)
+        local = np.tensordot(points, turn, (-1, 1))  # (..., P, G, 3)
         return (np.abs(local - middle) < half + margin).all(-1).any(-1).sum(-1)
 
     def height(self, name: str, start: np.ndarray, goal: np.ndarray, margin: float = 0.08) -> float:
