@@ -37,6 +37,8 @@ def test_another_type_is_a_difference_and_its_own_defaults_are_none() -> None:
 
 @pytest.mark.parametrize("path", sorted((ROOT / "recipes").glob("*.yaml")), ids=lambda p: p.stem)
 def test_a_recipe_differs_in_what_it_says(path: Path) -> None:
+    if path.stem.startswith("libero"):
+        pytest.importorskip("libero")
     config = parse(RunConfig, [str(path)])
     said = {k: v for k, v in flat(read_recipe(path)).items() if k != "job_name"}
     found = changed(config)
