@@ -26,6 +26,7 @@ import draccus
 import numpy as np
 
 from accerl_lerobot.config.ranges import Range, Section
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Observation
 from accerl_lerobot.seeds import EVAL_SEEDS
 
@@ -116,6 +117,18 @@ class World(ABC):
 
     def close(self) -> None:  # noqa: B027 - most worlds hold nothing
         """Frees the simulator. Safe to call twice."""
+
+
+def check_episode(spec: WorldSpec, seed: int, task: str) -> None:
+    """Refuses an episode that a MuJoCo world cannot begin.
+
+    Raises:
+        InputError: no such task, or a seed that NumPy's former generator does not take.
+    """
+    if task not in spec.tasks:
+        raise InputError("task", task, f"this world has: {', '.join(spec.tasks)}")
+    if not 0 <= seed < 2**32:
+        raise InputError("seed", seed, "use 0 to 2**32 - 1")
 
 
 def checked_actions(actions: np.ndarray, spec: WorldSpec) -> np.ndarray:

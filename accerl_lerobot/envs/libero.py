@@ -13,9 +13,18 @@ from typing import Annotated, Literal
 import numpy as np
 
 from accerl_lerobot.config.ranges import Range
-from accerl_lerobot.envs.base import ChunkResult, EnvConfig, World, WorldSpec, checked_actions, task_code
+from accerl_lerobot.envs.base import (
+    ChunkResult,
+    EnvConfig,
+    World,
+    WorldSpec,
+    check_episode,
+    checked_actions,
+    task_code,
+)
 from accerl_lerobot.envs.libero_simulator import FPS, MAX_OBJECTS, OBJECT_NUMBERS, ROBOT_NUMBERS, Simulator
 from accerl_lerobot.envs.libero_tasks import instruction, resolve
+from accerl_lerobot.envs.metaworld import diverged
 from accerl_lerobot.errors import InputError, expanded
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 
@@ -124,10 +133,7 @@ class LiberoWorld(World):
         return self._simulators[self._task]
 
     def reset(self, seed: int, task: str) -> Observation:
-        if task not in self.spec.tasks:
-            raise InputError("task", task, f"this world has: {', '.join(self.spec.tasks)}")
-        if not 0 <= seed < 2**32:
-            raise InputError("seed", seed, "use 0 to 2**32 - 1")
+        check_episode(self.spec, seed, task)
         self._done = True  # until the new episode stands: an error below leaves a world that must be reset
         if task not in self._simulators:
             self._simulators[task] = Simulator(task, self.config.rendering, self.config.assets)
@@ -143,7 +149,7 @@ class LiberoWorld(World):
         for action in actions:
             succeeded = self.simulator.step(action)
             self._steps += 1
-            nonfinite = not self.simulator.finite
+            nonfinite = diverged(self.simulator.data)
             succeeded &= not nonfinite
             rewards.append(1.0 if succeeded and not self._success else 0.0)
             self._success |= succeeded

@@ -112,15 +112,11 @@ class Simulator:
         for body, pos, quat in self._fixtures:
             self.model.body_pos[body], self.model.body_quat[body] = pos, quat
         _placed(self.env.reset, seed)
-        data, env = self.data, self.env
+        env = self.env
         if seed in EVAL_SEEDS:
             row = self._recorded[(seed - EVAL_SEEDS.start) % len(self._recorded)]
-            data.time, data.qpos[:], data.qvel[:] = (
-                row[0],
-                row[1 : 1 + self.model.nq],
-                row[1 + self.model.nq :],
-            )
-            self._mujoco.mj_forward(self.model, data)
+            env.sim.set_state_from_flattened(row)
+            env.sim.forward()
         env._check_success()
         env._post_process()
         env.robots[0].gripper.current_action = np.zeros(1)
@@ -174,19 +170,12 @@ class Simulator:
     def _control(self, action: np.ndarray, decided: bool) -> None:
         """Sets the motors for the current state."""
         if decided:
-            self._goal = self._new_goal(action, self._position, self._rotation)
+            self._goal = self._new_goal(action)
         self._mujoco.mj_jacSite(self.model, self.data, *self._jacobian, self._site)
         torques = self._torques(self._arm, Aim(*self._goal, self._rest, self._gains))
         self._ctrl[self._motors] = np.clip(torques, *self._limits)
         self._grip = np.clip(self._grip + self._closing, -1.0, 1.0)
         self._ctrl[self._grip_motors] = self._grip_centre + self._grip_half * self._grip
-
-    @property
-    def finite(self) -> bool:
-        """False if MuJoCo has met numbers that are not, and has reset itself."""
-        warning = self._mujoco.mjtWarning
-        bad = (warning.mjWARN_BADQPOS, warning.mjWARN_BADQVEL, warning.mjWARN_BADQACC)
-        return not any(self.data.warning.number[kind] for kind in bad)
 
     def state(self) -> np.ndarray:
         """LeRobot's ``observation.state``, float32 (8,): hand's position and axis-angle, both fingers."""
@@ -264,15 +253,13 @@ class Simulator:
         mujoco.mj_comPos(self.model, self._seen)
         mujoco.mj_camlight(self.model, self._seen)
 
-    def _new_goal(
-        self, action: np.ndarray, position: np.ndarray, rotation: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _new_goal(self, action: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pose to go to: what the action adds to the hand's own; without a turn, the former rotation."""
         from robosuite.utils.control_utils import set_goal_orientation
 
         delta = self.env.robots[0].controller.scale_action(action[:6])
-        turned = set_goal_orientation(delta[3:], rotation) if delta[3:].any() else self._goal[1]
-        return position + delta[:3], turned
+        turned = set_goal_orientation(delta[3:], self._rotation) if delta[3:].any() else self._goal[1]
+        return self._position + delta[:3], turned
 
 
 @functools.cache
@@ -371,7 +358,7 @@ def _build(task: str, assets: str) -> Any:
         return ControlEnv(str(bddl_file(task)), use_camera_obs=False, has_offscreen_renderer=False).env
 
     compiled = MjSim.from_xml_string
-    # Room for 5,000 contacts is 1.3 GB of addresses for each simulation, with which no process can be forked.
+    # Space for 5,000 contacts is 1.3 GB of addresses for each simulation, and no process could be forked.
     MjSim.from_xml_string = lambda xml: compiled(re.sub(r"<size [^>]*>", f'<size memory="{ARENA}"/>', xml))
     try:
         env = _placed(build, 0)

@@ -40,7 +40,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 
 from accerl_lerobot.config.ranges import Positive, Range, Section
-from accerl_lerobot.envs.base import ChunkResult, EnvConfig, World, WorldSpec, checked_actions, task_code
+from accerl_lerobot.envs.base import (
+    ChunkResult,
+    EnvConfig,
+    World,
+    WorldSpec,
+    check_episode,
+    checked_actions,
+    task_code,
+)
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 
@@ -371,10 +379,7 @@ class MetaWorld(World):
         return self._raw
 
     def reset(self, seed: int, task: str) -> Observation:
-        if task not in self.spec.tasks:
-            raise InputError("task", task, f"this world has: {', '.join(self.spec.tasks)}")
-        if not 0 <= seed < 2**32:
-            raise InputError("seed", seed, "use 0 to 2**32 - 1")
+        check_episode(self.spec, seed, task)
         self._done = True  # until the new episode stands: an error below leaves a world that must be reset
         if task not in self._sims:
             self._sims[task] = self._build(task)
@@ -397,7 +402,7 @@ class MetaWorld(World):
             self._delayed.append(action)
             self._raw, shaped, _, _, info = sim.step(self._delayed.popleft())
             self._steps += 1
-            nonfinite = not (math.isfinite(shaped) and np.isfinite(self._raw).all()) or _diverged(sim)
+            nonfinite = not (math.isfinite(shaped) and np.isfinite(self._raw).all()) or diverged(sim.data)
             succeeded = not nonfinite and bool(info["success"])
             if self.config.reward == "dense":
                 rewards.append(shaped)
@@ -479,8 +484,8 @@ class MetaWorld(World):
         return np.ascontiguousarray(image[::-1, ::-1]) if camera == "corner2" else image
 
 
-def _diverged(sim: Any) -> bool:
+def diverged(data: Any) -> bool:
     """True if MuJoCo met non-finite numbers in this episode and silently reset itself."""
     warning = import_mujoco().mjtWarning
     bad = (warning.mjWARN_BADQPOS, warning.mjWARN_BADQVEL, warning.mjWARN_BADQACC)
-    return any(sim.data.warning.number[kind] for kind in bad)
+    return any(data.warning.number[kind] for kind in bad)
