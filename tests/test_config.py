@@ -136,7 +136,7 @@ MISTAKES: list[tuple[list[str], str]] = [
         "algorithm.type='gippo': did you mean gipo? Otherwise use one of awr, chunk_critic, decoupled, "
         "gipo, is, ppo, sapo, self_imitation",
     ),
-    (["--env.type=mujoco"], "env.type='mujoco': use one of lerobot, libero, metaworld, simulated"),
+    (["--env.type=mujoco"], "env.type='mujoco': use one of gym, lerobot, libero, metaworld, simulated"),
     (["--env.task=drawer-v3"], "env.task='drawer-v3': 'drawer-v3' is not a MetaWorld task; did you mean"),
     (["--trainer.hold_back=50"], "replay.max_lag=50: use more than trainer.hold_back, 50, or all is"),
     (["--algorithm.advantage=group"], "algorithm.advantage='group': add --rollout.group_size=8, say"),

@@ -243,8 +243,9 @@ def commands() -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(("path", "line"), commands())
-def test_commands_in_the_documents_parse(path: str, line: str) -> None:
+def test_commands_in_the_documents_parse(path: str, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Verb, fields, types and values; places that the reader fills in are written in capitals."""
+    monkeypatch.syspath_prepend(str(ROOT / "tests" / "packages" / "lerobot_env_reach"))
     configs = CONFIGS if line.startswith("accerl ") else BENCHMARKS
     verb, *arguments = shlex.split(line.removeprefix("python -m ").partition(" ")[2])
     if verb == "bench":

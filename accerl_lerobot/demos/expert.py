@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.envs.base import EnvConfig, World
-from accerl_lerobot.envs.libero import LiberoConfig
-from accerl_lerobot.envs.metaworld import MetaWorld, MetaWorldConfig, expert_name, import_mujoco
-from accerl_lerobot.envs.simulated import SimulatedConfig, SimulatedWorld
+from accerl_lerobot.envs.metaworld import MetaWorld, expert_name, import_mujoco
+from accerl_lerobot.envs.simulated import SimulatedWorld
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Observation
 
@@ -54,10 +54,11 @@ class Episode:
 
 def make_expert(config: EnvConfig, world: World, task: str) -> Expert:
     """The scripted expert of `task`, reading the simulator's own state."""
-    if type(config) not in _EXPERTS:
-        names = ", ".join(kind.get_choice_name(kind) for kind in _EXPERTS)
+    if config.expert is None:
+        names = ", ".join(name for name, kind in config.get_known_choices().items() if kind.expert)
         raise InputError("env.type", config.type, f"scripted experts exist for: {names}")
-    return _EXPERTS[type(config)](world, task)
+    expert: Expert = imported(config.expert)(world, task)
+    return expert
 
 
 def play(
@@ -119,7 +120,8 @@ def _push(size: int, longest: float, seed: int) -> np.ndarray:
     return pushed
 
 
-def _metaworld_expert(world: World, task: str) -> Expert:
+def metaworld_expert(world: World, task: str) -> Expert:
+    """MetaWorld's own policy for the task."""
     import_mujoco()
     from metaworld import policies
 
@@ -128,19 +130,7 @@ def _metaworld_expert(world: World, task: str) -> Expert:
     return lambda: policy.get_action(world.raw_observation)
 
 
-def _libero_expert(world: World, task: str) -> Expert:
-    from accerl_lerobot.demos.libero_expert import libero_expert  # imports SciPy
-
-    return libero_expert(world, task)
-
-
-def _simulated_expert(world: World, task: str) -> Expert:
+def simulated_expert(world: World, task: str) -> Expert:
+    """Holds the action that solves the episode."""
     assert isinstance(world, SimulatedWorld)
     return lambda: world.solution
-
-
-_EXPERTS: dict[type[EnvConfig], Callable[[World, str], Expert]] = {
-    LiberoConfig: _libero_expert,
-    MetaWorldConfig: _metaworld_expert,
-    SimulatedConfig: _simulated_expert,
-}

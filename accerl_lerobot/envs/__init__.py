@@ -6,10 +6,9 @@ Importing this package loads no simulator; a world imports its own when it is ma
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
+from accerl_lerobot.config.parsing import discover, imported
 from accerl_lerobot.envs.base import ChunkResult, EnvConfig, HistoryWorld, World, WorldSpec
+from accerl_lerobot.envs.gym_env import GymConfig, GymWorld
 from accerl_lerobot.envs.lerobot_env import LeRobotEnvConfig, LeRobotWorld
 from accerl_lerobot.envs.libero import LiberoConfig, LiberoWorld
 from accerl_lerobot.envs.metaworld import MetaWorld, MetaWorldConfig
@@ -19,6 +18,8 @@ from accerl_lerobot.errors import InputError
 __all__ = [
     "ChunkResult",
     "EnvConfig",
+    "GymConfig",
+    "GymWorld",
     "HistoryWorld",
     "LeRobotEnvConfig",
     "LeRobotWorld",
@@ -33,13 +34,6 @@ __all__ = [
     "make_world",
 ]
 
-_WORLDS: dict[type[EnvConfig], Callable[[Any], World]] = {
-    LeRobotEnvConfig: LeRobotWorld,
-    LiberoConfig: LiberoWorld,
-    MetaWorldConfig: MetaWorld,
-    SimulatedConfig: SimulatedWorld,
-}
-
 
 def make_world(config: EnvConfig, history: int = 1) -> World:
     """Builds the world that `config` describes.
@@ -52,7 +46,8 @@ def make_world(config: EnvConfig, history: int = 1) -> World:
         InputError: its simulator is not installed; what the world itself refuses.
     """
     try:
-        world = _WORLDS[type(config)](config)
+        discover(config.discover_packages_path, "env")
+        world: World = imported(config.world)(config)
     except ModuleNotFoundError as error:
         name = str(getattr(config, "name", config.type))
         extra = f"{'accerl-' if name == config.type else ''}lerobot[{name}]"

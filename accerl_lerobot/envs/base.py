@@ -20,7 +20,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import draccus
 import numpy as np
@@ -154,6 +154,15 @@ class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
         'metaworld'
     """
 
+    world: ClassVar[str]
+    """``module:class`` of the world, made from the config."""
+    expert: ClassVar[str | None] = None
+    """``module:function`` of the scripted expert for demonstrations: given a world and a task, it returns a
+    function whose every call is the action (A,) for the state that the world is in."""
+
+    discover_packages_path: str | None = field(default=None, metadata={"registers": True})
+    """Package to import that registers ``env.type``, ``env.id`` or ``env.name``, where that is not one of
+    ours, Gymnasium's or LeRobot's; every machine of the cluster needs it."""
     max_steps: Annotated[int, Range("[1, 1000000]")] = 500
     """Episode limit in env steps; reaching it truncates."""
 

@@ -10,7 +10,6 @@ Importing this file loads no LeRobot; making the world does.
 from __future__ import annotations
 
 import io
-import math
 import re
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
@@ -19,7 +18,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from accerl_lerobot.config.ranges import Range
-from accerl_lerobot.envs.base import ChunkResult, EnvConfig, World, WorldSpec, checked_actions
+from accerl_lerobot.envs.base import EnvConfig, WorldSpec
+from accerl_lerobot.envs.gym_env import SteppedWorld, resized
 from accerl_lerobot.envs.metaworld import close_at_exit, import_mujoco
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Observation
@@ -33,11 +33,13 @@ _NEEDS_MUJOCO = ("aloha", "metaworld", "robocasa")
 @EnvConfig.register_subclass("lerobot")
 @dataclass(frozen=True, kw_only=True)
 class LeRobotEnvConfig(EnvConfig):
-    """Which of LeRobot's environments.
+    """Which of LeRobot's environments, those of installed packages ``lerobot_env_*`` included.
 
     Example:
         >>> LeRobotEnvConfig(name="pusht", kwargs={"obs_type": "pixels_agent_pos"})
     """
+
+    world = "accerl_lerobot.envs.lerobot_env:LeRobotWorld"
 
     name: str = "pusht"
     """LeRobot's own name of the environment: what ``lerobot-eval --env.type`` takes."""
@@ -65,7 +67,7 @@ class LeRobotEnvConfig(EnvConfig):
             raise InputError("env.name", self.name, remedy)
 
 
-class LeRobotWorld(World):
+class LeRobotWorld(SteppedWorld):
     """One of LeRobot's environments; a suite of several tasks has one simulator for each.
 
     Args:
@@ -80,8 +82,11 @@ class LeRobotWorld(World):
             import_mujoco()
         from lerobot.envs.configs import EnvConfig as LeRobotConfig
         from lerobot.envs.factory import make_env
+        from lerobot.utils.import_utils import register_third_party_plugins
 
+        super().__init__(config.max_steps, config.reward, ends_with_success=False)
         self.config = config
+        register_third_party_plugins()
         known = LeRobotConfig.get_known_choices()
         if config.name not in known:
             raise InputError("env.name", config.name, f"LeRobot has: {', '.join(known)}")
@@ -100,9 +105,6 @@ class LeRobotWorld(World):
             )
         self._envs = _single_envs(self._vectors)
         self._task = ""
-        self._steps = 0
-        self._success = False
-        self._done = True
         self.spec = self._look()
         close_at_exit(self)
 
@@ -112,41 +114,16 @@ class LeRobotWorld(World):
         self._done = True
         env = self._envs[task]
         raw, _ = env.reset(seed=seed)
-        self._task, self._steps, self._success, self._done = task, 0, False, False
+        self._task = task
+        self._begin()
         return self._observe(raw)
 
-    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-        if self._done:
-            raise RuntimeError("the episode is over: call reset before step_chunk")
-        actions = checked_actions(actions, self.spec)
-        env, rewards, nonfinite = self._envs[self._task], [], False
-        for action in self._processed(actions):
-            raw, reward, ended, cut, info = env.step(action)
-            self._steps += 1
-            nonfinite = not (math.isfinite(reward) and _finite(raw))
-            succeeded = not nonfinite and bool(info.get("is_success", False))
-            first = succeeded and not self._success
-            rewards.append(float(reward) if self.config.reward == "env" else float(first))
-            self._success |= succeeded
-            terminated = bool(ended) and not nonfinite
-            truncated = not terminated and (nonfinite or bool(cut) or self._steps >= self.config.max_steps)
-            self._done = terminated or truncated
-            if self._done:
-                break
-        return ChunkResult(
-            observation=self._observe(raw),
-            rewards=np.asarray(rewards, np.float32),
-            terminated=terminated,
-            truncated=truncated,
-            success=self._success,
-            info={"nonfinite": 1.0} if nonfinite else {},
-        )
+    def _step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, bool]:
+        raw, reward, ended, cut, info = self._envs[self._task].step(action)
+        return raw, float(reward), bool(ended), bool(cut), bool(info.get("is_success", False))
 
     def render(self, height: int, width: int) -> np.ndarray:
-        from PIL import Image
-
-        frame = np.asarray(self._envs[self._task].render(), np.uint8)
-        return np.asarray(Image.fromarray(frame).resize((width, height), Image.Resampling.BILINEAR))
+        return resized(np.asarray(self._envs[self._task].render(), np.uint8), height, width)
 
     def close(self) -> None:
         for suite in self._vectors.values():
@@ -249,10 +226,3 @@ def _batched(raw: Any) -> Any:
     if isinstance(raw, dict):
         return {key: _batched(value) for key, value in raw.items()}
     return np.asarray(raw)[None]
-
-
-def _finite(raw: Any) -> bool:
-    if isinstance(raw, dict):
-        return all(_finite(value) for value in raw.values())
-    array = np.asarray(raw)
-    return array.dtype.kind != "f" or bool(np.isfinite(array).all())

@@ -47,6 +47,9 @@ class LiberoConfig(EnvConfig):
         ('libero_object/0', 'libero_object/3')
     """
 
+    expert = "accerl_lerobot.demos.libero_expert:libero_expert"
+    world = "accerl_lerobot.envs.libero:LiberoWorld"
+
     task: str = "libero_object"
     """Suites (libero_spatial, libero_object, libero_goal, libero_10, libero_90), or single tasks such as
     libero_object/3 with LIBERO's numbers, separated by commas."""

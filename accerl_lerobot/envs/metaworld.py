@@ -287,6 +287,9 @@ class MetaWorldConfig(EnvConfig):
         ('drawer-open-v3', 'door-open-v3')
     """
 
+    expert = "accerl_lerobot.demos.expert:metaworld_expert"
+    world = "accerl_lerobot.envs.metaworld:MetaWorld"
+
     task: str = "drawer-open-v3"
     """Task names separated by commas, or LeRobot's groups: easy, medium, hard, very_hard, all. A world keeps
     each task it has played, at about 90 MB a task."""

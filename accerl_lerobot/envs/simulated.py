@@ -40,6 +40,9 @@ class SimulatedConfig(EnvConfig):
         >>> SimulatedConfig(task="match", step_ms=0.2, frame_ms=6.0, latency="lognormal", latency_cv=0.5)
     """
 
+    expert = "accerl_lerobot.demos.expert:simulated_expert"
+    world = "accerl_lerobot.envs.simulated:SimulatedWorld"
+
     task: str = "match"
     """``match`` (the action is the target), ``mirror`` (its negative), or both separated by a comma."""
     action_dim: Annotated[int, Range("[1, 32]")] = 2

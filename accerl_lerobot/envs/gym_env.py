@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Any registered Gymnasium environment with continuous actions, its observation mapped to LeRobot's features.
+
+    accerl train RECIPE --env.type=gym --env.id=mine/Reach-v0 --env.discover_packages_path=my_package
+
+Importing this file loads no Gymnasium; making the world does.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+from abc import abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
+
+import numpy as np
+
+from accerl_lerobot.config.ranges import Range
+from accerl_lerobot.envs.base import ChunkResult, EnvConfig, World, WorldSpec, checked_actions
+from accerl_lerobot.errors import InputError
+from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
+
+RENDER = "render"
+"""In `GymConfig.images`: the picture that the environment renders."""
+
+
+@EnvConfig.register_subclass("gym")
+@dataclass(frozen=True, kw_only=True)
+class GymConfig(EnvConfig):
+    """A Gymnasium environment, and which of its observations become which features.
+
+    Keys of nested observations are joined by dots. An episode ends with its first success.
+
+    Example:
+        >>> GymConfig(id="gym_pusht/PushT-v0", state=("agent_pos",), images={"image": "pixels"},
+        ...           kwargs={"obs_type": "pixels_agent_pos"}, discover_packages_path="gym_pusht")
+    """
+
+    world = "accerl_lerobot.envs.gym_env:GymWorld"
+
+    id: str = ""
+    """Name in Gymnasium's registry. The package that registers it is `discover_packages_path`."""
+    kwargs: dict[str, Any] = field(default_factory=dict)
+    """Arguments of ``gymnasium.make``."""
+    images: dict[str, str] = field(default_factory=lambda: {"image": RENDER})
+    """Camera → key of the observation, uint8 (H, W, 3), or ``render``: what the environment renders, once a
+    decision. Each becomes ``observation.images.<camera>``."""
+    image_size: Annotated[int, Range("[0, 1024]")] = 0
+    """Height and width that images are resized to, in pixels; 0: as they are."""
+    state: tuple[str, ...] = ()
+    """Keys whose numbers, one after the other, are ``observation.state``; empty: the whole observation, if it
+    is one vector."""
+    environment_state: tuple[str, ...] = ()
+    """Keys whose numbers, and the share of `max_steps` gone, are ``observation.environment_state``, for
+    ``algorithm.type=chunk_critic``. ``state``: the same as `state`."""
+    success: str = "is_success"
+    """Key of the environment's ``info`` that is true once the task is achieved; empty: its ``terminated``."""
+    task: str = ""
+    """Instruction text."""
+    fps: Annotated[int, Range("[1, 1000]")] = 20
+    """Control rate in Hz, for datasets and videos."""
+    reward: Literal["success", "env"] = "success"
+    """``success`` (1.0 at the first success, else 0.0) or ``env`` (the environment's own)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.id or ":" in self.id:
+            remedy = "use a name of Gymnasium's registry, and env.discover_packages_path for its package"
+            raise InputError("env.id", self.id, remedy)
+
+    @property
+    def state_size(self) -> int:
+        """See the base class."""
+        if not self.environment_state:
+            return 0
+        from accerl_lerobot.config.parsing import encode
+
+        return _state_size(json.dumps(encode(self), sort_keys=True))
+
+
+@functools.cache
+def _state_size(config: str) -> int:
+    """Length of ``observation.environment_state`` of a `GymConfig`, which only its environment knows."""
+    from accerl_lerobot.config.parsing import decode
+
+    world = GymWorld(decode(GymConfig, json.loads(config)))
+    try:
+        return len(world.reset(0, world.spec.tasks[0])[ENVIRONMENT_STATE])
+    finally:
+        world.close()
+
+
+class SteppedWorld(World):
+    """A world around an environment with Gymnasium's ``step``; episode limit and success are kept here.
+
+    Args:
+        max_steps: episode limit.
+        reward: ``success``, or ``env`` for the environment's own.
+        ends_with_success: True if the first success ends an episode.
+    """
+
+    def __init__(self, max_steps: int, reward: str, *, ends_with_success: bool) -> None:
+        self._max_steps, self._reward, self._ends_with_success = max_steps, reward, ends_with_success
+        self._steps, self._success, self._done = 0, False, True
+
+    @abstractmethod
+    def _step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, bool]:
+        """Observation, reward, terminated, truncated, and True where the task is achieved."""
+
+    @abstractmethod
+    def _observe(self, raw: Any) -> Observation:
+        """The environment's observation as LeRobot's features."""
+
+    def _processed(self, actions: np.ndarray) -> Iterable[np.ndarray]:
+        """Actions (K, A) as the environment takes them."""
+        return actions
+
+    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
+        """See the base class."""
+        if self._done:
+            raise RuntimeError("the episode is over: call reset before step_chunk")
+        actions = checked_actions(actions, self.spec)
+        rewards, nonfinite = [], False
+        for action in self._processed(actions):
+            raw, reward, ended, cut, achieved = self._step(action)
+            self._steps += 1
+            nonfinite = not (math.isfinite(reward) and _finite(raw))
+            achieved = achieved and not nonfinite
+            first = achieved and not self._success
+            rewards.append(float(reward) if self._reward == "env" else float(first))
+            self._success |= achieved
+            terminated = not nonfinite and (ended or (self._success and self._ends_with_success))
+            truncated = not terminated and (nonfinite or cut or self._steps >= self._max_steps)
+            self._done = terminated or truncated
+            if self._done:
+                break
+        return ChunkResult(
+            observation=self._observe(raw),
+            rewards=np.asarray(rewards, np.float32),
+            terminated=terminated,
+            truncated=truncated,
+            success=self._success,
+            info={"nonfinite": 1.0} if nonfinite else {},
+        )
+
+    def _begin(self) -> None:
+        self._steps, self._success, self._done = 0, False, False
+
+
+class GymWorld(SteppedWorld):
+    """One Gymnasium environment.
+
+    Args:
+        config: which one.
+
+    Raises:
+        InputError: Gymnasium does not know it or refuses its arguments; an observation that `config` names is
+            missing or has another shape; actions are not a vector with bounds.
+    """
+
+    def __init__(self, config: GymConfig) -> None:
+        import gymnasium
+
+        super().__init__(config.max_steps, config.reward, ends_with_success=True)
+        self.config = config
+        self._pictures: dict[str, np.ndarray] = {}
+        """Images of the last observation, by camera."""
+        kwargs = {"render_mode": "rgb_array"} if RENDER in config.images.values() else {}
+        try:
+            # `unwrapped` leaves out Gymnasium's time limit: ours counts, and it truncates.
+            self._env = gymnasium.make(config.id, **(kwargs | config.kwargs)).unwrapped
+        except (gymnasium.error.Error, TypeError, ValueError) as error:
+            remedy = f"gymnasium.make refuses it ({error}); is env.discover_packages_path the package of it?"
+            raise InputError("env.id", config.id, remedy) from error
+        space = self._env.action_space
+        if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1 or not space.is_bounded():
+            raise InputError("env.id", config.id, f"actions must be a bounded vector, they are {space}")
+        raw, _ = self._env.reset(seed=0)
+        observation = self._observe(raw)
+        self.spec = WorldSpec(
+            images={f"observation.images.{name}": picture.shape for name, picture in self._pictures.items()},
+            state_dim=len(observation["observation.state"]),
+            action_dim=space.shape[0],
+            action_low=np.asarray(space.low, np.float32),
+            action_high=np.asarray(space.high, np.float32),
+            fps=config.fps,
+            max_steps=config.max_steps,
+            tasks=(config.id,),
+            instructions=(config.task,) if config.task else (),
+        )
+
+    def reset(self, seed: int, task: str) -> Observation:
+        """See the base class."""
+        if task not in self.spec.tasks:
+            raise InputError("task", task, f"this world has: {', '.join(self.spec.tasks)}")
+        self._done = True
+        raw, _ = self._env.reset(seed=seed)
+        self._begin()
+        return self._observe(raw)
+
+    def render(self, height: int, width: int) -> np.ndarray:
+        """See the base class."""
+        frame = self._env.render() if self._env.render_mode == "rgb_array" else None
+        if frame is None:  # a film shows what the policy sees
+            frame = next(iter(self._pictures.values()), np.zeros((height, width, 3), np.uint8))
+        return resized(frame, height, width)
+
+    def close(self) -> None:
+        """See the base class."""
+        self._env.close()
+        self._done = True
+
+    def _step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, bool]:
+        raw, reward, ended, cut, info = self._env.step(action)
+        achieved = bool(info.get(self.config.success, False)) if self.config.success else bool(ended)
+        return raw, float(reward), bool(ended), bool(cut), achieved
+
+    def _observe(self, raw: Any) -> Observation:
+        config, size = self.config, self.config.image_size
+        state = self._vector("state", raw, config.state)
+        observation: Observation = {TASK: config.task, "observation.state": state}
+        self._pictures = {}
+        for camera, key in config.images.items():
+            picture = self._env.render() if key == RENDER else _at(raw, key, "images")
+            picture = np.asarray(picture)
+            if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
+                remedy = f"{key} is {picture.dtype} {picture.shape}; an image is uint8 (H, W, 3)"
+                raise InputError("env.images", config.images, remedy)
+            self._pictures[camera] = resized(picture, size, size) if size else picture.copy()
+        observation |= {f"observation.images.{name}": picture for name, picture in self._pictures.items()}
+        if config.environment_state:
+            privileged = state
+            if config.environment_state != ("state",):
+                privileged = self._vector("environment_state", raw, config.environment_state)
+            observation[ENVIRONMENT_STATE] = np.append(privileged, self._steps / self._max_steps).astype(
+                np.float32
+            )
+        return observation
+
+    def _vector(self, name: str, raw: Any, keys: tuple[str, ...]) -> np.ndarray:
+        """Numbers of the observation, float32 (N,); all of them if no key is given."""
+        parts = [np.asarray(_at(raw, key, name)) for key in keys] or [np.asarray(raw)]
+        if any(part.dtype.kind not in "fiub" for part in parts):
+            shown = ", ".join(_keys(raw)) or "one array"
+            raise InputError(
+                f"env.{name}", list(keys), f"name keys with numbers; the observation has {shown}"
+            )
+        return np.concatenate([part.astype(np.float32).ravel() for part in parts])
+
+
+def resized(frame: np.ndarray, height: int, width: int) -> np.ndarray:
+    """An image, uint8 (height, width, 3), by bilinear interpolation."""
+    from PIL import Image
+
+    return np.asarray(Image.fromarray(frame).resize((width, height), Image.Resampling.BILINEAR))
+
+
+def _keys(raw: Any, prefix: str = "") -> list[str]:
+    """Dotted keys of a nested observation."""
+    if not isinstance(raw, dict):
+        return [prefix] if prefix else []
+    return [key for k, value in raw.items() for key in _keys(value, f"{prefix}.{k}" if prefix else str(k))]
+
+
+def _at(raw: Any, key: str, name: str) -> Any:
+    """The part of a nested observation with a dotted key.
+
+    Raises:
+        InputError: there is none; `name` is the field that asks for it.
+    """
+    value = raw
+    for part in key.split("."):
+        if not isinstance(value, dict) or part not in value:
+            shown = ", ".join(_keys(raw)) or "no keys: it is one array"
+            raise InputError(f"env.{name}", key, f"the observation has {shown}")
+        value = value[part]
+    return value
+
+
+def _finite(raw: Any) -> bool:
+    if isinstance(raw, dict):
+        return all(_finite(value) for value in raw.values())
+    array = np.asarray(raw)
+    return array.dtype.kind != "f" or bool(np.isfinite(array).all())
