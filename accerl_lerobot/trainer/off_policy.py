@@ -28,7 +28,7 @@ from accerl_lerobot.trainer.memory import Memory
 from accerl_lerobot.trainer.nonfinite import NonFiniteError
 from accerl_lerobot.trainer.sharding import arrange
 
-POLICY_BATCH = 128
+POLICY_BATCH = 64
 """Rows of one step of the policy."""
 
 
