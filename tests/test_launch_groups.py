@@ -65,7 +65,6 @@ def story(tiny_checkpoint: Path) -> Iterator[Story]:
             segment_length=3,
             group_size=SIZE,
             group_filter="return",
-            task_sampling="failures",
         ),
         replay=ReplayConfig(capacity=96, min_decisions=16, ahead=32, samples_per_insert=2.0),
         algorithm=GIPOConfig(advantage="group", value_coef=0.0),

@@ -264,7 +264,7 @@ def test_after_the_loss_of_a_worker_the_run_goes_on_from_its_last_checkpoint(
 def test_a_worker_that_is_lost_again_and_again_ends_the_run(
     tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    config = local_run(tiny_checkpoint, tmp_path, launch=LaunchConfig(engine="local", max_recoveries=2))
+    config = local_run(tiny_checkpoint, tmp_path, launch=LaunchConfig(engine="local", max_restarts=2))
     made = losing(monkeypatch, config, [7, 7, 7, 7])
     with pytest.raises(WorkerError, match="Killed"):
         run.train(config, tmp_path, Console())
@@ -275,7 +275,7 @@ def test_a_run_that_gets_further_each_time_is_not_stuck(
     tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     """Though no checkpoint is reached in between."""
-    launch = LaunchConfig(engine="local", max_recoveries=1)
+    launch = LaunchConfig(engine="local", max_restarts=1)
     config = local_run(tiny_checkpoint, tmp_path, launch=launch)
     made = losing(monkeypatch, config, [6, 7, 8, 9])
     summary = run.train(config, tmp_path, Console())

@@ -10,8 +10,8 @@ from typing import Any
 import psutil
 import pytest
 
-from accerl_lerobot.engine import supervisor
-from accerl_lerobot.engine.supervisor import ActorHandle, end
+from accerl_lerobot.engine import replicas
+from accerl_lerobot.engine.replicas import ActorHandle, end
 
 
 class Stand:
@@ -26,8 +26,8 @@ class Stand:
 
 @pytest.mark.parametrize("here", [True, False])
 def test_only_a_process_of_this_node_is_ended_by_its_number(here: bool, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(supervisor, "ray", Stand())
-    monkeypatch.setattr(supervisor, "GONE_S", 0.2)
+    monkeypatch.setattr(replicas, "ray", Stand())
+    monkeypatch.setattr(replicas, "GONE_S", 0.2)
     with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]) as process:
         worker = ActorHandle("somebody", None)
         worker.await_start(process.pid, 1.0, here)

@@ -110,7 +110,7 @@ class LocalEngine(Engine):
             config.rollout,
             "local",
             self._outbox.append,
-            self._ended,
+            self._episodes.append,
             self._plans.groups,
         )
         self._due: dict[int, Request] = {}
@@ -301,7 +301,3 @@ class LocalEngine(Engine):
     def _imagined(self) -> dict[str, float]:
         learner = {} if self._world_learner is None else self._world_learner.metrics()
         return {} if self._imagination is None else self._imagination.metrics() | learner
-
-    def _ended(self, result: EpisodeResult) -> None:
-        self._plans.report(result)
-        self._episodes.append(result)

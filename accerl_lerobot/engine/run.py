@@ -231,7 +231,7 @@ def train(
         if config.launch.engine != "local":
             ray_session.prepare(joins=config.launch.address is not None)
             session = stack.enter_context(contextlib.closing(ray_session.RaySession(config.launch)))
-        recovery = Recovery(config.launch.max_recoveries)
+        recovery = Recovery(config.launch.max_restarts)
         while True:
             # A run, or what is left of it, by one set of workers.
             history = 1 if load is not None else check_policy(config, own=True)

@@ -54,9 +54,6 @@ class InferenceConfig(Section, section="inference"):
     """How long the oldest request waits for others, seconds."""
     num_threads: Threads = 1
     """CPU threads of the forward pass."""
-    max_restarts: Annotated[int, Range("[0, 1000000]")] = 3
-    """How often in a row each replica is restarted alone after it died or hung; 30 s of service reset the
-    count. After that all workers are restarted, from the last checkpoint."""
 
 
 class InferenceWorker:

@@ -24,11 +24,9 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Observation, Origin, Request, Segment
 from accerl_lerobot.rollout.groups import (
     EpisodeOutcome,
-    GroupAdvantage,
     GroupFilter,
     Groups,
     GroupSlot,
-    TaskSampling,
 )
 from accerl_lerobot.rollout.segments import SegmentBuilder
 from accerl_lerobot.seeds import noise_seed
@@ -109,10 +107,6 @@ class RolloutConfig(Section, section="rollout"):
     """Exploring episodes that start alike (same task and seed, other noise) and are compared with each other,
     for ``algorithm.advantage=group``; 0: none are.
     """
-    group_advantage: GroupAdvantage = "grpo"
-    """grpo: (R − mean)/std of the group. rloo: R − mean of the others. grpo_no_std: R − mean. R is the
-    undiscounted return of the episode.
-    """
     group_filter: GroupFilter = "outcome"
     """Which groups are thrown away, having nothing to compare. return: those whose returns are all equal.
     outcome: also those in which all episodes succeeded or all failed. none: no group.
@@ -122,20 +116,9 @@ class RolloutConfig(Section, section="rollout"):
     success need `return`. Where all groups are thrown away, because the policy never fails or always does, no
     update is made: watch ``groups_dropped``.
     """
-    task_sampling: TaskSampling = "uniform"
-    """Which task an exploring episode, or group, is about. uniform: each in turn. failures: p(task) ∝ 1 +
-    failures among the task's last `task_window` exploring episodes of the same worker.
-    """
-    task_window: Annotated[int, Range("[1, 1000000]")] = 100
-    """Exploring episodes of a task that `task_sampling` remembers."""
     episodes: Steps = 0
     """Exploring episodes in all; 0: as many as the updates need. Once they are played, learning goes on while
     replay has something to give, which is little unless more is imagined, and then ends.
-    """
-    max_restarts: Annotated[int, Range("[0, 1000000]")] = 3
-    """Restarts of each worker after a crash or hang; one more restarts all workers from the last checkpoint.
-
-    Not reset by progress: an environment that keeps crashing needs fixing.
     """
 
     def __post_init__(self) -> None:

@@ -125,7 +125,7 @@ class RolloutWorker:
             config,
             name,
             self._outbox.append,
-            self._ended,
+            self._results.append,
             self._plans.groups,
         )
         self._clock.enter(WAIT_IN)
@@ -245,7 +245,3 @@ class RolloutWorker:
         self._entered = time.monotonic()
         yield
         self._moved, self._entered = time.monotonic(), None
-
-    def _ended(self, result: EpisodeResult) -> None:
-        self._plans.report(result)
-        self._results.append(result)
