@@ -20,8 +20,9 @@ import ray
 
 from accerl_lerobot.engine import launch, replicas
 from accerl_lerobot.engine.config import LaunchConfig
-from accerl_lerobot.engine.contract import Progress, WorkerError, pause_s
 from accerl_lerobot.engine.launch import RayEngine
+from accerl_lerobot.engine.loop import Progress
+from accerl_lerobot.engine.stopping import WorkerError, pause_s
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.stats import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker

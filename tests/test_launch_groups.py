@@ -18,7 +18,7 @@ import pytest
 
 from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.contract import Progress
+from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.stats import evaluation_plans
 from accerl_lerobot.replay import ReplayConfig, decisions_under_way, lag_bound

@@ -11,8 +11,8 @@ import pytest
 
 from accerl_lerobot.algorithms import AlgorithmConfig, GIPOConfig
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.contract import Engine, Progress
 from accerl_lerobot.engine.local import LocalEngine
+from accerl_lerobot.engine.loop import Engine, Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.stats import evaluation_plans
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig

@@ -14,9 +14,9 @@ import pytest
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import placement
 from accerl_lerobot.engine.config import LaunchConfig, PlacementConfig, RunConfig
-from accerl_lerobot.engine.contract import WorkerError
 from accerl_lerobot.engine.placement import Node, Plan, place_workers, plan_workers
-from accerl_lerobot.engine.run import train
+from accerl_lerobot.engine.run import execute
+from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import PolicyConfig
@@ -237,5 +237,5 @@ def test_a_run_that_does_not_fit_does_not_begin(tmp_path: Path, monkeypatch: pyt
     trainer = TrainerConfig(updates=1, batch_decisions=16, ranks=2, sharding="zero2")
     config = tiny_run(Path("nowhere"), trainer=trainer, policy=PolicyConfig(path="nowhere"))
     with pytest.raises(InputError, match=r"trainer\.ranks=2: .* 2 ranks on 1 GPUs leave 1 without"):
-        train(config, tmp_path, Console())
+        execute(config, tmp_path, Console())
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]

@@ -29,7 +29,7 @@ ENGINE = {"launch.py", "placement.py", "ray_session.py", "replicas.py"}
 SHELLS = ENGINE | {
     "doctor.py",
     "worker.py",
-    "imagination_workers.py",
+    "imagination.py",
     "peers.py",
     "factory.py",
     "endpoint.py",

@@ -19,21 +19,24 @@ has a timeout. Workers get handles of each other and never hold the engine.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
 import ray
 from ray.exceptions import RayError, RayTaskError
 
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, saved_version
 from accerl_lerobot.engine.config import RunConfig, journal_folder, timeline_folder
-from accerl_lerobot.engine.contract import Engine, Progress, Saved, WorkerError
+from accerl_lerobot.engine.loop import Engine, Progress, Saved
 from accerl_lerobot.engine.placement import actor_options, place_workers
 from accerl_lerobot.engine.ray_session import RaySession
-from accerl_lerobot.engine.replicas import START_S, ActorHandle, InferenceReplicas, RolloutWorkers, end
+from accerl_lerobot.engine.replicas import START_S, ActorHandle, InferenceReplicas, RolloutWorkers
+from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
@@ -45,8 +48,27 @@ from accerl_lerobot.world_model.guard import IMAGINATION, WORLD_LEARNING
 logger = logging.getLogger(__name__)
 
 POLL_S = 0.5
+GONE_S = 3.0
+"""How long a killed process may take to be gone."""
 BLAME_S = 10.0
 """How long to wait for the failure that another failure is the consequence of."""
+
+
+def end(workers: Iterable[ActorHandle], *, told: bool = True) -> None:
+    """End workers and wait until they are gone, so that nothing writes any more when others start.
+
+    Args:
+        told: True: Ray tells them to end, which a stopped process does not hear; False: Ray is lost.
+    """
+    workers = list(workers)
+    for worker in workers if told else ():
+        ray.kill(worker.actor)
+    processes = [worker.process for worker in workers if worker.process is not None]
+    left = psutil.wait_procs(processes, timeout=GONE_S if told else 0.0)[1]
+    for process in left:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            process.kill()
+    psutil.wait_procs(left, timeout=GONE_S)
 
 
 class RayEngine(Engine):
@@ -59,10 +81,6 @@ class RayEngine(Engine):
         state: the ``training_state`` to resume from, without the episodes under way; None: begin.
         load: makes the policy's adapter, in the processes that have one; None: of LeRobot's checkpoint.
         session: the Ray to use, which outlives this engine; None: one that ends with it.
-
-    Raises:
-        InputError: the state is of a run in one process.
-        WorkerError: a worker did not start; carries its own traceback.
     """
 
     def __init__(
@@ -220,7 +238,7 @@ class RayEngine(Engine):
             self._add(name, rank)
         self._trainer = self._add("trainer", trainer)
         if imagination.share:
-            from accerl_lerobot.engine.imagination_workers import ImaginationWorker, WorldLearningWorker
+            from accerl_lerobot.engine.imagination import ImaginationWorker, WorldLearningWorker
 
             imaginer = make(IMAGINATION, ImaginationWorker, 4, c, self._state, timeline)
             self._imaginer = self._add(IMAGINATION, imaginer)
@@ -322,11 +340,7 @@ class RayEngine(Engine):
             raise WorkerError(f"{worker.name} worker failed for good:\n{error}") from error
 
     def _check_hung(self) -> None:
-        """Restart a rollout worker or inference replica that hangs.
-
-        Raises:
-            WorkerError: another worker does not answer.
-        """
+        """Restart a rollout worker or inference replica that hangs."""
         for worker in self._others:
             if worker.silent_s() > self._limit:
                 raise WorkerError(f"{worker.name} worker has not answered for {worker.silent_s():.0f} s")
@@ -334,11 +348,7 @@ class RayEngine(Engine):
         self._inference.check_hung()  # last, since others are not listened to during a restart
 
     def _check_moving(self, progress: Progress) -> None:
-        """End a run in which every worker answers and nothing moves.
-
-        Raises:
-            WorkerError: neither decisions nor updates for `LaunchConfig.stall_s`.
-        """
+        """End a run in which every worker answers and nothing moves."""
         imagined = tuple(progress.imagination.get(k) for k in ("decisions", "learn_steps", "validation_s"))
         state = (progress.version, progress.rollout.get("decisions"), progress.rollout["restarts"], imagined)
         now = time.monotonic()

@@ -26,8 +26,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from accerl_lerobot.engine.contract import WorkerError
 from accerl_lerobot.engine.ray_session import FIELD, start_ray
+from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.metrics import numbered
 
@@ -118,9 +118,6 @@ class Plan:
         It goes to the node with the fewest rollout workers for its cores, among node 0 and those that have
         any.
 
-        Args:
-            alive: keys of the nodes that are there.
-
         Raises:
             WorkerError: none is left, as when Ray itself has been lost.
         """
@@ -158,11 +155,7 @@ def roles_of(config: RunConfig) -> list[Role]:
 
 
 def candidates(nodes: Sequence[Node], role: Role) -> list[Node]:
-    """The nodes that a role may be on.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The nodes that a role may be on."""
     if role.selector is None:
         return [nodes[0]]
     if role.selector == ALL:
@@ -181,9 +174,6 @@ def candidates(nodes: Sequence[Node], role: Role) -> list[Node]:
 
 def plan_workers(nodes: Sequence[Node], config: RunConfig) -> Plan:
     """Place all workers of a run.
-
-    Args:
-        nodes: by number.
 
     Raises:
         InputError: a node is not there or does not see the run's files, or there are too few GPUs.
@@ -248,11 +238,7 @@ def _gpu_shares(roles: list[Role], sites: dict[str, list[Node]], config: RunConf
 
 
 def _take_gpu(sites: list[Node], free: dict[int, list[float]], share: float, role: Role) -> Node:
-    """Take a share of the fullest GPU of the first node that has room for it, as Ray does.
-
-    Raises:
-        InputError: none has.
-    """
+    """Take a share of the fullest GPU of the first node that has room for it, as Ray does."""
     for node in sites:
         left = free[node.number]
         if fitting := [i for i, room in enumerate(left) if room >= share - TINY]:
@@ -288,11 +274,7 @@ def place_workers(config: RunConfig) -> Plan:
 
 
 def rehearse(config: RunConfig) -> list[str]:
-    """The plan as lines, of a run that joins a cluster; leaves it as it was.
-
-    Raises:
-        InputError: see `start_ray` and `place_workers`.
-    """
+    """The plan as lines, of a run that joins a cluster; leaves it as it was."""
     import ray
 
     if ray.is_initialized():
@@ -320,11 +302,7 @@ def alive_nodes() -> frozenset[str]:
 
 
 def _check_free(plan: Plan) -> None:
-    """Take the planned GPUs of every node for a moment.
-
-    Raises:
-        InputError: other runs hold them.
-    """
+    """Take the planned GPUs of every node for a moment."""
     import ray
     from ray.exceptions import GetTimeoutError
 

@@ -17,7 +17,7 @@ import logging
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -28,9 +28,10 @@ from ray.exceptions import ActorUnavailableError, GetTimeoutError, RayActorError
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.engine.config import RunConfig, timeline_folder
-from accerl_lerobot.engine.contract import WorkerError, check_new, episode_key, pause_s
+from accerl_lerobot.engine.loop import check_new, episode_key
 from accerl_lerobot.engine.placement import Plan, actor_options, alive_nodes
 from accerl_lerobot.engine.ray_session import NO_HUB_TOKEN
+from accerl_lerobot.engine.stopping import WorkerError, pause_s
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.batcher import BatcherStats, dealt, merge_metrics, merge_stats
 from accerl_lerobot.metrics import numbered
@@ -51,8 +52,6 @@ AWAY_S = 10.0
 UNREACHABLE_S = 60.0
 """How long a process on another node may be out of reach before it is restarted, unless its node is found to
 have left, which Ray takes half of that to decide."""
-GONE_S = 3.0
-"""How long a killed process may take to be gone."""
 LOOK_S = 1.0
 """Interval at which a process in a long call, or a node out of reach, is looked at."""
 ROLLOUT = "rollout"
@@ -69,9 +68,7 @@ class ActorHandle:
     Example:
         >>> worker = ActorHandle("trainer", actor)
         >>> worker.work = actor.run.remote()    # `ray.wait` on it: its end is an event
-        >>> worker.ask("metrics")               # again and again: does nothing until the answer is picked up
-        >>> worker.answer(), worker.silent_s()
-        (None, 0.4)
+        >>> worker.ask("metrics")               # does nothing until the last answer was picked up
     """
 
     def __init__(self, name: str, actor: Any) -> None:
@@ -163,23 +160,6 @@ class ActorHandle:
                 raise WorkerError(f"{self.name} worker has not answered for {now - asked:.0f} s, in {method}")
 
 
-def end(workers: Iterable[ActorHandle], *, told: bool = True) -> None:
-    """End workers and wait until they are gone, so that nothing writes any more when others start.
-
-    Args:
-        told: True: Ray tells them to end, which a stopped process does not hear; False: Ray is lost.
-    """
-    workers = list(workers)
-    for worker in workers if told else ():
-        ray.kill(worker.actor)
-    processes = [worker.process for worker in workers if worker.process is not None]
-    left = psutil.wait_procs(processes, timeout=GONE_S if told else 0.0)[1]
-    for process in left:
-        with contextlib.suppress(psutil.NoSuchProcess):
-            process.kill()
-    psutil.wait_procs(left, timeout=GONE_S)
-
-
 @dataclass(kw_only=True)
 class WorkerSlot:
     """A place for one process after the other."""
@@ -229,11 +209,7 @@ class ReplicaSet[S: WorkerSlot](ABC):
 
     @abstractmethod
     def _restart(self, slot: S, error: Exception) -> None:
-        """Replace the process of a slot.
-
-        Raises:
-            WorkerError: see `restart_worker`.
-        """
+        """Replace the process of a slot; see `restart_worker`."""
 
     def _end_process(self, slot: S, error: Exception, *, free: bool = False) -> None:
         """End the process of a slot and count the restart, unless it is `free`."""
@@ -280,22 +256,13 @@ class RolloutSlot(WorkerSlot):
     """True if replay has all of them."""
 
     @property
-    def starts(self) -> int:
-        """Position in the worker's seeds, see `EpisodePlans.starts`."""
-        return 0 if self.report is None else self.report.starts
-
-    @property
-    def stuck_s(self) -> float:
-        """How long the worker or its world has been at what it does now."""
-        return 0.0 if self.report is None else max(self.report.in_world_s, self.report.stuck_s)
+    def next_incarnation(self) -> int:
+        """Incarnation of another process in this place."""
+        return incarnation_after(self.incarnation, 0 if self.report is None else self.report.starts)
 
 
 class RolloutWorkers(ReplicaSet[RolloutSlot]):
     """The rollout workers of a run.
-
-    Args:
-        history: env steps that an observation holds.
-        state: the ``training_state`` to resume from; None: begin.
 
     Raises:
         InputError: the state is not of an asynchronous run with as many workers.
@@ -380,7 +347,8 @@ class RolloutWorkers(ReplicaSet[RolloutSlot]):
     @property
     def stuck_s(self) -> float:
         """How long the slowest worker or world has been at what it does now."""
-        return max(slot.stuck_s for slot in self._slots)
+        reports = [slot.report for slot in self._slots if slot.report is not None]
+        return max((max(report.in_world_s, report.stuck_s) for report in reports), default=0.0)
 
     def check_hung(self) -> None:
         """Restart workers that do not answer or do nothing, whose world does not return, or that do not find
@@ -393,7 +361,7 @@ class RolloutWorkers(ReplicaSet[RolloutSlot]):
         """Write the rollout workers' part of ``training_state``."""
         slots = [
             {
-                "incarnation": incarnation_after(slot.incarnation, slot.starts) - 1,
+                "incarnation": slot.next_incarnation - 1,
                 "budget": slot.budget,
                 "outstanding": list(slot.outstanding.values()),
             }
@@ -454,7 +422,7 @@ class RolloutWorkers(ReplicaSet[RolloutSlot]):
         self._end_process(slot, error, free=moved)  # that its node has left is not the worker's fault
         self._past["restarts"] += 1
         _add(self._past, slot.report)
-        slot.incarnation = incarnation_after(slot.incarnation, slot.starts)
+        slot.incarnation = slot.next_incarnation
         slot.report, slot.moved = None, None
         if slot.budget is not None:
             slot.budget = whole_groups(slot.budget, self._config.rollout)
@@ -501,8 +469,6 @@ class InferenceSlot(WorkerSlot):
 class InferenceReplicas(ReplicaSet[InferenceSlot]):
     """The inference replicas of a run; rollout worker i asks replica i modulo their number.
 
-        started ─► ready ─► listens and serves ─► has the trainer's newest weights ─► its clients are told
-
     Args:
         version: of the first weights.
         state: the ``training_state`` that holds these; None: they are the policy's.
@@ -541,11 +507,7 @@ class InferenceReplicas(ReplicaSet[InferenceSlot]):
         return [worker.actor for worker in self.workers()]
 
     def lock_step(self, in_turn: bool) -> None:
-        """Have each replica decide for all its worlds together, or not any more.
-
-        Raises:
-            WorkerError: a replica does not answer.
-        """
+        """Have each replica decide for all its worlds together, or not any more."""
         rollout = self._config.rollout
         clients = dealt(rollout.workers, len(self._slots))
         for slot in self._slots:

@@ -57,16 +57,7 @@ class InferenceConfig(Section, section="inference"):
 
 
 class InferenceWorker:
-    """Becomes an asynchronous Ray actor in `launch`.
-
-    Args:
-        policy: the checkpoint, the same for every replica and the trainer.
-        version: of the first weights.
-        state: the ``training_state`` that holds these; None: they are the checkpoint's.
-        load: makes the adapter; None: of LeRobot's checkpoint.
-        timeline: folder of the timeline; None: none is kept.
-        name: its row there.
-    """
+    """Becomes an asynchronous Ray actor in `launch`."""
 
     def __init__(
         self,

@@ -51,15 +51,6 @@ class EpisodePlans:
     Example:
         >>> plans = EpisodePlans(config, tasks, seed=0, worlds=8)
         >>> runner = RolloutRunner(worlds, lambda: plans.next(exploring=True), ..., groups=plans.groups)
-
-    Args:
-        config: groups and tasks.
-        tasks: the training tasks.
-        seed: the run's.
-        worlds: how many the worker steps.
-        worker: its index.
-        incarnation: how often it has been restarted.
-        budget: exploring episodes at most; None: no end.
     """
 
     def __init__(
@@ -89,11 +80,7 @@ class EpisodePlans:
         self._queued.extend(plans)
 
     def next(self, exploring: bool) -> EpisodePlan | None:
-        """The episode that a free world is to run; None: it has to wait.
-
-        Args:
-            exploring: whether exploring episodes are wanted at all.
-        """
+        """The episode that a free world is to run; None: it has to wait."""
         if self._queued:
             return self._queued.popleft()
         if not exploring or self.spent:

@@ -55,11 +55,7 @@ class Slot:
         return {name: getattr(self, name) for name in _STATE} | {"builder": builder}
 
     def restore(self, state: dict[str, Any], segment_length: int) -> None:
-        """Goes on from what `state` gave: the world is brought back by doing again what was done in it.
-
-        Raises:
-            RuntimeError: it does not show then what it had shown.
-        """
+        """Goes on from what `state` gave: the world is brought back by doing again what was done in it."""
         plan: EpisodePlan | None = state["plan"]
         if plan is None:
             return
@@ -285,11 +281,7 @@ class RolloutRunner:
         return {"counters": replace(self.counters), "sequence": self._sequence, "slots": slots}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Goes on from what `state` gave: worlds are brought back by doing again what was done in them.
-
-        Raises:
-            RuntimeError: a world does not show then what it had shown.
-        """
+        """Goes on from what `state` gave: worlds are brought back by doing again what was done in them."""
         self.counters, self._sequence = state["counters"], state["sequence"]
         for slot, saved in zip(self._slots, state["slots"], strict=True):
             slot.restore(saved, self.config.segment_length)

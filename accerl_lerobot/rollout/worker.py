@@ -76,17 +76,7 @@ class WorkerShare:
 
 
 class RolloutWorker:
-    """Becomes a threaded Ray actor in `launch`: `run` on one thread, `report` on another.
-
-    Args:
-        env: the world's config; one instance per slot.
-        config: sizes.
-        tasks: the training tasks.
-        seed: the run's.
-        share: which worker this is.
-        history: env steps that an observation holds.
-        timeline: folder of the timeline; None: none is kept.
-    """
+    """Becomes a threaded Ray actor in `launch`: `run` on one thread, `report` on another."""
 
     def __init__(
         self,

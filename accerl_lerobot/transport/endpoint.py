@@ -33,11 +33,7 @@ class Endpoint:
     """Address of its shared memory; None: it can only be reached through Ray."""
 
     def connect(self) -> Client:
-        """Open a connection for this process.
-
-        Raises:
-            ServiceStoppedError: the service is gone.
-        """
+        """Open a connection for this process."""
         if self.address is not None and available() and self.address.node == this_node():
             return SharedMemoryClient(self.name, self.address)
         return RayClient(self.name, self.method)
@@ -49,12 +45,7 @@ def uses_shared_memory(transport: Transport) -> bool:
 
 
 class RayClient(Client):
-    """Calls an actor's method, by value: from any node to any other.
-
-    Args:
-        name: of the service, for messages.
-        method: of its handle; takes one message and returns the reply.
-    """
+    """Calls an actor's method, by value: from any node to any other."""
 
     def __init__(self, name: str, method: Any) -> None:
         super().__init__(name)
@@ -108,9 +99,6 @@ class ReconnectingClient(Client):
         []
         >>> client.away_s  # since it was lost
         0.5
-
-    Args:
-        name: of the service, for messages.
     """
 
     def __init__(self, name: str) -> None:

@@ -42,12 +42,7 @@ class WeightPublisher:
             part.flush(max(0.0, deadline - time.monotonic()))
 
     def add(self, reader: Any) -> None:
-        """Send to another reader, an actor handle, from the newest set on.
-
-        Raises:
-            RuntimeError: the trainer's memory cannot be reached from there, and could be before.
-            ray.exceptions.RayError: the reader has died.
-        """
+        """Send to another reader, an actor handle, from the newest set on."""
         for part in self.parts:
             if isinstance(part, RayPublisher):
                 part.add(reader)
@@ -69,9 +64,6 @@ def make_publisher(readers: Sequence[Any], transport: Transport = "auto") -> Wei
         readers: actor handles with ``receive_weights(version, tensors, published_s)`` and
             ``open_weights(address)``, as `InferenceWorker` has them.
         transport: ray, or auto: shared memory to readers on this machine.
-
-    Raises:
-        ray.exceptions.RayError: a reader has died.
     """
     if uses_shared_memory(transport):
         publisher = SharedMemoryPublisher(len(readers))
@@ -163,11 +155,7 @@ class RayPublisher(Publisher):
                     self._drop(reader, error)
 
     def _advance(self, reader: _Reader) -> None:
-        """Send a reader the newest set if it is free and has another one.
-
-        Raises:
-            RayError: it has died or cannot be reached, or, a RayTaskError, what it has raised.
-        """
+        """Send a reader the newest set if it is free and has another one."""
         if reader.under_way is not None:
             done, _ = ray.wait([reader.under_way], timeout=0)
             if not done:
