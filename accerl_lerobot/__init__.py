@@ -17,7 +17,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from accerl_lerobot.engine.api import (
+    from accerl_lerobot.engine.config import RunConfig
+    from accerl_lerobot.engine.run import (
         ActingPolicy,
         EvaluationResult,
         TrainResult,
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
         resume,
         train,
     )
-    from accerl_lerobot.engine.config import RunConfig
     from accerl_lerobot.engine.stopping import StoppedError
     from accerl_lerobot.errors import InputError
 
@@ -52,5 +52,5 @@ def __getattr__(name: str) -> Any:
     # At first use: workers and `accerl --help` import this package too, and need none of it.
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = importlib.import_module(f"{__name__}.{_ELSEWHERE.get(name, 'engine.api')}")
+    module = importlib.import_module(f"{__name__}.{_ELSEWHERE.get(name, 'engine.run')}")
     return getattr(module, name)

@@ -172,8 +172,7 @@ class Start:
             light.write_text(yaml.safe_dump(encode(recipe), sort_keys=False))
             self._arguments = [f"--config_path={light}"]
         else:
-            more = [f"--{room}.max_restarts=1000" for room in ("rollout", "inference")]
-            self._arguments += ["--rollout.workers=2", *more]
+            self._arguments += ["--rollout.workers=2", "--launch.max_restarts=1000"]
         if recipe.policy.path is None:
             self._arguments += self._policy(console)
 

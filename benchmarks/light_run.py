@@ -18,7 +18,6 @@ from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.stats import EvaluationConfig
-from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
@@ -43,8 +42,7 @@ def light_config(
         job_name="light",
         env=SimulatedConfig(max_steps=32, frame_ms=40.0, latency="lognormal", latency_cv=0.5),
         policy=PolicyConfig(path="made of time", device="cpu"),
-        rollout=RolloutConfig(workers=2, worlds=4, segment_length=4, max_restarts=1_000_000),
-        inference=InferenceConfig(max_restarts=1_000_000),
+        rollout=RolloutConfig(workers=2, worlds=4, segment_length=4),
         replay=ReplayConfig(capacity=512, min_decisions=32, ahead=64, samples_per_insert=1.0),
         trainer=TrainerConfig(
             updates=updates,
@@ -58,7 +56,7 @@ def light_config(
             rank_timeout_s=stall_s,
         ),
         evaluation=EvaluationConfig(episodes=100, before=False, videos=0),
-        launch=LaunchConfig(stall_s=stall_s),
+        launch=LaunchConfig(stall_s=stall_s, max_restarts=1_000_000),
         save_every_s=save_every_s,
     )
 

@@ -22,7 +22,7 @@ import ray
 from accerl_lerobot.engine.ray_session import start_ray
 from accerl_lerobot.experience import Decision, Request
 from accerl_lerobot.transport.contract import Client
-from accerl_lerobot.transport.endpoint import Endpoint, uses_shared_memory
+from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.transport.memfd import listening, new_name, new_socket
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryServer
 from benchmarks.transport import (
@@ -137,7 +137,6 @@ class Crowd:
         self._started = False
 
     def __enter__(self) -> Crowd:
-        uses_shared_memory("shared_memory")  # refuses where there is none
         self._started = not ray.is_initialized()
         if self._started:
             start_ray()

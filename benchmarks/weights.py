@@ -28,9 +28,10 @@ from accerl_lerobot.config.ranges import Range, Repeats, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import ray_session
 from accerl_lerobot.errors import check_absent, make_folder
+from accerl_lerobot.transport.endpoint import Transport
 from benchmarks.study import named
 
-ARMS = {"shared memory": "shared_memory", "Ray": "ray"}
+ARMS: dict[str, Transport] = {"shared memory": "auto", "Ray": "ray"}
 """Arm → transport."""
 FAR = ("Ray",)
 """Arms with readers on other nodes."""

@@ -10,7 +10,7 @@ from typing import Any
 
 from accerl_lerobot.algorithms import AlgorithmConfig, RatioConfig
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.engine.contract import Engine, Progress
+from accerl_lerobot.engine.loop import Engine, Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.stats import EvaluationConfig
 from accerl_lerobot.policies.config import PolicyConfig

@@ -19,7 +19,7 @@ import yaml
 from accerl_lerobot import cli
 from accerl_lerobot.cli import verbs
 from accerl_lerobot.engine.config import RunConfig, encode
-from accerl_lerobot.engine.contract import WorkerError
+from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.errors import InputError, kept_traceback, one_line
 
 ROOT = Path(__file__).parents[1]
@@ -202,7 +202,7 @@ class TestTrain:
             seen.update(config=config, directory=directory)
             return {"success_before": 0.25, "success_after": 0.75, "wall_s": 3.0}
 
-        monkeypatch.setattr("accerl_lerobot.engine.run.train", train)
+        monkeypatch.setattr("accerl_lerobot.engine.run.execute", train)
         assert cli.main([*arguments, "--trainer.lr=1e-5"]) == 0
         out, err = capsys.readouterr()
         assert json.loads(out)["success_after"] == 0.75
@@ -220,7 +220,7 @@ class TestTrain:
                 (directory / "demos").mkdir()
             raise InputError("MUJOCO_GL", "", "install it")
 
-        monkeypatch.setattr("accerl_lerobot.engine.run.train", train)
+        monkeypatch.setattr("accerl_lerobot.engine.run.execute", train)
         assert cli.main(arguments) == 2
         assert (tmp_path / "run").exists() is work
 
@@ -369,7 +369,7 @@ def test_a_run_that_cannot_go_on_ends_with_one_line(
     def fails(*arguments: object) -> None:
         raise error
 
-    monkeypatch.setattr(run, "train", fails)
+    monkeypatch.setattr(run, "execute", fails)
     recipe, folder = tmp_path / "light.yaml", tmp_path / "run"
     recipe.write_text(yaml.safe_dump(encode(light_config(updates=1))))
     assert verbs.train([f"--config_path={recipe}", f"--output_dir={folder}"], light_policy()) == 1

@@ -19,10 +19,10 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.contract import Progress
-from accerl_lerobot.engine.imagination_workers import ImaginationWorker, WorldLearningWorker
+from accerl_lerobot.engine.imagination import ImaginationWorker, WorldLearningWorker
 from accerl_lerobot.engine.local import LocalEngine
-from accerl_lerobot.engine.run import train
+from accerl_lerobot.engine.loop import Progress
+from accerl_lerobot.engine.run import execute
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Segment
@@ -353,6 +353,6 @@ def test_the_summary_says_what_was_imagined(tiny_checkpoint: Path, tmp_path: Pat
 
     config = imagining(tiny_checkpoint, model="oracle")
     config = replace(config, launch=replace(config.launch, engine="local"))
-    summary = train(config, tmp_path, Console())
+    summary = execute(config, tmp_path, Console())
     assert summary["episodes_explored"] == 6 and summary["imagination"]["decisions"] > 0
     assert summary["updates"] == 12

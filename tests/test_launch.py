@@ -17,7 +17,7 @@ import pytest
 
 from accerl_lerobot.checkpoint.layout import PRETRAINED
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.contract import Progress
+from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.stats import evaluation_plans
 from accerl_lerobot.replay import ReplayConfig, lag_bound

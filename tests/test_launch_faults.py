@@ -20,8 +20,9 @@ import ray
 
 from accerl_lerobot.engine import launch, replicas
 from accerl_lerobot.engine.config import LaunchConfig
-from accerl_lerobot.engine.contract import Progress, WorkerError, pause_s
 from accerl_lerobot.engine.launch import RayEngine
+from accerl_lerobot.engine.loop import Progress
+from accerl_lerobot.engine.stopping import WorkerError, pause_s
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.stats import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
@@ -122,7 +123,7 @@ def test_a_run_ends_by_itself_and_closing_leaves_no_process(engine):
 def test_both_transports_play_the_same_episodes(engine):
     """Every decision of an evaluation is drawn from its request's seed, so one that differs shows."""
     played = []
-    for transport in ("ray", "shared_memory"):
+    for transport in ("ray", "auto"):
         env, launch = replace(SLOW, reward="dense"), LaunchConfig(stall_s=120, transport=transport)
         one = engine(env=env, rollout=TWO, launch=launch)
         (deciding,), inserting = one._rollouts._inference, one._rollouts._replay
@@ -170,7 +171,11 @@ def test_a_worker_that_does_not_start_is_an_error_and_the_others_are_ended(engin
 
 
 def test_a_world_that_keeps_crashing_ends_the_run_with_its_own_traceback(engine):
-    one = engine(env=SimulatedConfig(crash_after=30), rollout=RolloutConfig(worlds=2, max_restarts=2))
+    one = engine(
+        env=SimulatedConfig(crash_after=30),
+        rollout=RolloutConfig(worlds=2),
+        launch=LaunchConfig(max_restarts=2),
+    )
     one.train()
     restarts: list[float] = []
     with pytest.raises(RuntimeError, match="rollout 0 worker failed for good after 2 restarts") as caught:
@@ -260,9 +265,9 @@ def lose_inference(one: RayEngine, how: Callable[[str], object], name: str = "in
             one.plan(evaluation_plans(("match",), 24, "during"))
             how(name)
             died = progress.version
-        elif died is not None and not all(one._inference.up):
+        elif died is not None and not progress.inference["restarts"]:
             away.append(progress)
-        elif back is None and progress.inference["restarts"]:
+        elif back is None and died is not None:
             back = progress.version
             one.plan(evaluation_plans(("match",), 8, "later"))
         elif (
@@ -292,7 +297,7 @@ def hit(one: RayEngine, number: signal.Signals) -> Callable[[str], None]:
     return lambda name: os.kill(one.pids()[name], number)
 
 
-@pytest.mark.parametrize("transport", [pytest.param("ray", marks=pytest.mark.slow), "shared_memory"])
+@pytest.mark.parametrize("transport", [pytest.param("ray", marks=pytest.mark.slow), "auto"])
 def test_an_inference_that_is_killed_is_replaced_alone(engine, transport: Transport):
     launched = LaunchConfig(stall_s=120.0, transport=transport)
     one = engine(env=HARD, rollout=TWO, trainer=ENDLESS, launch=launched)
@@ -311,7 +316,7 @@ def test_while_one_of_two_hangs_the_other_goes_on(engine):
 
 @pytest.mark.slow
 def test_an_exception_in_the_inference_service_is_survived_as_often_as_it_may_be_and_then_its_own(engine):
-    one = engine(env=HARD, rollout=TWO, trainer=ENDLESS, inference=InferenceConfig(max_restarts=1))
+    one = engine(env=HARD, rollout=TWO, trainer=ENDLESS, launch=LaunchConfig(max_restarts=1))
     lose_inference(one, lambda name: ray.get(next(one._inference.workers()).actor.fail.remote()))
     ray.get(next(one._inference.workers()).actor.fail.remote())
     text = until_failure(one)
@@ -340,7 +345,7 @@ class NoRoom(LightInference):
 
 @pytest.mark.slow
 def test_an_inference_that_does_not_start_again_ends_the_run(engine, monkeypatch):
-    one = engine(trainer=ENDLESS, inference=InferenceConfig(max_restarts=2))
+    one = engine(trainer=ENDLESS, launch=LaunchConfig(max_restarts=2))
     until_training(one)
     monkeypatch.setattr(inference_worker, "InferenceWorker", NoRoom)
     os.kill(one.pids()["inference"], signal.SIGKILL)
@@ -383,7 +388,7 @@ def test_a_worker_that_does_not_find_inference_is_replaced(engine, monkeypatch):
 def test_a_world_that_does_not_return_is_no_reason_to_wait_for_ever(engine):
     endless = SimulatedConfig(max_steps=16, step_ms=1e6)
     one = engine(
-        env=endless, rollout=RolloutConfig(worlds=1, max_restarts=0), launch=LaunchConfig(stall_s=5.0)
+        env=endless, rollout=RolloutConfig(worlds=1), launch=LaunchConfig(stall_s=5.0, max_restarts=0)
     )
     one.train()
     text = until_failure(one)

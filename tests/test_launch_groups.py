@@ -18,7 +18,7 @@ import pytest
 
 from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.contract import Progress
+from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.stats import evaluation_plans
 from accerl_lerobot.replay import ReplayConfig, decisions_under_way, lag_bound
@@ -65,7 +65,6 @@ def story(tiny_checkpoint: Path) -> Iterator[Story]:
             segment_length=3,
             group_size=SIZE,
             group_filter="return",
-            task_sampling="failures",
         ),
         replay=ReplayConfig(capacity=96, min_decisions=16, ahead=32, samples_per_insert=2.0),
         algorithm=GIPOConfig(advantage="group", value_coef=0.0),

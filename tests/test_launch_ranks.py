@@ -21,8 +21,8 @@ from safetensors.torch import load_file
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, STEP, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.contract import WorkerError
 from accerl_lerobot.engine.launch import RayEngine
+from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.evaluation.stats import evaluation_plans
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.runs import collect, drive, polls, tiny_run

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from accerl_lerobot.algorithms import AlgorithmConfig, GIPOConfig, PPOConfig
+from accerl_lerobot.algorithms import AlgorithmConfig, GIPOConfig
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.contract import Engine, Progress
 from accerl_lerobot.engine.local import LocalEngine
+from accerl_lerobot.engine.loop import Engine, Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.evaluation.stats import evaluation_plans
 from accerl_lerobot.policies.config import FlowSamplerConfig, PolicyConfig
@@ -130,20 +130,9 @@ def test_a_random_policy_learns_the_task(tiny_checkpoint: Path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("algorithm", "form"),
-    [
-        (GIPOConfig(advantage="group", value_coef=0.0), "grpo"),
-        (PPOConfig(advantage="group", value_coef=0.0), "rloo"),
-    ],
-    ids=["gipo", "ppo"],
-)
-def test_a_random_policy_learns_the_task_from_groups_and_without_a_critic(
-    tiny_checkpoint: Path, algorithm: AlgorithmConfig, form: Any
-):
-    rollout = RolloutConfig(
-        worlds=32, segment_length=8, group_size=8, group_advantage=form, group_filter="return"
-    )
+def test_a_random_policy_learns_the_task_from_groups_and_without_a_critic(tiny_checkpoint: Path):
+    rollout = RolloutConfig(worlds=32, segment_length=8, group_size=8, group_filter="return")
+    algorithm = GIPOConfig(advantage="group", value_coef=0.0)
     config = learning_run(tiny_checkpoint, algorithm=algorithm, rollout=rollout)
     engine = LocalEngine(config, ("match",))
     before = success(engine)

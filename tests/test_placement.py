@@ -13,10 +13,10 @@ import pytest
 
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import placement
-from accerl_lerobot.engine.config import LaunchConfig, PlacementConfig, RoleConfig, RunConfig, decode
-from accerl_lerobot.engine.contract import WorkerError
+from accerl_lerobot.engine.config import LaunchConfig, PlacementConfig, RunConfig
 from accerl_lerobot.engine.placement import Node, Plan, place_workers, plan_workers
-from accerl_lerobot.engine.run import train
+from accerl_lerobot.engine.run import execute
+from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import PolicyConfig
@@ -24,6 +24,8 @@ from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import ImaginationConfig
 from tests.runs import tiny_run
+
+ROLES = ("trainer", "inference", "rollout")
 
 
 def cluster(*sizes: tuple[float, float], **resources: str) -> list[Node]:
@@ -35,7 +37,6 @@ def cluster(*sizes: tuple[float, float], **resources: str) -> list[Node]:
             name=f"10.0.0.{i + 1}",
             cpus=cpus,
             gpus=gpus,
-            host=f"host{i}",
             resources=frozenset({resources[f"n{i}"]} if f"n{i}" in resources else ()),
         )
         for i, (cpus, gpus) in enumerate(sizes)
@@ -49,8 +50,7 @@ def run(
     rollouts: int = 2,
     imagining: bool = False,
     device: str = "auto",
-    transport: Any = "auto",
-    **placement: RoleConfig,
+    **placement: str,
 ) -> RunConfig:
     """A run of so many workers, its roles placed as the other keywords say."""
     sharding = "zero2" if ranks > 1 else "none"
@@ -61,12 +61,8 @@ def run(
         inference=InferenceConfig(workers=services),
         rollout=RolloutConfig(workers=max(rollouts, services), worlds=1, segment_length=3),
         imagination=ImaginationConfig(share=0.5 if imagining else 0.0, model="oracle"),
-        launch=LaunchConfig(address="auto", transport=transport, placement=PlacementConfig(**placement)),
+        launch=LaunchConfig(address="auto", placement=PlacementConfig(**placement)),
     )
-
-
-def at(nodes: str | None = None, gpus: float | None = None, cpus: float = 0.0) -> RoleConfig:
-    return RoleConfig(nodes=nodes, gpus=gpus, cpus=cpus)
 
 
 def where(plan: Plan) -> dict[str, tuple[int, float]]:
@@ -91,8 +87,6 @@ def test_nothing_said_all_is_here_and_shares_what_is_left_of_the_gpus(gpus: floa
 
 def test_a_policy_on_the_cpu_leaves_gpus_alone():
     assert {gpus for _, gpus in where(plan_workers(cluster((8, 4)), run(device="cpu"))).values()} == {0.0}
-    with pytest.raises(InputError, match=r"inference\.gpus=0\.5: policy\.device=cpu takes none"):
-        plan_workers(cluster((8, 4)), run(device="cpu", inference=at(gpus=0.5)))
 
 
 def test_ranks_that_do_not_fit_are_refused_as_on_one_machine():
@@ -100,29 +94,21 @@ def test_ranks_that_do_not_fit_are_refused_as_on_one_machine():
         plan_workers(cluster((8, 3)), run(ranks=4))
 
 
-def test_the_sum_is_in_the_error():
-    config = run(ranks=4, services=2, trainer=at(gpus=1), inference=at(gpus=0.5))
+def test_roles_whose_nodes_overlap_may_not_fit():
+    config = run(ranks=2, services=2, inference="all")
     with pytest.raises(InputError) as caught:
-        plan_workers(cluster((8, 4)), config)
+        plan_workers(cluster((8, 2), (8, 1)), config)
     assert str(caught.value) == (
-        "launch.placement.inference.gpus=0.5: 4 trainer × 1 + 2 inference × 0.5 = 5 GPUs, and there are 4 on "
-        "node 0 (10.0.0.1); ask for less, or for other nodes"
+        "launch.placement.inference='all': 2 × 1 GPUs do not fit on node 0 (10.0.0.1), node 1 (10.0.0.2) "
+        "beside others; name the same nodes for all of these, or nodes of their own"
     )
-    found = where(plan_workers(cluster((8, 5)), config))
-    assert [found[f"inference {i}"] for i in range(2)] == [(0, 0.5)] * 2
-
-
-def test_parts_that_add_up_but_fit_on_no_single_gpu_are_refused():
-    config = run(services=2, trainer=at(gpus=0.6), inference=at(gpus=0.6))
-    with pytest.raises(
-        InputError, match=r"1\.8 GPUs, and there are 2 on .*, of which no single one has room"
-    ):
-        plan_workers(cluster((8, 2)), config)
+    found = where(plan_workers(cluster((8, 2), (8, 2)), config))
+    assert [found[f"inference {i}"] for i in range(2)] == [(1, 1.0)] * 2
 
 
 def test_each_role_goes_where_it_is_sent_and_shares_what_is_there():
     nodes = cluster((8, 2), (8, 1), (64, 0), (32, 0), n2="sim", n3="sim")
-    config = run(ranks=2, services=2, rollouts=6, imagining=True, imagination=at("1"), rollout=at("sim"))
+    config = run(ranks=2, services=2, rollouts=6, imagining=True, imagination="1", rollout="sim")
     plan = plan_workers(nodes, config)
     found = where(plan)
     assert [found[name] for name in ("trainer", "trainer rank 1")] == [(0, 0.6)] * 2
@@ -139,72 +125,39 @@ def test_each_role_goes_where_it_is_sent_and_shares_what_is_there():
     ]
 
 
-def test_cores_are_kept_where_they_are_asked_for():
-    config = run(rollouts=6, rollout=at("all", cpus=2))
-    assert rollouts_by_node(plan_workers(cluster((4, 0), (8, 0)), config)) == {0: 2, 1: 4}
-    with pytest.raises(InputError, match=r"rollout\.cpus=2: 6 × 2 = 12 CPUs .* there are 4 on node 0 .*7 on"):
-        plan_workers(cluster((4, 0), (7, 0)), config)
-
-
 def test_a_node_that_is_not_there_is_refused_with_those_that_are():
     nodes = cluster((8, 0), (8, 0), n1="sim")
     for name in ("7", "simulators"):
-        with pytest.raises(InputError, match=rf"rollout\.nodes='{name}': .*numbers 0 to 1 and resources sim"):
-            plan_workers(nodes, run(rollout=at(name)))
+        with pytest.raises(InputError, match=rf"rollout='{name}': .*numbers 0 to 1 and resources sim"):
+            plan_workers(nodes, run(rollout=name))
 
 
 def test_what_has_a_network_stays_where_the_files_are():
     nodes = cluster((8, 0), (64, 4))
     nodes[1] = replace(nodes[1], unseen="the run's folder, outputs/a")
-    with pytest.raises(
-        InputError, match=r"inference\.nodes='1': node 1 \(10\.0\.0\.2\) does not see the run's"
-    ):
-        plan_workers(nodes, run(inference=at("1")))
-    plan = plan_workers(nodes, run(rollouts=9, inference=at("all"), rollout=at("all")))
+    with pytest.raises(InputError, match=r"inference='1': node 1 \(10\.0\.0\.2\) does not see the run's"):
+        plan_workers(nodes, run(inference="1"))
+    plan = plan_workers(nodes, run(rollouts=9, inference="all", rollout="all"))
     assert where(plan)["inference"] == (0, 0.0)
     assert rollouts_by_node(plan) == {1: 9}  # the cores of node 0 have a trainer and a policy already
 
 
-def test_gpus_of_some_who_share_nodes_and_not_of_others_are_refused():
-    config = run(trainer=at(gpus=0.5))
-    with pytest.raises(InputError, match=r"trainer\.gpus=0\.5: say the same of inference, on the same nodes"):
-        plan_workers(cluster((8, 1)), config)
-    assert where(plan_workers(cluster((8, 1), (8, 1)), run(trainer=at(gpus=0.5), inference=at("1"))))
-
-
-def test_two_ranks_never_share_a_gpu():
-    with pytest.raises(InputError, match=r"trainer\.gpus=0\.5: two ranks could share a GPU"):
-        plan_workers(cluster((8, 2)), run(ranks=2, trainer=at(gpus=0.5), inference=at(gpus=0.5)))
-
-
 def test_cuda_is_not_looked_for_on_nodes_without():
     with pytest.raises(InputError, match=r"policy\.device='cuda': there is no GPU on node 1"):
-        plan_workers(cluster((8, 1), (8, 0)), run(device="cuda", inference=at("1")))
-
-
-def test_shared_memory_ends_where_the_machine_does():
-    nodes, config = cluster((8, 0), (8, 0)), run(transport="shared_memory", rollout=at("all"))
-    with pytest.raises(InputError, match=r"launch\.transport='shared_memory': node 1 .* shares no memory"):
-        plan_workers(nodes, config)
-    assert plan_workers([nodes[0], replace(nodes[1], host="host0")], config)  # two nodes of one machine
+        plan_workers(cluster((8, 1), (8, 0)), run(device="cuda", inference="1"))
 
 
 def test_a_rollout_worker_whose_node_has_left_goes_to_one_that_is_there():
-    plan = plan_workers(cluster((4, 0), (8, 0), (8, 0)), run(rollouts=5, rollout=at("all", cpus=4)))
-    assert rollouts_by_node(plan) == {0: 1, 1: 2, 2: 2}
+    plan = plan_workers(cluster((64, 0), (8, 0), (8, 0)), run(rollouts=24, rollout="all"))
+    assert rollouts_by_node(plan) == {0: 20, 1: 2, 2: 2}
     left = frozenset({"key0", "key1"})
     for name in [n for n, place in plan.places.items() if place.node.number == 2]:
         plan = plan.moved(name, left)
-        assert plan.places[name].cpus == 0.0  # whether there is room for it or not
-    assert rollouts_by_node(plan) == {0: 2, 1: 3}
-    assert plan.moved("rollout 1", frozenset({"key0"})).places["rollout 1"].node.number == 0
+    assert rollouts_by_node(plan) == {0: 22, 1: 2}
+    moved = next(name for name, place in plan.places.items() if place.node.number == 1)
+    assert plan.moved(moved, frozenset({"key0"})).places[moved].node.number == 0
     with pytest.raises(WorkerError, match="rollout 1 worker is lost, and no node is left"):
         plan.moved("rollout 1", frozenset())  # a worker's loss may be noticed before its node's
-
-
-def test_rollout_workers_take_no_gpu():
-    with pytest.raises(InputError, match=r"rollout\.gpus=0\.5: rollout workers have no network"):
-        decode(RunConfig, {"launch": {"placement": {"rollout": {"gpus": 0.5}}}})
 
 
 @pytest.mark.parametrize(
@@ -216,7 +169,7 @@ def test_rollout_workers_take_no_gpu():
             {"address": "auto", "engine": "local"},
             r"launch\.address='auto': launch\.engine=local is one process",
         ),
-        ({"placement": PlacementConfig(rollout=RoleConfig(nodes="1"))}, r"placement=.*a private Ray has one"),
+        ({"placement": PlacementConfig(rollout="1")}, r"placement=.*a private Ray has one"),
         ({"open_cluster": True}, r"launch\.open_cluster=True: it is about the cluster of launch\.address"),
     ],
 )
@@ -252,20 +205,17 @@ def test_whatever_is_planned_fits():
         nodes = cluster(
             *[(rng.choice([2, 8, 64]), rng.choice([0, 1, 2, 4])) for _ in range(rng.randint(1, 4))]
         )
-        sites = [rng.choice([None, "all", str(rng.randrange(len(nodes)))]) for _ in range(3)]
-        said = rng.random() < 0.5
+        sites = {name: rng.choice(["0", "all", str(rng.randrange(len(nodes)))]) for name in ROLES}
         config = run(
             ranks=rng.choice([1, 1, 2, 3]),
             services=rng.randint(1, 3),
             rollouts=rng.randint(3, 8),
-            trainer=at(sites[0], rng.choice([0.6, 1.0]) if said else None),
-            inference=at(sites[1], rng.choice([0.25, 0.6, 1.0]) if said else None),
-            rollout=at(sites[2], cpus=rng.choice([0, 0, 1, 2])),
+            **sites,
         )
         try:
             plan = plan_workers(nodes, config)
         except InputError as error:
-            assert "GPU" in str(error) or "CPUs" in str(error), error
+            assert "GPU" in str(error), error
             continue
         made += 1
         assert (
@@ -273,7 +223,6 @@ def test_whatever_is_planned_fits():
         )
         for node in nodes:
             here = [place for place in plan.places.values() if place.node.number == node.number]
-            assert sum(place.cpus for place in here) <= node.cpus + 1e-6
             free = [1.0] * int(node.gpus)
             for share in [place.gpus for place in here if place.gpus]:
                 fullest = min((g for g in range(len(free)) if free[g] >= share - 1e-6), key=lambda g: free[g])
@@ -281,11 +230,12 @@ def test_whatever_is_planned_fits():
     assert made > 80
 
 
-def test_a_run_that_does_not_fit_does_not_begin(tmp_path: Path):
+def test_a_run_that_does_not_fit_does_not_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Not even with what comes before its workers."""
-    config = tiny_run(Path("nowhere"), launch=LaunchConfig(placement=PlacementConfig(rollout=at(cpus=4096))))
-    with pytest.raises(
-        InputError, match=r"rollout\.cpus=4096: 1 × 4096 = 4096 CPUs .* node 0 \(this machine\)"
-    ):
-        train(config, tmp_path, Console())
+    machine = replace(cluster((8, 1))[0], name="this machine")
+    monkeypatch.setattr(placement, "this_machine", lambda: machine)
+    trainer = TrainerConfig(updates=1, batch_decisions=16, ranks=2, sharding="zero2")
+    config = tiny_run(Path("nowhere"), trainer=trainer, policy=PolicyConfig(path="nowhere"))
+    with pytest.raises(InputError, match=r"trainer\.ranks=2: .* 2 ranks on 1 GPUs leave 1 without"):
+        execute(config, tmp_path, Console())
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]

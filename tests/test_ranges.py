@@ -21,7 +21,7 @@ from accerl_lerobot.config.ranges import Choice, Device, Positive, Range, Sectio
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
-from accerl_lerobot.engine.config import RoleConfig
+from accerl_lerobot.engine.config import PlacementConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.card import PullConfig
 from accerl_lerobot.policies.config import (
@@ -121,7 +121,7 @@ RULES = [
     (NetworkConfig, {"channels": ()}, "world_model.model.network.channels="),
     (ReplayConfig, {"min_decisions": 5000}, "replay.min_decisions="),
     (ReplayConfig, {"ahead": 5000}, "replay.ahead="),
-    (RoleConfig, {"nodes": " "}, "launch.placement.nodes=' ': name a node"),
+    (PlacementConfig, {"rollout": " "}, "launch.placement.rollout=' ': name a node"),
     (RolloutConfig, {"group_size": 1}, "rollout.group_size=1: groups of one have no comparison"),
     (SFTConfig, {"policy": {"chunk_size": 4}}, "sft.policy="),
     (TimelineConfig, {"runs": ()}, "runs="),

@@ -19,8 +19,8 @@ import pytest
 
 from accerl_lerobot.engine import ray_session
 from accerl_lerobot.engine.config import LaunchConfig
-from accerl_lerobot.engine.contract import WorkerError
 from accerl_lerobot.engine.ray_session import RaySession, RayWatch, process_kind
+from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.errors import InputError
 from tests.light_workers import light_ray
 

@@ -25,11 +25,11 @@ PACKAGE = ROOT / "accerl_lerobot"
 
 HEADER = "# SPDX-License-Identifier: Apache-2.0\n"
 LONGEST_FILE = 600
-ENGINE = {"launch.py", "placement.py", "ray_session.py", "replicas.py", "supervisor.py"}
+ENGINE = {"launch.py", "placement.py", "ray_session.py", "replicas.py"}
 SHELLS = ENGINE | {
     "doctor.py",
     "worker.py",
-    "imagination_workers.py",
+    "imagination.py",
     "peers.py",
     "factory.py",
     "endpoint.py",

@@ -18,8 +18,8 @@ from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.engine import launch
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.contract import Progress
 from accerl_lerobot.engine.launch import RayEngine
+from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.stats import evaluation_plans

@@ -13,9 +13,10 @@ import yaml
 
 from accerl_lerobot.checkpoint.layout import saved_version
 from accerl_lerobot.console import Console
-from accerl_lerobot.engine import run
+from accerl_lerobot.engine import run, stopping
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig, parse
-from accerl_lerobot.engine.contract import Engine, Progress, Saved, WorkerError
+from accerl_lerobot.engine.loop import Engine, Progress, Saved
+from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.stats import EvaluationConfig
@@ -50,7 +51,7 @@ def local_run(checkpoint: Path, output_dir: Path | None, **sections: Any) -> Run
 def finished(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
     config = local_run(tiny_checkpoint, tmp_path_factory.mktemp("outputs") / "run")
     directory = run.make_output_dir(config)
-    return Finished(config, directory, run.train(config, directory, Console()))
+    return Finished(config, directory, run.execute(config, directory, Console()))
 
 
 def records(directory: Path, kind: str) -> list[dict[str, Any]]:
@@ -77,7 +78,7 @@ def test_the_evaluation_before_can_be_left_out(tiny_checkpoint: Path, tmp_path: 
         tiny_checkpoint, tmp_path / "run", evaluation=EvaluationConfig(episodes=4, before=False, videos=0)
     )
     directory = run.make_output_dir(config)
-    summary = run.train(config, directory, Console())
+    summary = run.execute(config, directory, Console())
     assert [r["group"] for r in records(directory, "evaluation")] == ["after"]
     assert summary["success_before"] is summary["ci95"]["before"] is None and summary["n_after"] == 4
     assert (directory / "success_curve.png").is_file() and not (directory / "before_after.mp4").exists()
@@ -147,7 +148,7 @@ def test_a_policy_that_does_not_fit_the_world_is_refused_before_any_worker_start
     monkeypatch.setattr(run, "make_engine", lambda *_: pytest.fail("a worker was started"))
     config = local_run(tiny_checkpoint, tmp_path, env=SimulatedConfig(action_dim=3, state_dim=6))
     with pytest.raises(InputError, match=r"policy.path"):
-        run.train(config, tmp_path, Console())
+        run.execute(config, tmp_path, Console())
 
 
 class Scripted(Engine):
@@ -212,7 +213,7 @@ def test_an_evaluation_that_ends_after_training_is_not_lost(
 ):
     config = local_run(tiny_checkpoint, tmp_path, save_every_updates=0)
     engine = scripted(monkeypatch, config)
-    summary = run.train(config, tmp_path, Console())
+    summary = run.execute(config, tmp_path, Console())
     found = records(tmp_path, "evaluation")
     assert [r["group"] for r in found] == ["before", "during-1", "during-2", "after"]
     assert [r["n"] for r in found] == [8, 4, 4, 8]
@@ -242,7 +243,7 @@ def losing(monkeypatch: pytest.MonkeyPatch, config: RunConfig, lost_at: list[int
 
     monkeypatch.setattr(run, "make_engine", make)
     monkeypatch.setattr(run, "check_policy", lambda config, **_: 1)
-    monkeypatch.setattr(run, "pause_s", lambda times: 0.01 * times)
+    monkeypatch.setattr(stopping, "pause_s", lambda times: 0.01 * times)
     return made
 
 
@@ -251,7 +252,7 @@ def test_after_the_loss_of_a_worker_the_run_goes_on_from_its_last_checkpoint(
 ):
     config = local_run(tiny_checkpoint, tmp_path)
     made = losing(monkeypatch, config, [7, 11, 11])
-    summary = run.train(config, tmp_path, Console())
+    summary = run.execute(config, tmp_path, Console())
     assert len(made) == 4 and all(engine.closed for engine in made) and summary["updates"] == 12
     assert [r["update"] for r in records(tmp_path, "train")] == list(range(1, 13)), "none twice"
     said = capsys.readouterr().err
@@ -264,10 +265,10 @@ def test_after_the_loss_of_a_worker_the_run_goes_on_from_its_last_checkpoint(
 def test_a_worker_that_is_lost_again_and_again_ends_the_run(
     tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    config = local_run(tiny_checkpoint, tmp_path, launch=LaunchConfig(engine="local", max_recoveries=2))
+    config = local_run(tiny_checkpoint, tmp_path, launch=LaunchConfig(engine="local", max_restarts=2))
     made = losing(monkeypatch, config, [7, 7, 7, 7])
     with pytest.raises(WorkerError, match="Killed"):
-        run.train(config, tmp_path, Console())
+        run.execute(config, tmp_path, Console())
     assert len(made) == 3 and all(engine.closed for engine in made)
 
 
@@ -275,10 +276,10 @@ def test_a_run_that_gets_further_each_time_is_not_stuck(
     tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     """Though no checkpoint is reached in between."""
-    launch = LaunchConfig(engine="local", max_recoveries=1)
+    launch = LaunchConfig(engine="local", max_restarts=1)
     config = local_run(tiny_checkpoint, tmp_path, launch=launch)
     made = losing(monkeypatch, config, [6, 7, 8, 9])
-    summary = run.train(config, tmp_path, Console())
+    summary = run.execute(config, tmp_path, Console())
     assert len(made) == 5 and summary["updates"] == 12
     assert capsys.readouterr().err.count("(1 of 1 times)") == 4
     assert [r["update"] for r in records(tmp_path, "train")] == list(range(1, 13)), "none twice"
@@ -290,7 +291,7 @@ def test_without_a_checkpoint_there_is_nothing_to_go_on_from(
     config = local_run(tiny_checkpoint, tmp_path, save_every_updates=0, save_every_s=0.0)
     made = losing(monkeypatch, config, [7])
     with pytest.raises(WorkerError, match="Killed"):
-        run.train(config, tmp_path, Console())
+        run.execute(config, tmp_path, Console())
     assert len(made) == 1 and made[0].closed
 
 
@@ -308,7 +309,7 @@ def test_groups_with_nothing_to_compare_are_said_aloud(
         return replace(progress, episodes=[*progress.episodes, explored], rollout=progress.rollout | counters)
 
     monkeypatch.setattr(engine, "poll", fruitless)
-    run.train(engine.config, tmp_path, Console())
+    run.execute(engine.config, tmp_path, Console())
     said = " ".join(capsys.readouterr().err.split())
     # At 60 and 120; one is kept at 140, from where it is counted again: at 200.
     assert said.count("50 groups in a row were dropped and nothing is learned from them") == 3
@@ -323,7 +324,7 @@ def test_a_run_that_fails_closes_the_engine_and_keeps_its_own_error(
     engine = scripted(monkeypatch, config)
     monkeypatch.setattr(engine, "train", lambda: (_ for _ in ()).throw(error))
     with pytest.raises(type(error)) as caught:
-        run.train(config, tmp_path, Console())
+        run.execute(config, tmp_path, Console())
     assert caught.value is error and engine.closed
     assert len(records(tmp_path, "evaluation")) == 1, "what was measured before is kept"
     assert not (tmp_path / "summary.json").exists()

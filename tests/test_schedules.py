@@ -17,7 +17,7 @@ import pytest
 
 from accerl_lerobot.engine import launch
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.engine.contract import Progress
+from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation.stats import evaluation_plans

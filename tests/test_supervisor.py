@@ -10,8 +10,9 @@ from typing import Any
 import psutil
 import pytest
 
-from accerl_lerobot.engine import supervisor
-from accerl_lerobot.engine.supervisor import ActorHandle, end
+from accerl_lerobot.engine import launch, replicas
+from accerl_lerobot.engine.launch import end
+from accerl_lerobot.engine.replicas import ActorHandle
 
 
 class Stand:
@@ -26,8 +27,9 @@ class Stand:
 
 @pytest.mark.parametrize("here", [True, False])
 def test_only_a_process_of_this_node_is_ended_by_its_number(here: bool, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(supervisor, "ray", Stand())
-    monkeypatch.setattr(supervisor, "GONE_S", 0.2)
+    for module in (launch, replicas):
+        monkeypatch.setattr(module, "ray", Stand())
+    monkeypatch.setattr(launch, "GONE_S", 0.2)
     with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]) as process:
         worker = ActorHandle("somebody", None)
         worker.await_start(process.pid, 1.0, here)

@@ -28,7 +28,7 @@ from ray.cluster_utils import Cluster  # noqa: E402
 
 from accerl_lerobot.engine import launch  # noqa: E402
 from accerl_lerobot.engine import placement as planning  # noqa: E402
-from accerl_lerobot.engine.config import LaunchConfig, PlacementConfig, RoleConfig  # noqa: E402
+from accerl_lerobot.engine.config import LaunchConfig, PlacementConfig  # noqa: E402
 from accerl_lerobot.engine.launch import RayEngine  # noqa: E402
 from accerl_lerobot.envs import SimulatedConfig  # noqa: E402
 from accerl_lerobot.errors import InputError  # noqa: E402
@@ -44,7 +44,7 @@ from tests.runs import collect, drive, polls, tiny_run  # noqa: E402
 NOTICED_SOON = {"health_check_initial_delay_ms": 1000, "health_check_period_ms": 1000,
                 "health_check_timeout_ms": 2000, "health_check_failure_threshold": 3}  # fmt: skip
 SLOW = SimulatedConfig(max_steps=16, step_ms=2.0)
-FOUR = RolloutConfig(workers=4, worlds=2, segment_length=3, max_restarts=0)
+FOUR = RolloutConfig(workers=4, worlds=2, segment_length=3)
 
 
 class FarInference(LightInference):
@@ -71,13 +71,13 @@ def two_nodes() -> Iterator[tuple[Cluster, Any]]:
 
 def engine(address: str, nodes: str, updates: int) -> RayEngine:
     """A run with its rollout workers on these nodes."""
-    placement = PlacementConfig(rollout=RoleConfig(nodes=nodes, cpus=0.5))
+    placement = PlacementConfig(rollout=nodes)
     config = tiny_run(
         Path("nowhere"),
         env=SLOW,
         rollout=FOUR,
         trainer=TrainerConfig(updates=updates, batch_decisions=16),
-        launch=LaunchConfig(address=address, placement=placement, stall_s=60.0),
+        launch=LaunchConfig(address=address, placement=placement, stall_s=60.0, max_restarts=0),
     )
     return RayEngine(config, ("match",))
 
@@ -138,23 +138,19 @@ def what_does_not_fit_is_refused(made: Cluster, second: Any, monkeypatch: pytest
         assert "it asks for no token" in refused(lambda: engine(address, "sim", 1))
     assert not ray.is_initialized()
     key = next(n["NodeID"] for n in _nodes(address) if "sim" in n["Resources"])
-    teller = planning._reporter
+    honest = planning.report_node
 
-    def other_teller() -> Any:
-        tell = teller()
+    def report(policy: Path | None, marker: Path | None) -> Any:
+        import ray
 
-        def other(mark: str | None, policy: str | None) -> dict[str, str]:
-            import ray
-
-            there = ray.is_initialized() and ray.get_runtime_context().get_node_id() == key
-            return tell(mark, policy) | ({"lerobot": ""} if there else {})
-
-        return other
+        versions, *seen = honest(policy, marker)
+        there = ray.is_initialized() and ray.get_runtime_context().get_node_id() == key
+        return versions | ({"lerobot": "0.0"} if there else {}), *seen
 
     with monkeypatch.context() as patch:
-        patch.setattr(planning, "_reporter", other_teller)
+        patch.setattr(planning, "report_node", report)
         text = refused(lambda: engine(address, "sim", 1))
-        assert "node 1 (127.0.0.1) has lerobot missing, and this is" in text
+        assert "node 1 (127.0.0.1) has lerobot 0.0, and this is" in text
 
 
 def _nodes(address: str) -> list[dict[str, Any]]:
@@ -190,7 +186,7 @@ def a_node_that_leaves_takes_nothing_along(made: Cluster, second: Any) -> None:
             break
     assert {parent(pid) for name, pid in one.pids().items()} == {raylet(made.head_node)}
     one.close()
-    assert "rollout.nodes='sim': no node of the cluster" in refused(lambda: engine(made.address, "sim", 1))
+    assert "rollout='sim': no node of the cluster" in refused(lambda: engine(made.address, "sim", 1))
 
 
 def main() -> None:

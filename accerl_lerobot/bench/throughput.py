@@ -23,7 +23,7 @@ from accerl_lerobot.bench.host import Processors, as_markdown, as_table, host, r
 from accerl_lerobot.config.ranges import Positive, Repeats, Section
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, parse
-from accerl_lerobot.engine.contract import Progress
+from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.errors import InputError, expanded, make_folder
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.policies.config import Load

@@ -150,43 +150,18 @@ def train(arguments: list[str], load: Load | None = None) -> int:
         load: makes the policy's adapter; None: of LeRobot's checkpoint.
     """
     config: RunConfig = parse(RunConfig, arguments)
-    from accerl_lerobot import guardian
     from accerl_lerobot.engine import run
-    from accerl_lerobot.engine.contract import WorkerError
-    from accerl_lerobot.engine.preflight import check_start
-    from accerl_lerobot.engine.stopping import StoppedError, locked, resume_command, resumed_run
+    from accerl_lerobot.engine.stopping import StoppedError
 
-    begun = resumed_run(read_arguments(arguments)[0], config) if config.resume else None
-    if load is None and begun is None:
-        check_start(config)  # before there is a folder
     console = Console()
-    directory = run.make_output_dir(config) if begun is None else begun.directory
-    console.say(f"run {directory}")
-    guardian.explain(remedy=f"to resume: {resume_command(directory)}")
     try:
-        with (
-            redirect_stdout(sys.stderr),
-            kept_traceback(directory),
-            locked(directory, "config_path", "another process resumes it"),
-        ):
-            wanted = None if begun is None else begun.checkpoint
-            summary = run.train(config, directory, console, wanted, load)
-    except InputError:
-        if begun is None:
-            run.discard_unused(directory)
-        raise
+        directory, summary = run.start(config, console, read_arguments(arguments)[0], load)
     except StoppedError as stopped:
         console.say(str(stopped))
         return 128 + stopped.number
     except BaseException as error:
-        if is_full(error):
-            console.say(f"the disk of {directory} is full; free some space, then {resume_command(directory)}")
+        if is_full(error) or run.is_brief(error):
             return 1
-        if isinstance(error, WorkerError) and "\n" not in str(error):  # without a worker's traceback
-            console.say(f"{error}; to resume: {resume_command(directory)}")
-            return 1
-        how = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-        console.say(f"{how}; to resume from the last checkpoint: {resume_command(directory)}")
         raise
     before = summary["success_before"]
     console.say(
@@ -261,7 +236,7 @@ def evaluate(arguments: list[str]) -> int:
     whole = RunConfig(**{name: getattr(config, name) for name in sections})
     console = Console()
     with redirect_stdout(sys.stderr):
-        results = run.evaluate(whole, console, config.evaluation.videos if out else 0)
+        results = run.play_evaluation(whole, console, config.evaluation.videos if out else 0)
     summary: dict[str, Any] = summarise(results) | {"policy": config.policy.path}
     console.say(f"{config.policy.path}, LeRobot's sampler")
     console.rich.print(table(summary, "evaluation"))

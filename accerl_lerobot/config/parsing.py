@@ -90,7 +90,6 @@ LEROBOT = {
     "push_to_hub": _PUSH,
     "save_checkpoint_to_hub": _PUSH,
     "algorithm.type=grpo": f"{_GROUP}. Otherwise ",
-    "algorithm.type=rloo": f"{_GROUP} --rollout.group_advantage=rloo. Otherwise ",
     **{
         f"env.type={name}": f"for LeRobot's {name} use env.type=lerobot --env.name={name}. Otherwise "
         for name in (

@@ -40,48 +40,33 @@ __all__ = ["DatasetConfig", "LaunchConfig", "RunConfig", "check_chunk", "decode"
 
 
 @dataclass(frozen=True, kw_only=True)
-class RoleConfig(Section, section="launch.placement"):
-    """Nodes of a kind of worker, and what each takes there."""
-
-    nodes: str | None = None
-    """A node's number as ``accerl doctor`` prints it, 0 being the one where the run is started; the name of a
-    custom resource, as in ``ray start --resources='{"simulators": 1}'``; or all. None: node 0."""
-    gpus: Annotated[float, Range("[0, 1]")] | None = None
-    """Share of a GPU for each. None: those with a network on the same nodes share what these have."""
-    cpus: NonNegative = 0.0
-    """Cores reserved for each; 0: none."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.nodes is not None and not self.nodes.strip():
-            remedy = "name a node's number or resource, or use all"
-            raise InputError(f"{self.SECTION}.nodes", self.nodes, remedy)
-
-
-@dataclass(frozen=True, kw_only=True)
 class PlacementConfig(Section, section="launch.placement"):
-    """Nodes of all workers; replay is where the run is started."""
+    """Nodes of all workers; replay is where the run is started.
 
-    trainer: RoleConfig = field(default_factory=RoleConfig)
-    """Each of its ranks."""
-    inference: RoleConfig = field(default_factory=RoleConfig)
-    """Each replica."""
-    imagination: RoleConfig = field(default_factory=RoleConfig)
-    """The worker that imagines, and the one that trains the world model."""
-    rollout: RoleConfig = field(default_factory=RoleConfig)
-    """Each rollout worker."""
+    A node's number as ``accerl doctor`` prints it, 0 being the one where the run is started; the name of a
+    custom resource, as in ``ray start --resources='{"simulators": 1}'``; or all. None: node 0.
+    """
+
+    trainer: str | None = None
+    """Nodes of the trainer's ranks."""
+    inference: str | None = None
+    """Nodes of the inference replicas."""
+    imagination: str | None = None
+    """Nodes of the worker that imagines, and of the one that trains the world model."""
+    rollout: str | None = None
+    """Nodes of the rollout workers."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.rollout.gpus:
-            remedy = "rollout workers have no network; leave the field out"
-            raise InputError("launch.placement.rollout.gpus", self.rollout.gpus, remedy)
+        for name, nodes in vars(self).items():
+            if nodes is not None and not nodes.strip():
+                remedy = "name a node's number or resource, or use all"
+                raise InputError(f"{self.SECTION}.{name}", nodes, remedy)
 
     @property
     def elsewhere(self) -> bool:
         """True if any worker may be on another node."""
-        roles = (self.trainer, self.inference, self.imagination, self.rollout)
-        return any(role.nodes not in (None, "0") for role in roles)
+        return any(nodes not in (None, "0") for nodes in vars(self).values())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,25 +82,23 @@ class LaunchConfig(Section, section="launch"):
     open_cluster: bool = False
     """Join a cluster that asks for no token: whoever reaches it runs code in your workers."""
     placement: PlacementConfig = field(default_factory=PlacementConfig)
-    """Nodes of the workers, and what each takes there."""
+    """Nodes of the workers."""
     schedule: Schedule = ASYNCHRONOUS
     """asynchronous: no worker waits for another. synchronous: a batch is collected, by all environments in
     lock step, then learned from. overlap: the next one is collected meanwhile. The last two are for measuring
     what the first gains; with several inference replicas, the environments of each are in step."""
     transport: Transport = "auto"
-    """Transport of requests, segments and weights. shared_memory: between processes of one node. ray: copied,
-    to any node. auto: shared memory on one node, if the system has it, and Ray otherwise."""
+    """Transport of requests, segments and weights. auto: shared memory between processes of one node, if the
+    system has it, and Ray otherwise. ray: always Ray."""
     stall_s: Positive = 300.0
     """Timeout in seconds for an answer of a worker, a step of an environment, and any progress of the run.
 
     A rollout worker or an inference replica is restarted alone then; after any other loss, all workers are.
     """
-    max_recoveries: Annotated[int, Range("[0, 1000000]")] = 3
-    """How often in a row, without a later update or checkpoint in between, all workers are restarted from the
-    last checkpoint after the loss of one that is not restarted alone."""
-    timeline: bool = True
-    """True if every worker records what it does when, for ``accerl timeline``: up to 8 MB each time one is
-    started."""
+    max_restarts: Annotated[int, Range("[0, 1000000]")] = 3
+    """How often in a row a rollout worker or an inference replica is restarted alone; 30 s at work reset the
+    count. After that, and after any other loss, all workers are restarted from the last checkpoint, as often
+    in a row without a later update or checkpoint in between."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -281,7 +264,7 @@ def journal_folder(config: RunConfig) -> Path | None:
 def timeline_folder(config: RunConfig) -> Path | None:
     """Where the timeline of a run's workers is kept; None: nowhere."""
     folder = journal_folder(config)
-    return folder / TIMELINE if folder is not None and config.launch.timeline else None
+    return None if folder is None else folder / TIMELINE
 
 
 def check_chunk(policy: dict[str, Any]) -> None:

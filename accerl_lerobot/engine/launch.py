@@ -19,35 +19,56 @@ has a timeout. Workers get handles of each other and never hold the engine.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
 import ray
 from ray.exceptions import RayError, RayTaskError
 
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE, saved_version
 from accerl_lerobot.engine.config import RunConfig, journal_folder, timeline_folder
-from accerl_lerobot.engine.contract import Engine, Progress, Saved, WorkerError
+from accerl_lerobot.engine.loop import Engine, Progress, Saved
 from accerl_lerobot.engine.placement import actor_options, place_workers
 from accerl_lerobot.engine.ray_session import RaySession
-from accerl_lerobot.engine.replicas import START_S, InferenceReplicas, RolloutWorkers
-from accerl_lerobot.engine.supervisor import ActorHandle, end
+from accerl_lerobot.engine.replicas import START_S, ActorHandle, InferenceReplicas, RolloutWorkers
+from accerl_lerobot.engine.stopping import WorkerError
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.transport.contract import ServiceStoppedError
-from accerl_lerobot.transport.endpoint import Endpoint, uses_shared_memory
+from accerl_lerobot.transport.endpoint import Endpoint
 from accerl_lerobot.world_model.guard import IMAGINATION, WORLD_LEARNING
 
 logger = logging.getLogger(__name__)
 
 POLL_S = 0.5
+GONE_S = 3.0
+"""How long a killed process may take to be gone."""
 BLAME_S = 10.0
 """How long to wait for the failure that another failure is the consequence of."""
+
+
+def end(workers: Iterable[ActorHandle], *, told: bool = True) -> None:
+    """End workers and wait until they are gone, so that nothing writes any more when others start.
+
+    Args:
+        told: True: Ray tells them to end, which a stopped process does not hear; False: Ray is lost.
+    """
+    workers = list(workers)
+    for worker in workers if told else ():
+        ray.kill(worker.actor)
+    processes = [worker.process for worker in workers if worker.process is not None]
+    left = psutil.wait_procs(processes, timeout=GONE_S if told else 0.0)[1]
+    for process in left:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            process.kill()
+    psutil.wait_procs(left, timeout=GONE_S)
 
 
 class RayEngine(Engine):
@@ -60,10 +81,6 @@ class RayEngine(Engine):
         state: the ``training_state`` to resume from, without the episodes under way; None: begin.
         load: makes the policy's adapter, in the processes that have one; None: of LeRobot's checkpoint.
         session: the Ray to use, which outlives this engine; None: one that ends with it.
-
-    Raises:
-        InputError: the state is of a run in one process, or this system has no shared memory.
-        WorkerError: a worker did not start; carries its own traceback.
     """
 
     def __init__(
@@ -75,12 +92,11 @@ class RayEngine(Engine):
         load: Load | None = None,
         session: RaySession | None = None,
     ) -> None:
-        uses_shared_memory(config.launch.transport)
         self._config, self._state, self._load = config, state, load
         self._limit = config.launch.stall_s
         self._version = 0 if state is None else saved_version(state)
         self._rollouts = RolloutWorkers(config, tasks, history, state)
-        self._inference = InferenceReplicas(config, self._version, state, load)
+        self._inference = InferenceReplicas(config, self._version, state, load, self._move)
         self._others: list[ActorHandle] = []
         """All other workers."""
         self._imaginer: ActorHandle | None = None
@@ -134,8 +150,6 @@ class RayEngine(Engine):
             raise WorkerError(lost)
         self._ask()
         self._await_end()
-        for index, endpoint in self._inference.advance():
-            self._move(index, endpoint)
         episodes = self._listen()
         self._check_hung()
         updates, self._updates = self._updates, []
@@ -224,7 +238,7 @@ class RayEngine(Engine):
             self._add(name, rank)
         self._trainer = self._add("trainer", trainer)
         if imagination.share:
-            from accerl_lerobot.engine.imagination_workers import ImaginationWorker, WorldLearningWorker
+            from accerl_lerobot.engine.imagination import ImaginationWorker, WorldLearningWorker
 
             imaginer = make(IMAGINATION, ImaginationWorker, 4, c, self._state, timeline)
             self._imaginer = self._add(IMAGINATION, imaginer)
@@ -253,6 +267,7 @@ class RayEngine(Engine):
         if self._imaginer is not None and index == self._config.inference.workers - 1:
             self._imaginer_asks = inference
             self._imaginer.call("move", inference, timeout=self._limit)
+        self._last_change = time.monotonic()  # a restart has timeouts of its own
 
     def _ask(self) -> None:
         self._inference.ask()
@@ -263,8 +278,7 @@ class RayEngine(Engine):
     def _await_end(self) -> None:
         """Wait a little, and handle every worker whose long call has ended."""
         works = {worker.work: worker for worker in self._everyone() if worker.work is not None}
-        awaited = [*works, *self._inference.awaited()]
-        if not ray.wait(awaited, num_returns=1, timeout=POLL_S)[0]:
+        if not ray.wait(list(works), num_returns=1, timeout=POLL_S)[0]:
             return
         ended = set(ray.wait(list(works), num_returns=len(works), timeout=0)[0])
         for reference, worker in works.items():
@@ -326,23 +340,15 @@ class RayEngine(Engine):
             raise WorkerError(f"{worker.name} worker failed for good:\n{error}") from error
 
     def _check_hung(self) -> None:
-        """Restart a rollout worker or inference replica that hangs.
-
-        Raises:
-            WorkerError: another worker does not answer.
-        """
+        """Restart a rollout worker or inference replica that hangs."""
         for worker in self._others:
             if worker.silent_s() > self._limit:
                 raise WorkerError(f"{worker.name} worker has not answered for {worker.silent_s():.0f} s")
-        self._inference.check_hung()
-        self._rollouts.check_hung(self._inference.up)
+        self._rollouts.check_hung()
+        self._inference.check_hung()  # last, since others are not listened to during a restart
 
     def _check_moving(self, progress: Progress) -> None:
-        """End a run in which every worker answers and nothing moves.
-
-        Raises:
-            WorkerError: neither decisions nor updates for `LaunchConfig.stall_s`.
-        """
+        """End a run in which every worker answers and nothing moves."""
         imagined = tuple(progress.imagination.get(k) for k in ("decisions", "learn_steps", "validation_s"))
         state = (progress.version, progress.rollout.get("decisions"), progress.rollout["restarts"], imagined)
         now = time.monotonic()
@@ -350,8 +356,7 @@ class RayEngine(Engine):
         # Where one worker is to blame, `_check_hung` finds it a moment later.
         silent = max(worker.silent_s() for worker in self._everyone())
         suspect = max(silent, self._rollouts.stuck_s) > self._limit / 2
-        # The restart of a replica has a timeout of its own.
-        if state != self._last_state or not waiting or not all(self._inference.up):
+        if state != self._last_state or not waiting:
             self._last_state, self._last_change = state, now
         elif now - self._last_change > self._limit and not suspect:
             raise WorkerError(

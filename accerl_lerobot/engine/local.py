@@ -21,7 +21,7 @@ import numpy as np
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS, WORLD_MODEL
 from accerl_lerobot.engine.config import RunConfig, journal_folder, timeline_folder
-from accerl_lerobot.engine.contract import Engine, Progress, Saved, check_new, episode_key
+from accerl_lerobot.engine.loop import Engine, Progress, Saved, check_new, episode_key
 from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Request, Segment
@@ -43,18 +43,7 @@ LOCAL = "local"
 
 
 class LocalEngine(Engine):
-    """Single-process engine.
-
-    Args:
-        config: the run; its ``policy.path`` must be set.
-        tasks: the training tasks.
-        history: env steps that an observation holds, the policy's ``n_obs_steps``.
-        state: the ``training_state`` to resume from, bit for bit; None: begin.
-        load: makes the policy's adapter; None: of LeRobot's checkpoint.
-
-    Raises:
-        InputError: the state is of an asynchronous run.
-    """
+    """Single-process engine."""
 
     def __init__(
         self,
@@ -110,7 +99,7 @@ class LocalEngine(Engine):
             config.rollout,
             "local",
             self._outbox.append,
-            self._ended,
+            self._episodes.append,
             self._plans.groups,
         )
         self._due: dict[int, Request] = {}
@@ -301,7 +290,3 @@ class LocalEngine(Engine):
     def _imagined(self) -> dict[str, float]:
         learner = {} if self._world_learner is None else self._world_learner.metrics()
         return {} if self._imagination is None else self._imagination.metrics() | learner
-
-    def _ended(self, result: EpisodeResult) -> None:
-        self._plans.report(result)
-        self._episodes.append(result)

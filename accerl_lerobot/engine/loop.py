@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The run once its engine has started: evaluation, training, checkpoints, and their records."""
+"""The interface of an engine, and what a run does with it: evaluation, training, checkpoints and records."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import json
 import math
 import shutil
 import time
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,12 +30,11 @@ from accerl_lerobot.checkpoint.layout import (
 )
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig
-from accerl_lerobot.engine.contract import Engine, Progress
 from accerl_lerobot.engine.stopping import Stopping, raise_if_stopped
 from accerl_lerobot.evaluation.pictures import before_after, success_curve
 from accerl_lerobot.evaluation.stats import evaluation_plans, summarise
 from accerl_lerobot.metrics import MetricsLog, plain
-from accerl_lerobot.rollout.runner import EpisodeResult
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.timeline import CHECKPOINT, EVALUATION, TIMELINE, TRAINING, Clock, NoClock
 from accerl_lerobot.timeline.read import Watch
 
@@ -50,6 +50,89 @@ _STATE = (
     "before", "evaluations", "curve", "recent", "explored", "lags", "lag_max", "mismatch_max", "during",
     "base", "groups", "steps", "evaluated", "saved",
 )  # fmt: skip
+
+
+@dataclass(kw_only=True)
+class Progress:
+    """Events since the last poll."""
+
+    version: int
+    """Updates made so far."""
+    done: bool = False
+    """The trainer has made all its updates."""
+    updates: list[dict[str, float]] = field(default_factory=list)
+    """Metrics of each update."""
+    episodes: list[EpisodeResult] = field(default_factory=list)
+    """Finished episodes, both exploring and planned."""
+    rollout: dict[str, float] = field(default_factory=dict)
+    """Counters over all rollout workers since the run began."""
+    replay: dict[str, float] = field(default_factory=dict)
+    inference: dict[str, float] = field(default_factory=dict)
+    imagination: dict[str, float] = field(default_factory=dict)
+    """Empty where nothing is imagined."""
+
+
+class Saved(NamedTuple):
+    """Files of one checkpoint."""
+
+    version: int
+    """Version of the policy: updates behind it."""
+    updates: list[dict[str, float]]
+    """Metrics of updates that `Engine.poll` has not reported and will not report."""
+
+
+class Engine(ABC):
+    """Environments, policy and trainer, fresh or restored from what `save` has written.
+
+    Example:
+        >>> engine.plan(evaluation_plans(tasks, 100, "before"))   # runs at once, nothing else does
+        >>> engine.train()                                        # planned episodes still go first
+        >>> while not (progress := engine.poll()).done: ...
+        >>> engine.save(directory)
+    """
+
+    @abstractmethod
+    def plan(self, plans: list[EpisodePlan]) -> None:
+        """Queue episodes that are run before any exploring one; `poll` reports one result for each.
+
+        Raises:
+            ValueError: an episode of the same group and index has been planned and not been reported yet.
+        """
+
+    @abstractmethod
+    def train(self) -> None:
+        """Start exploring and learning; both end by themselves after the configured updates."""
+
+    @abstractmethod
+    def poll(self) -> Progress:
+        """Do or await a little work and report it."""
+
+    @abstractmethod
+    def save(self, directory: Path) -> Saved:
+        """Write a checkpoint's ``pretrained_model`` and ``training_state``, see `checkpoint`.
+
+        All parts are of the same update: no segment counts as learned from that was used later, and no
+        planned episode is reported twice.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """End all workers. Does not raise, so that it hides no other error. Safe to call twice."""
+
+
+def episode_key(plan: EpisodePlan) -> tuple[str, int]:
+    """Key of a planned episode."""
+    return plan.group, plan.index
+
+
+def check_new(plans: Sequence[EpisodePlan], outstanding: Container[tuple[str, int]]) -> None:
+    """Check the argument of `Engine.plan`."""
+    keys: set[tuple[str, int]] = set()
+    for plan in plans:
+        key = episode_key(plan)
+        if key in keys or key in outstanding:
+            raise ValueError(f"episode {plan.index} of {plan.group!r} is planned twice")
+        keys.add(key)
 
 
 def run_plans(
@@ -139,14 +222,7 @@ class Loop:
         self._watch = Watch(self.directory / TIMELINE)
 
     def run(self, state: Path | None) -> dict[str, Any]:
-        """Do the run, or the rest of it; returns the summary.
-
-        Args:
-            state: the ``training_state`` to resume from; None: begin.
-
-        Raises:
-            StoppedError: it was asked to stop.
-        """
+        """Do the run, or the rest of it; returns the summary."""
         evaluation = self.config.evaluation
         filmed: list[EpisodeResult] = []
         if state is not None:

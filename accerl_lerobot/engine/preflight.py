@@ -55,11 +55,7 @@ SLACK_BYTES = 128 * 2**20
 
 
 def check_world(env: EnvConfig) -> WorldSpec:
-    """Build and resets an environment once, so that what is wrong with it shows before anything long.
-
-    Raises:
-        InputError: its simulator is not installed or cannot draw here, or it refuses its options.
-    """
+    """Build and resets an environment once, so that what is wrong with it shows before anything long."""
     world = make_world(env)
     try:
         world.reset(0, world.spec.tasks[0])
@@ -88,9 +84,6 @@ def check_policy(config: RunConfig, spec: WorldSpec | None = None, *, own: bool 
 
 def check_start(config: RunConfig) -> int:
     """Refuse a run that could not begin or whose outcome could not be used; what can be is checked here.
-
-    Returns:
-        The policy's ``n_obs_steps``.
 
     Raises:
         InputError: no policy, dataset or device; parts that do not fit each other, see `check_features`; more
@@ -152,21 +145,7 @@ def _say_if_unlike(config: RunConfig, spec: WorldSpec, meta: Any, history: int) 
 def check_training_data(
     sft: SFTConfig, dataset: DatasetConfig, policy: Any, spec: WorldSpec | None, rename_map: dict[str, str]
 ) -> Any:
-    """Compare dataset, policy and environment of an SFT.
-
-    Args:
-        sft: makes the policy.
-        dataset: without a name, demonstrations will be recorded in the environment.
-        policy: LeRobot's config of it, see `check_sft_policy`; of the checkpoint, where it starts from one.
-        spec: of the environment; None: there is none to act in.
-        rename_map: environment's name → policy's name.
-
-    Returns:
-        LeRobot's metadata of the dataset; None without a name.
-
-    Raises:
-        InputError: see `check_features`; LeRobot's policy refuses these features.
-    """
+    """Compare dataset, policy and environment of an SFT."""
     from accerl_lerobot.demos.dataset_files import open_metadata
 
     meta = None if dataset.repo_id is None else open_metadata(dataset)
@@ -216,11 +195,7 @@ def _check_new_policy(policy: Any, source: Features, sft: SFTConfig) -> None:
 
 
 def check_wandb(config: WandBConfig) -> None:
-    """Refuse logging to Weights & Biases where nobody is logged in.
-
-    Raises:
-        InputError: see above; or its package is not installed.
-    """
+    """Refuse logging to Weights & Biases where nobody is logged in."""
     if not config.enable or os.environ.get("WANDB_MODE") in ("offline", "disabled", "dryrun"):
         return
     try:
@@ -267,11 +242,7 @@ def check_disk(folder: str | None, needed: int, field: str = "output_dir") -> No
 
 
 def check_machine(config: RunConfig) -> None:
-    """Refuse sizes far beyond this machine's memory.
-
-    Raises:
-        InputError: names the field that takes most memory.
-    """
+    """Refuse sizes far beyond this machine's memory."""
     if config.launch.address is not None:  # the other nodes may have more
         return
     from accerl_lerobot.cli.doctor import memory_parts_gib, total_memory_gib
@@ -299,9 +270,6 @@ def policy_gib(config: RunConfig) -> float:
     """Memory that the weights of ``policy.path`` take in all processes of a run; activations come on top.
 
     On a GPU they are not in the machine's memory. Nothing is known of a policy that an SFT will make.
-
-    Raises:
-        InputError: see `policy_to_be`.
     """
     from accerl_lerobot.policies.loading import policy_sizes, rehearsed_config, resolve_device
 

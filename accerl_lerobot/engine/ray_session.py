@@ -29,8 +29,7 @@ from typing import TYPE_CHECKING, Any
 import psutil
 
 from accerl_lerobot import guardian
-from accerl_lerobot.engine.contract import WorkerError, pause_s
-from accerl_lerobot.engine.stopping import arrived, deferred
+from accerl_lerobot.engine.stopping import WorkerError, arrived, deferred, pause_s
 from accerl_lerobot.errors import InputError
 
 if TYPE_CHECKING:
@@ -93,11 +92,7 @@ UNAUTHORISED = ("Unauthenticated", "UNAUTHENTICATED", "InvalidAuthToken", "Authe
 
 
 def prepare(joins: bool = False) -> None:
-    """Set the environment variables that Ray and its workers read; what is set already stays.
-
-    Args:
-        joins: True if a cluster is joined, with the user's token.
-    """
+    """Set the environment variables that Ray and its workers read; what is set already stays."""
     for key, value in WORKERS.items():
         os.environ.setdefault(key, value)
     if joins:
@@ -117,11 +112,7 @@ def prepare(joins: bool = False) -> None:
 
 
 def check_private() -> None:
-    """Refuse to start a private Ray that others could use.
-
-    Raises:
-        RuntimeError: Ray was imported before `prepare`.
-    """
+    """Refuse to start a private Ray that others could use."""
     if not all(os.environ.get(key) for key in PRIVATE) or not any(os.environ.get(key) for key in _AUTH):
         remedy = "start a new process, or call ray_session.prepare() before Ray is imported"
         raise RuntimeError(f"Ray has been imported, and would be open to others if started now: {remedy}")
@@ -253,11 +244,7 @@ def _join(launch: LaunchConfig) -> None:
 
 
 def check_cluster(launch: LaunchConfig) -> None:
-    """Ask a cluster for its status with this run's token and without one, in processes of their own.
-
-    Raises:
-        InputError: it is no Ray cluster, of another version, refuses the token, or asks for none.
-    """
+    """Ask a cluster for its status with this run's token and without one, in processes of their own."""
     address = str(launch.address)
     if address != "auto":
         host, _, port = address.rpartition(":")
@@ -322,12 +309,7 @@ class RaySession:
         return self._lost if self._watch is None else self._watch.look()
 
     def start(self) -> None:
-        """Start Ray unless it is there, or if it does not respond any more.
-
-        Raises:
-            InputError: there is no such cluster, see `start_ray`.
-            WorkerError: it does not start.
-        """
+        """Start Ray unless it is there, or if it does not respond any more."""
         import ray
 
         if ray.is_initialized():

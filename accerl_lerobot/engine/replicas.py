@@ -1,30 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The workers that are restarted alone.
+"""Supervision of the processes of an asynchronous run.
 
-    RolloutWorkers       lose unfinished segments and groups with a process; planned episodes are re-run
-    InferenceReplicas    lose nothing: a request carries its noise, and clients ask the successor again
+    ActorHandle          one process: a long call that must not end unasked, and one question at a time
+    RolloutWorkers       restarted alone: a process loses its unfinished segments and groups; planned episodes
+                         are run again
+    InferenceReplicas    restarted alone: nothing is lost, as a request carries its noise and clients ask the
+                         successor again
 
-Resuming a run works the same way.
+The engine waits for a restart, and the other workers go on meanwhile. Resuming a run works the same way.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import math
 import time
-from collections.abc import Generator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import psutil
 import ray
-from ray.exceptions import ActorUnavailableError, RayError
+from ray.exceptions import ActorUnavailableError, GetTimeoutError, RayActorError, RayError, RayTaskError
 
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.engine.config import RunConfig, timeline_folder
-from accerl_lerobot.engine.contract import WorkerError, check_new, episode_key, pause_s
-from accerl_lerobot.engine.placement import actor_options, alive_nodes
+from accerl_lerobot.engine.loop import check_new, episode_key
+from accerl_lerobot.engine.placement import Plan, actor_options, alive_nodes
 from accerl_lerobot.engine.ray_session import NO_HUB_TOKEN
-from accerl_lerobot.engine.supervisor import ActorHandle, ReplicaSet, WorkerSlot
+from accerl_lerobot.engine.stopping import WorkerError, pause_s
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.batcher import BatcherStats, dealt, merge_metrics, merge_stats
 from accerl_lerobot.metrics import numbered
@@ -32,23 +39,202 @@ from accerl_lerobot.policies.config import Load
 from accerl_lerobot.rollout.plans import budgets, incarnation_after, whole_groups
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.rollout.worker import Report
-from accerl_lerobot.transport.endpoint import Endpoint, uses_shared_memory
+from accerl_lerobot.transport.endpoint import Endpoint, Transport, uses_shared_memory
 
 logger = logging.getLogger(__name__)
 
 START_S = 600.0
 """Timeout for the start of a worker; `LaunchConfig.stall_s` counts from its first answer."""
+STEADY_S = 30.0
+"""A worker that has run for so long starts counting restarts anew."""
 AWAY_S = 10.0
-"""How long a rollout worker may fail to connect to an inference replica that is up."""
+"""How long a rollout worker may fail to connect to its inference replica."""
 UNREACHABLE_S = 60.0
 """How long a process on another node may be out of reach before it is restarted, unless its node is found to
 have left, which Ray takes half of that to decide."""
-STEADY_S = 30.0
-"""An inference replica that has served for so long starts counting restarts anew."""
-QUICK_S = 0.2
-"""How long to wait for an answer that usually comes at once."""
+LOOK_S = 1.0
+"""Interval at which a process in a long call, or a node out of reach, is looked at."""
 ROLLOUT = "rollout"
 """Name of the rollout workers' part of a checkpoint."""
+
+
+class ActorHandle:
+    """One long call that must not end unasked, and one question at a time.
+
+    Questions are asked without waiting and answers picked up later, so a worker that hangs cannot hang the
+    engine, its silence has a length, and orders arrive in order, which Ray does not promise for an actor with
+    threads.
+
+    Example:
+        >>> worker = ActorHandle("trainer", actor)
+        >>> worker.work = actor.run.remote()    # `ray.wait` on it: its end is an event
+        >>> worker.ask("metrics")               # does nothing until the last answer was picked up
+    """
+
+    def __init__(self, name: str, actor: Any) -> None:
+        self.name, self.actor = name, actor
+        self.work: Any = None
+        self.process: psutil.Process | None = None
+        """None: not known yet, or on another node."""
+        self.answered = False
+        self._question: Any = None
+        self._asked = 0.0
+
+    def await_start(self, reference: Any, timeout: float, here: bool) -> None:
+        """Wait for the answer to ``ready``, its process id.
+
+        Args:
+            here: True on this node; a process of that number on another node must not be touched.
+        """
+        pid = self.result(reference, "ready", timeout)
+        if here:
+            with contextlib.suppress(psutil.NoSuchProcess):  # the next question will tell
+                self.process = psutil.Process(pid)
+
+    def endpoint(self, method: str, transport: Transport, timeout: float) -> Endpoint:
+        """Where other workers reach this method."""
+        address = self.call("listen", timeout=timeout) if uses_shared_memory(transport) else None
+        return Endpoint(name=self.name, method=getattr(self.actor, method), address=address)
+
+    def ask(self, method: str, *arguments: Any) -> bool:
+        """Ask unless an answer is outstanding; returns True if it did."""
+        if self._question is not None:
+            return False
+        self._question, self._asked = getattr(self.actor, method).remote(*arguments), time.monotonic()
+        return True
+
+    def answer(self, timeout: float = 0.0) -> Any:
+        """The answer to the last question, once; None if there is none yet.
+
+        Raises:
+            RayError: the call failed, or the process has died.
+        """
+        if self._question is None or not ray.wait([self._question], timeout=timeout)[0]:
+            return None
+        question, self._question = self._question, None
+        answer = ray.get(question)
+        self.answered = True
+        return answer
+
+    def silent_s(self) -> float:
+        """Seconds for which an answer has been outstanding."""
+        if self._question is None or ray.wait([self._question], timeout=0)[0]:
+            return 0.0
+        return time.monotonic() - self._asked
+
+    def call(self, method: str, *arguments: Any, timeout: float, silence: float | None = None) -> Any:
+        """Call a method and wait for its answer.
+
+        Args:
+            timeout: seconds until the answer.
+            silence: seconds in which it must answer ``ready`` meanwhile; None: it need not.
+
+        Raises:
+            WorkerError: it failed, with its traceback, or did not answer in time.
+        """
+        reference = getattr(self.actor, method).remote(*arguments)
+        if silence is not None:
+            self._check_alive(reference, method, timeout, silence)
+        return self.result(reference, method, timeout)
+
+    def result(self, reference: Any, method: str, timeout: float) -> Any:
+        """See `call`, for a call that has been made."""
+        try:
+            return ray.get(reference, timeout=timeout)
+        except GetTimeoutError as error:
+            raise WorkerError(f"{self.name} worker did not answer {method} within {timeout:.0f} s") from error
+        except RayError as error:
+            raise WorkerError(f"{self.name} worker failed in {method}:\n{error}") from error
+
+    def _check_alive(self, reference: Any, method: str, timeout: float, silence: float) -> None:
+        """Wait for an answer that may take long, from a process that must not hang."""
+        deadline = time.monotonic() + timeout
+        beat, asked = self.actor.ready.remote(), time.monotonic()
+        while not ray.wait([reference], timeout=min(LOOK_S, silence / 4))[0]:
+            now = time.monotonic()
+            if now > deadline:
+                return  # `result` reports it
+            if ray.wait([beat], timeout=0)[0]:
+                beat, asked = self.actor.ready.remote(), now
+            elif now - asked > silence:
+                raise WorkerError(f"{self.name} worker has not answered for {now - asked:.0f} s, in {method}")
+
+
+@dataclass(kw_only=True)
+class WorkerSlot:
+    """A place for one process after the other."""
+
+    index: int
+    name: str
+    worker: ActorHandle = None  # type: ignore[assignment]
+    """Set by `ReplicaSet.start`."""
+    restarts: int = 0
+    """In a row."""
+    since: float = math.inf
+    """When the process was at work, on `time.monotonic`."""
+
+
+class ReplicaSet[S: WorkerSlot](ABC):
+    """Workers of one kind that can be restarted alone, `LaunchConfig.max_restarts` times in a row each."""
+
+    def __init__(self, config: RunConfig, slots: list[S]) -> None:
+        self._config, self._slots = config, slots
+        self._plan = Plan((), {})
+
+    def start(self, plan: Plan) -> None:
+        """Start a process for each slot, where the plan says."""
+        self._plan = plan
+        for slot in self._slots:
+            slot.worker = self._new(slot)
+
+    def workers(self) -> Iterator[ActorHandle]:
+        """All workers of this kind, once they have been started."""
+        return (slot.worker for slot in self._slots if slot.worker is not None)
+
+    def restart_worker(self, worker: ActorHandle, error: Exception) -> bool:
+        """Restart a worker that has failed; False if it is not one of these.
+
+        Raises:
+            WorkerError: it has been restarted too often; carries its traceback.
+        """
+        for slot in self._slots:
+            if slot.worker is worker:
+                self._restart(slot, error)
+                return True
+        return False
+
+    @abstractmethod
+    def _new(self, slot: S) -> ActorHandle:
+        """Start a process for a slot."""
+
+    @abstractmethod
+    def _restart(self, slot: S, error: Exception) -> None:
+        """Replace the process of a slot; see `restart_worker`."""
+
+    def _end_process(self, slot: S, error: Exception, *, free: bool = False) -> None:
+        """End the process of a slot and count the restart, unless it is `free`."""
+        if time.monotonic() - slot.since > STEADY_S:
+            slot.restarts = 0
+        if slot.restarts >= self._config.launch.max_restarts and not free:
+            times = f" after {slot.restarts} restarts" if slot.restarts else ""
+            raise WorkerError(f"{slot.name} worker failed for good{times}:\n{error}") from error
+        reason = str(error).strip().splitlines()[-1][:200]
+        logger.warning("%s worker is restarted: %s", slot.name, reason)
+        ray.kill(slot.worker.actor)
+        slot.restarts, slot.since = slot.restarts + (not free), math.inf
+
+    def _answers(self) -> Iterator[tuple[S, Any]]:
+        """Answers that have come. A worker whose answer is an error is restarted."""
+        for slot in self._slots:
+            try:
+                answer = slot.worker.answer()
+            except RayActorError:
+                continue  # its long call has ended as well, and the engine deals with that
+            except RayError as error:
+                self._restart(slot, error)
+                continue
+            if answer is not None:
+                yield slot, answer
 
 
 @dataclass(kw_only=True)
@@ -68,28 +254,15 @@ class RolloutSlot(WorkerSlot):
     """Exploring episodes left; None: no end."""
     spent: bool = False
     """True if replay has all of them."""
-    unreachable: tuple[float, Exception] | None = None
-    """Since when the process cannot be reached, on `time.monotonic`, and the error."""
 
     @property
-    def starts(self) -> int:
-        """Position in the worker's seeds, see `EpisodePlans.starts`."""
-        return 0 if self.report is None else self.report.starts
-
-    @property
-    def stuck_s(self) -> float:
-        """How long the worker or its world has been at what it does now."""
-        return 0.0 if self.report is None else max(self.report.in_world_s, self.report.stuck_s)
+    def next_incarnation(self) -> int:
+        """Incarnation of another process in this place."""
+        return incarnation_after(self.incarnation, 0 if self.report is None else self.report.starts)
 
 
 class RolloutWorkers(ReplicaSet[RolloutSlot]):
     """The rollout workers of a run.
-
-    Args:
-        config: the run.
-        tasks: the training tasks.
-        history: env steps that an observation holds.
-        state: the ``training_state`` to resume from; None: begin.
 
     Raises:
         InputError: the state is not of an asynchronous run with as many workers.
@@ -102,7 +275,7 @@ class RolloutWorkers(ReplicaSet[RolloutSlot]):
             RolloutSlot(index=index, name=f"rollout {index}", budget=budget, spent=budget == 0)
             for index, budget in enumerate(budgets(config.rollout))
         ]
-        super().__init__(config, slots, config.rollout.max_restarts)
+        super().__init__(config, slots)
         self._tasks, self._history = tasks, history
         self._past: dict[str, float] = {"restarts": 0.0}
         """Counters of processes that have ended."""
@@ -134,7 +307,6 @@ class RolloutWorkers(ReplicaSet[RolloutSlot]):
     def ask(self, training: bool) -> None:
         """Ask each worker for a report, unless one is outstanding."""
         for slot in self._slots:
-            assert slot.worker is not None
             if slot.worker.ask("report", training, slot.unsent, self.in_turn, slot.moved):
                 slot.unsent = []
                 if slot.moved is not None and slot.report is not None:
@@ -146,6 +318,7 @@ class RolloutWorkers(ReplicaSet[RolloutSlot]):
         episodes: list[EpisodeResult] = []
         for slot, report in self._answers():
             slot.report, slot.spent = report, report.spent
+            slot.since = min(slot.since, time.monotonic())
             if slot.budget is not None:
                 slot.budget -= sum(e.plan.explore for e in report.episodes)
             for episode in report.episodes:
@@ -158,8 +331,7 @@ class RolloutWorkers(ReplicaSet[RolloutSlot]):
         """Sums over all processes since the run began."""
         totals = dict(self._past)
         for slot in self._slots:
-            for key, value in (slot.report.counters if slot.report is not None else {}).items():
-                totals[key] = totals.get(key, 0.0) + value
+            _add(totals, slot.report)
         return totals
 
     @property
@@ -175,37 +347,21 @@ class RolloutWorkers(ReplicaSet[RolloutSlot]):
     @property
     def stuck_s(self) -> float:
         """How long the slowest worker or world has been at what it does now."""
-        return max(slot.stuck_s for slot in self._slots)
+        reports = [slot.report for slot in self._slots if slot.report is not None]
+        return max((max(report.in_world_s, report.stuck_s) for report in reports), default=0.0)
 
-    def restart_worker(self, worker: ActorHandle, error: Exception) -> bool:
+    def check_hung(self) -> None:
+        """Restart workers that do not answer or do nothing, whose world does not return, or that do not find
+        inference."""
         for slot in self._slots:
-            remote = slot.worker is worker and self._plan.places[slot.name].node.number
-            if remote and isinstance(error, ActorUnavailableError):
-                slot.unreachable = (time.monotonic(), error)  # `check_hung` finds out what has happened
-                return True
-        return super().restart_worker(worker, error)
-
-    def check_hung(self, served: list[bool]) -> None:
-        """Restart workers that do not answer, do nothing, whose world does not return or who do not find
-        inference.
-
-        Args:
-            served: of each inference replica, True if it is up."""
-        there = alive_nodes() if any(slot.unreachable for slot in self._slots) else frozenset()
-        for slot in self._slots:
-            if slot.unreachable is not None:
-                since, error = slot.unreachable
-                left = self._plan.places[slot.name].node.key not in there
-                if left or time.monotonic() - since > UNREACHABLE_S:
-                    self._restart(slot, error)
-            elif why := self._hung(slot, served[slot.index % len(served)]):
+            if why := self._hung(slot):
                 self._restart(slot, RuntimeError(why))
 
     def save(self, directory: Path) -> None:
         """Write the rollout workers' part of ``training_state``."""
         slots = [
             {
-                "incarnation": incarnation_after(slot.incarnation, slot.starts) - 1,
+                "incarnation": slot.next_incarnation - 1,
                 "budget": slot.budget,
                 "outstanding": list(slot.outstanding.values()),
             }
@@ -233,9 +389,8 @@ class RolloutWorkers(ReplicaSet[RolloutSlot]):
         slot.outstanding |= {episode_key(plan): plan for plan in plans}
         slot.unsent += plans
 
-    def _hung(self, slot: RolloutSlot, served: bool) -> str:
+    def _hung(self, slot: RolloutSlot) -> str:
         """Reason to restart a worker; empty: none."""
-        assert slot.worker is not None
         limit, silent, report = self._config.launch.stall_s, slot.worker.silent_s(), slot.report
         if silent > (limit if slot.worker.answered else max(START_S, limit)):
             return f"no answer for {silent:.0f} s"
@@ -245,7 +400,7 @@ class RolloutWorkers(ReplicaSet[RolloutSlot]):
             return f"its world has not returned for {report.in_world_s:.0f} s"
         if report.stuck_s > limit:
             return f"it has done nothing for {report.stuck_s:.0f} s"
-        if report.away_s > AWAY_S and slot.moved is None and served:
+        if report.away_s > AWAY_S and slot.moved is None:
             return f"without inference, which is up, for {report.away_s:.0f} s: {report.away_why}"
         return ""
 
@@ -261,18 +416,25 @@ class RolloutWorkers(ReplicaSet[RolloutSlot]):
         return ActorHandle(slot.name, made)
 
     def _restart(self, slot: RolloutSlot, error: Exception) -> None:
+        if isinstance(error, ActorUnavailableError):
+            self._await_verdict(slot.name)
         moved = self._move(slot.name)
         self._end_process(slot, error, free=moved)  # that its node has left is not the worker's fault
         self._past["restarts"] += 1
-        for key, value in (slot.report.counters if slot.report is not None else {}).items():
-            self._past[key] = self._past.get(key, 0.0) + value
-        slot.incarnation = incarnation_after(slot.incarnation, slot.starts)
-        slot.report, slot.moved, slot.unreachable = None, None, None
+        _add(self._past, slot.report)
+        slot.incarnation = slot.next_incarnation
+        slot.report, slot.moved = None, None
         if slot.budget is not None:
             slot.budget = whole_groups(slot.budget, self._config.rollout)
         slot.worker = self._new(slot)
         slot.unsent = list(slot.outstanding.values())
         self._run(slot)
+
+    def _await_verdict(self, name: str) -> None:
+        """Wait until Ray has decided whether the node of a worker out of reach has left, if it is another."""
+        node, until = self._plan.places[name].node, time.monotonic() + UNREACHABLE_S
+        while node.number and node.key in alive_nodes() and time.monotonic() < until:
+            time.sleep(LOOK_S)
 
     def _move(self, name: str) -> bool:
         """Plan another node for a worker whose own has left; False if that is still there."""
@@ -285,89 +447,77 @@ class RolloutWorkers(ReplicaSet[RolloutSlot]):
         return True
 
     def _run(self, slot: RolloutSlot) -> None:
-        assert slot.worker is not None
         inference = self._inference[slot.index % len(self._inference)]
         slot.worker.work = slot.worker.actor.run.remote(inference, self._replay)
+
+
+def _add(totals: dict[str, float], report: Report | None) -> None:
+    """Add a report's counters to `totals`."""
+    for key, value in (report.counters if report is not None else {}).items():
+        totals[key] = totals.get(key, 0.0) + value
 
 
 @dataclass(kw_only=True)
 class InferenceSlot(WorkerSlot):
     """An inference replica's place."""
 
-    up: bool = True
-    """True if its clients have been told where it is."""
-    since: float = 0.0
-    """Start of its service, on `time.monotonic`."""
     metrics: dict[str, float] = field(default_factory=dict)
-    due: float = 0.0
-    """When the next process is to be started, while there is none."""
-    steps: Generator[Any, Any, Endpoint] | None = None
-    """Remaining steps of a process that is not up yet."""
-    awaited: Any = None
-    """Reference that `steps` waits for."""
-    deadline: float = 0.0
+    lock_step: int = 0
+    """Worlds that are decided for together; 0: each for itself."""
 
 
 class InferenceReplicas(ReplicaSet[InferenceSlot]):
     """The inference replicas of a run; rollout worker i asks replica i modulo their number.
 
-        started ─► ready ─► listens and serves ─► has the trainer's newest weights ─► its clients are told
-
     Args:
-        config: the run.
         version: of the first weights.
         state: the ``training_state`` that holds these; None: they are the policy's.
         load: makes the policy's adapter; None: of LeRobot's checkpoint.
+        moved: called with the index and new endpoint of a replica that has been restarted.
     """
 
-    def __init__(self, config: RunConfig, version: int, state: Path | None, load: Load | None) -> None:
+    def __init__(
+        self,
+        config: RunConfig,
+        version: int,
+        state: Path | None,
+        load: Load | None,
+        moved: Callable[[int, Endpoint], None],
+    ) -> None:
         names = numbered("inference", config.inference.workers)
-        slots = [InferenceSlot(index=index, name=name) for index, name in enumerate(names)]
-        super().__init__(config, slots, config.inference.max_restarts)
+        super().__init__(config, [InferenceSlot(index=i, name=name) for i, name in enumerate(names)])
         self._arguments = (config.policy, config.inference, version, state, load, timeline_folder(config))
+        self._moved = moved
         self.restarts = 0
         """Restarts of all replicas since this engine began."""
         self._trainer: Any = None
         """Handle of the trainer; None: nothing is published yet."""
-        self._lock_step = [0] * len(slots)
-        """Worlds of each that are decided for together."""
 
     def open(self) -> list[Endpoint]:
         """Have all replicas serve, once they are ready; their endpoints."""
         launch = self._config.launch
         endpoints = [w.endpoint("decide", launch.transport, launch.stall_s) for w in self.workers()]
-        for slot, worker in zip(self._slots, self.workers(), strict=True):
-            worker.work, slot.since = worker.actor.serve.remote(), time.monotonic()
+        for slot in self._slots:
+            slot.worker.work, slot.since = slot.worker.actor.serve.remote(), time.monotonic()
         return endpoints
 
     def publishing(self, trainer: Any) -> list[Any]:
-        """Have replicas that come later join this trainer; handles of those that get the first weights."""
+        """Have replicas that come later join this trainer; handles of those that there are."""
         self._trainer = trainer
-        return [slot.worker.actor for slot in self._slots if slot.up and slot.worker is not None]
+        return [worker.actor for worker in self.workers()]
 
     def lock_step(self, in_turn: bool) -> None:
-        """Have each replica decide for all its worlds together, or not any more.
-
-        Raises:
-            WorkerError: a replica does not answer.
-        """
+        """Have each replica decide for all its worlds together, or not any more."""
         rollout = self._config.rollout
         clients = dealt(rollout.workers, len(self._slots))
         for slot in self._slots:
-            self._lock_step[slot.index] = clients[slot.index] * rollout.worlds if in_turn else 0
-            if slot.up and slot.worker is not None:
-                observations, limit = self._lock_step[slot.index], self._config.launch.stall_s
-                slot.worker.call("lock_step", observations, timeout=limit)
+            slot.lock_step = clients[slot.index] * rollout.worlds if in_turn else 0
+            slot.worker.call("lock_step", slot.lock_step, timeout=self._config.launch.stall_s)
 
     def ask(self) -> None:
         """Ask each replica for its metrics, unless they are outstanding."""
-        for slot in self._slots:
-            if slot.up and slot.worker is not None:
-                slot.worker.ask("metrics")
-
-    def awaited(self) -> list[Any]:
-        """References that restarts wait for."""
-        return [slot.awaited for slot in self._slots if slot.awaited is not None]
+        for worker in self.workers():
+            worker.ask("metrics")
 
     def listen(self) -> dict[str, float]:
         """Pick up metrics; all replicas as one."""
@@ -379,30 +529,8 @@ class InferenceReplicas(ReplicaSet[InferenceSlot]):
     def check_hung(self) -> None:
         """Restart replicas that do not answer."""
         for slot in self._slots:
-            silent = 0.0 if slot.worker is None else slot.worker.silent_s()
-            if slot.up and silent > self._config.launch.stall_s:
+            if (silent := slot.worker.silent_s()) > self._config.launch.stall_s:
                 self._restart(slot, RuntimeError(f"no answer for {silent:.0f} s"))
-
-    def advance(self) -> list[tuple[int, Endpoint]]:
-        """Continue restarts without waiting.
-
-        Returns:
-            Index and endpoint of each replica that has come up."""
-        ready = []
-        for slot in self._slots:
-            if slot.up or (slot.worker is None and time.monotonic() < slot.due):
-                continue
-            try:
-                if (endpoint := self._step(slot)) is not None:
-                    ready.append((slot.index, endpoint))
-            except (RayError, TimeoutError) as error:
-                self._restart(slot, error)
-        return ready
-
-    @property
-    def up(self) -> list[bool]:
-        """True for each replica whose clients know where it is."""
-        return [slot.up for slot in self._slots]
 
     def batching(self) -> BatcherStats:
         """Batches of all replicas so far."""
@@ -417,68 +545,50 @@ class InferenceReplicas(ReplicaSet[InferenceSlot]):
         return ActorHandle(slot.name, actor.remote(*self._arguments, slot.name))
 
     def _restart(self, slot: InferenceSlot, error: Exception) -> None:
-        if slot.up and time.monotonic() - slot.since > STEADY_S:
-            slot.restarts = 0
-        pause = pause_s(slot.restarts)
-        self._end_process(slot, error)
-        if (node := self._plan.places[slot.name].node).key not in alive_nodes():
-            raise WorkerError(f"{slot.name} worker is lost: {node} has left:\n{error}") from error
-        slot.up, slot.steps, slot.awaited, slot.metrics = False, None, None, {}
-        slot.due = time.monotonic() + pause
-        self.restarts += 1
+        again: Exception | None = error
+        while again is not None:
+            self._end_process(slot, again)
+            if (node := self._plan.places[slot.name].node).key not in alive_nodes():
+                raise WorkerError(f"{slot.name} worker is lost: {node} has left:\n{again}") from again
+            self.restarts += 1
+            time.sleep(pause_s(slot.restarts - 1))
+            slot.worker, slot.metrics = self._new(slot), {}
+            again = self._come_up(slot)
+        logger.info("%s worker is up again", slot.name)
 
-    def _step(self, slot: InferenceSlot) -> Endpoint | None:
-        """Take the next steps of a restart, as far as that needs no waiting; the endpoint after the last one.
+    def _come_up(self, slot: InferenceSlot) -> Exception | None:
+        """Wait until a new process serves with the trainer's newest weights, and tell its clients.
 
-        Raises:
-            RayError: the process has died or failed.
-            TimeoutError: it takes too long.
+        Returns:
+            The error, if it fails or takes too long.
         """
-        answer = None
-        if slot.steps is None:
-            slot.worker = self._new(slot)
-            slot.steps = self._come_up(slot, slot.worker)
-        elif ray.wait([slot.awaited], timeout=0)[0]:
-            answer = ray.get(slot.awaited)
-        elif time.monotonic() > slot.deadline:
-            raise TimeoutError("it takes too long to start")
-        else:
-            return None
-        until = time.monotonic() + QUICK_S
+        worker, launch = slot.worker, self._config.launch
+        here = self._plan.places[slot.name].node.number == 0
         try:
-            while True:
-                slot.awaited = slot.steps.send(answer)
-                if not ray.wait([slot.awaited], timeout=max(0.0, until - time.monotonic()))[0]:
-                    return None
-                answer = ray.get(slot.awaited)
-        except StopIteration as end:
-            slot.steps = slot.awaited = None
-            slot.up, slot.since = True, time.monotonic()
-            logger.info("%s worker is up again", slot.name)
-            endpoint: Endpoint = end.value
-            return endpoint
+            worker.await_start(worker.actor.ready.remote(), max(START_S, launch.stall_s), here)
+            endpoint = worker.endpoint("decide", launch.transport, launch.stall_s)
+            worker.work = worker.actor.serve.remote()
+            if slot.lock_step:
+                worker.call("lock_step", slot.lock_step, timeout=launch.stall_s)
+            if self._trainer is not None:
+                self._await_weights(worker)
+        except (RayError, TimeoutError, WorkerError) as error:
+            return error
+        slot.since = time.monotonic()
+        self._moved(slot.index, endpoint)
+        return None
 
-    def _come_up(self, slot: InferenceSlot, worker: ActorHandle) -> Generator[Any, Any, Endpoint]:
-        """Steps until a new process can be asked; waits for the references that it yields."""
-        launch = self._config.launch
-        slot.deadline = time.monotonic() + max(START_S, launch.stall_s)
-        yield worker.actor.ready.remote()
-        slot.deadline = time.monotonic() + launch.stall_s
-        address = (yield worker.actor.listen.remote()) if uses_shared_memory(launch.transport) else None
-        worker.work = worker.actor.serve.remote()
-        lock_step, joined = 0, False
-        # Again until nothing has changed meanwhile: training may have begun, or the schedule changed.
-        while True:
-            if lock_step != self._lock_step[slot.index]:
-                lock_step = self._lock_step[slot.index]
-                yield worker.actor.lock_step.remote(lock_step)
-            elif self._trainer is not None and not joined:
-                newest = yield self._trainer.join.remote(worker.actor)
-                while (yield worker.actor.metrics.remote())["version"] < newest:
-                    if time.monotonic() > slot.deadline:
-                        raise TimeoutError(f"weights of version {newest} have not come")
-                joined = True
-            else:
-                return Endpoint(
-                    name=worker.name, method=worker.actor.decide, address=address, transport=launch.transport
-                )
+    def _await_weights(self, worker: ActorHandle) -> None:
+        """Wait until a new replica has weights as new as the trainer's were when it joined."""
+        limit = self._config.launch.stall_s
+        deadline = time.monotonic() + limit
+        try:
+            newest = ray.get(self._trainer.join.remote(worker.actor), timeout=limit)
+        except RayActorError as error:
+            if isinstance(error, RayTaskError):  # the trainer says that the replica has died
+                raise
+            return  # the trainer has died, and the engine deals with that
+        while worker.call("metrics", timeout=limit)["version"] < newest:
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"weights of version {newest} have not come")
+            time.sleep(LOOK_S / 20)

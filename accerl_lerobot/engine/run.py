@@ -10,6 +10,11 @@ outputs/<run>/
   metrics.jsonl          and tensorboard/
   timeline/              what every worker did when, see `accerl timeline`
   success_curve.png, summary.json, and before_after.mp4 unless evaluation.before=false
+
+`train`, `resume`, `evaluate` and `load_policy` are the Python interface, imported from `accerl_lerobot`.
+Recording and Ray start processes that import the main module again, so a script calls `train` under
+``if __name__ == "__main__":``. Progress goes to the standard error. A mistake in the settings raises
+`InputError` before any work begins: one line with the field, its value and the remedy.
 """
 
 from __future__ import annotations
@@ -19,32 +24,34 @@ import datetime
 import json
 import logging
 import shutil
+import sys
 import time
-from dataclasses import replace
+from collections.abc import Mapping
+from contextlib import redirect_stdout
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import yaml
 
+from accerl_lerobot import guardian
 from accerl_lerobot.algorithms import ChunkCriticConfig, OffPolicyConfig
 from accerl_lerobot.checkpoint.layout import (
-    AWAY,
     CHECKPOINTS,
     CONFIG,
     DEMOS,
+    LAST,
     PRETRAINED,
     TRAINING_STATE,
     go_back_to,
-    has_checkpoint,
-    newest_whole,
     write_atomically,
 )
 from accerl_lerobot.config.dataset import DatasetConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import ray_session
-from accerl_lerobot.engine.config import RunConfig, encode, timeline_folder
-from accerl_lerobot.engine.contract import Engine, WorkerError, pause_s
-from accerl_lerobot.engine.loop import Loop, Outputs, Times, run_plans
+from accerl_lerobot.engine.config import RunConfig, encode, parse, timeline_folder
+from accerl_lerobot.engine.loop import Engine, Loop, Outputs, Times, run_plans
 from accerl_lerobot.engine.preflight import (
     check_machine,
     check_placement,
@@ -52,32 +59,38 @@ from accerl_lerobot.engine.preflight import (
     check_start,
     check_world,
 )
-from accerl_lerobot.engine.stopping import LOCK, Stopping, raise_if_stopped
-from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, make_folder
-from accerl_lerobot.evaluation.stats import evaluation_plans
-from accerl_lerobot.metrics import METRICS, MetricsLog
-from accerl_lerobot.policies.config import Load, loader
-from accerl_lerobot.replay.journal import EPISODES
+from accerl_lerobot.engine.stopping import (
+    LOCK,
+    WARM_START,
+    Recovery,
+    StoppedError,
+    Stopping,
+    WorkerError,
+    checkpoint_of,
+    continued,
+    improving,
+    locked,
+    raise_if_stopped,
+    resume_command,
+    resumed_run,
+)
+from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, make_folder
+from accerl_lerobot.evaluation.stats import Rate, evaluation_plans
+from accerl_lerobot.experience import Observation, Request
+from accerl_lerobot.metrics import MetricsLog
+from accerl_lerobot.policies.config import Load, PolicyConfig, loader
 from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.timeline import RECOVERY, open_clock
 
 if TYPE_CHECKING:
     from accerl_lerobot.engine.ray_session import RaySession
+    from accerl_lerobot.policies.adapter import LeRobotAdapter
 
 logger = logging.getLogger(__name__)
 
-BASE = "base"
-"""Folder of the policy that a run began from, where that had to be reconstructed."""
-WARM_START = "warm_start.json"
-"""File with the path of the policy that came of a run's own demonstrations and SFT."""
-
 
 def make_output_dir(config: Any) -> Path:
-    """Create the folder of a run: ``output_dir``, or one named after date, time and ``job_name``.
-
-    Raises:
-        InputError: it exists, or cannot be created.
-    """
+    """Create the folder of a run: ``output_dir``, or one named after date, time and ``job_name``."""
     if config.output_dir is None:
         now = datetime.datetime.now()
         path = Path("outputs") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}_{config.job_name}"
@@ -94,14 +107,54 @@ def discard_unused(directory: Path) -> None:
         shutil.rmtree(directory)
 
 
-def evaluate(config: RunConfig, console: Console, filmed: int = 0) -> list[EpisodeResult]:
-    """Play the evaluation episodes of a run with LeRobot's sampler, on seeds that are never trained on.
+def start(
+    config: RunConfig, console: Console, recipe: Path | None = None, load: Load | None = None
+) -> tuple[Path, dict[str, Any]]:
+    """Do a new run, or with ``config.resume`` the rest of the one whose config is `recipe`.
 
-    Args:
-        config: of which the sections of algorithms and training do not matter.
-        console: progress for people.
-        filmed: episodes whose frames are kept.
+    Raises:
+        InputError: the settings do not fit each other, the policy or the environment.
+        StoppedError: a signal has stopped it.
     """
+    resumed = resumed_run(recipe, config) if config.resume else None
+    if load is None and resumed is None:
+        check_start(config)  # before there is a folder
+    directory = make_output_dir(config) if resumed is None else resumed.directory
+    console.say(f"run {directory}")
+    how = resume_command(directory)
+    guardian.explain(remedy=f"to resume: {how}")
+    try:
+        with (
+            redirect_stdout(sys.stderr),
+            kept_traceback(directory),
+            locked(directory, "config_path", "another process resumes it"),
+        ):
+            wanted = None if resumed is None else resumed.checkpoint
+            return directory, execute(config, directory, console, wanted, load)
+    except InputError:
+        if resumed is None:
+            discard_unused(directory)
+        raise
+    except StoppedError:
+        raise
+    except BaseException as error:
+        if is_full(error):
+            console.say(f"the disk of {directory} is full; free some space, then {how}")
+        elif is_brief(error):
+            console.say(f"{error}; to resume: {how}")
+        else:
+            verb = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+            console.say(f"{verb}; to resume from the last checkpoint: {how}")
+        raise
+
+
+def is_brief(error: BaseException) -> bool:
+    """True for the loss of a worker without a traceback of its own."""
+    return isinstance(error, WorkerError) and "\n" not in str(error)
+
+
+def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> list[EpisodeResult]:
+    """Play the evaluation episodes of a run with LeRobot's sampler, on seeds that are never trained on."""
     check_machine(config)
     spec = check_world(config.env)
     engine = make_engine(config, spec.tasks, check_policy(config, spec))
@@ -181,14 +234,14 @@ def warm_start(config: RunConfig, directory: Path, console: Console) -> RunConfi
     return improving(config, path)
 
 
-def train(
+def execute(
     config: RunConfig,
     directory: Path,
     console: Console,
     wanted: str | None = None,
     load: Load | None = None,
 ) -> dict[str, Any]:
-    """Run everything and return the summary, which is also in ``summary.json``.
+    """Do all phases and return the summary, which is also in ``summary.json``.
 
     Args:
         config: the run.
@@ -203,7 +256,7 @@ def train(
         StoppedError: it was asked to stop, and has been saved.
     """
     started = time.monotonic()
-    checkpoint = None if wanted is None else _checkpoint(directory, wanted, console)
+    checkpoint = None if wanted is None else checkpoint_of(directory, wanted, console)
     if wanted is not None and checkpoint is None and load is None:
         check_start(config)
     text = yaml.safe_dump(encode(replace(config, resume=False)), sort_keys=False)
@@ -215,7 +268,7 @@ def train(
         config = _warm_started(config, directory, console)
     else:
         go_back_to(checkpoint)
-        config = _resumed(config, directory, checkpoint, console)
+        config = continued(config, directory, checkpoint, console)
         if load is None:
             check_start(config)
         _check_imagination(config, resuming=True)
@@ -231,7 +284,7 @@ def train(
         if config.launch.engine != "local":
             ray_session.prepare(joins=config.launch.address is not None)
             session = stack.enter_context(contextlib.closing(ray_session.RaySession(config.launch)))
-        recovery = Recovery(config.launch.max_recoveries)
+        recovery = Recovery(config.launch.max_restarts)
         while True:
             # A run, or what is left of it, by one set of workers.
             history = 1 if load is not None else check_policy(config, own=True)
@@ -256,60 +309,7 @@ def train(
                 checkpoint = recovery.next(directory / CHECKPOINTS, console, loss, times.furthest)
                 raise_if_stopped(stop, directory)
                 go_back_to(checkpoint)
-                config = _resumed(config, directory, checkpoint, console)
-
-
-class Recovery:
-    """Chooses the checkpoint to resume from after the loss of a worker, unless that happens again and again.
-
-    Args:
-        most: times in a row.
-    """
-
-    def __init__(self, most: int) -> None:
-        self._most, self._times, self._begun, self._furthest = most, 0, "", -1
-
-    def next(self, checkpoints: Path, console: Console, error: WorkerError, furthest: int) -> Path:
-        """The checkpoint to resume from; waits longer each time without progress in between.
-
-        Args:
-            furthest: the latest update so far. A run that gets further each time is not stuck, though it may
-                be hit again before its next checkpoint.
-
-        Raises:
-            WorkerError: `error`: there is no checkpoint, or it has been tried often enough.
-        """
-        try:
-            path, passed = newest_whole(checkpoints)
-        except InputError:
-            raise error from None
-        stuck = path.name == self._begun and furthest <= self._furthest
-        self._times = self._times + 1 if stuck else 1
-        self._begun, self._furthest = path.name, max(furthest, self._furthest)
-        if self._times > self._most:
-            raise error
-        for why in passed:
-            console.say(f"passed over checkpoint {why}")
-        pause = pause_s(self._times - 1)
-        when = f" in {pause:.0f} s" if pause else ""
-        reason = f"the disk of {checkpoints.parent} is full" if is_full(error) else error
-        console.say(f"{reason}\ngoing on from {path}{when} ({self._times} of {self._most} times)")
-        time.sleep(pause)
-        return path
-
-
-def _checkpoint(directory: Path, wanted: str, console: Console) -> Path | None:
-    """The checkpoint to resume from; None if there is none yet."""
-    if not has_checkpoint(directory / CHECKPOINTS):
-        console.say("there is no checkpoint yet: the run begins again after its warm start")
-        for name in (METRICS, EPISODES):
-            (directory / name).unlink(missing_ok=True)
-        shutil.rmtree(directory / "tensorboard", ignore_errors=True)
-        return None
-    path, passed = newest_whole(directory / CHECKPOINTS, wanted)
-    for why in passed:
-        console.say(f"passed over checkpoint {why}")
-    return path
+                config = continued(config, directory, checkpoint, console)
 
 
 def _warm_started(config: RunConfig, directory: Path, console: Console) -> RunConfig:
@@ -328,32 +328,6 @@ def _warm_started(config: RunConfig, directory: Path, console: Console) -> RunCo
     return improving(config, path)
 
 
-def _resumed(config: RunConfig, directory: Path, checkpoint: Path, console: Console) -> RunConfig:
-    """The run from its checkpoint on, which holds everything, whatever has become of its start."""
-    if config.policy.tuning.mode != "lora":
-        return improving(config, checkpoint / PRETRAINED)
-    # A checkpoint has low-rank adapters merged; apart from what they adapt they are in the training state.
-    start = _start(config, directory)
-    if start is None:
-        start = str(directory / BASE)
-        if not Path(start).is_dir():
-            from accerl_lerobot.policies.loading import reconstruct_base
-
-            with console.stage("the policy it began from is not here: reconstructing it, up to rounding"):
-                reconstruct_base(config.policy, checkpoint, directory / BASE)
-    return improving(config, start)
-
-
-def _start(config: RunConfig, directory: Path) -> str | None:
-    """The policy that a run began from, a folder or Hub id; None if it is not here any more."""
-    path, note = config.policy.path, directory / WARM_START
-    if path is None:
-        made = directory / json.loads(note.read_text())["policy"] if note.is_file() else None
-        return str(made) if made is not None and made.is_dir() else None
-    on_the_hub = not path.startswith((".", "/", "~", f"{AWAY}/")) and path.count("/") <= 1
-    return path if on_the_hub or Path(path).expanduser().is_dir() else None
-
-
 def _check_imagination(config: RunConfig, resuming: bool) -> None:
     if config.imagination.share:
         from accerl_lerobot.engine.imagination import check_imagination
@@ -367,6 +341,147 @@ def _check_imagination(config: RunConfig, resuming: bool) -> None:
         check_imagination(config)
 
 
-def improving(config: RunConfig, path: Path | str) -> RunConfig:
-    """The run as one that improves a checkpoint."""
-    return replace(config, policy=replace(config.policy, path=str(path)), sft=replace(config.sft, steps=0))
+@dataclass(frozen=True, kw_only=True)
+class TrainResult:
+    """Outcome of a run."""
+
+    directory: Path
+    """Everything of the run; see the top of this file."""
+    policy: Path
+    """The improved policy, a LeRobot checkpoint."""
+    before: Rate | None
+    """Success before RL; None with ``evaluation.before=false``."""
+    after: Rate
+    """Success after it, on the same starts."""
+    summary: dict[str, Any]
+    """Content of ``summary.json``: env steps, episodes, updates, lag, seconds, success by task."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationResult:
+    """Outcome of an evaluation."""
+
+    success: Rate
+    tasks: dict[str, Rate]
+    episodes: list[EpisodeResult]
+    """Each with its task, seed, steps and return."""
+
+
+class ActingPolicy:
+    """A LeRobot policy with its processors."""
+
+    def __init__(self, adapter: LeRobotAdapter) -> None:
+        self.adapter = adapter
+        self.history: int = adapter.policy.config.n_obs_steps
+        self._decisions = 0
+
+    def act(self, observation: Observation) -> np.ndarray:
+        """One decision, with LeRobot's own sampler.
+
+        Args:
+            observation: ``observation.images.<camera>`` uint8 (H, W, 3), ``observation.state`` float32 (S,)
+                and ``task``, the instruction. For a policy with ``n_obs_steps`` above 1 each array begins
+                with that dimension, oldest first, as ``make_world(config, policy.history)`` gives them.
+
+        Returns:
+            float32 (K, A): the next K actions, in the environment's units.
+        """
+        self._decisions += 1
+        request = Request(observation=observation, noise_seed=self._decisions, explore=False)
+        return self.adapter.decide([request], version=0)[0].chunk
+
+
+def load_config(recipe: str | Path | None = None, changes: Mapping[str, Any] | None = None) -> RunConfig:
+    """Settings of a run, as ``accerl train`` reads them.
+
+    Args:
+        recipe: a YAML file; None: the defaults.
+        changes: field → value, such as ``{"env.task": "door-open-v3", "trainer.updates": 100}``.
+
+    Raises:
+        InputError: a field does not exist, or a value does not fit.
+    """
+    path = [] if recipe is None else [f"--config_path={recipe}"]
+    fields = [f"--{name}={_written(value)}" for name, value in (changes or {}).items()]
+    config: RunConfig = parse(RunConfig, [*path, *fields])
+    return config
+
+
+def train(config: RunConfig) -> TrainResult:
+    """Demonstrations and SFT where the settings ask for them, then RL, with an evaluation before and after.
+
+    Raises:
+        InputError: the settings do not fit each other, the policy or the environment.
+        StoppedError: a signal has stopped it; `resume` goes on.
+    """
+    if config.resume:
+        raise InputError("resume", True, "use accerl_lerobot.resume(DIRECTORY)")
+    return _result(*start(config, Console()))
+
+
+def resume(directory: str | Path, changes: Mapping[str, Any] | None = None) -> TrainResult:
+    """Goes on with a run that was stopped, from its last whole checkpoint."""
+    recipe = Path(directory) / CONFIG
+    config = load_config(recipe, {**(changes or {}), "resume": True})
+    return _result(*start(config, Console(), recipe))
+
+
+def evaluate(
+    config: RunConfig,
+    policy: str | Path | None = None,
+    episodes: int | None = None,
+    revision: str | None = None,
+) -> EvaluationResult:
+    """Success of a policy with LeRobot's own sampler, on starts that no run of this seed trains on.
+
+    Args:
+        config: its environment, seed and workers are used.
+        policy: a LeRobot checkpoint, on disk or the Hub; None: ``config.policy.path``.
+        episodes: how many; None: ``config.evaluation.episodes``.
+        revision: commit of `policy` on the Hub.
+    """
+    if policy is not None:
+        config = improving(config, policy)
+        config = replace(config, policy=replace(config.policy, revision=revision))
+    if episodes is not None:
+        config = replace(config, evaluation=replace(config.evaluation, episodes=episodes))
+    with redirect_stdout(sys.stderr):
+        results = play_evaluation(config, Console())
+    tasks = {
+        name: [r for r in results if r.plan.task == name] for name in sorted({r.plan.task for r in results})
+    }
+    return EvaluationResult(
+        success=_rate(results), tasks={name: _rate(of) for name, of in tasks.items()}, episodes=results
+    )
+
+
+def load_policy(path: str | Path, revision: str | None = None, device: str = "auto") -> ActingPolicy:
+    """A LeRobot checkpoint, on disk or the Hub, ready to act; runs no code from it and unpickles nothing."""
+    from accerl_lerobot.policies.loading import load_adapter
+
+    with redirect_stdout(sys.stderr):
+        return ActingPolicy(load_adapter(PolicyConfig(path=str(path), revision=revision, device=device)))
+
+
+def _result(directory: Path, summary: dict[str, Any]) -> TrainResult:
+    before = None
+    if summary["success_before"] is not None:
+        before = Rate(successes=round(summary["success_before"] * summary["n_before"]), n=summary["n_before"])
+    return TrainResult(
+        directory=directory,
+        policy=directory / CHECKPOINTS / LAST / PRETRAINED,
+        before=before,
+        after=Rate(successes=round(summary["success_after"] * summary["n_after"]), n=summary["n_after"]),
+        summary=summary,
+    )
+
+
+def _rate(results: list[EpisodeResult]) -> Rate:
+    return Rate(successes=sum(r.success for r in results), n=len(results))
+
+
+def _written(value: Any) -> str:
+    """A value as the command line has it."""
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    return f"[{','.join(map(_written, value))}]" if isinstance(value, list | tuple) else str(value)

@@ -1,22 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stopping a run by SIGTERM, as schedulers send it, or Ctrl-C; and resuming it."""
+"""Stopping a run by SIGTERM, as schedulers send it, or Ctrl-C; and resuming one, also after a loss."""
 
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 import shlex
+import shutil
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from accerl_lerobot.errors import InputError, make_folder
+from accerl_lerobot.errors import InputError, is_full, make_folder
 
 if TYPE_CHECKING:
+    from accerl_lerobot.console import Console
     from accerl_lerobot.engine.config import RunConfig
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT)
@@ -29,6 +34,11 @@ CHANGEABLE = (
     "imagination.discover_packages_path",
 )  # fmt: skip
 """Fields and sections that may change when a run is resumed: what is learned, and from what, stays."""
+LONGEST_PAUSE_S = 8.0
+BASE = "base"
+"""Folder of the policy that a run began from, where that had to be reconstructed."""
+WARM_START = "warm_start.json"
+"""File with the path of the policy that came of a run's own demonstrations and SFT."""
 _pipe: tuple[int, int] | None = None
 """Where C code notes signals, also while the main thread hangs and Python handles none."""
 _arrived = False
@@ -55,13 +65,17 @@ def _listen() -> None:
     _arrived = False
 
 
-class StoppedError(Exception):
-    """A run was asked to stop, and can be resumed.
+def pause_s(restarts: int) -> float:
+    """Seconds to wait before another restart; twice as long each time, up to `LONGEST_PAUSE_S`."""
+    return min(2.0 ** (restarts - 1), LONGEST_PAUSE_S) if restarts else 0.0
 
-    Args:
-        number: of the signal.
-        words: for people: how to resume.
-    """
+
+class WorkerError(RuntimeError):
+    """A worker is lost for good, and the engine with it; another engine can resume from a checkpoint."""
+
+
+class StoppedError(Exception):
+    """A run was asked to stop, and can be resumed."""
 
     def __init__(self, number: int, words: str) -> None:
         self.number = number
@@ -74,11 +88,7 @@ class TerminatedError(KeyboardInterrupt):
 
 @contextmanager
 def interrupted() -> Iterator[None]:
-    """Handle SIGTERM like Ctrl-C: what has been started is ended on the way out.
-
-    Raises:
-        TerminatedError: it came.
-    """
+    """Handle SIGTERM like Ctrl-C: what has been started is ended on the way out."""
 
     def end(number: int, frame: FrameType | None) -> None:
         signal.signal(number, signal.SIG_IGN)  # a second one would interrupt what ends the rest
@@ -175,11 +185,7 @@ class Stopping:
 
 
 def raise_if_stopped(stop: Stopping, directory: Path) -> None:
-    """End a run that was asked to stop.
-
-    Raises:
-        StoppedError: it was.
-    """
+    """End a run that was asked to stop."""
     if stop.asked is not None:
         words = f"stopped by {signal.Signals(stop.asked).name}; to resume: {resume_command(directory)}"
         raise StoppedError(stop.asked, words)
@@ -244,6 +250,96 @@ def resumed_run(path: Path | None, config: RunConfig) -> ResumedRun:
     return ResumedRun(directory, checkpoint)
 
 
+class Recovery:
+    """Chooses the checkpoint to resume from after a loss, unless that happens again and again."""
+
+    def __init__(self, most: int) -> None:
+        self._most, self._times, self._begun, self._furthest = most, 0, "", -1
+
+    def next(self, checkpoints: Path, console: Console, error: WorkerError, furthest: int) -> Path:
+        """The checkpoint to resume from; waits longer each time without progress in between.
+
+        Args:
+            furthest: the latest update so far. A run that gets further each time is not stuck, though it may
+                be hit again before its next checkpoint.
+
+        Raises:
+            WorkerError: `error`: there is no checkpoint, or it has been tried often enough.
+        """
+        from accerl_lerobot.checkpoint.layout import newest_whole
+
+        try:
+            path, passed = newest_whole(checkpoints)
+        except InputError:
+            raise error from None
+        stuck = path.name == self._begun and furthest <= self._furthest
+        self._times = self._times + 1 if stuck else 1
+        self._begun, self._furthest = path.name, max(furthest, self._furthest)
+        if self._times > self._most:
+            raise error
+        for why in passed:
+            console.say(f"passed over checkpoint {why}")
+        pause = pause_s(self._times - 1)
+        when = f" in {pause:.0f} s" if pause else ""
+        reason = f"the disk of {checkpoints.parent} is full" if is_full(error) else error
+        console.say(f"{reason}\ngoing on from {path}{when} ({self._times} of {self._most} times)")
+        time.sleep(pause)
+        return path
+
+
+def checkpoint_of(directory: Path, wanted: str, console: Console) -> Path | None:
+    """The checkpoint to resume from; None if there is none yet."""
+    from accerl_lerobot.checkpoint.layout import CHECKPOINTS, has_checkpoint, newest_whole
+    from accerl_lerobot.metrics import METRICS
+    from accerl_lerobot.replay.journal import EPISODES
+
+    if not has_checkpoint(directory / CHECKPOINTS):
+        console.say("there is no checkpoint yet: the run begins again after its warm start")
+        for name in (METRICS, EPISODES):
+            (directory / name).unlink(missing_ok=True)
+        shutil.rmtree(directory / "tensorboard", ignore_errors=True)
+        return None
+    path, passed = newest_whole(directory / CHECKPOINTS, wanted)
+    for why in passed:
+        console.say(f"passed over checkpoint {why}")
+    return path
+
+
+def continued(config: RunConfig, directory: Path, checkpoint: Path, console: Console) -> RunConfig:
+    """The run from its checkpoint on, which holds everything, whatever has become of its start."""
+    from accerl_lerobot.checkpoint.layout import PRETRAINED
+
+    if config.policy.tuning.mode != "lora":
+        return improving(config, checkpoint / PRETRAINED)
+    # A checkpoint has low-rank adapters merged; apart from what they adapt they are in the training state.
+    start = _start(config, directory)
+    if start is None:
+        start = str(directory / BASE)
+        if not Path(start).is_dir():
+            from accerl_lerobot.policies.loading import reconstruct_base
+
+            with console.stage("the policy it began from is not here: reconstructing it, up to rounding"):
+                reconstruct_base(config.policy, checkpoint, directory / BASE)
+    return improving(config, start)
+
+
+def _start(config: RunConfig, directory: Path) -> str | None:
+    """The policy that a run began from, a folder or Hub id; None if it is not here any more."""
+    from accerl_lerobot.checkpoint.layout import AWAY
+
+    path, note = config.policy.path, directory / WARM_START
+    if path is None:
+        made = directory / json.loads(note.read_text())["policy"] if note.is_file() else None
+        return str(made) if made is not None and made.is_dir() else None
+    on_the_hub = not path.startswith((".", "/", "~", f"{AWAY}/")) and path.count("/") <= 1
+    return path if on_the_hub or Path(path).expanduser().is_dir() else None
+
+
+def improving(config: RunConfig, path: Path | str) -> RunConfig:
+    """The run as one that improves a checkpoint."""
+    return replace(config, policy=replace(config.policy, path=str(path)), sft=replace(config.sft, steps=0))
+
+
 def _differences(before: Any, now: Any, name: str) -> dict[str, tuple[Any, Any]]:
     """Dotted field → old and new value, where they differ."""
     if not (isinstance(before, dict) and isinstance(now, dict)):
@@ -264,9 +360,6 @@ def locked(directory: Path, field: str, in_use: str) -> Iterator[int]:
 
     Returns:
         A file descriptor to hand to child processes that are to keep it locked.
-
-    Raises:
-        InputError: it is in use.
     """
     make_folder(directory, field, again=True)
     with (directory / LOCK).open("w") as file:

@@ -85,13 +85,6 @@ class Batcher[R: Sized]:
         True
         >>> batcher.take(now=0.005), batcher.next_deadline()
         ([['a', 'b']], 0.015)
-
-    Args:
-        max_batch: observations in a batch at most, at least 1. A single larger request is served alone.
-        max_wait_s: how long the oldest request may wait for others, in seconds, at least 0.
-
-    Raises:
-        InputError: either is out of range.
     """
 
     def __init__(self, max_batch: int, max_wait_s: float) -> None:
@@ -152,14 +145,7 @@ class Batcher[R: Sized]:
         return oldest if now else oldest + self.max_wait_s
 
     def take(self, now: float) -> list[R]:
-        """Remove the next batch, due or not: the oldest requests, as many as fit, at least one.
-
-        Args:
-            now: seconds, for the statistics.
-
-        Returns:
-            The requests in order of arrival; empty if none waits.
-        """
+        """Remove the next batch, due or not: the oldest requests, as many as fit, at least one."""
         batch: list[R] = []
         size = 0
         if self._together and not self._left:

@@ -54,22 +54,10 @@ class InferenceConfig(Section, section="inference"):
     """How long the oldest request waits for others, seconds."""
     num_threads: Threads = 1
     """CPU threads of the forward pass."""
-    max_restarts: Annotated[int, Range("[0, 1000000]")] = 3
-    """How often in a row each replica is restarted alone after it died or hung; 30 s of service reset the
-    count. After that all workers are restarted, from the last checkpoint."""
 
 
 class InferenceWorker:
-    """Becomes an asynchronous Ray actor in `launch`.
-
-    Args:
-        policy: the checkpoint, the same for every replica and the trainer.
-        version: of the first weights.
-        state: the ``training_state`` that holds these; None: they are the checkpoint's.
-        load: makes the adapter; None: of LeRobot's checkpoint.
-        timeline: folder of the timeline; None: none is kept.
-        name: its row there.
-    """
+    """Becomes an asynchronous Ray actor in `launch`."""
 
     def __init__(
         self,

@@ -156,9 +156,6 @@ class Replay:
         Returns:
             Whether it was stored: False for a key seen before and for a non-finite segment, which are
             counted.
-
-        Raises:
-            InputError: the segment alone is longer than the capacity.
         """
         n = len(segment)
         if n > self.config.capacity:
@@ -199,9 +196,6 @@ class Replay:
         Returns:
             The segments, none twice; empty, with nothing counted as used, if fewer decisions are available.
             That can happen although `may_sample` held, when segments were too old: try again later.
-
-        Raises:
-            ValueError: `num_decisions` is below 1.
         """
         if num_decisions < 1:
             raise ValueError(f"sample of {num_decisions} decisions: ask for at least 1")
@@ -270,11 +264,7 @@ class Replay:
         return {"counters": counters, "keys": list(self._keys), "entries": entries, "carry": self._carry}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Goes on from what `state` gave.
-
-        Raises:
-            RuntimeError: something has been inserted already.
-        """
+        """Goes on from what `state` gave."""
         if self.counters != ReplayCounters():
             raise RuntimeError("restore before the first insert")
         self.counters, self._carry = state["counters"], state["carry"]

@@ -47,11 +47,7 @@ class Done:
 
 
 class Journal:
-    """Appends; a segment is on its way to the disk, whatever becomes of this process, when `write` returns.
-
-    Args:
-        path: of the file, which may exist.
-    """
+    """Appends; when `write` returns, a segment reaches the disk whatever becomes of this process."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._file = path, path.open("ab")
@@ -90,11 +86,7 @@ class Journal:
 
 
 def read_journal(path: Path) -> Iterator[Done]:
-    """Reads a journal, in order; a last line that is half written is left out.
-
-    Raises:
-        InputError: there is no such file, or a line in it is broken.
-    """
+    """Reads a journal, in order; a last line that is half written is left out."""
     if not path.is_file():
         remedy = f"no {path.name} there; name the folder of an accerl train run"
         raise InputError("path", str(path.parent), remedy)

@@ -150,13 +150,6 @@ def decisions_under_way(
     at least once in `episode_decisions` and completes the oldest group first; so the last episode begins at
     most ⌈(group_size − 1)/worlds⌉ episodes after the first, and lasts one more. What is inserted in that time
     was decided in it or was itself held back, for no longer than that: at most twice this number.
-
-    Args:
-        workers: rollout processes.
-        worlds: of each.
-        segment_length: decisions of the longest segment.
-        group_size: episodes that are held back for each other; 0 for none.
-        episode_decisions: of the longest episode; needed with groups only.
     """
     if not group_size:
         return workers * worlds * segment_length

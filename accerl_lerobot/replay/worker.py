@@ -50,17 +50,7 @@ class News(NamedTuple):
 
 
 class ReplayWorker:
-    """Becomes an asynchronous Ray actor in `launch`.
-
-    Args:
-        config: size and pace.
-        seed: of the draw among segments used equally often.
-        imagined: size and pace of imagined experience; None: there is none.
-        patient: see `MixedReplay`.
-        state: the ``training_state`` to go on from; None: begin.
-        directory: of the run, for the journal; None: none is kept.
-        timeline: folder of the timeline; None: none is kept.
-    """
+    """Becomes an asynchronous Ray actor in `launch`."""
 
     def __init__(
         self,
@@ -105,11 +95,7 @@ class ReplayWorker:
         return serve_on_loop(self.insert).address
 
     async def run(self) -> None:
-        """Lasts until `close`; that it ends earlier is how the engine learns of this process's death.
-
-        Raises:
-            Exception: what has gone wrong while something was stored or drawn.
-        """
+        """Lasts until `close`; that it ends earlier is how the engine learns of this process's death."""
         async with self._changed:
             await self._changed.wait_for(lambda: self._closed or self._failure is not None)
             if self._failure is not None:

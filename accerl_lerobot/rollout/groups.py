@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Episodes from equal starts are held back until all of their group have ended, then compared.
 
-    grpo          Â = (R − mean) / (std + ε)        arXiv 2402.03300
-    rloo          Â = R − mean of the others        arXiv 2402.14740
-    grpo_no_std   Â = R − mean                      arXiv 2503.20783, "Dr. GRPO"
+    Â = (R − mean) / (std + ε)        GRPO, arXiv 2402.03300
 
 R is the undiscounted return of an episode, decision costs included; mean and std are over the group, and
 every decision of an episode gets the same Â. A group that has nothing to compare is thrown away, which is the
@@ -15,21 +13,11 @@ What must hold, in decisions:
 
 An episode that was thrown away itself (its world returned NaN) leaves its group, and the others are compared
 without it; a group of which fewer than two are left is thrown away.
-
-Which task an exploring episode is about.
-
-    uniform    each in turn
-    failures   p(task) ∝ 1 + failures among its last `window` exploring episodes
-
-The second is the dynamic weighted resampling of AcceRL, arXiv 2603.18464: a task that always succeeds is
-still explored now and then, and what the policy forgets counts again.
 """
 
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
@@ -38,23 +26,19 @@ import numpy as np
 from accerl_lerobot.checkpoint.snapshot import kind
 from accerl_lerobot.experience import Segment
 
-GroupAdvantage = Literal["grpo", "rloo", "grpo_no_std"]
 GroupFilter = Literal["outcome", "return", "none"]
 
 STD_EPSILON = 1e-6
 """Added to the standard deviation; returns that differ by less count as equal."""
 
 
-def group_advantages(returns: np.ndarray, form: GroupAdvantage) -> np.ndarray:
+def group_advantages(returns: np.ndarray) -> np.ndarray:
     """Advantages float64 (n,), with mean 0, from undiscounted returns (n,), n ≥ 2; see the top of the file.
 
     The standard deviation is that of the group itself (divided by n, not n − 1).
     """
-    returns = np.asarray(returns, np.float64)
-    if form == "rloo":
-        return returns - (returns.sum() - returns) / (len(returns) - 1)
-    centred = returns - returns.mean()
-    return centred / (returns.std() + STD_EPSILON) if form == "grpo" else centred
+    centred = np.asarray(returns, np.float64) - np.mean(returns)
+    return np.asarray(centred / (centred.std() + STD_EPSILON))
 
 
 @kind
@@ -133,16 +117,12 @@ class Groups:
     Args:
         size: episodes per group, at least 2.
         worlds: that episodes run in at the same time.
-        form: of the advantage.
         rule: which groups are thrown away, see `RolloutConfig.group_filter`.
     """
 
-    def __init__(
-        self, size: int, worlds: int, form: GroupAdvantage = "grpo", rule: GroupFilter = "outcome"
-    ) -> None:
+    def __init__(self, size: int, worlds: int, rule: GroupFilter = "outcome") -> None:
         self.size, self.limit = size, open_limit(size, worlds)
         self.counters = GroupCounters()
-        self._form: GroupAdvantage = form
         self._rule: GroupFilter = rule
         self._open: dict[int, list[Member]] = {}
         self._newest, self._claimed = -1, size
@@ -222,7 +202,7 @@ class Groups:
             self._drop(group)
             return []
         self.counters.kept += 1
-        advantages = group_advantages(np.array([o.episode_return for o in outcomes]), self._form)
+        advantages = group_advantages(np.array([o.episode_return for o in outcomes]))
         released = [
             replace(segment, advantage=np.full(len(segment), advantage, np.float32))
             for (member, _), advantage in zip(left, advantages, strict=True)
@@ -235,58 +215,3 @@ class Groups:
         for member in members:
             self.counters.dropped_decisions += sum(len(s) for s in member.segments)
             member.segments = []
-
-
-TaskSampling = Literal["uniform", "failures"]
-
-
-class TaskSampler:
-    """The tasks of one rollout worker's exploring episodes, the same for equal seeds and reports.
-
-    Example:
-        >>> sampler = TaskSampler(("door-open-v3", "drawer-open-v3"), "failures", window=100, seed=(0, 0, 0))
-        >>> task = sampler.next()
-        >>> sampler.report(task, success=False)
-
-    Args:
-        tasks: names, each once.
-        sampling: see the top of this file.
-        window: episodes of each task that are remembered.
-        seed: of the draws.
-        first: which task is the first in turn, counted on beyond the last.
-    """
-
-    def __init__(
-        self, tasks: Sequence[str], sampling: TaskSampling, window: int, seed: Sequence[int], first: int = 0
-    ) -> None:
-        self._tasks, self._turn = tuple(tasks), first
-        self._sampling: TaskSampling = sampling
-        self._rng = np.random.default_rng(list(seed))
-        self._failed: dict[str, deque[bool]] = {task: deque(maxlen=window) for task in tasks}
-
-    def probabilities(self) -> np.ndarray:
-        """float64 (tasks,), what `failures` draws the next task by."""
-        weights = np.array([1 + sum(self._failed[task]) for task in self._tasks], np.float64)
-        return np.asarray(weights / weights.sum())
-
-    def next(self) -> str:
-        """The task of the next episode, or of the next group of episodes."""
-        if self._sampling == "uniform":
-            self._turn += 1
-            return self._tasks[(self._turn - 1) % len(self._tasks)]
-        return self._tasks[int(self._rng.choice(len(self._tasks), p=self.probabilities()))]
-
-    def state(self) -> dict[str, Any]:
-        """All that `restore` needs; see `snapshot`."""
-        failed = {task: list(recent) for task, recent in self._failed.items()}
-        return {"turn": self._turn, "rng": self._rng, "failed": failed}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Goes on from what `state` gave."""
-        self._turn, self._rng = state["turn"], state["rng"]
-        for task, recent in state["failed"].items():
-            self._failed[task].extend(recent)
-
-    def report(self, task: str, success: bool) -> None:
-        """Counts one finished exploring episode."""
-        self._failed[task].append(not success)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which episode a free world runs next: planned evaluations first, then exploring ones.
 
-An exploring episode is a task (`groups.py`), a seed of this worker's own (`seeds.py`) and, where episodes are
+An exploring episode is a task, each in turn, a seed of this worker's own (`seeds.py`) and, where episodes are
 compared with each other, a place in a group (`groups.py`): the episodes of a group share task and seed, so
 they start alike, and their exploration noise differs.
 """
@@ -13,8 +13,8 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Any
 
-from accerl_lerobot.rollout.groups import Groups, TaskSampler
-from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
+from accerl_lerobot.rollout.groups import Groups
+from accerl_lerobot.rollout.runner import EpisodePlan, RolloutConfig
 from accerl_lerobot.seeds import train_seed
 
 STARTS_PER_INCARNATION = 1000
@@ -51,16 +51,6 @@ class EpisodePlans:
     Example:
         >>> plans = EpisodePlans(config, tasks, seed=0, worlds=8)
         >>> runner = RolloutRunner(worlds, lambda: plans.next(exploring=True), ..., groups=plans.groups)
-        >>> plans.report(result)      # of each finished episode
-
-    Args:
-        config: groups and tasks.
-        tasks: the training tasks.
-        seed: the run's.
-        worlds: how many the worker steps.
-        worker: its index.
-        incarnation: how often it has been restarted.
-        budget: exploring episodes at most; None: no end.
     """
 
     def __init__(
@@ -77,16 +67,10 @@ class EpisodePlans:
         self._budget = budget
         self.groups: Groups | None = None
         if config.group_size:
-            self.groups = Groups(config.group_size, worlds, config.group_advantage, config.group_filter)
+            self.groups = Groups(config.group_size, worlds, config.group_filter)
         self._seed, self._worker = seed, worker
         self._starts = incarnation * STARTS_PER_INCARNATION
-        self._tasks = TaskSampler(
-            tasks,
-            config.task_sampling,
-            config.task_window,
-            (seed, worker, incarnation),
-            self._starts + worker,
-        )
+        self._tasks = tasks
         self._start = ("", 0)
         # Filled and emptied on different threads: appending to and popping from a deque is atomic.
         self._queued: deque[EpisodePlan] = deque()
@@ -96,11 +80,7 @@ class EpisodePlans:
         self._queued.extend(plans)
 
     def next(self, exploring: bool) -> EpisodePlan | None:
-        """The episode that a free world is to run; None: it has to wait.
-
-        Args:
-            exploring: whether exploring episodes are wanted at all.
-        """
+        """The episode that a free world is to run; None: it has to wait."""
         if self._queued:
             return self._queued.popleft()
         if not exploring or self.spent:
@@ -127,7 +107,6 @@ class EpisodePlans:
             "starts": self._starts,
             "start": self._start,
             "queued": list(self._queued),
-            "tasks": self._tasks.state(),
             "groups": None if self.groups is None else self.groups.state(),
         }
 
@@ -135,7 +114,6 @@ class EpisodePlans:
         """Goes on from what `state` gave."""
         self._budget, self._starts, self._start = state["budget"], state["starts"], state["start"]
         self._queued.extend(state["queued"])
-        self._tasks.restore(state["tasks"])
         if self.groups is not None:
             self.groups.restore(state["groups"])
 
@@ -151,12 +129,8 @@ class EpisodePlans:
         task, seed = self._start
         return EpisodePlan(task=task, seed=seed, explore=True, place=place)
 
-    def report(self, result: EpisodeResult) -> None:
-        """Takes note of a finished episode."""
-        if result.plan.explore:
-            self._tasks.report(result.plan.task, result.success)
-
     def _new_start(self) -> tuple[str, int]:
         """A task, and a seed that no episode of this worker has had."""
         number, self._starts = self._starts, self._starts + 1
-        return self._tasks.next(), train_seed(self._seed, self._worker, number)
+        task = self._tasks[(number + self._worker) % len(self._tasks)]
+        return task, train_seed(self._seed, self._worker, number)

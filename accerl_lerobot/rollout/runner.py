@@ -24,11 +24,9 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Decision, Observation, Origin, Request, Segment
 from accerl_lerobot.rollout.groups import (
     EpisodeOutcome,
-    GroupAdvantage,
     GroupFilter,
     Groups,
     GroupSlot,
-    TaskSampling,
 )
 from accerl_lerobot.rollout.segments import SegmentBuilder
 from accerl_lerobot.seeds import noise_seed
@@ -57,11 +55,7 @@ class Slot:
         return {name: getattr(self, name) for name in _STATE} | {"builder": builder}
 
     def restore(self, state: dict[str, Any], segment_length: int) -> None:
-        """Goes on from what `state` gave: the world is brought back by doing again what was done in it.
-
-        Raises:
-            RuntimeError: it does not show then what it had shown.
-        """
+        """Goes on from what `state` gave: the world is brought back by doing again what was done in it."""
         plan: EpisodePlan | None = state["plan"]
         if plan is None:
             return
@@ -109,10 +103,6 @@ class RolloutConfig(Section, section="rollout"):
     """Exploring episodes that start alike (same task and seed, other noise) and are compared with each other,
     for ``algorithm.advantage=group``; 0: none are.
     """
-    group_advantage: GroupAdvantage = "grpo"
-    """grpo: (R − mean)/std of the group. rloo: R − mean of the others. grpo_no_std: R − mean. R is the
-    undiscounted return of the episode.
-    """
     group_filter: GroupFilter = "outcome"
     """Which groups are thrown away, having nothing to compare. return: those whose returns are all equal.
     outcome: also those in which all episodes succeeded or all failed. none: no group.
@@ -122,20 +112,9 @@ class RolloutConfig(Section, section="rollout"):
     success need `return`. Where all groups are thrown away, because the policy never fails or always does, no
     update is made: watch ``groups_dropped``.
     """
-    task_sampling: TaskSampling = "uniform"
-    """Which task an exploring episode, or group, is about. uniform: each in turn. failures: p(task) ∝ 1 +
-    failures among the task's last `task_window` exploring episodes of the same worker.
-    """
-    task_window: Annotated[int, Range("[1, 1000000]")] = 100
-    """Exploring episodes of a task that `task_sampling` remembers."""
     episodes: Steps = 0
     """Exploring episodes in all; 0: as many as the updates need. Once they are played, learning goes on while
     replay has something to give, which is little unless more is imagined, and then ends.
-    """
-    max_restarts: Annotated[int, Range("[0, 1000000]")] = 3
-    """Restarts of each worker after a crash or hang; one more restarts all workers from the last checkpoint.
-
-    Not reset by progress: an environment that keeps crashing needs fixing.
     """
 
     def __post_init__(self) -> None:
@@ -302,11 +281,7 @@ class RolloutRunner:
         return {"counters": replace(self.counters), "sequence": self._sequence, "slots": slots}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Goes on from what `state` gave: worlds are brought back by doing again what was done in them.
-
-        Raises:
-            RuntimeError: a world does not show then what it had shown.
-        """
+        """Goes on from what `state` gave: worlds are brought back by doing again what was done in them."""
         self.counters, self._sequence = state["counters"], state["sequence"]
         for slot, saved in zip(self._slots, state["slots"], strict=True):
             slot.restore(saved, self.config.segment_length)

@@ -17,12 +17,6 @@ class SegmentBuilder:
         >>> builder = SegmentBuilder(observation, length=8, origin=Origin("door-open-v3", seed=3, decision=0))
         >>> builder.add(decision, actions, reward=0.0, steps=10, following=next_observation)   # repeated
         >>> segment = builder.cut(key="rollout0.0.17", terminated=True, success=True)
-
-    Args:
-        observation: what `World.reset` returned.
-        length: largest T of a segment.
-        origin: of the first segment.
-        source: stamped on every segment.
     """
 
     def __init__(self, observation: Observation, length: int, origin: Origin, source: str = REAL) -> None:

@@ -76,17 +76,7 @@ class WorkerShare:
 
 
 class RolloutWorker:
-    """Becomes a threaded Ray actor in `launch`: `run` on one thread, `report` on another.
-
-    Args:
-        env: the world's config; one instance per slot.
-        config: sizes.
-        tasks: the training tasks.
-        seed: the run's.
-        share: which worker this is.
-        history: env steps that an observation holds.
-        timeline: folder of the timeline; None: none is kept.
-    """
+    """Becomes a threaded Ray actor in `launch`: `run` on one thread, `report` on another."""
 
     def __init__(
         self,
@@ -125,7 +115,7 @@ class RolloutWorker:
             config,
             name,
             self._outbox.append,
-            self._ended,
+            self._results.append,
             self._plans.groups,
         )
         self._clock.enter(WAIT_IN)
@@ -245,7 +235,3 @@ class RolloutWorker:
         self._entered = time.monotonic()
         yield
         self._moved, self._entered = time.monotonic(), None
-
-    def _ended(self, result: EpisodeResult) -> None:
-        self._plans.report(result)
-        self._results.append(result)

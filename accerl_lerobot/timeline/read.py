@@ -159,7 +159,7 @@ def read_timeline(run_directory: Path) -> Timeline:
         remedy = f"no run in it: there is no {CONFIG}, which every run writes first"
         raise InputError("runs", str(run_directory), remedy)
     if not processes:
-        remedy = "a run without a timeline: it was made with launch.timeline=false, or no worker has begun"
+        remedy = "a run without a timeline: no worker has begun"
         raise InputError("runs", str(run_directory), remedy)
     return Timeline(run=run_directory, rows=_rows(processes))
 

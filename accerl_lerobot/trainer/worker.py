@@ -27,6 +27,7 @@ from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
 from accerl_lerobot.trainer.nonfinite import keeping
 from accerl_lerobot.trainer.peers import Learner, LearnerSettings, Peers
+from accerl_lerobot.transport.endpoint import Transport
 from accerl_lerobot.weights.factory import CONNECT_S, WeightPublisher, make_publisher
 from accerl_lerobot.weights.publisher import PublishDelay
 
@@ -67,7 +68,7 @@ class TrainerWorker:
         """Answers once the policy is loaded; returns this process's id."""
         return os.getpid()
 
-    def run(self, replay: Any, readers: list[Any], transport: str = "auto") -> int:
+    def run(self, replay: Any, readers: list[Any], transport: Transport = "auto") -> int:
         """Trains; returns the number of updates made.
 
         Args:

@@ -62,11 +62,7 @@ class Encoded(NamedTuple):
 
 
 def encode(message: Any) -> Encoded:
-    """Encode lists, tuples, dicts with str keys, registered kinds, arrays and plain values.
-
-    Raises:
-        TypeError: the message holds something else.
-    """
+    """Encode lists, tuples, dicts with str keys, registered kinds, arrays and plain values."""
     arrays: list[np.ndarray] = []
     try:
         header = _to_json(_node(message, arrays)).encode()
@@ -84,9 +80,6 @@ def decode(buffer: Any, start: int, size: int, *, copy: bool = True) -> Any:
 
     Args:
         copy: False: its arrays are views of the buffer.
-
-    Raises:
-        DamagedMessageError: this is no message, or not all of one.
     """
     try:
         if not 0 <= start <= start + SIZE.size <= start + size <= len(buffer):

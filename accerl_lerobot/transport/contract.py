@@ -37,9 +37,6 @@ class Client(ABC):
         >>> first, second = inference.send([request]), inference.send([another])
         >>> inference.done(timeout=0.5)  # as they come
         [(1, [Decision(...)])]
-
-    Args:
-        name: of the service, for messages.
     """
 
     def __init__(self, name: str) -> None:
@@ -75,12 +72,7 @@ class Client(ABC):
         """End the connection and forget what is under way. Safe to call twice."""
 
     def ask(self, messages: Sequence[Any], timeout: float) -> list[Any]:
-        """Send messages and wait for all replies; nothing else may be under way.
-
-        Raises:
-            ServiceStoppedError: see `done`.
-            TimeoutError: they did not all come in time.
-        """
+        """Send messages and wait for all replies; nothing else may be under way."""
         under_way: dict[int, int] = {}
         """Ticket → index of the message."""
         replies: dict[int, Any] = {}

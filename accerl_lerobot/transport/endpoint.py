@@ -9,13 +9,11 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from accerl_lerobot.errors import InputError
 from accerl_lerobot.transport.contract import Client, ServiceStoppedError
 from accerl_lerobot.transport.memfd import available
 from accerl_lerobot.transport.shared_memory import Address, SharedMemoryClient, this_node
 
-Transport = Literal["auto", "ray", "shared_memory"]
-FIELD = "launch.transport"
+Transport = Literal["auto", "ray"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,41 +31,21 @@ class Endpoint:
     """Method of its Ray actor handle."""
     address: Address | None = None
     """Address of its shared memory; None: it can only be reached through Ray."""
-    transport: Transport = "auto"
 
     def connect(self) -> Client:
-        """Open a connection for this process.
-
-        Raises:
-            InputError: shared memory was asked for, and the service is on another node.
-            ServiceStoppedError: the service is gone.
-        """
+        """Open a connection for this process."""
         if self.address is not None and available() and self.address.node == this_node():
             return SharedMemoryClient(self.name, self.address)
-        if self.transport == "shared_memory":
-            remedy = f"{self.name} is on another node; use auto or ray"
-            raise InputError(FIELD, self.transport, remedy)
         return RayClient(self.name, self.method)
 
 
 def uses_shared_memory(transport: Transport) -> bool:
-    """True if services are to offer shared memory.
-
-    Raises:
-        InputError: it was asked for and this system does not have it.
-    """
-    if transport == "shared_memory" and not available():
-        raise InputError(FIELD, transport, "this system has no memfd, epoll and eventfd; use auto or ray")
+    """True if services are to offer shared memory."""
     return transport != "ray" and available()
 
 
 class RayClient(Client):
-    """Calls an actor's method, by value: from any node to any other.
-
-    Args:
-        name: of the service, for messages.
-        method: of its handle; takes one message and returns the reply.
-    """
+    """Calls an actor's method, by value: from any node to any other."""
 
     def __init__(self, name: str, method: Any) -> None:
         super().__init__(name)
@@ -121,9 +99,6 @@ class ReconnectingClient(Client):
         []
         >>> client.away_s  # since it was lost
         0.5
-
-    Args:
-        name: of the service, for messages.
     """
 
     def __init__(self, name: str) -> None:

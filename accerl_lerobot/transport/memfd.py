@@ -117,9 +117,6 @@ class Slot:
 
     Args:
         file: descriptor, which can be closed afterwards.
-
-    Raises:
-        DamagedTokenError: not a descriptor of `new_slot`.
     """
 
     def __init__(self, file: int) -> None:
@@ -134,11 +131,7 @@ class Slot:
 
 
 def new_slot(size: int) -> int:
-    """Shared memory for at least `size` bytes, as a file descriptor.
-
-    Raises:
-        TypeError: the message is too large.
-    """
+    """Shared memory for at least `size` bytes, as a file descriptor."""
     room = max(LEAST, 1 << (size - 1).bit_length())
     if room > LARGEST:
         raise TypeError(f"a message of {size} bytes cannot be sent; there is room for {LARGEST}")
@@ -157,11 +150,7 @@ def send_token(connection: socket.socket, token: Token, file: int | None = None)
 
 
 def receive_token(connection: socket.socket) -> tuple[Token, Slot | None] | None:
-    """The next token, and the slot that came with it; None if the other end is gone.
-
-    Raises:
-        DamagedTokenError: something else came.
-    """
+    """The next token, and the slot that came with it; None if the other end is gone."""
     packet, ancillary, _, _ = connection.recvmsg(_TOKEN.size + 1, _ONE_FILE)
     file = None
     for level, kind, data in ancillary:

@@ -63,11 +63,7 @@ def this_node() -> str:
 
 
 class SharedMemoryClient(Client):
-    """The caller's end.
-
-    Raises:
-        ServiceStoppedError: the service is gone, or another user has taken its place.
-    """
+    """The caller's end."""
 
     def __init__(self, name: str, address: Address) -> None:
         super().__init__(name)

@@ -7,14 +7,12 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any
 
 import ray
 from ray.exceptions import ActorDiedError, GetTimeoutError, RayError, RayTaskError
 
-from accerl_lerobot.errors import InputError
-from accerl_lerobot.transport.endpoint import FIELD, Transport
-from accerl_lerobot.transport.memfd import available
+from accerl_lerobot.transport.endpoint import Transport, uses_shared_memory
 from accerl_lerobot.weights.publisher import FLUSH_S, Publisher, WeightBuffer, wall_clock
 from accerl_lerobot.weights.shared_memory import SharedMemoryPublisher
 
@@ -44,19 +42,14 @@ class WeightPublisher:
             part.flush(max(0.0, deadline - time.monotonic()))
 
     def add(self, reader: Any) -> None:
-        """Send to another reader, an actor handle, from the newest set on.
-
-        Raises:
-            InputError: the trainer's memory cannot be reached from there, and Ray is not used.
-            ray.exceptions.RayError: the reader has died.
-        """
+        """Send to another reader, an actor handle, from the newest set on."""
         for part in self.parts:
             if isinstance(part, RayPublisher):
                 part.add(reader)
                 return
             if isinstance(part, SharedMemoryPublisher) and _connect(part, [reader]) == [True]:
                 return
-        raise InputError(FIELD, "shared_memory", "a restarted worker is on another machine; use ray")
+        raise RuntimeError("a restarted worker cannot reach the trainer's memory")
 
     def close(self) -> None:
         """See `Publisher.close`."""
@@ -64,21 +57,15 @@ class WeightPublisher:
             part.close()
 
 
-def make_publisher(readers: Sequence[Any], transport: str = "auto") -> WeightPublisher:
+def make_publisher(readers: Sequence[Any], transport: Transport = "auto") -> WeightPublisher:
     """Connect readers to a publisher.
 
     Args:
         readers: actor handles with ``receive_weights(version, tensors, published_s)`` and
             ``open_weights(address)``, as `InferenceWorker` has them.
-        transport: shared_memory, ray, or auto: the former for readers on this machine, the latter for others.
-
-    Raises:
-        InputError: shared memory is asked for and not available.
-        ray.exceptions.RayError: a reader has died.
+        transport: ray, or auto: shared memory to readers on this machine.
     """
-    if transport not in get_args(Transport):
-        raise InputError(FIELD, transport, f"use one of {', '.join(get_args(Transport))}")
-    if transport != "ray" and available():
+    if uses_shared_memory(transport):
         publisher = SharedMemoryPublisher(len(readers))
         try:
             near = _connect(publisher, readers)
@@ -87,13 +74,11 @@ def make_publisher(readers: Sequence[Any], transport: str = "auto") -> WeightPub
             raise
         if all(near):
             return WeightPublisher(publisher)
-        if any(near) and transport == "auto":
+        if any(near):
             publisher.expect(sum(near))
             far = [reader for reader, here in zip(readers, near, strict=True) if not here]
             return WeightPublisher(publisher, RayPublisher(far))
         publisher.close()
-    if transport == "shared_memory":
-        raise InputError(FIELD, transport, "it needs Linux and all workers on one machine; use ray")
     return WeightPublisher(RayPublisher(readers))
 
 
@@ -170,11 +155,7 @@ class RayPublisher(Publisher):
                     self._drop(reader, error)
 
     def _advance(self, reader: _Reader) -> None:
-        """Send a reader the newest set if it is free and has another one.
-
-        Raises:
-            RayError: it has died or cannot be reached, or, a RayTaskError, what it has raised.
-        """
+        """Send a reader the newest set if it is free and has another one."""
         if reader.under_way is not None:
             done, _ = ray.wait([reader.under_way], timeout=0)
             if not done:

@@ -174,11 +174,7 @@ class WeightUpdate:
 
 
 class Publisher(ABC):
-    """Base of both publishers.
-
-    Args:
-        make: makes a buffer of at least so many bytes.
-    """
+    """Base of both publishers."""
 
     def __init__(self, make: Callable[[int], WeightBuffer]) -> None:
         self._make = make

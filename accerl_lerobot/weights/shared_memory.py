@@ -72,11 +72,7 @@ class _Reader:
 
 
 class SharedMemoryPublisher(Publisher):
-    """The trainer's end.
-
-    Args:
-        readers: how many will connect to begin with.
-    """
+    """The trainer's end."""
 
     def __init__(self, readers: int) -> None:
         super().__init__(WeightBuffer.shared)
@@ -217,9 +213,6 @@ class SharedMemoryReader:
         address: the publisher's.
         deliver: called on that thread with each set; the next one comes once it is released.
         failed: called on that thread if it ends because of an error, which the publisher's end is not.
-
-    Raises:
-        OSError: nobody of this user listens there.
     """
 
     def __init__(

@@ -72,7 +72,7 @@ def real(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
         output_dir=str(tmp_path_factory.mktemp("report") / "real"),
     )
     directory = run.make_output_dir(config)
-    run.train(config, directory, Console())
+    run.execute(config, directory, Console())
     return directory
 
 

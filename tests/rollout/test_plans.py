@@ -15,7 +15,7 @@ from accerl_lerobot.rollout.plans import (
     incarnation_after,
     whole_groups,
 )
-from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutConfig
+from accerl_lerobot.rollout.runner import EpisodePlan, RolloutConfig
 from accerl_lerobot.seeds import train_seed
 from tests.rollout.worlds import evaluate
 
@@ -31,12 +31,6 @@ def make(worlds: int = 4, worker: int = 0, incarnation: int = 0, **config) -> Ep
 def take(plans: EpisodePlans, count: int) -> list[EpisodePlan]:
     found = [plans.next(exploring=True) for _ in range(count)]
     return [plan for plan in found if plan is not None]
-
-
-def ended(plan: EpisodePlan, success: bool) -> EpisodeResult:
-    return EpisodeResult(
-        plan=plan, success=success, episode_return=0.0, steps=1, decisions=1, versions=(0, 0)
-    )
 
 
 def test_without_groups_every_episode_has_its_own_seed_and_tasks_take_turns():
@@ -103,18 +97,6 @@ def test_not_even_where_the_one_before_has_played_thousands():
         seen |= seeds
         incarnation = incarnation_after(incarnation, starts)
     assert incarnation == 9
-
-
-@pytest.mark.parametrize("group_size", [0, 2])
-def test_tasks_that_fail_are_explored_more(group_size):
-    plans = make(task_sampling="failures", task_window=50, group_size=group_size, worlds=4000)
-    for _ in range(50):
-        plans.report(ended(EpisodePlan(task="lift", seed=0, explore=True), success=False))
-        plans.report(ended(EpisodePlan(task="push", seed=0, explore=True), success=True))
-        plans.report(ended(evaluate(task="push"), success=False))  # an evaluation is no exploring episode
-    starts = take(plans, 4000)[:: group_size or 1]
-    share = sum(p.task == "lift" for p in starts) / len(starts)
-    assert share == pytest.approx(51 / 53, abs=0.02)
 
 
 @pytest.mark.parametrize("group_size", [0, 2])

@@ -201,15 +201,6 @@ def test_a_group_reaches_replay_whole_stamped_and_in_small_parts(stage):
     assert all(len(set(members)) == len(members) <= 3 for members in seeds.values())
 
 
-def test_the_plans_hear_of_every_finished_episode(stage, monkeypatch: pytest.MonkeyPatch):
-    one = stage(lambda segments: True)
-    heard: list[EpisodeResult] = []
-    monkeypatch.setattr(one.worker._plans, "report", heard.append)
-    one.order(True, planned(2))
-    one.until(lambda: len(one.episodes) >= 8)
-    assert heard[: len(one.episodes)] == one.episodes
-
-
 def test_exploring_pauses_while_a_group_stands_at_the_door(stage):
     door: list[Future[bool]] = []
     arguments: dict[str, Any] = {"group_size": 3, "group_filter": "none", "segment_length": 1}

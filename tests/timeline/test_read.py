@@ -104,7 +104,7 @@ def test_a_folder_without_a_run_and_a_run_without_a_timeline(tmp_path: Path) -> 
     (tmp_path / "empty").mkdir()
     (tmp_path / "bare").mkdir()
     (tmp_path / "bare" / "config.yaml").write_text("")
-    said = {"nowhere": "no such folder", "file": "a file", "empty": "no run in it", "bare": "launch.timeline"}
+    said = {"nowhere": "no such folder", "file": "a file", "empty": "no run in it", "bare": "no worker"}
     for name, text in said.items():
         with pytest.raises(InputError, match=f"^runs='[^']*{name}': .*{text}"):
             shares(tmp_path / name)
