@@ -60,6 +60,7 @@ DEEPEST = 50
 MOST_NODES = 20_000
 LARGEST_RECIPE = 2**20
 """Bounds of a recipe: levels, values and bytes."""
+RECIPES = "recipes"
 TYPE = "type"
 """The key that picks one config of several, as in ``env.type``."""
 LONGEST_KEY = 80
@@ -228,13 +229,23 @@ def read_arguments(arguments: list[str], bare: str | None = None) -> tuple[Path 
     return (None if path is None else expanded(path, "config_path")), given
 
 
+def shipped_recipes() -> dict[str, Path]:
+    """Recipes of this package by name: beside its code in a wheel, in ``recipes/`` of the repository."""
+    package = Path(__file__).parents[1]
+    folder = next((f for f in (package / RECIPES, package.parent / RECIPES) if f.is_dir()), None)
+    return {} if folder is None else {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
 def read_recipe(path: Path) -> dict[str, Any]:
-    """The tree in a YAML (or JSON) file."""
+    """The tree in a YAML (or JSON) file, or in one of `shipped_recipes`."""
     if not path.is_file():
-        names = [p.name for p in path.parent.glob("*.y*ml")]
-        near = difflib.get_close_matches(path.name, names, n=3)
-        hint = f"did you mean {' or '.join(str(path.parent / name) for name in near)}?" if near else ""
-        raise InputError("config_path", str(path), f"no such file; {hint or 'see recipes/'}")
+        shipped = shipped_recipes()
+        path = shipped.get(str(path), path)
+    if not path.is_file():
+        names = [*(str(p) for p in path.parent.glob("*.y*ml")), *shipped]
+        near = difflib.get_close_matches(str(path), names, n=3)
+        hint = f"did you mean {' or '.join(near)}" if near else f"this package has {', '.join(shipped)}"
+        raise InputError("config_path", str(path), f"no such file; {hint}")
     try:
         check_recipe_size(path, "config_path")
         tree = load_yaml(path.read_text())

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The wheel holds all that a run outside of the repository needs."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with nothing but what the wheel puts there."""
+    site = tmp_path_factory.mktemp("site")
+    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([*pip, f"--target={site}", str(ROOT)], check=True)
+    return site
+
+
+def accerl(site: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"PYTHONPATH": str(site)}
+    command = [sys.executable, "-m", "accerl_lerobot.cli", *arguments]
+    return subprocess.run(command, env=environment, cwd=site, capture_output=True, text=True, check=False)
+
+
+def test_recipes_are_found_by_name(installed: Path):
+    done = accerl(installed, "train", "--config_path=quickstart", "--trainer.updates=-1")
+    assert done.returncode == 2 and done.stderr.startswith("accerl: trainer.updates=-1"), done.stderr
+    done = accerl(installed, "train", "--config_path=quickstar")
+    assert "no such file; did you mean quickstart" in done.stderr
+
+
+def test_everything_that_is_not_code_comes_too(installed: Path):
+    package = installed / "accerl_lerobot"
+    here = {
+        p.relative_to(ROOT / "accerl_lerobot")
+        for p in (ROOT / "accerl_lerobot").rglob("*")
+        if p.is_file() and "__pycache__" not in p.parts
+    }
+    there = {p.relative_to(package) for p in package.rglob("*") if p.is_file() and "__pycache__" not in p.parts}
+    recipes = {Path("recipes") / p.name for p in (ROOT / "recipes").iterdir()}
+    assert there == here | recipes
+    assert {p.name for p in installed.iterdir()} >= {"accerl_lerobot"}
+    assert not {"tests", "benchmarks", "datasets", "recipes", "docs"} & {p.name for p in installed.iterdir()}
