@@ -146,6 +146,7 @@ def test_folders_below_tests_are_packages() -> None:
 def test_the_top_level_is_the_agreed_one() -> None:
     folders = {"accerl_lerobot", "benchmarks", "recipes", "datasets", "tests", "docs", ".ci"}
     files = {"pyproject.toml", "README.md", "LICENSE", "Makefile", ".gitignore", ".python-version"}
+    files |= {"CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md"}
     assert {p.relative_to(ROOT).parts[0] for p in tracked()} <= folders | files
 
 
@@ -223,7 +224,7 @@ def test_no_paths_of_a_machine() -> None:
 
 def test_links_in_the_documents_lead_somewhere() -> None:
     broken = []
-    for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "datasets").rglob("*.md")]:
+    for path in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "datasets").rglob("*.md")]:
         for target in re.findall(r"\]\(([^)#]+)[^)]*\)", path.read_text()):
             if not target.startswith("http") and not (path.parent / target).exists():
                 broken.append(f"{path.relative_to(ROOT)}: {target}")
@@ -233,7 +234,7 @@ def test_links_in_the_documents_lead_somewhere() -> None:
 def commands() -> list[tuple[str, str]]:
     """Lines `accerl …` and `python -m benchmarks …` of the documents' code blocks, continued lines joined."""
     found = []
-    for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "datasets").rglob("*.md")]:
+    for path in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "datasets").rglob("*.md")]:
         for block in re.findall(r"```(?:bash|sh)\n(.*?)```", path.read_text(), flags=re.DOTALL):
             for line in block.replace("\\\n", " ").splitlines():
                 line = line.split("  #")[0].strip()
