@@ -133,8 +133,8 @@ MISTAKES: list[tuple[list[str], str]] = [
     (["--env.task=[a]"], "env.task=['a']: use text"),
     (
         ["--algorithm.type=gippo"],
-        "algorithm.type='gippo': did you mean gipo? Otherwise use one of awr, chunk_critic, decoupled, "
-        "gipo, is, ppo, sapo, self_imitation",
+        "algorithm.type='gippo': did you mean gipo? Otherwise use one of chunk_critic, gipo, ppo, "
+        "self_imitation",
     ),
     (["--env.type=mujoco"], "env.type='mujoco': use one of lerobot, libero, metaworld, simulated"),
     (["--env.task=drawer-v3"], "env.task='drawer-v3': 'drawer-v3' is not a MetaWorld task; did you mean"),

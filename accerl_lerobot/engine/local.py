@@ -32,7 +32,7 @@ from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutRunner
 from accerl_lerobot.seeds import global_generators, restore_global_generators
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, WEIGHT_SYNC, open_clock
-from accerl_lerobot.trainer.nonfinite import keeping
+from accerl_lerobot.trainer.batch import keeping
 from accerl_lerobot.weights.publisher import PublishDelay
 from accerl_lerobot.world_model.guard import IMAGINATION
 

@@ -310,9 +310,8 @@ def policy_gib(config: RunConfig) -> float:
     rehearsed_config(config.policy)
     sizes, trainer, algorithm = policy_sizes(config.policy), config.trainer, config.algorithm
     copies = 3  # the gradient and Adam's two moments
-    if isinstance(algorithm, RatioConfig):  # and copies of older weights
-        older = (trainer.probe_every, algorithm.reference_coef, algorithm.proximal_updates)
-        copies += sum(map(bool, older))
+    if isinstance(algorithm, RatioConfig) and trainer.probe_every:
+        copies += 1  # of older weights
     processes = 2 if trainer.hold_back else 1
     if config.launch.engine != "local":
         processes, copies = trainer.ranks + config.inference.workers, copies + 2  # two sets are published
