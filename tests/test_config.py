@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,7 +14,6 @@ from accerl_lerobot import cli
 from accerl_lerobot.algorithms import GIPOConfig, PPOConfig
 from accerl_lerobot.cli.verbs import DemosRun, EvalRun, SFTRun
 from accerl_lerobot.config import parsing
-from accerl_lerobot.config.help import help_text
 from accerl_lerobot.config.ranges import Positive, Range, Share
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig
@@ -50,18 +48,6 @@ class TestOverrides:
         assert config.env == SimulatedConfig(task="match", image_size=64)
         assert config.algorithm == GIPOConfig(sigma=2.0, gamma=0.9)
         assert config.trainer.lr == 3e-5 and config.job_name == "mine"
-
-    def test_the_other_fields_of_a_room_keep_the_values_that_help_shows(self) -> None:
-        """Also for a section whose default in this place is not that of its class."""
-        usual = RunConfig().imagination
-        config = parse(
-            RunConfig, ["--imagination.replay.ahead=100", "--imagination.learn.validation.max_windows=7"]
-        )
-        assert config.imagination.replay == replace(usual.replay, ahead=100)
-        assert config.imagination.learn.validation == replace(usual.learn.validation, max_windows=7)
-        text = help_text("train", RunConfig, "train", "all")
-        assert f"--imagination.replay.capacity={usual.replay.capacity} " in text
-        assert f"--imagination.learn.validation.auroc={usual.learn.validation.auroc} " in text
 
     @pytest.mark.parametrize("form", ["--config_path={}", "--config_path {}", "{}"])
     def test_forms_of_naming_a_recipe(self, recipe: str, form: str) -> None:

@@ -172,9 +172,6 @@ def _models(
         remedy = "it has no success model to train on; use imagination.learn.steps_per_episode=0"
         raise InputError("imagination.path", config.imagination.path, remedy)
     check_fit(models.model.spec, world, executed, history, models.success is not None)
-    config.imagination.replay.check(
-        batch_decisions=config.trainer.batch_decisions,
-        segment_decisions=_longest(world, executed),
-        field="imagination.replay",
-    )
+    imagined, longest = config.imagination.imagined_replay(config.replay), _longest(world, executed)
+    imagined.check(batch_decisions=config.trainer.batch_decisions, segment_decisions=longest)
     return models

@@ -32,7 +32,7 @@ from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
-from accerl_lerobot.world_model.guard import IMAGINATION, WORLD_LEARNING
+from accerl_lerobot.world_model.config import IMAGINATION, WORLD_LEARNING
 from accerl_lerobot.world_model.online import Promotion
 
 if TYPE_CHECKING:
