@@ -234,8 +234,7 @@ def check_wandb(config: WandBConfig) -> None:
 
 def demos_bytes(config: DemosConfig, spec: WorldSpec) -> int:
     """Disk space that demonstrations take, if half of the env steps are made and PNG halves the images."""
-    steps = min(spec.max_steps, config.max_steps)
-    return config.episodes * steps * sum(map(math.prod, spec.images.values())) // 4
+    return config.episodes * spec.max_steps * sum(map(math.prod, spec.images.values())) // 4
 
 
 def disk_bytes(config: RunConfig, spec: WorldSpec, history: int) -> int:
