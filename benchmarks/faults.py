@@ -33,6 +33,7 @@ from accerl_lerobot.engine.ray_session import RAY_PROCESSES
 from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate
+from accerl_lerobot.trainer.batch import MAX_NONFINITE
 from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.hits import FAULTS, START_S, TIDY_S, places, strike
 from benchmarks.light_run import light_config
@@ -249,7 +250,7 @@ def _target(
             while done < len(drawn):
                 if moments:
                     victim.await_update(moments[done], WAIT_S, every=1.0)
-                in_a_row = start.recipe.trainer.max_nonfinite
+                in_a_row = MAX_NONFINITE
                 struck = strike(victim, orders, str(done), target, drawn[done], rng, in_a_row)
                 result["hits"].append(asdict(struck))
                 done += 1

@@ -37,7 +37,7 @@ class BenchLagConfig(StudyConfig):
 
     output_dir: str = "outputs/lag"
     """Folder of the runs and of lag.json, lag.md and lag.png; finished cells in it are kept."""
-    algorithms: tuple[str, ...] = ("gipo", "ppo", "decoupled", "sapo")
+    algorithms: tuple[str, ...] = ("gipo", "ppo")
     """Values of ``algorithm.type``; the algorithm's other fields are the recipe's where it has them."""
     lags: tuple[Steps, ...] = (0, 4, 16, 64)
     """Values of ``trainer.hold_back``, in updates; what replay adds is reported."""

@@ -28,6 +28,7 @@ from accerl_lerobot.errors import InputError, check_absent, make_folder
 from accerl_lerobot.metrics import METRICS, MetricsLog, WandBConfig
 from accerl_lerobot.replay.journal import EPISODES
 from accerl_lerobot.timeline.read import shares
+from accerl_lerobot.trainer.batch import MAX_NONFINITE
 from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.faults import BenchFaultsConfig, Start, end_run, recipe_of
 from benchmarks.hits import START_S, strike
@@ -108,7 +109,7 @@ def bench_soak(config: BenchSoakConfig) -> dict[str, Any]:
         with console.stage("blocks", total=config.blocks) as stage:
             for number in range(config.blocks):
                 kind = ORDER[number % len(ORDER)]
-                block = _block(config, victim, orders, str(number), kind, rng, recipe.trainer.max_nonfinite)
+                block = _block(config, victim, orders, str(number), kind, rng, MAX_NONFINITE)
                 result["blocks"].append(block)
                 stage.update(number + 1, f"{kind}: {block['updates']:.1f} updates/s")
         result |= compare(result["blocks"])

@@ -26,12 +26,10 @@ from accerl_lerobot.engine.run import execute
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Segment
-from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline.read import shares
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import (
-    GuardConfig,
     ImaginationConfig,
     NetworkConfig,
     OnlineLearnConfig,
@@ -43,7 +41,7 @@ from accerl_lerobot.world_model.learners import new_success_model
 from accerl_lerobot.world_model.pixels import PixelWorldModel
 from accerl_lerobot.world_model.pretrain import world_spec
 from accerl_lerobot.world_model.store import save_world_model
-from tests.runs import drive, polls, tiny_run
+from tests.runs import adjusted, drive, polls, tiny_run
 
 # About half of all episodes succeed when it is acted at random.
 ENV = SimulatedConfig(max_steps=16, hold=8, tolerance=0.45)
@@ -57,7 +55,13 @@ LOOSE = ValidationConfig(
     stride=4,
     max_windows=40,
 )
-IMAGINED_REPLAY = ReplayConfig(capacity=64, min_decisions=1, ahead=16, samples_per_insert=1.0)
+CONSTANTS = ("window", "min_real_episodes", "max_gap")
+
+
+def learning(validate_every: int = 2, held_out: float = 0.4, validation: ValidationConfig = LOOSE) -> Any:
+    """A world model that is trained in the run, and validated after so many episodes."""
+    constants = {"validate_every": validate_every, "held_out": held_out, "validation": validation}
+    return adjusted(OnlineLearnConfig, **constants)(steps_per_episode=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -74,13 +78,13 @@ def world_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def imagining(
     checkpoint: Path, *, episodes: int = 6, sections: dict[str, Any] | None = None, **config: Any
 ) -> RunConfig:
-    watched = {k: config.pop(k) for k in ("window", "min_real_episodes", "max_gap") if k in config}
-    guard = GuardConfig(**({"window": 10_000} | watched))
-    fields: dict[str, Any] = {"share": 0.5, "rollouts": 4, "replay": IMAGINED_REPLAY, "guard": guard}
+    constants = {"window": 10_000, "samples_per_insert": 1.0}
+    constants |= {name: config.pop(name) for name in CONSTANTS if name in config}
+    fields: dict[str, Any] = {"share": 0.5, "rollouts": 4}
     return tiny_run(
         checkpoint,
         env=ENV,
-        imagination=ImaginationConfig(**(fields | config)),
+        imagination=adjusted(ImaginationConfig, **constants)(**(fields | config)),
         rollout=RolloutConfig(worlds=4, segment_length=4, episodes=episodes, time_limit="fail"),
         trainer=TrainerConfig(updates=12, batch_decisions=16, warmup_updates=2, value_warmup_updates=2),
         **(sections or {}),
@@ -138,7 +142,7 @@ def test_without_imagination_a_run_ends_when_its_episodes_are_used_up(tiny_check
 
 
 def test_two_runs_are_equal_to_the_last_bit(tiny_checkpoint: Path, world_model: Path):
-    learn = OnlineLearnConfig(steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE)
+    learn = learning()
     config = imagining(tiny_checkpoint, path=str(world_model), learn=learn, episodes=24)
     runs = [run_locally(config) for _ in range(2)]
     one, other = ([u for p in history for u in p.updates] for history, _, _ in runs)
@@ -157,7 +161,7 @@ def test_a_run_that_was_left_goes_on_as_if_it_had_not(
     model: str, left_at: float, tiny_checkpoint: Path, world_model: Path, tmp_path: Path
 ):
     """Rollouts, world model and success model included."""
-    learn = OnlineLearnConfig(steps_per_episode=1.0, validate_every=8, held_out=0.5, validation=LOOSE)
+    learn = learning(validate_every=8, held_out=0.5)
     chosen: dict[str, Any] = {"model": model, "start_at_reset_prob": 0.5, "window": 4, "max_gap": 2.0}
     chosen["min_real_episodes"] = 2
     if model != "oracle":
@@ -189,7 +193,7 @@ def test_a_run_that_was_left_goes_on_as_if_it_had_not(
 
 @pytest.mark.slow
 def test_rollouts_of_a_model_that_is_trained_are_compared(tiny_checkpoint: Path, world_model: Path):
-    learn = OnlineLearnConfig(steps_per_episode=1.0, validate_every=8, held_out=0.5, validation=LOOSE)
+    learn = learning(validate_every=8, held_out=0.5)
     config = imagining(
         tiny_checkpoint, path=str(world_model), learn=learn, episodes=24, start_at_reset_prob=0.5,
         window=4, min_real_episodes=2, max_gap=2.0,
@@ -208,7 +212,7 @@ def test_rollouts_of_a_model_that_is_trained_are_compared(tiny_checkpoint: Path,
 
 @pytest.mark.slow
 def test_nothing_is_imagined_before_the_model_has_passed(tiny_checkpoint: Path, world_model: Path):
-    learn = OnlineLearnConfig(steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE)
+    learn = learning()
     history, batches, _ = run_locally(
         imagining(tiny_checkpoint, path=str(world_model), learn=learn, episodes=24)
     )
@@ -218,7 +222,7 @@ def test_nothing_is_imagined_before_the_model_has_passed(tiny_checkpoint: Path, 
     assert imagined[first - 1] == 0 < imagined[-1]
     versions = {s.world_version for b in batches for s in b if s.source == IMAGINED}
     assert versions and 0 not in versions, "the one it began with never imagined"
-    strict = replace(learn, validation=replace(LOOSE, sensitivity=1e9))
+    strict = learning(validation=replace(LOOSE, sensitivity=1e9))
     history, batches, _ = run_locally(imagining(tiny_checkpoint, path=str(world_model), learn=strict))
     assert history[-1].imagination["rejected"] >= 2 and history[-1].imagination["rollouts"] == 0
     assert 0 < len(batches) < 12 and not any(decisions(b, IMAGINED) for b in batches)
@@ -228,7 +232,7 @@ def test_nothing_is_imagined_before_the_model_has_passed(tiny_checkpoint: Path, 
 def test_it_runs_asynchronously(tiny_checkpoint: Path, world_model: Path, tmp_path: Path):
     from accerl_lerobot.engine.launch import RayEngine
 
-    learn = OnlineLearnConfig(steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE)
+    learn = learning()
     config = imagining(tiny_checkpoint, path=str(world_model), learn=learn, episodes=12)
     config = replace(config, rollout=replace(config.rollout, workers=2))
     engine = RayEngine(replace(config, output_dir=str(tmp_path)), ("match",))
@@ -325,7 +329,7 @@ def test_what_does_not_fit_is_refused_before_the_run_begins(
 
 @pytest.mark.slow
 def test_what_a_run_learns_its_world_model_from_is_real(tiny_checkpoint: Path, world_model: Path):
-    learn = OnlineLearnConfig(steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE)
+    learn = learning()
     config = imagining(tiny_checkpoint, path=str(world_model), learn=learn, episodes=24)
     engine = LocalEngine(config, ("match",))
     assert engine._world_learner is not None
@@ -343,14 +347,11 @@ def test_sections_that_do_not_go_together(tiny_checkpoint: Path):
         tiny_run(
             tiny_checkpoint, env=ENV, imagination=ImaginationConfig(share=0.5, model="oracle"), rollout=groups
         )
-    with pytest.raises(InputError, match=r"^imagination\.replay\.ahead=4: use at least one batch, 16"):
-        imagining(tiny_checkpoint, model="oracle", replay=replace(IMAGINED_REPLAY, ahead=4))
     with pytest.raises(InputError, match=r"^rollout\.episodes=7: use a multiple of rollout.group_size, 4"):
         RolloutConfig(group_size=4, episodes=7)
 
 
 def test_the_summary_says_what_was_imagined(tiny_checkpoint: Path, tmp_path: Path):
-
     config = imagining(tiny_checkpoint, model="oracle")
     config = replace(config, launch=replace(config.launch, engine="local"))
     summary = execute(config, tmp_path, Console())

@@ -133,7 +133,7 @@ def test_every_logged_number_is_explained(tiny_checkpoint: Path) -> None:
         "--trainer.value_warmup_updates=0",
     ]
     told: set[str] = set()
-    for more in (off_policy, ["--algorithm.reference_coef=0.1"]):
+    for more in (off_policy, []):
         config = parse(RunConfig, arguments + more)
         engine = make_engine(config, ("match",), history=1)
         try:

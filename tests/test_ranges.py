@@ -25,7 +25,6 @@ from accerl_lerobot.engine.config import PlacementConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.hub.card import PullConfig
 from accerl_lerobot.policies.config import (
-    GaussianSamplerConfig,
     TuningConfig,
 )
 from accerl_lerobot.replay import ReplayConfig
@@ -100,9 +99,6 @@ def test_every_field_refuses_a_choice_that_there_is_not(cls: type[Any]):
 
 RULES = [
     (BackboneConfig, {"image": 48}, "sft.backbone.image=48: use a multiple of 32"),
-    (BackboneConfig, {"heads": 5}, "sft.backbone.heads=5: use a divisor of the width 96"),
-    (BackboneConfig, {"vision_heads": 3}, "sft.backbone.vision_heads=3: use a divisor of the width 64"),
-    (BackboneConfig, {"kv_heads": 3}, "sft.backbone.kv_heads=3: use a divisor of the 4 heads"),
     (BackboneConfig, {"hidden": 12}, "sft.backbone.hidden=12: use a multiple of 8"),
     (BenchAsyncVsSyncConfig, {"cvs": ()}, "cvs="),
     (BenchBatchingConfig, {"waits_ms": ()}, "waits_ms="),
@@ -115,8 +111,6 @@ RULES = [
     (BenchScalingConfig, {"counts": (2, 2)}, "counts="),
     (BenchTransportConfig, {"sizes": ("1 GB",)}, "sizes="),
     (DemosConfig, {"repo_id": "plain"}, "demos.repo_id="),
-    (GaussianSamplerConfig, {"std_min": 0.2}, "policy.sampler.std_min="),
-    (GaussianSamplerConfig, {"std_max": 0.2}, "policy.sampler.std_max="),
     (MachineryConfig, {"segment_length": 5}, "segment_length="),
     (NetworkConfig, {"channels": ()}, "world_model.model.network.channels="),
     (ReplayConfig, {"min_decisions": 5000}, "replay.min_decisions="),

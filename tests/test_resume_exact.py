@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.algorithms import ChunkCriticConfig, GIPOConfig, SelfImitationConfig
-from accerl_lerobot.algorithms.losses import DecoupledConfig
 from accerl_lerobot.checkpoint.layout import TRAINING_STATE
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.local import LocalEngine
@@ -34,7 +33,6 @@ GROUPS: dict[str, Any] = {
 CASES: dict[str, dict[str, Any]] = {
     "plain": {},
     "weights held back": {"trainer": {"hold_back": 3, "probe_every": 4}},
-    "copies of weights": {"algorithm": DecoupledConfig(reference_coef=0.1, proximal_every=4, level="chunk")},
     "groups": GROUPS,
     "chunk critic": {
         "env": SimulatedConfig(max_steps=16, environment_state=True),

@@ -22,33 +22,22 @@ from accerl_lerobot.algorithms.contract import (
     LossInputs,
     OffPolicyConfig,
     RatioConfig,
+    SelfImitationConfig,
     check_level,
 )
-from accerl_lerobot.algorithms.losses import (
-    AWRConfig,
-    DecoupledConfig,
-    GIPOConfig,
-    ImportanceConfig,
-    PPOConfig,
-    SAPOConfig,
-)
+from accerl_lerobot.algorithms.losses import GIPOConfig, PPOConfig
 from accerl_lerobot.algorithms.objective import LossOutput
-from accerl_lerobot.algorithms.self_imitation import SelfImitationConfig
 
 __all__ = [
-    "AWRConfig",
     "AlgorithmConfig",
     "ChunkCriticConfig",
-    "DecoupledConfig",
     "GIPOConfig",
-    "ImportanceConfig",
     "Level",
     "LossInputs",
     "LossOutput",
     "OffPolicyConfig",
     "PPOConfig",
     "RatioConfig",
-    "SAPOConfig",
     "SelfImitationConfig",
     "check_level",
 ]

@@ -64,19 +64,8 @@ class RatioConfig(AlgorithmConfig):
     """Weight of the critic's regression error."""
     kl_coef: NonNegative = 0.0
     """Weight of KL(μ‖π), the distance from the behaviour policy."""
-    reference_coef: NonNegative = 0.0
-    """Weight of KL(π‖π_ref), the distance from the policy that RL began with.
-
-    Above 0 the trainer keeps a copy of those weights and re-scores every batch under it: one more forward
-    pass. Estimated from samples of μ corrected by ρ; `ratio.kl_to_reference` says what that leaves.
-    """
     entropy_coef: NonNegative = 0.0
     """Weight of the entropy bonus."""
-
-    @property
-    def proximal_updates(self) -> int:
-        """For how many updates the weights behind `LossInputs.log_prob_proximal` are kept; 0: not used."""
-        return 0
 
     def loss(self, inputs: LossInputs) -> LossOutput:
         """The objective, with its diagnostics; `objective.assemble` adds the shared terms."""
@@ -94,6 +83,16 @@ class OffPolicyConfig(AlgorithmConfig):
     memory: Annotated[int, Range("[1000, 100000000]")] = 100_000
     """Decisions that the trainer remembers; the oldest leave first. At images of 64 pixels, 100,000 are
     1.2 GB."""
+
+
+@AlgorithmConfig.register_subclass("self_imitation")
+@dataclass(frozen=True, kw_only=True)
+class SelfImitationConfig(OffPolicyConfig):
+    """Settings of self-imitation; it has no critic.
+
+    It imitates the policy's own successful episodes as they come in: rejection fine-tuning without rounds,
+    or filtered behaviour cloning (related: arXiv 1806.05635). It is the baseline to beat at equal episodes.
+    """
 
 
 def check_level(level: Level, actions: int | None) -> None:
@@ -140,10 +139,6 @@ class LossInputs:
     With it the losses of micro-batches, weighted by their decisions, add up to that of the whole batch. None:
     this is the whole batch.
     """
-    log_prob_reference: Tensor | None = None
-    """(N, L), log π_ref; needed if `RatioConfig.reference_coef` is above 0."""
-    log_prob_proximal: Tensor | None = None
-    """(N, L), log π_prox; needed if `RatioConfig.proximal_updates` is above 0."""
 
     def __post_init__(self) -> None:
         if self.log_prob_new.dim() != 2 or self.log_prob_new.shape != self.log_prob_old.shape:
@@ -151,7 +146,7 @@ class LossInputs:
             raise ValueError(f"log_prob_new {new} and log_prob_old {old}: both must be (N, L)")
         n, width = self.log_prob_new.shape
         flat = ("advantage", "value", "value_error", "returns", "entropy")
-        for name in (*flat, "factors", "log_prob_reference", "log_prob_proximal"):
+        for name in (*flat, "factors"):
             tensor: Tensor | None = getattr(self, name)
             shape = (n,) if name in flat else (n, width)
             if tensor is not None and tuple(tensor.shape) != shape:

@@ -138,7 +138,7 @@ def _adapter(config: BenchPolicyConfig, device: Any, directory: Path) -> Any:
 
     from accerl_lerobot.config.parsing import imported
     from accerl_lerobot.policies.adapter import LeRobotAdapter, ValueHead
-    from accerl_lerobot.policies.config import POLICIES, FlowSamplerConfig, ValueHeadConfig, steps_field
+    from accerl_lerobot.policies.config import POLICIES, FlowSamplerConfig, steps_field
     from accerl_lerobot.policies.flow import FlowFamily
     from accerl_lerobot.policies.saving import tune
 
@@ -151,7 +151,7 @@ def _adapter(config: BenchPolicyConfig, device: Any, directory: Path) -> Any:
     model = imported(POLICIES[config.type][0])(policy)
     family = FlowFamily(model, FlowSamplerConfig(stochastic=config.stochastic, noise_level=0.2))
     inputs: Any = _RandomInputs(config, device)
-    critic = ValueHead(model.width, ValueHeadConfig())
+    critic = ValueHead(model.width)
     adapter = LeRobotAdapter(policy, inputs, model, family, critic, config.precision)
     tune(policy, model, config.tuning)
     return adapter

@@ -79,7 +79,6 @@ LEROBOT = {
     "rename_map": "use policy.rename_map",
     "optimizer.lr": "use trainer.lr (RL) or sft.lr (fine-tuning)",
     "optimizer.betas": "use trainer.betas",
-    "optimizer.weight_decay": "use trainer.weight_decay",
     "optimizer.grad_clip_norm": "use trainer.grad_clip",
     "policy.type": "use policy.path (a checkpoint) or sft.policy.type (a new policy)",
     "policy.pretrained_path": "use policy.path",

@@ -3,10 +3,11 @@
 
 Same arguments, same result, but that a new policy of images reads no ``observation.environment_state``, which
 a real robot does not have. π0-FAST's action tokeniser, whose newest code LeRobot would fetch and run, is
-read by `policies.fast` instead. ``--code_revision=COMMIT`` has code from the Hub run, of this commit only.
+read by `policies.pi0` instead. ``--code_revision=COMMIT`` has code from the Hub run, of this commit only.
 
-``--cache_items=true`` keeps the dataset's items in memory: LeRobot 0.6.1 decodes every image of an action
-chunk to read the chunk's actions, 3.8 ms an item for a chunk of ten 64-pixel frames.
+The dataset's items are kept in memory where they take less than 4 GiB and are not transformed at random:
+LeRobot 0.6.1 decodes every image of an action chunk to read the chunk's actions, 3.8 ms an item for a chunk
+of ten 64-pixel frames.
 
 Run: ``python -m accerl_lerobot.demos.guarded_train <lerobot-train arguments>``
 """
@@ -23,7 +24,7 @@ from torch.utils.data import Dataset
 
 from accerl_lerobot.checkpoint.safety import Origin
 from accerl_lerobot.demos.dataset_files import checked
-from accerl_lerobot.demos.sft import CACHE, CODE_REVISION, REFUSED
+from accerl_lerobot.demos.sft import CODE_REVISION, REFUSED
 from accerl_lerobot.experience import ENVIRONMENT_STATE
 from accerl_lerobot.policies.guard import guarded, input_error
 
@@ -61,23 +62,14 @@ def item_bytes(meta: Any) -> int:
     return sum(4 * math.prod(meta.features[key]["shape"]) for key in meta.camera_keys)
 
 
-def _without_simulator(stock: Any) -> Any:
-    """LeRobot's function that makes datasets, without a simulator's state beside the images to train on."""
+def _adapted(stock: Any) -> Any:
+    """LeRobot's function that makes datasets, without a simulator's state beside the images to train on, and
+    with a `CachedDataset` where that is possible."""
 
     def make(cfg: Any) -> tuple[Any, Any]:
         train, evaluation = stock(cfg)
         if train.meta.camera_keys:
             train.meta.features.pop(ENVIRONMENT_STATE, None)
-        return train, evaluation
-
-    return make
-
-
-def _cached(stock: Any) -> Any:
-    """LeRobot's function that makes the datasets, with a `CachedDataset` where that is possible."""
-
-    def make(cfg: Any) -> tuple[Any, Any]:
-        train, evaluation = stock(cfg)
         fixed = not cfg.dataset.image_transforms.enable and not cfg.dataset.streaming
         size = item_bytes(train.meta) * cfg.policy.n_obs_steps
         if fixed and len(train) * size <= MAX_BYTES:
@@ -98,10 +90,8 @@ def main() -> None:
 
     code, root, name = given(CODE_REVISION), given("--dataset.root="), given("--dataset.repo_id=")
     origin = Origin("dataset.repo_id", name) if root is None else Origin("dataset.root", root)
-    lerobot_train.make_train_eval_datasets = _without_simulator(lerobot_train.make_train_eval_datasets)
-    if CACHE in sys.argv:
-        lerobot_train.make_train_eval_datasets = _cached(lerobot_train.make_train_eval_datasets)
-    sys.argv[1:] = [a for a in sys.argv[1:] if a != CACHE and not a.startswith(CODE_REVISION)]
+    lerobot_train.make_train_eval_datasets = _adapted(lerobot_train.make_train_eval_datasets)
+    sys.argv[1:] = [a for a in sys.argv[1:] if not a.startswith(CODE_REVISION)]
     try:
         with contextlib.ExitStack() as guards:
             guards.enter_context(guarded("sft", code))

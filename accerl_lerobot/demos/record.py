@@ -71,8 +71,6 @@ class DemosConfig(Section, section="demos"):
     """Keep expert episodes that failed; otherwise they are tried again with another seed."""
     shifted: bool = False
     """Apply ``env.shift`` to the demonstrations too; otherwise they show the world without it."""
-    max_steps: Annotated[int, Range("[1, 1000000]")] = 500
-    """Episode limit in env steps; the environment's own limit holds too."""
     seed: Seed = 0
     """Disjoint demonstrations for different seeds."""
     processes: Annotated[int, Range("[1, 64]")] = 2
@@ -92,7 +90,6 @@ def record_demos(env_config: EnvConfig, config: DemosConfig) -> Path:
         The dataset's folder; open it with ``LeRobotDataset(config.repo_id, root=...)``.
     """
     root = check_free(config.root, "demos.")
-    env_config = env_config.shortened(config.max_steps)
     if not config.shifted:
         env_config = env_config.nominal()
     world = make_world(env_config)
@@ -206,5 +203,5 @@ def _record_one(slot: int) -> tuple[Episode, int]:
         "demos.failure_share" if fail else "demos.action_noise",
         share if fail else _config.action_noise,
         f"{_MAX_TRIES} tries of {task} in a row did not {'fail' if fail else 'succeed'}; "
-        "lower it, or allow more env steps (env.max_steps, demos.max_steps)",
+        "lower it, or allow more env steps (env.max_steps)",
     )

@@ -32,8 +32,8 @@ from accerl_lerobot.policies.config import discovery, register_policies
 
 logger = logging.getLogger(__name__)
 
-CODE_REVISION, CACHE = "--code_revision=", "--cache_items=true"
-"""Our arguments of the trainer."""
+CODE_REVISION = "--code_revision="
+"""Our argument of the trainer."""
 HELD_OUT = re.compile(r"\bstep (\d+): eval_loss=(\S+)")
 """LeRobot's report of a loss on held-out episodes."""
 REFUSED = "accerl refuses: "
@@ -65,10 +65,9 @@ class SFTConfig(Section, section="sft"):
     held_out: Annotated[float, Range("[0, 1)")] = 0.0
     """Share of each task's episodes that is not trained on: the checkpoint, one of ten, that predicts these
     actions best is used; 0: all are trained on, and the last checkpoint is used."""
-    cache: bool = True
-    """Keep the dataset's items in memory, see `guarded_train`; not above 4 GiB nor with image transforms."""
     num_workers: Annotated[int, Range("[0, 256]")] = 0
-    """Data-loading processes; 0 loads in the trainer, which is what `cache` wants."""
+    """Data-loading processes; 0 loads in the trainer, which is best for datasets that fit into memory, see
+    `guarded_train`."""
     num_threads: Threads = 2
     """CPU threads of the trainer."""
     init_path: str | None = None
@@ -120,7 +119,7 @@ def sft_command(
     policy |= {name: value for name, value in preset.items() if name in known}
     if config.init_path is not None and "pretrained_backbone_weights" in known:
         policy["pretrained_backbone_weights"] = None  # the checkpoint's replace them; spares their download
-    command = [sys.executable, "-m", "accerl_lerobot.demos.guarded_train"] + ([CACHE] if config.cache else [])
+    command = [sys.executable, "-m", "accerl_lerobot.demos.guarded_train"]
     command += [f"{CODE_REVISION}{config.code_revision}"] if config.code_revision else []
     command += [f"--policy.{key}={_as_argument(value)}" for key, value in policy.items()]
     command += discovery(kind)
@@ -177,7 +176,7 @@ def run_sft(
         config = replace(config, init_path=str(fetched_checkpoint(config.init_path, None, "sft.init_path")))
     output_dir.parent.mkdir(parents=True, exist_ok=True)
     if config.init_path is None and config.backbone is not None:
-        write_backbone(output_dir.parent / "backbone", config.backbone, texts)
+        write_backbone(output_dir.parent / "backbone", config.backbone.sizes, texts)
     config = _with_backbone_in_place(config, output_dir.parent / "init")
     command = sft_command(config, dataset, output_dir, seed, device, picked(dataset, config.pick))
     logger.info("%s", shlex.join(command))

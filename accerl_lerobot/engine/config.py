@@ -212,14 +212,8 @@ class RunConfig(Section):
             raise InputError("trainer.cpu_offload", True, remedy)
         batch, imagination = self.trainer.batch_decisions, self.imagination
         if self.trainer.updates:
-            # Of both, as a batch is all real before anything is imagined, and all imagined after the last
-            # real episode.
+            # `engine.imagination` checks that a whole imagined rollout fits too.
             self.replay.check(batch_decisions=batch, segment_decisions=self.rollout.segment_length)
-            if imagination.share:
-                # `engine.imagination` checks it again with the length of a whole rollout.
-                imagination.replay.check(
-                    batch_decisions=batch, segment_decisions=1, field="imagination.replay"
-                )
         if imagination.share and self.launch.schedule != ASYNCHRONOUS:
             remedy = "use asynchronous: imagination takes no turns"
             raise InputError("launch.schedule", self.launch.schedule, remedy)

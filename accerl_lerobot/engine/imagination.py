@@ -39,7 +39,7 @@ from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
 from accerl_lerobot.world_model.config import VIDEOS, OnlineLearnConfig
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.data import fingerprint, load_episodes
-from accerl_lerobot.world_model.guard import IMAGINATION, WORLD_LEARNING
+from accerl_lerobot.world_model.config import IMAGINATION, WORLD_LEARNING
 from accerl_lerobot.world_model.online import OnlineLearner, PretrainingEpisodes, Promotion
 from accerl_lerobot.world_model.registry import (
     ImaginationModels,
@@ -185,11 +185,8 @@ def _models(
         remedy = "it has no success model to train on; use imagination.learn.steps_per_episode=0"
         raise InputError("imagination.path", config.imagination.path, remedy)
     check_fit(models.model.spec, world, executed, history, models.success is not None)
-    config.imagination.replay.check(
-        batch_decisions=config.trainer.batch_decisions,
-        segment_decisions=_longest(world, executed),
-        field="imagination.replay",
-    )
+    imagined, longest = config.imagination.imagined_replay(config.replay), _longest(world, executed)
+    imagined.check(batch_decisions=config.trainer.batch_decisions, segment_decisions=longest)
     return models
 
 

@@ -43,7 +43,7 @@ from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.transport.contract import ServiceStoppedError
 from accerl_lerobot.transport.endpoint import Endpoint
-from accerl_lerobot.world_model.guard import IMAGINATION, WORLD_LEARNING
+from accerl_lerobot.world_model.config import IMAGINATION, WORLD_LEARNING
 
 logger = logging.getLogger(__name__)
 
@@ -231,7 +231,8 @@ class RayEngine(Engine):
         ranks = [make(name, TrainerRank, 1, rank, learner) for rank, name in enumerate(names, start=1)]
         trainer = make("trainer", TrainerWorker, 4, learner, timeline, ranks, journal_folder(c))
         self._inference.start(plan)
-        imagined, counted = imagination.replay if imagination.share else None, c.rollout.episodes > 0
+        imagined = imagination.imagined_replay(c.replay) if imagination.share else None
+        counted = c.rollout.episodes > 0
         stores = (c.replay, c.seed, imagined, counted, self._state, journal_folder(c), timeline)
         self._replay = self._add("replay", make("replay", ReplayWorker, 1000, *stores))
         for name, rank in zip(names, ranks, strict=True):

@@ -32,9 +32,9 @@ from accerl_lerobot.rollout.plans import EpisodePlans
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult, RolloutRunner
 from accerl_lerobot.seeds import global_generators, restore_global_generators
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, WAIT_IN, WEIGHT_SYNC, open_clock
-from accerl_lerobot.trainer.nonfinite import keeping
+from accerl_lerobot.trainer.batch import keeping
 from accerl_lerobot.weights.publisher import PublishDelay
-from accerl_lerobot.world_model.guard import IMAGINATION
+from accerl_lerobot.world_model.config import IMAGINATION
 
 logger = logging.getLogger(__name__)
 
@@ -71,7 +71,8 @@ class LocalEngine(Engine):
         imagination = config.imagination
         folder, counted = journal_folder(config), config.rollout.episodes > 0
         journal = None if folder is None else Journal(folder / EPISODES)
-        self._replay = MixedReplay(config.replay, imagination.replay, imagination.share, counted, journal)
+        imagined = imagination.imagined_replay(config.replay)
+        self._replay = MixedReplay(config.replay, imagined, imagination.share, counted, journal)
         self._imagination = self._world_learner = None
         if imagination.share:
             from accerl_lerobot.engine.imagination import make_imagination, make_learner

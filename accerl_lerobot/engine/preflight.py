@@ -209,8 +209,7 @@ def check_wandb(config: WandBConfig) -> None:
 
 def demos_bytes(config: DemosConfig, spec: WorldSpec) -> int:
     """Disk space that demonstrations take, if half of the env steps are made and PNG halves the images."""
-    steps = min(spec.max_steps, config.max_steps)
-    return config.episodes * steps * sum(map(math.prod, spec.images.values())) // 4
+    return config.episodes * spec.max_steps * sum(map(math.prod, spec.images.values())) // 4
 
 
 def disk_bytes(config: RunConfig, spec: WorldSpec, history: int) -> int:
@@ -278,9 +277,8 @@ def policy_gib(config: RunConfig) -> float:
     rehearsed_config(config.policy)
     sizes, trainer, algorithm = policy_sizes(config.policy), config.trainer, config.algorithm
     copies = 3  # the gradient and Adam's two moments
-    if isinstance(algorithm, RatioConfig):  # and copies of older weights
-        older = (trainer.probe_every, algorithm.reference_coef, algorithm.proximal_updates)
-        copies += sum(map(bool, older))
+    if isinstance(algorithm, RatioConfig) and trainer.probe_every:
+        copies += 1  # of older weights
     processes = 2 if trainer.hold_back else 1
     if config.launch.engine != "local":
         processes, copies = trainer.ranks + config.inference.workers, copies + 2  # two sets are published

@@ -14,7 +14,6 @@ one; all before them are passed without a picture, as always.
 
 from __future__ import annotations
 
-import dataclasses
 import shlex
 from abc import ABC, abstractmethod
 from collections import deque
@@ -175,10 +174,6 @@ class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
     def state_size(self) -> int:
         """Numbers of ``observation.environment_state``; 0 where observations hold none."""
         return 0
-
-    def shortened(self, max_steps: int) -> Self:
-        """This config with its episode limit lowered to `max_steps`, if it is longer."""
-        return dataclasses.replace(self, max_steps=min(self.max_steps, max_steps))
 
     def nominal(self) -> Self:
         """This config without deployment shift; an environment that has one overrides it."""

@@ -24,12 +24,16 @@ from accerl_lerobot.checkpoint.tensors import in_parts, part_of, whole
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Decision, Request
 from accerl_lerobot.policies import saving
-from accerl_lerobot.policies.config import PolicyConfig, ValueHeadConfig
+from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.policies.family import Encoded, Family, Model, pooled
 from accerl_lerobot.policies.teacher import PREFIX, Teacher
 
 if TYPE_CHECKING:
     from accerl_lerobot.experience import Segment
+
+
+HIDDEN = 128
+"""Width of the critic's hidden layer."""
 
 
 class ValueHead(nn.Module):
@@ -39,16 +43,15 @@ class ValueHead(nn.Module):
     loaded must not change its critic.
     """
 
-    def __init__(self, width: int, config: ValueHeadConfig) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
-        self.config = config
         self.query = nn.Parameter(torch.zeros(width))
         self.norm = nn.LayerNorm(width)
-        self.hidden = nn.Linear(width, config.hidden)
+        self.hidden = nn.Linear(width, HIDDEN)
         bound, generator = width**-0.5, torch.Generator().manual_seed(torch.initial_seed() % 2**63)
         for parameter in self.hidden.parameters():  # as nn.Linear begins
             nn.init.uniform_(parameter, -bound, bound, generator=generator)
-        self.out = nn.Linear(config.hidden, 1)
+        self.out = nn.Linear(HIDDEN, 1)
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 

@@ -16,7 +16,7 @@ import draccus
 
 from accerl_lerobot.checkpoint.safety import check_remote_code
 from accerl_lerobot.config.parsing import imported
-from accerl_lerobot.config.ranges import Device, Positive, Range, Section
+from accerl_lerobot.config.ranges import Device, Range, Section
 from accerl_lerobot.errors import InputError
 
 if TYPE_CHECKING:
@@ -34,15 +34,6 @@ class SamplerConfig(Section, draccus.ChoiceRegistry, section="policy.sampler"):
 
     def override(self, policy_config: Any) -> None:
         """Puts what it asks of the policy itself into LeRobot's config, which is saved with the policy."""
-
-
-def _check_order(config: SamplerConfig, low: str, middle: str, high: str) -> None:
-    value = getattr(config, middle)
-    for name, right in ((low, getattr(config, low) < value), (high, value < getattr(config, high))):
-        if not right:
-            side = "below" if name == low else "above"
-            remedy = f"use a value {side} policy.sampler.{middle}, {value:g}"
-            raise InputError(f"policy.sampler.{name}", getattr(config, name), remedy)
 
 
 @SamplerConfig.register_subclass("flow")
@@ -78,15 +69,13 @@ class GaussianSamplerConfig(SamplerConfig):
     """
 
     std: Annotated[float, Range("(0, 2]")] = 0.2
-    """Std of every action at the start, in normalised units."""
-    std_min: Positive = 0.05
-    """Lower bound of the learned std, > 0 and below `std`."""
-    std_max: Positive = 0.5
-    """Upper bound of the learned std, above `std`."""
+    """Std of every action at the start, in normalised units. It is learned, between a quarter of this and 2.5
+    times as much."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_order(self, "std_min", "std", "std_max")
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Bounds of the learned std."""
+        return self.std / 4, 2.5 * self.std
 
 
 @SamplerConfig.register_subclass("diffusion")
@@ -110,14 +99,6 @@ class DiffusionSamplerConfig(SamplerConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ValueHeadConfig(Section, section="policy.value_head"):
-    """The critic that sits on the policy's own features."""
-
-    hidden: Annotated[int, Range("[1, 65536]")] = 128
-    """Width of the hidden layer."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class TuningConfig(Section, section="policy.tuning"):
     """Which of the policy's weights are trained and published; the critic always is."""
 
@@ -126,9 +107,7 @@ class TuningConfig(Section, section="policy.tuning"):
     without the vision-language backbone. lora: low-rank adapters; saved merged, so that stock LeRobot loads
     the result."""
     rank: Annotated[int, Range("[1, 65536]")] = 16
-    """lora: rank of the adapters."""
-    alpha: Annotated[int, Range("[1, 65536]")] = 16
-    """lora: the adapters' output is scaled by alpha / rank."""
+    """lora: rank of the adapters, whose output is not scaled."""
     targets: str | None = None
     """lora: regular expression that must match the whole name of a linear layer inside the policy; those
     inside PyTorch's own attention are passed over, as it reads their weights without calling them. None: what
@@ -164,7 +143,6 @@ class PolicyConfig(Section, section="policy"):
     than bfloat16 resolves."""
     sampler: SamplerConfig | None = None
     """How it explores. None: the first family of its policy type, with that family's defaults."""
-    value_head: ValueHeadConfig = field(default_factory=ValueHeadConfig)
     tuning: TuningConfig = field(default_factory=TuningConfig)
     rename_map: dict[str, str] = field(default_factory=dict)
     """World feature name → policy feature name, as in LeRobot's ``--rename_map``."""

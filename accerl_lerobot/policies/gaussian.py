@@ -96,7 +96,7 @@ class StdHead(nn.Module):
     def __init__(self, width: int, action_dim: int, sampler: GaussianSamplerConfig) -> None:
         super().__init__()
         self.norm, self.out = nn.LayerNorm(width), nn.Linear(width, action_dim)
-        self.bounded = BoundedStd(sampler.std_min, sampler.std_max)
+        self.bounded = BoundedStd(*sampler.bounds)
         self.bounded.start(self.out, sampler.std)
 
     def forward(self, rows: Tensor) -> Tensor:

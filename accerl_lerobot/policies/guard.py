@@ -148,7 +148,7 @@ def check_ours(ours: dict[str, Any], origin: Origin) -> None:
     Raises:
         InputError: it is of another form than `loading.save_pretrained` writes.
     """
-    for key in ("sampler", "value_head", "rename_map"):
+    for key in ("sampler", "rename_map"):
         if not isinstance(ours.get(key, {}), dict):
             raise origin.refuse(f"{OURS}: {key}", "a mapping is wanted; remove the file to start without it")
 

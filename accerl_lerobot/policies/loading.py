@@ -230,7 +230,7 @@ def _load(config: PolicyConfig, *, rehearsal: bool = False) -> LeRobotAdapter:
         processing = Processing(pre, post, device, config.rename_map)
         sampler = sampler_config(config, lerobot_config.type)
         family = imported(FAMILIES[sampler.type])(model, sampler)
-        critic = ValueHead(model.width, config.value_head)
+        critic = ValueHead(model.width)
         adapter = LeRobotAdapter(policy, processing, model, family, critic, config.precision)
         if (folder / OURS).is_file():
             _load_ours(adapter, folder, origin)
@@ -273,18 +273,12 @@ def _load_ours(adapter: LeRobotAdapter, folder: Path, origin: Origin) -> None:
         adapter.family.load_state_dict(state)
     elif state and mine:
         logger.warning("the checkpoint's weights of the sampler are not loaded: they are of another shape")
-    hidden = ours.get("value_head", {}).get("hidden", adapter.value_head.config.hidden)
-    if hidden != adapter.value_head.config.hidden:
-        logger.warning(
-            "the checkpoint's critic is not loaded, a new one starts at V = 0: policy.value_head.hidden=%s, "
-            "there %s", adapter.value_head.config.hidden, hidden,
-        )  # fmt: skip
-    elif (folder / VALUE_HEAD).is_file():
+    if (folder / VALUE_HEAD).is_file():
         state = dict(read_tensors(folder / VALUE_HEAD, origin))
         try:
             adapter.value_head.load_state_dict(state)
         except RuntimeError as error:
-            remedy = f"{OURS} says another critic than it is; remove both to start anew ({brief(error)})"
+            remedy = f"it is no critic of this policy; remove it to start anew ({brief(error)})"
             raise origin.refuse(VALUE_HEAD, remedy) from error
 
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -96,7 +95,7 @@ def _inject(policy: Any, config: TuningConfig) -> None:
         remedy = f"matches none of the policy's {len(linear)} linear layers, such as {some}"
         raise InputError("policy.tuning.targets", targets, remedy)
     policy.requires_grad_(False)
-    lora = LoraConfig(r=config.rank, lora_alpha=config.alpha, target_modules=matching, lora_dropout=0.0)
+    lora = LoraConfig(r=config.rank, lora_alpha=config.rank, target_modules=matching, lora_dropout=0.0)
     inject_adapter_in_model(lora, policy)
 
 
@@ -136,7 +135,6 @@ def save_pretrained(
             save_file(tensors, directory / name)
     ours = {
         "sampler": draccus.encode(adapter.family.sampler, SamplerConfig),
-        "value_head": asdict(config.value_head),
         "rename_map": config.rename_map,
     }
     (directory / OURS).write_text(json.dumps(ours, indent=2) + "\n")

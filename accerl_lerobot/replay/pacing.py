@@ -73,13 +73,12 @@ class ReplayConfig(Section, section="replay"):
                 remedy = f"use 1 to capacity, {self.capacity}"
                 raise InputError(f"replay.{name}", getattr(self, name), remedy)
 
-    def check(self, *, batch_decisions: int, segment_decisions: int, field: str = "replay") -> None:
+    def check(self, *, batch_decisions: int, segment_decisions: int) -> None:
         """Refuses a pace that could stall or waste, once the batch size and the segment length are known.
 
         Args:
             batch_decisions: decisions one update asks for.
             segment_decisions: T of the longest segment.
-            field: that this config stands in.
 
         Raises:
             InputError: both sides could wait for each other forever, or the trainer for the warm start, or
@@ -87,19 +86,19 @@ class ReplayConfig(Section, section="replay"):
         """
         if self.ahead < batch_decisions:
             remedy = f"use at least one batch, {batch_decisions}, or both sides wait for each other"
-            raise InputError(f"{field}.ahead", self.ahead, remedy)
+            raise InputError("replay.ahead", self.ahead, remedy)
         # Each of a segment's draws is for another update.
         oldest = math.ceil(self.samples_per_insert) - 1
         if self.max_lag < oldest:
             remedy = (
-                f"with {field}.samples_per_insert={self.samples_per_insert:g} what is drawn last is {oldest} "
+                f"with replay.samples_per_insert={self.samples_per_insert:g} what is drawn last is {oldest} "
                 f"updates old at least; use {oldest} or more, rather several times as many"
             )
-            raise InputError(f"{field}.max_lag", self.max_lag, remedy)
+            raise InputError("replay.max_lag", self.max_lag, remedy)
         least = max(self.min_decisions, self.ahead) + segment_decisions - 1
         if self.capacity < least:
             remedy = f"use at least {least}: the larger of min_decisions and ahead, and one segment"
-            raise InputError(f"{field}.capacity", self.capacity, remedy)
+            raise InputError("replay.capacity", self.capacity, remedy)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -65,7 +65,7 @@ LEARNING: tuple[Spec, ...] = (
     ("Policy loss", "The algorithm's own term.", {"policy_loss": "policy loss"}, {}),
     ("Value loss", "Squared error of the critic against the returns.", {"value_loss": "value loss"}, {}),
     ("KL divergence", "How far the policy has left its samples; in the loss, far samples are bounded.",
-     {"approx_kl": "unbounded", "kl": "in the loss", "kl_reference": "to the start"}, {"unit": "nats"}),
+     {"approx_kl": "unbounded", "kl": "in the loss"}, {"unit": "nats"}),
     ("Samples that count little", "Ratios outside the range of PPO, and samples weighed below a tenth.",
      {"clip_fraction": "outside the clip", "low_weight": "weight below 0.1"}, {"share": True, "bottom": 0}),
     ("Effective sample size", "100 %: all samples count alike.", {"ess": "share of the batch"}, SHARE),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Segments laid end to end, as one update sees them.
+"""Segments laid end to end, as one update sees them; those of an update that is not finite are kept.
 
 Shapes: S segments, N decisions in all, L log-prob factors of one.
 """
@@ -7,15 +7,22 @@ Shapes: S segments, N decisions in all, L log-prob factors of one.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import Segment
+
+if TYPE_CHECKING:
+    from accerl_lerobot.trainer.off_policy import OffPolicyUpdate
+    from accerl_lerobot.trainer.update import Update
 
 Part = tuple[dict[str, np.ndarray], list[str], dict[str, Tensor]]
 """Observations, tasks and latents of some decisions, as `PolicyAdapter.evaluate` takes them."""
@@ -110,3 +117,33 @@ def turns(rows: np.ndarray, size: int, rank: int, ranks: int) -> list[Turn]:
 def split(rows: np.ndarray, size: int) -> list[np.ndarray]:
     """Rows in parts of at most `size`."""
     return np.split(rows, range(size, len(rows), size))
+
+
+MAX_NONFINITE = 5
+"""Updates with a non-finite loss or gradient are skipped and counted; so many in a row are an error."""
+
+
+class NonFiniteError(RuntimeError):
+    """Too many updates in a row had a non-finite loss or gradient."""
+
+
+@contextmanager
+def keeping(
+    directory: Path | None, update: Update | OffPolicyUpdate, segments: Sequence[Segment]
+) -> Iterator[None]:
+    """Keeps the segments of an update, made inside, that raises `NonFiniteError`, for people to look at.
+
+    ``nonfinite-000123.json`` and ``.safetensors`` in the run's `directory` hold what would have made update
+    123; `snapshot.load` reads it. With None nothing is kept.
+
+    Raises:
+        NonFiniteError: what `Update.step` has raised, with the name of the file.
+    """
+    try:
+        yield
+    except NonFiniteError as error:
+        if directory is None:
+            raise
+        path = directory / f"nonfinite-{update.version + 1:06d}"
+        snapshot.save(path, {"update": update.version + 1, "said": str(error), "segments": list(segments)})
+        raise NonFiniteError(f"{error}; its batch is in {path}.json") from error

@@ -53,8 +53,6 @@ class TrainerConfig(Section, section="trainer"):
     """
     grad_clip: Positive = 1.0
     """Largest gradient norm of the policy, and of the critic head, each by itself."""
-    weight_decay: Annotated[float, Range("[0, 1)")] = 0.0
-    """AdamW's, of weight matrices only: biases, norms and other vectors are not decayed."""
     betas: tuple[Annotated[float, Range("[0, 1)")], Annotated[float, Range("[0, 1)")]] = (0.9, 0.95)
     publish_every: Annotated[int, Range("[1, 1000000]")] = 1
     """Updates between two publications of the weights."""
@@ -65,8 +63,6 @@ class TrainerConfig(Section, section="trainer"):
 
     While it waits for one, the trainer holds a copy of the policy's weights.
     """
-    max_nonfinite: Annotated[int, Range("[1, 1000000]")] = 5
-    """Updates with a non-finite loss or gradient are skipped and counted; so many in a row are an error."""
     num_threads: Threads = 1
     """CPU threads of each rank."""
     ranks: Annotated[int, Range("[1, 1024]")] = 1

@@ -15,17 +15,17 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.algorithms import OffPolicyConfig
-from accerl_lerobot.algorithms.diagnostics import lag_metrics
+from accerl_lerobot.algorithms.objective import lag_metrics
 from accerl_lerobot.checkpoint.tensors import optimizer_state, restore_optimizer
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import LeRobotAdapter
 from accerl_lerobot.policies.family import Encoded
 from accerl_lerobot.policies.teacher import PREFIX
+from accerl_lerobot.trainer.batch import MAX_NONFINITE, NonFiniteError
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.frozen_policies import CRITIC
 from accerl_lerobot.trainer.memory import Memory
-from accerl_lerobot.trainer.nonfinite import NonFiniteError
+from accerl_lerobot.trainer.probe import CRITIC
 from accerl_lerobot.trainer.sharding import arrange
 
 POLICY_BATCH = 64
@@ -59,9 +59,7 @@ class OffPolicyUpdate:
         self._owed: dict[str, float] = {}
         self._schedule_updates = config.updates
         self._policy = [p for k, p in adapter.trainable().items() if not k.startswith((CRITIC, PREFIX))]
-        self.optimizer = torch.optim.AdamW(
-            self._policy, lr=config.lr, betas=config.betas, weight_decay=config.weight_decay
-        )
+        self.optimizer = torch.optim.AdamW(self._policy, lr=config.lr, betas=config.betas, weight_decay=0.0)
 
     def step(self, segments: Sequence[Segment]) -> dict[str, float]:
         """Learns from new episodes and from those before; the version rises by one.
@@ -181,11 +179,11 @@ class OffPolicyUpdate:
         """Counts a step that was left out because its loss or gradient is not finite.
 
         Raises:
-            NonFiniteError: ``trainer.max_nonfinite`` of them since the policy's last step.
+            NonFiniteError: `MAX_NONFINITE` of them since the policy's last step.
         """
         self.skipped += 1
         self._skipped_in_a_row += 1
-        if self._skipped_in_a_row >= self.config.max_nonfinite:
+        if self._skipped_in_a_row >= MAX_NONFINITE:
             raise NonFiniteError(
                 f"{self._skipped_in_a_row} steps in a row had a non-finite loss or gradient (the last one, "
                 f"{step}: loss {loss:g}, gradient norm {norm:g}); lower trainer.lr or trainer.value_lr"

@@ -7,8 +7,8 @@ With ``advantage=group`` the advantages are those that the rollout workers stamp
 only makes the critic's targets; where ``value_coef`` is 0, not even those, and V is not computed beforehand.
 
 Values stored with the samples are stale by their lag, so they are recomputed; the stored log-probs are not,
-since they are what the ratio divides by. Log-probs under older weights come from `frozen_policies`. Knows no
-process: the Ray worker and the single-process mode both call `Update.step`.
+since they are what the ratio divides by. Knows no process: the Ray worker and the single-process mode both
+call `Update.step`.
 
 Shapes: S segments, T decisions of the longest one, N decisions in all.
 """
@@ -24,24 +24,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from accerl_lerobot.algorithms import (
-    AlgorithmConfig,
-    LossInputs,
-    RatioConfig,
-    check_level,
-)
+from accerl_lerobot.algorithms import AlgorithmConfig, LossInputs, RatioConfig, check_level
 from accerl_lerobot.algorithms.advantages import decision_mask, gae, moments, normalise
-from accerl_lerobot.algorithms.diagnostics import lag_metrics
-from accerl_lerobot.algorithms.ratio import present
+from accerl_lerobot.algorithms.objective import lag_metrics, present
 from accerl_lerobot.checkpoint.tensors import optimizer_state, restore_optimizer, whole
 from accerl_lerobot.config.parsing import imported
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.adapter import PolicyAdapter
-from accerl_lerobot.trainer.batch import Batch, Part, collate, pick, turns
+from accerl_lerobot.trainer.batch import MAX_NONFINITE, Batch, NonFiniteError, collate, pick, turns
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.frozen_policies import CRITIC, FrozenPolicies, Probe
-from accerl_lerobot.trainer.nonfinite import NonFiniteError
+from accerl_lerobot.trainer.probe import CRITIC, Probe
 from accerl_lerobot.trainer.ranks import Ranks
 from accerl_lerobot.trainer.sharding import arrange, synchronise
 
@@ -91,32 +84,22 @@ class Update:
         self.skipped = 0
         self._skipped_in_a_row = 0
         self._moments = torch.zeros(3, dtype=torch.float64)
-        self.frozen = FrozenPolicies(adapter)
-        if algorithm.reference_coef:
-            self.frozen.take("reference", self.version)
-        self._probe = Probe(self.frozen, config, self.ranks)
+        self._probe = Probe(adapter, config, self.ranks)
         named = adapter.trainable()
         self._policy = [p for k, p in named.items() if not k.startswith(CRITIC)]
         self._value = [p for k, p in named.items() if k.startswith(CRITIC)]
         self._schedule_updates = config.updates
-        groups: list[dict[str, Any]] = [
-            {"params": [p for p in parameters if (p.dim() > 1) is decays], "weight_decay": decay}
-            for parameters in (self._policy, self._value)
-            for decays, decay in ((True, config.weight_decay), (False, 0.0))
-        ]
-        self.optimizer = torch.optim.AdamW(groups, lr=config.lr, betas=config.betas)
+        groups = [{"params": self._policy}, {"params": self._value}]
+        self.optimizer = torch.optim.AdamW(groups, lr=config.lr, betas=config.betas, weight_decay=0.0)
 
     def step(self, segments: Sequence[Segment]) -> dict[str, float]:
         """Applies one optimiser step and returns its metrics; the version rises by one.
 
         Raises:
-            NonFiniteError: `TrainerConfig.max_nonfinite` updates in a row were not finite; this one changes
-                nothing.
+            NonFiniteError: `MAX_NONFINITE` updates in a row were not finite; this one changes nothing.
         """
         batch = collate(segments)
         mismatch = self._probe.read(batch)
-        if self._is_proximal and self.algorithm.proximal_updates > 1:
-            self.frozen.take("proximal", self.version)
         lr, value_lr = self._set_rates()
         self.optimizer.zero_grad(set_to_none=True)
         metrics = self._backward(batch)
@@ -154,7 +137,6 @@ class Update:
             "schedule_updates": self._schedule_updates,
             "moments": self._moments.clone(),
             "optimizer": optimizer_state(self.optimizer),
-            "frozen_policies": self.frozen.state(),
             "probe": self._probe.state(),
         }
 
@@ -165,7 +147,6 @@ class Update:
         self._schedule_updates = state["schedule_updates"]
         self._moments = state["moments"]
         restore_optimizer(self.optimizer, state["optimizer"])
-        self.frozen.restore(state["frozen_policies"])
         self._probe.restore(state["probe"])
 
     @property
@@ -178,20 +159,14 @@ class Update:
         # A resumed run with more updates keeps the schedule that it began with, so that rates do not jump.
         share = partial(self.config.lr_share, self.version, updates=self._schedule_updates)
         lr, value_lr = self.config.lr * share(start=self._policy_start), self.config.value_lr * share()
-        for group, rate in zip(self.optimizer.param_groups, (lr, lr, value_lr, value_lr), strict=True):
+        for group, rate in zip(self.optimizer.param_groups, (lr, value_lr), strict=True):
             group["lr"] = rate
         return lr, value_lr
-
-    @property
-    def _is_proximal(self) -> bool:
-        """True if the weights of now are the proximal ones."""
-        every = self.algorithm.proximal_updates
-        return every > 0 and self.version % every == 0
 
     def _skip(self, loss: float, norm: float, value_norm: float) -> None:
         self.skipped += 1
         self._skipped_in_a_row += 1
-        if self._skipped_in_a_row >= self.config.max_nonfinite:
+        if self._skipped_in_a_row >= MAX_NONFINITE:
             raise NonFiniteError(
                 f"{self._skipped_in_a_row} updates in a row had a non-finite loss or gradient (the last one: "
                 f"loss {loss:g}, gradient norm of the policy {norm:g}, of the critic {value_norm:g}); "
@@ -211,11 +186,7 @@ class Update:
         samples: list[Tensor] = []
         for number, turn in enumerate(parts, 1):
             rows, part = turn.rows, batch.part(turn.rows)
-            reference = self._under("reference", part)
-            proximal = None if self._is_proximal else self._under("proximal", part)
             evaluation = self.adapter.evaluate(*part)
-            if self._is_proximal:
-                proximal = evaluation.log_prob.detach()
             if targets is None:
                 mine = evaluation.value.detach().cpu().float()
                 values = self.ranks.gather(mine if turn.own else mine[:0], len(batch))
@@ -233,8 +204,6 @@ class Update:
                 entropy=evaluation.entropy,
                 factors=None if factors is None else factors[rows].to(device),
                 ratios_per_decision=ratios,
-                log_prob_reference=reference,
-                log_prob_proximal=proximal,
             )
             output = self.algorithm.loss(inputs)
             share = len(rows) / len(batch) if turn.own else 0.0
@@ -261,10 +230,6 @@ class Update:
         """Means over all ranks, from each one's share of them."""
         mine = torch.tensor([list(means.values())], dtype=torch.float64)
         return dict(zip(means, self.ranks.gather(mine, self.ranks.size).sum(0).tolist(), strict=True))
-
-    def _under(self, name: str, part: Part) -> Tensor | None:
-        """log-probs (rows, L) under a copy; None if there is none."""
-        return self.frozen.log_prob(name, *part) if name in self.frozen else None
 
     def _ratios_per_decision(self, factors: Tensor) -> float:
         return float(present(factors, self.algorithm.level, self.adapter.actions).sum()) / len(factors)

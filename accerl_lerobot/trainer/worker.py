@@ -25,7 +25,7 @@ from accerl_lerobot.checkpoint.layout import PRETRAINED, TRAINING_STATE, WEIGHTS
 from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, Schedule
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WEIGHT_SYNC, open_clock
-from accerl_lerobot.trainer.nonfinite import keeping
+from accerl_lerobot.trainer.batch import keeping
 from accerl_lerobot.trainer.peers import Learner, LearnerSettings, Peers
 from accerl_lerobot.transport.endpoint import Transport
 from accerl_lerobot.weights.factory import CONNECT_S, WeightPublisher, make_publisher

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar
 
 import draccus
@@ -27,6 +27,10 @@ PIXELS = "pixels"
 """The type of our own class of learned world models."""
 VIDEOS = "validation"
 """Folder of a run with a video of each validation of its world model."""
+IMAGINATION = "imagination"
+"""Name of the worker that imagines, and of its state."""
+WORLD_LEARNING = "world learning"
+"""Name of the worker that trains the world model."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -276,41 +280,23 @@ class OnlineLearnConfig(Section, section="imagination.learn"):
     them after four decisions, and 2 % after 100 steps on 64 episodes of that policy. So nothing is imagined
     before it has passed validation on the policy's own episodes.
     """
-    held_out: Annotated[float, Range("(0, 1)")] = 0.2
-    """Share of real episodes held out for validation."""
-    validate_every: Annotated[int, Range("[1, 1000000]")] = 16
-    """Real episodes between two validations. Where real episodes are counted, no more are collected until
-    the validation is over. Once all are in, it is repeated after as many steps as so many would have
-    brought, five times at most; a model that has not passed by then is never used."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """Dataset of the pre-training: the model trains on the episodes it already knows, and is validated on
     those that were held out. Of another dataset it trains on all episodes."""
     online: DatasetConfig = field(default_factory=DatasetConfig)
     """Episodes of an earlier policy from the pre-training, used in the same way."""
-    validation: ValidationConfig = field(
-        default_factory=lambda: ValidationConfig(
-            max_windows=120, depth=4, auroc=0.6, false_success=0.5, recall=0.3, false_positives=0.3
-        )
+
+    held_out: ClassVar[float] = 0.2
+    """Share of real episodes held out for validation."""
+    validate_every: ClassVar[int] = 16
+    """Real episodes between two validations. Where real episodes are counted, no more are collected until
+    the validation is over. Once all are in, it is repeated after as many steps as so many would have
+    brought, five times at most; a model that has not passed by then is never used."""
+    validation: ClassVar[ValidationConfig] = ValidationConfig(
+        max_windows=120, depth=4, auroc=0.6, false_success=0.5, recall=0.3, false_positives=0.3
     )
-    """Checks that a model must pass to be used. A dozen held-out episodes say little; beyond that, `guard`
-    watches."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class GuardConfig(Section, section="imagination.guard"):
-    """The kill switch: nothing is imagined any more once imagined rollouts succeed much more often than
-    real episodes."""
-
-    max_gap: Positive = 0.5
-    """Largest difference of the success rates, imagined less real. Rollouts from resets are compared with
-    real episodes of the same time; where `start_at_reset_prob` is 0, rollouts are compared with the episodes
-    they start in. A world model that is promoted later gets another chance. With `start_at_reset_prob`,
-    nothing is compared any more once all real episodes have been played."""
-    window: Annotated[int, Range("[1, 1000000]")] = 100
-    """Imagined rollouts over which the gap is measured. When as many in a row end at once because the model
-    is too uncertain, nothing is imagined any more either."""
-    min_real_episodes: Annotated[int, Range("[1, 1000000]")] = 16
-    """Real episodes required before the gap is evaluated, with `start_at_reset_prob`."""
+    """Checks that a model must pass to be used. A dozen held-out episodes say little; beyond that, the kill
+    switch watches."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -333,26 +319,33 @@ class ImaginationConfig(Section, section="imagination"):
 
     That one is chosen on rollouts with executed actions. A policy that sees imagined frames succeeds more
     often: ``python -m benchmarks ranking`` says at which threshold it succeeds as often as in reality.
-    Validation uses it too, so a strict one needs a lower `learn.validation.recall`.
     """
     rollouts: Annotated[int, Range("[1, 100000]")] = 32
     """Imagined rollouts at a time, as one batch."""
     start_at_reset_prob: Share = 0.0
     """Share of rollouts that start where an episode began; the others start anywhere. The later one starts,
     the less of it is imagined, and the truer is how it ends."""
-    max_uncertainty: Positive = 2.0
+    learn: OnlineLearnConfig = field(default_factory=OnlineLearnConfig)
+
+    samples_per_insert: ClassVar[float] = 2.0
+    """How often an imagined decision is trained on, on average; see `imagined_replay`."""
+    max_uncertainty: ClassVar[float] = 2.0
     """A rollout ends before a prediction with a higher uncertainty, where 1 is the 95th percentile on
     training data."""
-    memory: Annotated[int, Range("[1, 10000000]")] = 4096
+    memory: ClassVar[int] = 4096
     """Newest real decisions that rollouts start at."""
-    guard: GuardConfig = field(default_factory=GuardConfig)
-    replay: ReplayConfig = field(
-        default_factory=lambda: ReplayConfig(
-            capacity=2048, min_decisions=1, samples_per_insert=4.0, ahead=512
-        )
-    )
-    """Size and pace of the replay buffer of imagined segments."""
-    learn: OnlineLearnConfig = field(default_factory=OnlineLearnConfig)
+    max_gap: ClassVar[float] = 0.5
+    """The kill switch: largest difference of the success rates, imagined less real.
+
+    Rollouts from resets are compared with real episodes of the same time; where `start_at_reset_prob` is 0,
+    rollouts are compared with the episodes they start in. A world model that is promoted later gets another
+    chance. With `start_at_reset_prob`, nothing is compared any more once all real episodes have been played.
+    """
+    window: ClassVar[int] = 100
+    """Imagined rollouts over which the gap is measured. When as many in a row end at once because the model
+    is too uncertain, nothing is imagined any more either."""
+    min_real_episodes: ClassVar[int] = 16
+    """Real episodes required before the gap is evaluated, with `start_at_reset_prob`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -362,6 +355,10 @@ class ImaginationConfig(Section, section="imagination"):
         if self.share and self.path is None and self.kind.needs_path:
             remedy = "give the folder world_model that accerl world-model has written"
             raise InputError("imagination.path", None, remedy)
+
+    def imagined_replay(self, replay: ReplayConfig) -> ReplayConfig:
+        """Size and pace of the replay buffer of imagined segments, from those of the run's."""
+        return replace(replay, min_decisions=1, samples_per_insert=self.samples_per_insert)
 
     @property
     def kind(self) -> ModelKind:

@@ -30,7 +30,7 @@ from accerl_lerobot.checkpoint.tensors import copied
 from accerl_lerobot.envs.base import WorldSpec
 from accerl_lerobot.experience import IMAGINED, Decision, Observation, Origin, Request, Segment
 from accerl_lerobot.rollout.segments import SegmentBuilder
-from accerl_lerobot.world_model.config import ImaginationConfig
+from accerl_lerobot.world_model.config import IMAGINATION, ImaginationConfig
 from accerl_lerobot.world_model.contract import (
     ActionHistory,
     Context,
@@ -41,7 +41,6 @@ from accerl_lerobot.world_model.contract import (
     replace_rows,
 )
 from accerl_lerobot.world_model.data import executed_actions, model_arrays, policy_observation
-from accerl_lerobot.world_model.guard import IMAGINATION, ImaginationCounters, KillSwitch
 from accerl_lerobot.world_model.registry import (
     ImaginationModels,
     OracleModel,
@@ -220,6 +219,85 @@ class _Held:
             self.allowed[: spec.context - 1] = False
 
 
+@kind
+@dataclass
+class ImaginationCounters:
+    """Counters of imagined rollouts so far."""
+
+    rollouts: int = 0
+    """Ended rollouts."""
+    decisions: int = 0
+    successes: int = 0
+    uncertain: int = 0
+    """Rollouts that ended before a prediction that was too uncertain."""
+
+
+class KillSwitch:
+    """Trips when imagined rollouts succeed too much more often than real episodes.
+
+    Each real outcome is compared with the success rate of imagined rollouts at that time. As both are of
+    nearly the same policy, a policy that improves does not trip the switch.
+
+    Args:
+        max_gap: largest difference of the two success rates.
+        window: imagined rollouts over which their rate is taken; until it is full, nothing is compared.
+        outcomes: real outcomes over which the difference is taken; the same holds for them.
+    """
+
+    def __init__(self, max_gap: float, window: int, outcomes: int) -> None:
+        self.max_gap, self.tripped = max_gap, False
+        self._rollouts: deque[bool] = deque(maxlen=window)
+        self._pairs: deque[tuple[float, bool]] = deque(maxlen=outcomes)
+        # Kept as numbers, as they are read on another thread too.
+        self._share = self._imagined = self._real = float("nan")
+
+    def add_imagined(self, success: bool) -> None:
+        """Takes the outcome of an imagined rollout."""
+        self._rollouts.append(success)
+        self._share = sum(self._rollouts) / len(self._rollouts)
+
+    def add_real(self, success: bool) -> None:
+        """Takes a real outcome; it does not count before the window is full."""
+        if len(self._rollouts) < (self._rollouts.maxlen or 0):
+            return
+        self._pairs.append((self._share, success))
+        count = len(self._pairs)
+        self._imagined = sum(share for share, _ in self._pairs) / count
+        self._real = sum(real for _, real in self._pairs) / count
+        if count == self._pairs.maxlen and self._imagined - self._real > self.max_gap:
+            self.tripped = True
+
+    def reset(self) -> None:
+        """Starts again for another world model; unless it has tripped, pairs of the last one still count."""
+        self._rollouts.clear()
+        self._share = float("nan")
+        if self.tripped:
+            self._pairs.clear()
+            self._imagined = self._real = float("nan")
+        self.tripped = False
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs; see `snapshot`."""
+        shares = (self._share, self._imagined, self._real, self.tripped)
+        return {"rollouts": list(self._rollouts), "pairs": list(self._pairs), "shares": shares}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continues from a `state`."""
+        self._rollouts.extend(state["rollouts"])
+        self._pairs.extend(state["pairs"])
+        self._share, self._imagined, self._real, self.tripped = state["shares"]
+
+    @property
+    def share(self) -> float:
+        """Success rate of the newest imagined rollouts; NaN before there are any."""
+        return self._share
+
+    @property
+    def shares(self) -> tuple[float, float]:
+        """Success rates, imagined and real, at the same times; NaN before there are any."""
+        return self._imagined, self._real
+
+
 class RolloutSettings(NamedTuple):
     """Settings that imagined rollouts share with the real ones of their run."""
 
@@ -270,8 +348,8 @@ class Imagination:
         self.config, self.counters = config, ImaginationCounters()
         # True if some rollouts are whole episodes, which can be compared with real ones of the same time.
         self._compares_whole = config.start_at_reset_prob > 0
-        outcomes = config.guard.min_real_episodes if self._compares_whole else config.guard.window
-        self.switch = KillSwitch(config.guard.max_gap, config.guard.window, outcomes)
+        outcomes = config.min_real_episodes if self._compares_whole else config.window
+        self.switch = KillSwitch(config.max_gap, config.window, outcomes)
         self.version = 0
         self.awaits_model = config.learns
         """True if no model has passed validation yet."""
@@ -362,7 +440,7 @@ class Imagination:
         """True if anything is to be imagined now."""
         if self.awaits_model or self.switch.tripped:
             return False
-        return self._uncertain_in_a_row < self.config.guard.window
+        return self._uncertain_in_a_row < self.config.window
 
     def requests(self) -> list[Request]:
         """Requests for decisions, one per rollout; none before there is a real segment, or switched off."""

@@ -15,7 +15,7 @@ def make_inputs(
 ) -> LossInputs:
     """Random float64 batch; `spread` is the standard deviation of log ρ per factor.
 
-    Every factor is an action, π_prox lies between μ and π, and the critic's error is squared.
+    Every factor is an action, and the critic's error is squared.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -33,12 +33,10 @@ def make_inputs(
         "entropy": normal(n).abs().requires_grad_(),
     }
     fields["value_error"] = (fields["value"] - fields["returns"]).square().requires_grad_()
-    fields["log_prob_reference"] = old + spread * normal(n, factors)
-    fields["log_prob_proximal"] = old + spread * normal(n, factors)
     return LossInputs(**{**fields, **replace})
 
 
-def one(log_ratio: float, advantage: float, log_proximal: float | None = None) -> LossInputs:
+def one(log_ratio: float, advantage: float) -> LossInputs:
     """A single decision with one factor; log-probs are relative to μ's."""
     zero = torch.zeros(1, dtype=torch.float64)
     new = torch.tensor([[log_ratio]], dtype=torch.float64, requires_grad=True)
@@ -51,7 +49,6 @@ def one(log_ratio: float, advantage: float, log_proximal: float | None = None) -
         value_error=zero,
         returns=zero,
         entropy=zero,
-        log_prob_proximal=torch.full_like(new, log_ratio if log_proximal is None else log_proximal),
     )
 
 

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from accerl_lerobot.algorithms import AlgorithmConfig
+from accerl_lerobot.algorithms import RatioConfig
 
 
 def gae(
@@ -57,13 +57,12 @@ def mean(terms: list[float]) -> float:
     return sum(terms) / len(terms)
 
 
-def gipo(logs: Ragged, advantage: np.ndarray, sigma: float, sigma_negative: float) -> float:
+def gipo(logs: Ragged, advantage: np.ndarray, sigma: float) -> float:
     """−E[ω ρ Â]."""
     terms = []
     for row, a in zip(logs, advantage, strict=True):
-        width = sigma if a > 0 else sigma_negative
         for x in row:
-            weight = math.exp(-0.5 * (x / width) ** 2)
+            weight = math.exp(-0.5 * (x / sigma) ** 2)
             terms.append(weight * math.exp(x) * a)
     return -mean(terms)
 
@@ -79,59 +78,8 @@ def ppo(logs: Ragged, advantage: np.ndarray, low: float, high: float) -> float:
     return -mean(terms)
 
 
-def decoupled(
-    moved: Ragged, behaviour: Ragged, advantage: np.ndarray, low: float, high: float, cap: float
-) -> float:
-    """−E[w · min(r Â, clip(r, 1 − low, 1 + high) Â)], w = 0 above the cap.
-
-    Args:
-        moved: log π/π_prox.
-        behaviour: log π_prox/μ.
-    """
-    terms = []
-    for row, other, a in zip(moved, behaviour, advantage, strict=True):
-        for x, y in zip(row, other, strict=True):
-            weight, r = math.exp(y), math.exp(x)
-            clipped = min(max(r, 1 - low), 1 + high)
-            terms.append(0.0 if weight > cap else weight * min(r * a, clipped * a))
-    return -mean(terms)
-
-
-def sapo(logs: Ragged, advantage: np.ndarray, tau_positive: float, tau_negative: float) -> float:
-    """−E[(4/τ) σ(τ(ρ − 1)) Â]."""
-    terms = []
-    for row, a in zip(logs, advantage, strict=True):
-        tau = tau_positive if a > 0 else tau_negative
-        for x in row:
-            terms.append(4 / tau / (1 + math.exp(-tau * (math.exp(x) - 1))) * a)
-    return -mean(terms)
-
-
-def importance(logs: Ragged, advantage: np.ndarray, cap: float) -> float:
-    """−E[min(ρ, cap) Â]."""
-    return -mean([min(math.exp(x), cap) * a for row, a in zip(logs, advantage, strict=True) for x in row])
-
-
-def awr(log_prob: Ragged, advantage: np.ndarray, beta: float, cap: float) -> float:
-    """−E[min(exp(Â/β), cap) log π]."""
-    terms = []
-    for row, a in zip(log_prob, advantage, strict=True):
-        for x in row:
-            terms.append(min(math.exp(a / beta), cap) * x)
-    return -mean(terms)
-
-
-def shared(
-    error: np.ndarray, logs: Ragged, apart: Ragged, entropy: np.ndarray, config: AlgorithmConfig
-) -> float:
-    """value_coef · error + kl_coef · KL(μ‖π) + reference_coef · KL(π‖π_ref) − entropy_coef · H.
-
-    Args:
-        logs: log π/μ.
-        apart: log π/π_ref.
-    """
+def shared(error: np.ndarray, logs: Ragged, entropy: np.ndarray, config: RatioConfig) -> float:
+    """value_coef · error + kl_coef · KL(μ‖π) − entropy_coef · H, where `logs` are log π/μ."""
     kl = mean([math.exp(x) - 1 - x for row in logs for x in row])
-    pairs = [p for row, other in zip(logs, apart, strict=True) for p in zip(row, other, strict=True)]
-    reference = mean([math.exp(x) * (math.exp(-y) - 1 + y) for x, y in pairs])
-    total = config.value_coef * mean(list(error)) + config.kl_coef * kl + config.reference_coef * reference
+    total = config.value_coef * mean(list(error)) + config.kl_coef * kl
     return float(total - config.entropy_coef * mean(list(entropy)))

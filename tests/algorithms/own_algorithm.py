@@ -18,8 +18,12 @@ class OwnReinforceConfig(RatioConfig):
     """Weight of the objective."""
 
     def loss(self, inputs: LossInputs) -> LossOutput:
-        from accerl_lerobot.algorithms.objective import advantage_column, assemble, mean_over_ratios
-        from accerl_lerobot.algorithms.ratio import at_level
+        from accerl_lerobot.algorithms.objective import (
+            advantage_column,
+            assemble,
+            at_level,
+            mean_over_ratios,
+        )
 
         log_prob = at_level(inputs.log_prob_new, inputs, self.level)
         log_ratio = at_level(inputs.log_prob_new - inputs.log_prob_old, inputs, self.level).detach()

@@ -16,7 +16,7 @@ from accerl_lerobot.demos import backbone
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     build = bench.lerobot_config
-    sizes = backbone.BackboneConfig(
+    sizes = backbone.BackboneSizes(
         hidden=32, heads=2, kv_heads=1, vision_hidden=16, vision_layers=1, patch=32
     )
     monkeypatch.setattr(backbone, "SMOLVLM2_500M", sizes)

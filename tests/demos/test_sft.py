@@ -51,9 +51,7 @@ TINY = SFTConfig(
         "train_expert_only": False,
         "freeze_vision_encoder": False,
     },
-    backbone=BackboneConfig(
-        hidden=32, heads=2, kv_heads=1, vision_hidden=16, vision_layers=1, vision_heads=2, patch=8, image=32
-    ),
+    backbone=BackboneConfig(hidden=32, patch=8, image=32),
 )
 
 
@@ -157,7 +155,7 @@ def test_what_cannot_be_cached_is_read_the_stock_way(
         ),
     )
     monkeypatch.setattr(guarded_train, "MAX_BYTES", limit)
-    monkeypatch.setattr(sys, "argv", ["lerobot-train", "--cache_items=true"])
+    monkeypatch.setattr(sys, "argv", ["lerobot-train"])
     guarded_train.main()
     assert isinstance(got[0], guarded_train.CachedDataset) == expected and got[1] == "evaluation"
 
@@ -281,10 +279,7 @@ def test_the_command_line(tmp_path: Path):
     command = sft_command(
         TINY, DatasetConfig(repo_id="a/b", root="/data", revision="v1"), tmp_path / "sft", 3, "cpu"
     )
-    assert (
-        command[:3] == [sys.executable, "-m", "accerl_lerobot.demos.guarded_train"]
-        and "--cache_items=true" in command
-    )
+    assert command[:3] == [sys.executable, "-m", "accerl_lerobot.demos.guarded_train"]
     for argument in (
         "--policy.type=smolvla",
         "--policy.resize_imgs_with_padding=[32, 32]",
@@ -304,9 +299,9 @@ def test_the_command_line(tmp_path: Path):
     start = tmp_path / "start"
     start.mkdir()
     (start / "config.json").write_text('{"type": "smolvla"}')
-    config = SFTConfig(steps=2, init_path=str(start), cache=False, extra_args=["--log_freq=1"])
+    config = SFTConfig(steps=2, init_path=str(start), extra_args=["--log_freq=1"])
     command = sft_command(config, HUB, tmp_path / "sft", 0, "cuda")
-    assert "--cache_items=true" not in command and f"--policy.path={start}" in command
+    assert f"--policy.path={start}" in command
     assert command[-1] == "--log_freq=1"
     assert not [a for a in command if a.startswith(("--policy.type", "--dataset.root", "--dataset.revision"))]
 

@@ -166,8 +166,3 @@ def test_configs_survive_the_command_line(case: Case):
 def test_zero_steps_are_refused(config: EnvConfig):
     with pytest.raises(InputError, match="env.max_steps=0"):
         dataclasses.replace(config, max_steps=0)
-
-
-def test_shortened_only_ever_lowers_the_limit():
-    config = SimulatedConfig(max_steps=25)
-    assert config.shortened(10).max_steps == 10 and config.shortened(99) == config

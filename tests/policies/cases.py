@@ -154,7 +154,7 @@ def slow_act(adapter: LeRobotAdapter, asked: list[Request], latent: Latent) -> l
         for row in range(3):
             weights = arrays(adapter.family.std)
             hidden = layer_norm(seen[-1][row, 0].numpy(), weights, "norm")
-            std = bounded(linear(hidden, weights, "out"), config.std_min, config.std_max)
+            std = bounded(linear(hidden, weights, "out"), *config.bounds)
             total += sum(normal_log_prob(u[row, dim], mean[row, dim], std[dim]) for dim in range(2))
         totals.append(total)
     hook.remove()
@@ -368,7 +368,7 @@ CASES = {
         kind="act",
         write=write_act,
         # Its ResNet rounds the chunk by up to 1e-6 from batch to batch, and log ρ by that over the std.
-        samplers=(GaussianSamplerConfig(std=0.5, std_max=1.0),),
+        samplers=(GaussianSamplerConfig(std=0.5),),
         slow=slow_act,
         stock=stock_act,
         parts=("model.backbone", "model.encoder.", "model.decoder.", "action_head"),

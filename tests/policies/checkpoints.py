@@ -65,9 +65,9 @@ def write_policy(
 
 def with_backbone(directory: Path, image: int) -> dict[str, Any]:
     """Fields of a policy on a tiny SmolVLM, which is written beside the policy's folder."""
-    from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
+    from accerl_lerobot.demos.backbone import BackboneSizes, write_backbone
 
-    sizes = BackboneConfig(
+    sizes = BackboneSizes(
         hidden=32,
         heads=2,
         kv_heads=1,

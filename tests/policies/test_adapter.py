@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from accerl_lerobot.policies.adapter import LeRobotAdapter, ValueHead, stack_observations
-from accerl_lerobot.policies.config import ValueHeadConfig
 from tests.policies.checkpoints import write_act
 from tests.policies.tiny import TEXTS, adapter_at, requests
 from tests.rounding import assert_close
@@ -61,10 +60,10 @@ def test_actions_come_back_in_the_world_s_units(tiny_checkpoint: Path):
 # ---- the critic
 
 
-def head(**options: object) -> ValueHead:
+def head() -> ValueHead:
     """With weights of ordinary size, as after some training."""
     torch.manual_seed(0)
-    module = ValueHead(6, ValueHeadConfig(**options))
+    module = ValueHead(6)
     with torch.no_grad():
         for parameter in module.parameters():
             parameter.normal_()
@@ -77,7 +76,7 @@ def inputs() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def test_a_new_critic_says_zero():
-    assert torch.equal(ValueHead(6, ValueHeadConfig())(*inputs()), torch.zeros(2))
+    assert torch.equal(ValueHead(6)(*inputs()), torch.zeros(2))
 
 
 def test_initial_weights_depend_on_the_seed_alone_and_not_on_what_was_drawn_before():
@@ -85,7 +84,7 @@ def test_initial_weights_depend_on_the_seed_alone_and_not_on_what_was_drawn_befo
     for seed, draws in ((3, 0), (3, 1000), (4, 0)):
         torch.manual_seed(seed)
         torch.randn(draws)
-        heads.append(ValueHead(6, ValueHeadConfig()).hidden.weight.detach())
+        heads.append(ValueHead(6).hidden.weight.detach())
     assert torch.equal(heads[0], heads[1]) and not torch.equal(heads[0], heads[2])
     assert heads[0].abs().max() <= 6**-0.5 and heads[0].std() == pytest.approx(6**-0.5 / 3**0.5, rel=0.1)
 

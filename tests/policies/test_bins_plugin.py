@@ -45,9 +45,7 @@ SFT = SFTConfig(
         "resize_imgs_with_padding": [32, 32],
         "freeze_vision_encoder": False,
     },
-    backbone=BackboneConfig(
-        hidden=32, heads=2, kv_heads=1, vision_hidden=16, vision_layers=1, vision_heads=2, patch=8, image=32
-    ),
+    backbone=BackboneConfig(hidden=32, patch=8, image=32),
     extra_args=["--log_freq=10"],
 )
 

@@ -159,7 +159,7 @@ def test_what_is_ours_is_checked_too(copied: Path, text: str, why: str):
 
 def test_a_critic_of_another_size(copied: Path):
     shutil.copy(copied / "model.safetensors", copied / "value_head.safetensors")
-    refused(copied, "value_head.safetensors: accerl.json says another critic than it is")
+    refused(copied, "value_head.safetensors: it is no critic of this policy")
 
 
 # ---- code and pickles

@@ -120,7 +120,7 @@ RUNS = {
     ),
     "act": Run(
         write=lambda path: write_act(path, image=8, chunk=4, executed=4),
-        sampler=GaussianSamplerConfig(std=0.4, std_min=0.1, std_max=1.0),
+        sampler=GaussianSamplerConfig(std=0.4),
         env=replace(ENV, image_size=8),
         updates=40,
         batch=96,

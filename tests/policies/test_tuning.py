@@ -57,7 +57,7 @@ def test_low_rank_adapters_start_as_the_policy_itself_and_are_saved_merged(
     written, name: str, tmp_path: Path
 ):
     path, asked = written(name), CASES[name].requests(8)
-    tuning = TuningConfig(mode="lora", rank=2, alpha=16, targets=TARGETS[name])
+    tuning = TuningConfig(mode="lora", rank=2, targets=TARGETS[name])
     torch.manual_seed(0)
     adapter, plain = adapter_at(path, tuning=tuning), adapter_at(path)
     names = policy_names(adapter)
@@ -101,14 +101,14 @@ def test_lerobot_freezes_some_of_smolvla_by_itself(path: Path):
 
 
 def test_the_merged_weight_by_hand(path: Path, tmp_path: Path):
-    tuning = TuningConfig(mode="lora", rank=2, alpha=6, targets=r"model\.action_out_proj")
+    tuning = TuningConfig(mode="lora", rank=2, targets=r"model\.action_out_proj")
     adapter = adapter_at(path, tuning=tuning)
     layer = adapter.policy.model.action_out_proj
     with torch.no_grad():
         layer.lora_B["default"].weight.normal_()
     save_pretrained(adapter, tmp_path / "saved", PolicyConfig(path=str(path), device="cpu", tuning=tuning))
     product = layer.lora_B["default"].weight @ layer.lora_A["default"].weight
-    expected = layer.base_layer.weight + 6 / 2 * product
+    expected = layer.base_layer.weight + product
     weight = load_file(tmp_path / "saved" / "model.safetensors")["model.action_out_proj.weight"]
     assert_close(weight, expected)
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from accerl_lerobot.algorithms import AlgorithmConfig, DecoupledConfig, GIPOConfig, PPOConfig
+from accerl_lerobot.algorithms import AlgorithmConfig, GIPOConfig, PPOConfig
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies.adapter import Evaluation, PolicyAdapter
@@ -143,13 +143,12 @@ def cases() -> dict[str, Case]:
         for number, segment in enumerate(batch):
             segment.advantage = np.full(len(segment), 1.0 - number, np.float32)
     few = [make_segments((1,) * (1 + i % 3), seed=i) for i in range(6)]
-    reference = GIPOConfig(reference_coef=0.1, kl_coef=0.1)
-    shrunk = {"grad_clip": 0.05, "weight_decay": 0.1}
+    shrunk = {"grad_clip": 0.05}
     return {
-        "whole": Case(LinearAdapter, reference, plain | shrunk | {"probe_every": 1}, uneven),
+        "whole": Case(LinearAdapter, GIPOConfig(), plain | shrunk | {"probe_every": 1}, uneven),
         "parts": Case(
             LinearAdapter,
-            DecoupledConfig(reference_coef=0.1),
+            PPOConfig(kl_coef=0.1),
             plain | {"micro_batch": 2, "advantage_memory": 0.5, "probe_every": 1},
             uneven,
         ),
@@ -157,7 +156,7 @@ def cases() -> dict[str, Case]:
         "broken": Case(LinearAdapter, GIPOConfig(), plain | {"micro_batch": 3}, broken),
         "counted": Case(LinearAdapter, GIPOConfig(level="token"), plain | {"micro_batch": 2}, counted),
         "compared": Case(LinearAdapter, GIPOConfig(advantage="group"), plain, compared),
-        "layers": Case(LayeredAdapter, reference, plain | {"micro_batch": 2, "probe_every": 1}, uneven),
+        "layers": Case(LayeredAdapter, GIPOConfig(), plain | {"micro_batch": 2, "probe_every": 1}, uneven),
         "forgetful": Case(LayeredAdapter, GIPOConfig(), plain | {"activation_checkpointing": True}, uneven),
     }
 

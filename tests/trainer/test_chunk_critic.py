@@ -24,10 +24,10 @@ from accerl_lerobot.policies.teacher import TASK_BITS, Ensemble, Teacher, WithTe
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.seeds import noise_seed
+from accerl_lerobot.trainer.batch import NonFiniteError
 from accerl_lerobot.trainer.chunk_critic import ChunkCriticUpdate, Critic
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.trainer.memory import Memory
-from accerl_lerobot.trainer.nonfinite import NonFiniteError
 from accerl_lerobot.trainer.off_policy import OffPolicyUpdate
 from tests.runs import tiny_run
 
@@ -343,7 +343,7 @@ def test_self_imitation_goes_where_successes_are(tiny_checkpoint: Path, known: b
 def test_a_step_imitates_successes_only(tiny_checkpoint: Path):
     """The loss of a step equals the family's, averaged over those rows of its batch that succeeded."""
     adapter = load_adapter(PolicyConfig(path=str(tiny_checkpoint), device="cpu"))
-    config = TrainerConfig(warmup_updates=0, value_warmup_updates=0, lr=0.0, weight_decay=0.0)
+    config = TrainerConfig(warmup_updates=0, value_warmup_updates=0, lr=0.0)
     update = OffPolicyUpdate(adapter, SelfImitationConfig(policy_steps=0.25), config)
     family = adapter.family
     family.imitation_loss = lambda encoded, chunk: chunk[:, 0, 0] + 0 * encoded.features.sum((1, 2))
@@ -393,9 +393,9 @@ def test_the_critic_computes_in_fp32_beside_a_policy_in_bf16(
 
 
 def test_what_is_not_finite_is_skipped_and_ends_the_run(tiny_checkpoint: Path):
-    update = learner(tiny_checkpoint, ChunkCriticConfig(policy_steps=1.0), max_nonfinite=3)
+    update = learner(tiny_checkpoint, ChunkCriticConfig(policy_steps=1.0))
     before = update.adapter.export_trainable()
-    with pytest.raises(NonFiniteError, match="3 steps in a row"):
+    with pytest.raises(NonFiniteError, match="5 steps in a row"):
         with torch.no_grad():
             update.teacher.network.biases[0].fill_(float("nan"))
         update.step([episode([0.0, 0.0, 0.0, 1.0])])

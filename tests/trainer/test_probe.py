@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +14,10 @@ import torch
 
 from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.experience import Segment
+from accerl_lerobot.policies.adapter import Evaluation
+from accerl_lerobot.trainer.batch import Part, collate
 from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.probe import Probe
 from accerl_lerobot.trainer.update import Update
 from tests.trainer.linear import LinearAdapter, decided_by, make_segments
 
@@ -120,19 +124,19 @@ def test_only_published_versions_are_probed():
 
 def test_nothing_is_probed_when_it_is_off_nor_after_the_last_update():
     update = make_update(replace(CONFIG, probe_every=0))
-    assert readings(update, 4) == [] and "probe" not in update.frozen
+    assert readings(update, 4) == [] and not update._probe._copy
     update = make_update(replace(CONFIG, updates=3))
-    assert readings(update, 3) == [1] and "probe" not in update.frozen
+    assert readings(update, 3) == [1] and not update._probe._copy
 
 
 def test_the_copy_is_freed_when_it_has_been_read():
     update = make_update()
-    assert "probe" in update.frozen
+    assert update._probe._copy
     update.step(fresh(update))
-    assert "probe" not in update.frozen
+    assert not update._probe._copy
     update.step(fresh(update))
     update.step(fresh(update))
-    assert "probe" in update.frozen
+    assert update._probe._copy
 
 
 def test_a_version_that_never_acted_is_given_up_for_the_newest():
@@ -165,3 +169,63 @@ def test_measuring_changes_nothing_that_is_learnt():
         expected = without.step(fresh(without, i))
         assert {k: v for k, v in metrics.items() if k not in NAMES} == expected
     assert all(torch.equal(p, without.adapter.copy()[k]) for k, p in with_.adapter.copy().items())
+
+
+# ---- the copy
+
+
+def whole(segments: Sequence[Any]) -> Part:
+    batch = collate(segments)
+    return batch.part(np.arange(len(batch)))
+
+
+def moved(adapter: LinearAdapter, by: float) -> None:
+    with torch.no_grad():
+        for parameter in adapter.trainable().values():
+            parameter.add_(by)
+
+
+def test_log_probs_are_those_of_the_copied_weights_whatever_happens_to_the_live_ones():
+    adapter, part = LinearAdapter(), whole(make_segments(LENGTHS))
+    probe = Probe(adapter, CONFIG)
+    then = adapter.evaluate(*part).log_prob.detach()
+    for _ in range(2):
+        moved(adapter, 0.3)
+        assert torch.equal(probe.log_prob(part), then)
+        assert not torch.equal(adapter.evaluate(*part).log_prob, then)
+
+
+def test_the_live_weights_are_back_afterwards_in_their_own_memory():
+    adapter, part = LinearAdapter(), whole(make_segments(LENGTHS))
+    probe = Probe(adapter, CONFIG)
+    assert [tensor.shape for tensor in probe._copy] == [adapter.weight.shape], "without the critic's"
+    moved(adapter, 0.3)
+    before, places = adapter.copy(), {k: p.data_ptr() for k, p in adapter.trainable().items()}
+    assert not probe.log_prob(part).requires_grad
+    for name, parameter in adapter.trainable().items():
+        assert torch.equal(parameter, before[name]) and parameter.data_ptr() == places[name]
+        assert parameter.requires_grad and parameter.grad is None
+
+
+@pytest.mark.parametrize("broken", ["evaluate", "copy"])
+def test_the_live_weights_are_back_even_after_an_error(broken: str, monkeypatch: pytest.MonkeyPatch):
+    adapter, part = LinearAdapter(), whole(make_segments(LENGTHS))
+    adapter.second = torch.nn.Parameter(torch.ones(3))
+    monkeypatch.setattr(adapter, "trainable", lambda: {"a": adapter.weight, "b": adapter.second})
+    probe = Probe(adapter, CONFIG)
+    moved(adapter, 0.3)
+    before = adapter.copy()
+    seen: list[bool] = []
+
+    def evaluate(*_: Any) -> Evaluation:
+        seen.append(torch.equal(adapter.weight, before["a"]))
+        raise MemoryError("too many rows")
+
+    if broken == "evaluate":
+        monkeypatch.setattr(adapter, "evaluate", evaluate)
+    else:
+        probe._copy.pop()  # the first parameter is swapped, then it fails
+    with pytest.raises((MemoryError, ValueError)):
+        probe.log_prob(part)
+    assert seen == ([False] if broken == "evaluate" else [])
+    assert all(torch.equal(p, before[k]) for k, p in adapter.trainable().items())

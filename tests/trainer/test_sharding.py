@@ -141,7 +141,6 @@ def test_one_goes_on_from_the_checkpoint_of_ranks(made: Any, alone: dict[str, di
 def test_the_cases_meet_what_they_are_for(alone: dict[str, dict[str, Any]]):
     assert alone["broken"]["metrics"][-1]["skipped"] == 2
     assert any("logprob/mismatch_mean" in metrics for metrics in alone["whole"]["metrics"])
-    assert all(metrics["kl_reference"] > 0 for metrics in alone["layers"]["metrics"][2:])
     assert min(metrics["decisions"] for metrics in alone["few"]["metrics"]) == 1, "four ranks, one decision"
     whole = alone["whole"]["metrics"]
     assert all(metrics["value_grad_norm"] > 0.05 for metrics in whole), "clipped"

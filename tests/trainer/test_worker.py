@@ -17,8 +17,8 @@ from accerl_lerobot.experience import Segment
 from accerl_lerobot.policies import loading
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.trainer import worker as module
+from accerl_lerobot.trainer.batch import NonFiniteError
 from accerl_lerobot.trainer.config import TrainerConfig
-from accerl_lerobot.trainer.nonfinite import NonFiniteError
 from accerl_lerobot.trainer.peers import LearnerSettings
 from accerl_lerobot.trainer.worker import TrainerWorker
 from accerl_lerobot.weights import factory
@@ -135,7 +135,7 @@ def test_weights_held_back_are_published_late_and_the_last_at_once():
 
 
 def test_a_batch_that_nothing_can_be_learnt_from_is_kept(tmp_path: Path):
-    stage = Stage(updates=6, max_nonfinite=2, directory=tmp_path)
+    stage = Stage(updates=9, directory=tmp_path)
     good = stage._sample
 
     def sample(decisions: int, version: int) -> list[Segment]:
@@ -145,13 +145,13 @@ def test_a_batch_that_nothing_can_be_learnt_from_is_kept(tmp_path: Path):
         return segments
 
     stage.replay = Handle(sample=sample, learnt=lambda: None)
-    with pytest.raises(NonFiniteError, match=r"2 updates in a row.*its batch is in .*nonfinite-000004\.json"):
+    with pytest.raises(NonFiniteError, match=r"5 updates in a row.*its batch is in .*nonfinite-000007\.json"):
         stage.run()
-    kept = snapshot.load(tmp_path / "nonfinite-000004")
-    assert kept["update"] == 4 and "loss nan" in kept["said"]
-    assert [segment.key for segment in kept["segments"]] == ["4.0", "4.1"]
+    kept = snapshot.load(tmp_path / "nonfinite-000007")
+    assert kept["update"] == 7 and "loss nan" in kept["said"]
+    assert [segment.key for segment in kept["segments"]] == ["7.0", "7.1"]
     assert np.isnan(kept["segments"][0].reward[0])
-    assert [record["update"] for record in stage.worker.metrics()] == [1, 2, 3]
+    assert [record["update"] for record in stage.worker.metrics()] == [1, 2, 3, 4, 5, 6]
 
 
 def test_a_closed_replay_ends_it_early():

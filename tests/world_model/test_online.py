@@ -30,6 +30,7 @@ from accerl_lerobot.world_model.online import (
     episode_weights,
 )
 from accerl_lerobot.world_model.pixels import PixelWorldModel
+from tests.runs import adjusted
 from tests.world_model.real_segments import SPEC, K, real_episode
 
 NETWORK = NetworkConfig(space_to_depth=2, channels=(8, 8), condition=8, planes=2)
@@ -39,8 +40,9 @@ def learner(**config: Any) -> OnlineLearner:
     torch.manual_seed(0)
     known = PretrainingEpisodes(config.pop("offline", []), config.pop("held_out_offline", []))
     threshold = config.pop("threshold", None)
-    fields = {"steps_per_episode": 2.0, "validate_every": 4, "held_out": 0.25}
-    learn = OnlineLearnConfig(**(fields | config), validation=ValidationConfig(depth=2))
+    fields: dict[str, Any] = {"steps_per_episode": 2.0, "validate_every": 4, "held_out": 0.25}
+    fields |= {"validation": ValidationConfig(depth=2)} | config
+    learn = adjusted(OnlineLearnConfig, **fields)(steps_per_episode=fields.pop("steps_per_episode"))
     model = PixelWorldModel(SPEC, PixelModelConfig(network=NETWORK))
     imagination = ImaginationConfig(learn=learn, threshold=threshold)
     made = OnlineLearner(model, new_success_model(K), imagination, known, seed=0)

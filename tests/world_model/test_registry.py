@@ -57,7 +57,7 @@ def begun(model: WorldModel, starts: list[Start]) -> State:
 
 
 def starts_of(*seeds: int, solve_at: int = 99) -> tuple[list[Start], dict[int, object]]:
-    pool = StartPool(SPEC, ImaginationConfig(memory=1000))
+    pool = StartPool(SPEC, ImaginationConfig())
     segments = {seed: real_episode(seed, solve_at=solve_at)[0] for seed in seeds}
     for segment in segments.values():
         pool.add(segment)

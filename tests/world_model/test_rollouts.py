@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
@@ -17,7 +18,7 @@ from accerl_lerobot.envs import make_world
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import IMAGINED, REAL, Decision, Request, Segment
 from accerl_lerobot.world_model import rollouts
-from accerl_lerobot.world_model.config import GuardConfig, ImaginationConfig, OnlineLearnConfig
+from accerl_lerobot.world_model.config import ImaginationConfig, OnlineLearnConfig
 from accerl_lerobot.world_model.contract import ActionHistory, Context, Prediction, State, WorldModel
 from accerl_lerobot.world_model.online import Promotion
 from accerl_lerobot.world_model.registry import (
@@ -26,7 +27,8 @@ from accerl_lerobot.world_model.registry import (
     ShuffledModel,
     check_fit,
 )
-from accerl_lerobot.world_model.rollouts import Imagination, RolloutSettings
+from accerl_lerobot.world_model.rollouts import Imagination, KillSwitch, RolloutSettings
+from tests.runs import adjusted
 from tests.world_model.real_segments import SPEC, WORLD, K, decided, real_episode
 
 WORLD_SPEC = make_world(WORLD).spec
@@ -82,6 +84,9 @@ def bright(monkeypatch: pytest.MonkeyPatch) -> Any:
     return Bright()
 
 
+CONSTANTS = ("window", "min_real_episodes", "max_gap", "max_uncertainty")
+
+
 def imagination(
     model: WorldModel, success: Any = None, *, fails: bool = True, world: Any = WORLD_SPEC, **config: Any
 ) -> tuple[Imagination, list[Segment]]:
@@ -90,10 +95,12 @@ def imagination(
         "share": 0.5, "path": "x", "rollouts": 4, "start_at_reset_prob": 0.0, "model": kind,
         "learn": OnlineLearnConfig(steps_per_episode=0),
     }  # fmt: skip
+    constants = {name: config.pop(name) for name in CONSTANTS if name in config}
     made: list[Segment] = []
     settings = RolloutSettings(decision_cost=0.01, time_limit_fails=fails, seed=0)
     models = ImaginationModels(model, success)
-    batch = Imagination(models, world, ImaginationConfig(**(fields | config)), settings, made.append)
+    given = adjusted(ImaginationConfig, **constants)(**(fields | config))
+    batch = Imagination(models, world, given, settings, made.append)
     return batch, made
 
 
@@ -215,7 +222,8 @@ def test_rollouts_that_succeed_too_often_are_switched_off_until_a_promotion(brig
         Counting(),
         bright,
         rollouts=4,
-        guard=GuardConfig(window=4, min_real_episodes=4, max_gap=0.5),
+        window=4,
+        min_real_episodes=4,
         world=ENDLESS,
     )
     for seed in range(8):
@@ -235,7 +243,8 @@ def test_rollouts_from_resets_are_compared_with_real_episodes(bright: Any):
         Counting(),
         bright,
         rollouts=4,
-        guard=GuardConfig(window=4, min_real_episodes=3, max_gap=0.5),
+        window=4,
+        min_real_episodes=3,
         start_at_reset_prob=1.0,
         world=ENDLESS,
     )
@@ -272,9 +281,7 @@ def test_unfinished_rollouts_are_dropped_when_a_model_is_promoted(bright: Any):
 
 def test_a_model_that_is_uncertain_of_everything_is_switched_off(bright: Any):
     model = Counting(uncertainty=9.0)
-    batch, made = imagination(
-        model, bright, rollouts=1, max_uncertainty=2.0, guard=GuardConfig(window=5), world=ENDLESS
-    )
+    batch, made = imagination(model, bright, rollouts=1, max_uncertainty=2.0, window=5, world=ENDLESS)
     batch.remember(real_episode(3)[0])
     play(batch, 5)
     assert batch.requests() == [] and not batch.on and not made and batch.counters.uncertain == 5
@@ -366,3 +373,68 @@ def test_what_does_not_go_together():
     assert ImaginationConfig(share=0.5, path="x").learns
     assert not ImaginationConfig(share=0.5, path="x", model="copy").learns
     assert not ImaginationConfig(path="x").learns
+
+
+# ---- the kill switch
+
+
+def ended(switch: KillSwitch, *outcomes: int) -> None:
+    for outcome in outcomes:
+        switch.add_imagined(bool(outcome))
+
+
+def test_rollouts_that_succeed_too_often_trip_it():
+    switch = KillSwitch(max_gap=0.3, window=4, outcomes=5)
+    assert math.isnan(switch.share) and all(math.isnan(share) for share in switch.shares)
+    ended(switch, 1, 0, 1, 0)
+    assert switch.share == 0.5
+    for i in range(5):
+        assert not switch.tripped, "not before there are so many real outcomes"
+        switch.add_real(i < 0)
+    assert switch.shares == (0.5, 0.0) and switch.tripped
+    switch.reset()
+    assert not switch.tripped and math.isnan(switch.share) and all(math.isnan(x) for x in switch.shares)
+
+
+def test_promotions_do_not_make_it_forget():
+    """Else a model that flatters would not be found out where its successors come before enough outcomes."""
+    switch = KillSwitch(max_gap=0.3, window=2, outcomes=6)
+    for _ in range(3):
+        assert not switch.tripped
+        ended(switch, 1, 1)
+        switch.add_real(False)
+        switch.add_real(False)
+        switch.reset() if not switch.tripped else None
+    assert switch.tripped
+
+
+def test_real_outcomes_before_the_window_is_full_do_not_count():
+    switch = KillSwitch(max_gap=0.3, window=4, outcomes=2)
+    ended(switch, 1, 1, 1)
+    for _ in range(5):
+        switch.add_real(False)
+    assert math.isnan(switch.shares[0]) and not switch.tripped
+    ended(switch, 1)
+    switch.add_real(False)
+    switch.add_real(True)
+    assert switch.shares == (1.0, 0.5) and switch.tripped
+
+
+def test_a_policy_that_learns_is_not_taken_for_a_world_model_that_flatters():
+    """Reality is held against what was imagined when it happened, not against what is imagined now."""
+    switch = KillSwitch(max_gap=0.3, window=2, outcomes=4)
+    for promised, happened in ((0, 0), (0, 0), (1, 1), (1, 1)):
+        ended(switch, promised, promised)
+        switch.add_real(bool(happened))
+    assert switch.share == 1.0 and switch.shares == (0.5, 0.5) and not switch.tripped
+
+
+def test_more_than_the_gap_not_as_much():
+    exact = KillSwitch(max_gap=0.5, window=2, outcomes=1)
+    ended(exact, 1, 0)
+    exact.add_real(False)
+    assert exact.shares == (0.5, 0.0) and not exact.tripped
+    better = KillSwitch(max_gap=0.1, window=1, outcomes=1)
+    ended(better, 0)
+    better.add_real(True)
+    assert not better.tripped, "reality may be as good as it likes"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,13 +15,13 @@ from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.data import model_arrays
 from accerl_lerobot.world_model.rollouts import StartPool
 from tests.rounding import assert_close
+from tests.runs import adjusted
 from tests.world_model.real_segments import SPEC, K, real_episode
 
 
-def pool(spec: WorldModelSpec = SPEC, **options: object) -> StartPool:
+def pool(spec: WorldModelSpec = SPEC, memory: int = 1000, **options: Any) -> StartPool:
     """Starts anywhere; an oracle's need their history."""
-    defaults = {"memory": 1000}
-    return StartPool(spec, ImaginationConfig(**(defaults | options)))  # type: ignore[arg-type]
+    return StartPool(spec, adjusted(ImaginationConfig, memory=memory)(**options))
 
 
 def test_a_start_is_a_real_observation_with_what_led_there():

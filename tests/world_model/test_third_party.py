@@ -28,7 +28,6 @@ from accerl_lerobot.world_model.config import (
     ImaginationConfig,
     LearnableModelConfig,
     LearnConfig,
-    OnlineLearnConfig,
     PixelModelConfig,
     WorldModelConfig,
 )
@@ -39,7 +38,7 @@ from accerl_lerobot.world_model.registry import make_models
 from accerl_lerobot.world_model.store import load_world_model, save_world_model
 from benchmarks.ranking import BenchRankingConfig
 from tests.runs import drive, replacing
-from tests.test_imagination import LOOSE, decisions, imagining, run_locally
+from tests.test_imagination import decisions, imagining, learning, run_locally
 from tests.world_model.test_pixels import SPEC, dots, windows
 from tests.world_model.test_pretrain import arguments, recorded
 
@@ -243,7 +242,7 @@ def test_classes_that_are_none(
 
 
 def test_it_goes_on_learning_in_a_run_and_is_saved_when_promoted(tiny_checkpoint: Path, tmp_path: Path):
-    learn = OnlineLearnConfig(steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE)
+    learn = learning()
     path = str(saved(tmp_path / "w", gain=3.0))
     config = imagining(tiny_checkpoint, path=path, discover_packages_path=PACKAGE, learn=learn, episodes=24)
     history, batches, engine = run_locally(config)
@@ -262,7 +261,7 @@ def test_it_goes_on_learning_in_a_run_and_is_saved_when_promoted(tiny_checkpoint
 def test_in_processes_of_their_own_they_find_it_too(tiny_checkpoint: Path, tmp_path: Path):
     from accerl_lerobot.engine.launch import RayEngine
 
-    learn = OnlineLearnConfig(steps_per_episode=1.0, validate_every=2, held_out=0.4, validation=LOOSE)
+    learn = learning()
     named = {"path": str(saved(tmp_path / "w")), "discover_packages_path": PACKAGE}
     config = imagining(tiny_checkpoint, learn=learn, episodes=24, **named)
     engine = RayEngine(replace(config, output_dir=str(tmp_path / "run")), ("match",))

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Do the process that acts and the one that learns agree on log-probs? Measured while both run.
+
+At equal weights log π = log μ is what everything else relies on. The two are never at equal weights when it
+could be compared, because samples are always a few versions old. So the trainer keeps a copy of one published
+version, waits for a batch with decisions of that version, scores those under the copy, and reports
+
+    logprob/mismatch_mean    mean of |Σ log π − Σ log μ| over these decisions, in nats
+    logprob/mismatch_max     the largest
+    logprob/mismatch_clip    share of them whose ratio is outside 1 ± 0.2
+
+which is rounding, or a mistake. Version 0 is equal everywhere at the start and is the first to be probed. A
+version may never have acted, because inference skipped it for a newer one: once most of a batch is newer,
+another one is taken. That is after `replay.max_lag` updates at the latest.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from accerl_lerobot.checkpoint.tensors import part_of, whole
+from accerl_lerobot.policies.adapter import PolicyAdapter
+from accerl_lerobot.trainer.batch import Batch, Part
+from accerl_lerobot.trainer.config import TrainerConfig
+from accerl_lerobot.trainer.ranks import Ranks
+from accerl_lerobot.trainer.sharding import swapped_in
+
+CRITIC = "value_head."
+"""How names of the critic's weights begin."""
+CLIP = 0.2
+"""PPO's usual range: a mismatch outside it would be clipped as if the policy had moved."""
+
+
+class Probe:
+    """One copy of the policy's trainable weights after the other, without the critic's.
+
+    A copy lies on the same device and in the same parts as the weights, and is freed once it has been read.
+
+    Args:
+        adapter: the policy that is being trained.
+        config: how often, and which versions are published.
+        ranks: who measure together; None: this process alone.
+    """
+
+    def __init__(self, adapter: PolicyAdapter, config: TrainerConfig, ranks: Ranks | None = None) -> None:
+        self.adapter, self._config, self._ranks = adapter, config, ranks or Ranks()
+        self._live = [p for name, p in adapter.trainable().items() if not name.startswith(CRITIC)]
+        self._copy: list[Tensor] = []
+        self._version: int | None = None
+        """Version of the copy; None: there is none."""
+        self._next = 0
+        self.renew(0)
+
+    def state(self) -> dict[str, Any]:
+        """All that `restore` needs; see `snapshot`."""
+        weights = [whole(tensor.detach()).clone() for tensor in self._copy]
+        return {"version": self._version, "next": self._next, "weights": weights}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state` gave."""
+        self._version, self._next = state["version"], state["next"]
+        # There are no weights in the state where there was no copy.
+        self._copy = [part_of(t, live) for t, live in zip(state["weights"], self._live, strict=False)]
+
+    def renew(self, version: int) -> None:
+        """Takes a copy if it is time for one.
+
+        Args:
+            version: of the weights, which have just been made.
+        """
+        config = self._config
+        due = config.probe_every and self._version is None and version >= self._next
+        if due and config.publishes(version) and version < config.updates:
+            self._copy = [parameter.detach().clone() for parameter in self._live]
+            self._version, self._next = version, version + config.probe_every
+
+    def read(self, batch: Batch) -> dict[str, float]:
+        """The mismatch, if the batch holds decisions of the probed version; else nothing."""
+        if self._version is None:
+            return {}
+        rows = np.flatnonzero(batch.version == self._version)
+        if len(rows):
+            metrics = self._measure(batch, rows)
+        elif np.median(batch.version) > self._version:
+            metrics, self._next = {}, 0
+        else:
+            return {}
+        self._copy, self._version = [], None
+        return metrics
+
+    @torch.no_grad()
+    def log_prob(self, part: Part) -> Tensor:
+        """log-probs (B, L) of stored latents under the copy, without gradient."""
+        with swapped_in(self.adapter, self._live, self._copy):
+            return self.adapter.evaluate(*part).log_prob
+
+    def _measure(self, batch: Batch, rows: np.ndarray) -> dict[str, float]:
+        apart = self._ranks.each(partial(self._apart, batch), rows, self._config.micro_batch)
+        return {
+            "logprob/mismatch_mean": float(apart.abs().mean()),
+            "logprob/mismatch_max": float(apart.abs().max()),
+            "logprob/mismatch_clip": float((apart.expm1().abs() > CLIP).double().mean()),
+        }
+
+    def _apart(self, batch: Batch, rows: np.ndarray) -> Tensor:
+        """Σ log π − Σ log μ of each row, float64."""
+        part = batch.part(rows)
+        difference = self.log_prob(part).cpu() - batch.log_prob[rows]
+        factors = self.adapter.factors(part[2])
+        if factors is not None:
+            difference = difference.masked_fill(~factors.cpu(), 0.0)
+        return difference.double().sum(dim=-1)

@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Extent of one ratio, factors that do not exist, the KL, and each logged number by hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from accerl_lerobot.algorithms import (
+    AlgorithmConfig,
+    GIPOConfig,
+    LossInputs,
+    PPOConfig,
+    RatioConfig,
+    check_level,
+)
+from accerl_lerobot.algorithms.objective import (
+    KL_LINEAR_ABOVE,
+    approx_kl,
+    at_level,
+    clip_fraction,
+    ess_share,
+    explained_variance,
+    kl_from_behaviour,
+    lag_metrics,
+    mean_over_ratios,
+    present,
+    quantiles,
+    share_below,
+)
+from accerl_lerobot.errors import InputError
+from tests.algorithms.inputs import gradient, make_inputs
+from tests.runs import ALGORITHMS
+
+X = torch.tensor([[1.0, 2.0, 4.0, 8.0, 16.0, 32.0]])
+FACTORS = torch.tensor([[True, True, True, True, False, False]])
+each_level = pytest.mark.parametrize("level", ["token", "action", "chunk"])
+each_algorithm = pytest.mark.parametrize(
+    "config", [AlgorithmConfig.get_choice_class(name)() for name in ALGORITHMS], ids=str
+)
+
+
+def inputs_of(**replaced: Any) -> LossInputs:
+    return make_inputs(n=1, factors=6, **replaced)
+
+
+@pytest.mark.parametrize(
+    ("level", "actions", "expected"),
+    [
+        ("token", None, [1.0, 2.0, 4.0, 8.0, 16.0, 32.0]),
+        ("action", 6, [1.0, 2.0, 4.0, 8.0, 16.0, 32.0]),
+        ("action", 3, [3.0, 12.0, 48.0]),
+        ("action", 2, [7.0, 56.0]),
+        ("chunk", None, [63.0]),
+    ],
+)
+def test_sums_by_hand(level: Any, actions: int | None, expected: list[float]) -> None:
+    assert at_level(X, inputs_of(actions=actions), level).tolist() == [expected]
+
+
+@pytest.mark.parametrize(
+    ("level", "expected", "there"),
+    [
+        ("token", [1.0, 2.0, 4.0, 8.0, 0.0, 0.0], [True, True, True, True, False, False]),
+        ("action", [3.0, 12.0, 0.0], [True, True, False]),
+        ("chunk", [15.0], [True]),
+    ],
+)
+def test_factors_that_do_not_exist_by_hand(level: Any, expected: list[float], there: list[bool]) -> None:
+    inputs = replace(inputs_of(actions=3), factors=FACTORS)
+    holes = X.masked_fill(~FACTORS, torch.nan)
+    assert at_level(holes, inputs, level).tolist() == [expected]
+    assert present(FACTORS, level, 3).tolist() == [there]
+
+
+def test_an_action_with_one_token_left_still_counts() -> None:
+    partly = torch.tensor([[True, False, False, False, True, True]])
+    assert present(partly, "action", 3).tolist() == [[True, False, True]]
+
+
+def test_means_weigh_existing_factors_alike() -> None:
+    """One decision has four, the other one: (1 + 2 + 4 + 8 + 10) / 5."""
+    factors = torch.cat([FACTORS, torch.tensor([[True, False, False, False, False, False]])])
+    x = torch.cat([X, torch.tensor([[10.0, 99.0, 99.0, 99.0, 99.0, 99.0]])])
+    inputs = replace(make_inputs(n=2, factors=6), factors=factors)
+    assert mean_over_ratios(x, inputs, "token").item() == 5.0
+
+
+@each_algorithm
+@each_level
+def test_what_does_not_exist_is_never_looked_at(config: RatioConfig, level: Any) -> None:
+    """NaN there changes neither loss nor metrics nor gradient."""
+    config = replace(config, level=level)
+    factors = torch.arange(4) < torch.tensor([4, 2, 3, 1, 4, 2, 3])[:, None]
+    clean = replace(make_inputs(n=7, factors=4, actions=2), factors=factors)
+    names = ("log_prob_new", "log_prob_old")
+    holes = {n: getattr(clean, n).detach().masked_fill(~factors, torch.nan) for n in names}
+    holes["log_prob_new"].requires_grad_()
+    dirty = replace(clean, **holes)
+    expected, got = config.loss(clean), config.loss(dirty)
+    torch.testing.assert_close(got.loss, expected.loss)
+    for name, metric in expected.metrics.items():
+        torch.testing.assert_close(got.metrics[name], metric, msg=name)
+    slope = gradient(dirty, got.loss)
+    torch.testing.assert_close(slope, gradient(clean, expected.loss))
+    assert (slope[~factors] == 0).all() and (slope[factors] != 0).any()
+
+
+@each_algorithm
+@each_level
+def test_micro_batches_add_up(config: RatioConfig, level: Any) -> None:
+    """Parts of 2 and 5 decisions, with different numbers of factors, against all 7."""
+    config = replace(config, level=level)
+    factors = torch.arange(4) < torch.tensor([4, 4, 1, 2, 1, 3, 1])[:, None]
+    whole = replace(make_inputs(n=7, factors=4, actions=2), factors=factors)
+    expected = gradient(whole, config.loss(whole).loss)
+    each = present(factors, level, 2).sum().item() / 7
+    total = torch.zeros_like(expected)
+    for rows in (slice(0, 2), slice(2, 7)):
+        fields = {k: v[rows] for k, v in vars(whole).items() if isinstance(v, torch.Tensor)}
+        part = replace(whole, **fields, ratios_per_decision=each)
+        share = len(part.value) / 7
+        total += gradient(whole, config.loss(part).loss * share)
+    torch.testing.assert_close(total, expected)
+
+
+def test_a_ratio_per_action_needs_actions() -> None:
+    for level in ("token", "chunk"):
+        check_level(level, None)
+        assert GIPOConfig(level=level).loss(make_inputs(actions=None)).loss.isfinite()
+    check_level("action", 3)
+    with pytest.raises(InputError, match="algorithm.level='action': use token or chunk") as caught:
+        check_level("action", None)
+    assert caught.value.field == "algorithm.level"
+    with pytest.raises(InputError, match="algorithm.level"):
+        GIPOConfig().loss(make_inputs(actions=None))
+
+
+# ---- the KL
+
+
+def test_kl_estimates_behaviour_to_policy_in_value_and_gradient() -> None:
+    """μ = N(0, 1), π = N(m, s): samples of μ, KL(μ‖π) = log s + (1 + m²)/(2s²) − ½ and its slope m/s² in
+    m."""
+    noise = torch.randn(200_000, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    mean = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+    s = 1.2
+    policy = torch.distributions.Normal(mean, s)
+    logs = policy.log_prob(noise) - torch.distributions.Normal(0.0, 1.0).log_prob(noise)
+    kl = kl_from_behaviour(logs).mean()
+    assert kl.item() == pytest.approx(math.log(s) + (1 + 0.09) / (2 * s * s) - 0.5, rel=0.02)
+    (slope,) = torch.autograd.grad(kl, mean)
+    assert slope.item() == pytest.approx(0.3 / (s * s), rel=0.02)
+
+
+def test_kl_pulls_back_from_both_sides_with_a_bounded_slope() -> None:
+    far = [-50.0, -1.0, 0.0, 1.0, KL_LINEAR_ABOVE, 50.0]
+    logs = torch.tensor(far, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(kl_from_behaviour(logs).sum(), logs)
+    edge = math.expm1(KL_LINEAR_ABOVE)
+    expected = [-1.0, math.expm1(-1.0), 0.0, math.expm1(1.0), edge, edge]
+    np.testing.assert_allclose(slope.numpy(), expected, atol=1e-12)
+
+
+# ---- metrics
+
+
+def test_effective_sample_size() -> None:
+    assert ess_share(torch.ones(4, 1)).item() == 1.0
+    assert ess_share(torch.tensor([[1.0], [0.0], [0.0], [0.0]])).item() == 0.25
+    assert ess_share(torch.tensor([[3.0], [1.0]])).item() == pytest.approx(16 / 20)
+    assert ess_share(torch.zeros(4, 1)).item() == 0.0
+    mask = torch.tensor([[True], [True], [False]])
+    assert ess_share(torch.tensor([[3.0], [1.0], [9.0]]), mask).item() == pytest.approx(16 / 20)
+
+
+def test_approx_kl_is_zero_only_on_policy() -> None:
+    assert approx_kl(torch.zeros(3, 2)).item() == 0.0
+    assert approx_kl(torch.tensor([[math.log(2.0)]])).item() == pytest.approx(1 - math.log(2.0))
+
+
+def test_shares() -> None:
+    rho = torch.tensor([[0.7], [0.9], [1.2], [1.4]])
+    assert clip_fraction(rho, 0.2, 0.28).item() == 0.5
+    assert share_below(rho, 1.0).item() == 0.5
+    exists = torch.tensor([[True], [True], [True], [False]])
+    assert share_below(rho, 1.0, exists).item() == pytest.approx(2 / 3)
+
+
+def test_explained_variance() -> None:
+    returns = torch.tensor([0.0, 1.0, 2.0, 3.0])
+    assert explained_variance(returns, returns).item() == 1.0
+    assert explained_variance(returns + 5.0, returns).item() == 1.0  # a constant offset is not variance
+    assert explained_variance(torch.zeros(4), returns).item() == 0.0
+    assert explained_variance(-returns, returns).item() == -3.0
+    assert explained_variance(returns, torch.ones(4)).item() == 0.0
+
+
+def test_quantiles_skip_what_does_not_exist() -> None:
+    x = torch.randn(9, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    mask = (torch.arange(9) < 6)[:, None].expand(9, 4)
+    got = quantiles(x, {"q": 0.3}, mask)["q"].item()
+    assert got == pytest.approx(np.quantile(x[:6].numpy(), 0.3))
+
+
+def test_lag() -> None:
+    lag = {k: v.item() for k, v in lag_metrics(torch.tensor([10, 9, 7]), 12).items()}
+    assert lag["lag_mean"] == pytest.approx((2 + 3 + 5) / 3) and lag["lag_max"] == 5.0
+    assert lag["lag_p95"] == pytest.approx(4.8)
+    assert lag_metrics(torch.tensor([3, 3]), 3)["lag_max"].item() == 0.0
+
+
+@pytest.mark.parametrize("config", [GIPOConfig(), PPOConfig()], ids=["gipo", "ppo"])
+def test_on_policy_batches_look_on_policy(config: GIPOConfig | PPOConfig) -> None:
+    metrics = {k: v.item() for k, v in config.loss(make_inputs(spread=0.0)).metrics.items()}
+    for name in ("approx_kl", "kl", "clip_fraction", "low_weight", "ratio_max_dev", "log_ratio_p50"):
+        assert metrics[name] == 0.0, name
+    assert metrics["ess"] == pytest.approx(1.0) and metrics["decisions"] == 12.0
+
+
+def test_gipo_keeps_more_effective_samples_than_plain_importance_sampling() -> None:
+    inputs = make_inputs(n=4000, factors=1, spread=1.5)
+    wide, narrow = GIPOConfig(sigma=math.inf), GIPOConfig(sigma=0.5)
+    ess = [c.loss(inputs).metrics["ess"].item() for c in (wide, narrow)]
+    assert ess[1] > 2 * ess[0]
