@@ -25,12 +25,12 @@ from accerl_lerobot.bench.latency import TRACE
 from accerl_lerobot.bench.throughput import ARMS, MOST_BUSY, Block, as_rows
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Seed, Steps
 from accerl_lerobot.console import Console
-from accerl_lerobot.envs.simulated import read_trace
 from accerl_lerobot.errors import InputError, output_folder
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.evaluation.stats import Rate, evaluation_plans
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
 from benchmarks.machinery import MachineryConfig
+from benchmarks.simulated_world import read_trace
 
 LEARNING = MachineryConfig(worlds=4, latency_ms=4.0, image_size=16, decide_ms=1.0, update_ms=8.0)
 """Small, as nothing is timed in it."""

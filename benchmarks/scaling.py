@@ -20,11 +20,11 @@ from accerl_lerobot.bench.host import as_markdown, as_table, floors, host, range
 from accerl_lerobot.bench.throughput import MOST_BUSY, Block, as_rows
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Repeats
 from accerl_lerobot.console import Console
-from accerl_lerobot.envs.simulated import read_trace
 from accerl_lerobot.errors import InputError, output_folder
 from accerl_lerobot.evaluation.pictures import drawing
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS
 from benchmarks.machinery import MachineryConfig
+from benchmarks.simulated_world import read_trace
 
 
 @dataclass(frozen=True, kw_only=True)

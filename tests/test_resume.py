@@ -216,7 +216,7 @@ def test_an_asynchronous_run_that_was_killed_and_stopped_goes_on(tiny_checkpoint
         tmp_path,
         tiny_checkpoint,
         launch=LaunchConfig(stall_s=120),
-        env=SimulatedConfig(max_steps=12, tolerance=0.4, step_ms=2.0),
+        env=SimulatedConfig(max_steps=12, tolerance=0.4),
         rollout=RolloutConfig(workers=2, worlds=2, segment_length=3),
         trainer=TrainerConfig(updates=150, batch_decisions=16, lr=1e-3),
         save_every_updates=4,

@@ -22,11 +22,12 @@ from accerl_lerobot.bench.host import as_markdown, as_table, host, write
 from accerl_lerobot.config.ranges import Range, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, World, make_world
-from accerl_lerobot.envs.simulated import RESET
 from accerl_lerobot.errors import output_folder
 from accerl_lerobot.seeds import train_seed
 
 TRACE = "trace.txt"
+RESET = "reset"
+"""First word of a trace's lines about resets."""
 QUANTILES = (0.5, 0.95, 0.99)
 
 

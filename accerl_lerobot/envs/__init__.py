@@ -17,6 +17,7 @@ from accerl_lerobot.envs.simulated import SimulatedConfig, SimulatedWorld
 from accerl_lerobot.errors import InputError
 
 __all__ = [
+    "WORLDS",
     "ChunkResult",
     "EnvConfig",
     "HistoryWorld",
@@ -33,7 +34,7 @@ __all__ = [
     "make_world",
 ]
 
-_WORLDS: dict[type[EnvConfig], Callable[[Any], World]] = {
+WORLDS: dict[type[EnvConfig], Callable[[Any], World]] = {
     LeRobotEnvConfig: LeRobotWorld,
     LiberoConfig: LiberoWorld,
     MetaWorldConfig: MetaWorld,
@@ -44,15 +45,10 @@ _WORLDS: dict[type[EnvConfig], Callable[[Any], World]] = {
 def make_world(config: EnvConfig, history: int = 1) -> World:
     """Builds the world that `config` describes.
 
-    Args:
-        config: of one of the kinds of world.
-        history: how many env steps an observation holds; above 1, arrays begin with that dimension.
-
-    Raises:
-        InputError: its simulator is not installed; what the world itself refuses.
+    An observation holds `history` env steps; above 1, arrays begin with that dimension.
     """
     try:
-        world = _WORLDS[type(config)](config)
+        world = WORLDS[type(config)](config)
     except ModuleNotFoundError as error:
         name = str(getattr(config, "name", config.type))
         extra = f"{'accerl-' if name == config.type else ''}lerobot[{name}]"

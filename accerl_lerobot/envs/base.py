@@ -3,13 +3,6 @@
 
 Episode limits, auto-reset and task text are ours, because simulators disagree on them: a world never resets
 itself, `terminated` means the task is over (bootstrap 0), `truncated` that only time ran out (bootstrap V).
-
-The root of all environment configs: ``--env.type=metaworld`` picks one.
-
-Observation history for policies that look back: the last observations of any world, oldest first.
-
-LeRobot's ``n_obs_steps`` counts env steps, not decisions, so the last states of a chunk are looked at one by
-one; all before them are passed without a picture, as always.
 """
 
 from __future__ import annotations
@@ -83,32 +76,19 @@ class World(ABC):
         >>> world = make_world(MetaWorldConfig(task="drawer-open-v3"))
         >>> observation = world.reset(seed=3, task="drawer-open-v3")
         >>> result = world.step_chunk(np.zeros((10, 4), np.float32))
-        >>> result.steps, result.done, result.success
-        (10, False, False)
     """
 
     spec: WorldSpec
 
     @abstractmethod
     def reset(self, seed: int, task: str) -> Observation:
-        """Starts an episode. Equal (seed, task) give bit-equal episodes under equal actions, in any process.
-
-        Raises:
-            InputError: `task` is not in ``spec.tasks``.
-        """
+        """Starts an episode; equal (seed, task) and actions give bit-equal episodes, in any process."""
 
     @abstractmethod
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-        """Executes up to K actions and observes once, after the last.
+        """Executes up to K of the actions, float32 (K, A), and observes once, after the last.
 
         Gives the same states, rewards and successes as K calls with one action each.
-
-        Args:
-            actions: float32 (K, A).
-
-        Raises:
-            RuntimeError: the episode is over; call `reset`.
-            ValueError: wrong shape or a non-finite action.
         """
 
     @abstractmethod
@@ -120,11 +100,7 @@ class World(ABC):
 
 
 def check_episode(spec: WorldSpec, seed: int, task: str) -> None:
-    """Refuses an episode that a MuJoCo world cannot begin.
-
-    Raises:
-        InputError: no such task, or a seed that NumPy's former generator does not take.
-    """
+    """Refuses a task that there is not, and a seed that NumPy's former generator does not take."""
     if task not in spec.tasks:
         raise InputError("task", task, f"this world has: {', '.join(spec.tasks)}")
     if not 0 <= seed < 2**32:
@@ -132,11 +108,7 @@ def check_episode(spec: WorldSpec, seed: int, task: str) -> None:
 
 
 def checked_actions(actions: np.ndarray, spec: WorldSpec) -> np.ndarray:
-    """The chunk as float32 within the world's bounds.
-
-    Raises:
-        ValueError: not (K ≥ 1, A), or a value is not finite.
-    """
+    """The chunk as float32 within the world's bounds; refuses other shapes than (K ≥ 1, A), and NaN."""
     actions = np.asarray(actions, np.float32)
     if actions.ndim != 2 or len(actions) == 0 or actions.shape[1] != spec.action_dim:
         raise ValueError(f"actions have shape {actions.shape}; expected (K >= 1, {spec.action_dim})")
@@ -147,12 +119,7 @@ def checked_actions(actions: np.ndarray, spec: WorldSpec) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
-    """Base of every environment config; subclasses register under the name given on the command line.
-
-    Example:
-        >>> draccus.decode(EnvConfig, {"type": "metaworld", "task": "door-open-v3"}).type
-        'metaworld'
-    """
+    """Base of every environment config; subclasses register the name that ``--env.type`` takes."""
 
     max_steps: Annotated[int, Range("[1, 1000000]")] = 500
     """Episode limit in env steps; reaching it truncates."""
@@ -176,6 +143,17 @@ class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
         return self
 
 
+def names(text: str) -> tuple[str, ...]:
+    """Names separated by commas."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def check_cameras(cameras: Sequence[str], text: str) -> None:
+    """Refuses `text` of ``env.camera`` where it names none, or one twice."""
+    if not cameras or len(set(cameras)) < len(cameras):
+        raise InputError("env.camera", text, "name each camera once, separated by commas")
+
+
 def task_code(tasks: Sequence[str], task: str) -> np.ndarray:
     """Part of ``observation.environment_state`` that tells tasks apart: one-hot, or empty for one task."""
     return np.eye(len(tasks))[tasks.index(task)] if len(tasks) > 1 else np.zeros(0)
@@ -189,11 +167,7 @@ _FIELDS_OF_PLUGIN = {
 
 
 def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
-    """``--env.…`` and seed of the stock ``lerobot-eval`` for an environment; none if LeRobot cannot have it.
-
-    Args:
-        env: a config's ``env``, as recipes and checkpoints hold it.
-    """
+    """``--env.…`` and seed of stock ``lerobot-eval`` for an environment; none if LeRobot cannot have it."""
     if (kind := env.get("type")) in _FIELDS_OF_PLUGIN:
         fields: dict[str, Any] = {"discover_packages_path": _PLUGIN, "type": f"accerl_{kind}"}
         fields |= {name: env[name] for name in _FIELDS_OF_PLUGIN[kind] if name in env}
@@ -208,12 +182,10 @@ def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
 class HistoryWorld(World):
     """A world whose observations hold its last states, in a dimension of `length` in front of each array.
 
-    An episode begins with copies of its first observation, as in LeRobot's own queues. Should the world cut
-    an episode short of ``spec.max_steps``, the last observation stands for those that were not looked at.
-
-    Args:
-        world: what is observed; closed with this one.
-        length: observations, at least 2.
+    LeRobot's ``n_obs_steps`` counts env steps, not decisions, so the last states of a chunk are looked at one
+    by one; all before them are passed without a picture. An episode begins with copies of its first
+    observation, as in LeRobot's own queues. Should the world cut an episode short of ``spec.max_steps``, the
+    last observation stands for those that were not looked at.
     """
 
     def __init__(self, world: World, length: int) -> None:
@@ -222,13 +194,11 @@ class HistoryWorld(World):
         self._length, self._left = length, 0
 
     def reset(self, seed: int, task: str) -> Observation:
-        """See the base class."""
         self._seen.extend([self._world.reset(seed, task)] * self._length)
         self._left = self.spec.max_steps
         return self._observation()
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-        """See the base class."""
         actions = checked_actions(actions, self.spec)
         steps = min(len(actions), self._left) or len(actions)  # after the end, the world itself complains
         unseen = max(0, steps - self._length + 1)
@@ -253,18 +223,14 @@ class HistoryWorld(World):
         )
 
     def render(self, height: int, width: int) -> np.ndarray:
-        """See the base class."""
         return self._world.render(height, width)
 
     def close(self) -> None:
-        """See the base class."""
         self._world.close()
 
     def _observation(self) -> Observation:
-        newest = self._seen[-1]
-        return {
-            key: np.stack([np.asarray(o[key]) for o in self._seen])
-            if isinstance(value, np.ndarray)
-            else value
-            for key, value in newest.items()
-        }
+        observation = dict(self._seen[-1])
+        for key, value in observation.items():
+            if isinstance(value, np.ndarray):
+                observation[key] = np.stack([np.asarray(o[key]) for o in self._seen])
+        return observation

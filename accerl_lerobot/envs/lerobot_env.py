@@ -66,14 +66,7 @@ class LeRobotEnvConfig(EnvConfig):
 
 
 class LeRobotWorld(World):
-    """One of LeRobot's environments; a suite of several tasks has one simulator for each.
-
-    Args:
-        config: Which one.
-
-    Raises:
-        InputError: LeRobot does not know the name or a field, or the environment shows no image and state.
-    """
+    """One of LeRobot's environments; a suite of several tasks has one simulator for each."""
 
     def __init__(self, config: LeRobotEnvConfig) -> None:
         if config.name in _NEEDS_MUJOCO:
@@ -93,10 +86,7 @@ class LeRobotWorld(World):
         self._before, self._after = self._lerobot_config.get_env_processors()
         with redirect_stdout(io.StringIO()):  # LeRobot prints, and results go there
             self._vectors = make_env(
-                self._lerobot_config,
-                n_envs=1,
-                use_async_envs=False,
-                trust_remote_code=config.trust_remote_code,
+                self._lerobot_config, n_envs=1, trust_remote_code=config.trust_remote_code
             )
         self._envs = _single_envs(self._vectors)
         self._task = ""
@@ -166,12 +156,8 @@ class LeRobotWorld(World):
         }
         if not images or _STATE not in observation:
             shown = ", ".join(k for k in observation if k != TASK) or "neither"
-            raise InputError(
-                "env.kwargs",
-                self.config.kwargs,
-                f"a policy needs images and a state, {self.config.name} shows {shown}; try "
-                "obs_type=pixels_agent_pos",
-            )
+            remedy = f"a policy needs images and a state, {self.config.name} shows {shown}"
+            raise InputError("env.kwargs", self.config.kwargs, f"{remedy}; try obs_type=pixels_agent_pos")
         space = env.action_space
         return WorldSpec(
             images=images,
@@ -215,21 +201,16 @@ class LeRobotWorld(World):
 
 
 def _check_hub(config: LeRobotEnvConfig, hub_path: str | None) -> None:
-    """Refuses code from the Hub that nobody asked for, or whose version is not named.
-
-    Raises:
-        InputError: see above.
-    """
+    """Refuses code from the Hub that nobody asked for, or whose version is not named."""
+    if hub_path is None and config.trust_remote_code:
+        remedy = f"{config.name} is no environment on the Hub; leave it out"
+        raise InputError("env.trust_remote_code", True, remedy)
     if hub_path is None:
-        if config.trust_remote_code:
-            remedy = f"{config.name} is no environment on the Hub; leave it out"
-            raise InputError("env.trust_remote_code", True, remedy)
         return
     if not config.trust_remote_code:
         remedy = f"{config.name} is code of {hub_path} on the Hub, which would run with your rights; read it,"
-        raise InputError(
-            "env.trust_remote_code", False, f"{remedy} then set this, and its commit in hub_path"
-        )
+        remedy += " then set this, and its commit in hub_path"
+        raise InputError("env.trust_remote_code", False, remedy)
     if not _PINNED.fullmatch(hub_path) or ".." in hub_path:
         remedy = "name a commit, owner/name@COMMIT or owner/name@COMMIT:file.py with 40 hexadecimal digits"
         raise InputError("env.kwargs.hub_path", hub_path, f"{remedy}: branches can be moved to other code")

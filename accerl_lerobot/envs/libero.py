@@ -18,8 +18,10 @@ from accerl_lerobot.envs.base import (
     EnvConfig,
     World,
     WorldSpec,
+    check_cameras,
     check_episode,
     checked_actions,
+    names,
     task_code,
 )
 from accerl_lerobot.envs.libero_simulator import FPS, MAX_OBJECTS, OBJECT_NUMBERS, ROBOT_NUMBERS, Simulator
@@ -72,8 +74,7 @@ class LiberoConfig(EnvConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         resolve(self.task)
-        if not self.cameras or len(set(self.cameras)) < len(self.cameras):
-            raise InputError("env.camera", self.camera, "name each camera once, separated by commas")
+        check_cameras(self.cameras, self.camera)
         if self.assets and not (expanded(self.assets, "env.assets") / "scenes").is_dir():
             raise InputError("env.assets", self.assets, "no folder of LIBERO's assets: it holds no scenes/")
 
@@ -92,7 +93,7 @@ class LiberoConfig(EnvConfig):
     @property
     def cameras(self) -> tuple[str, ...]:
         """The camera names that `camera` stands for."""
-        return tuple(name.strip() for name in self.camera.split(",") if name.strip())
+        return names(self.camera)
 
 
 def image_key(camera: str) -> str:
@@ -101,11 +102,7 @@ def image_key(camera: str) -> str:
 
 
 class LiberoWorld(World):
-    """One LIBERO instance; its simulators are built on first use of a task, then kept.
-
-    Args:
-        config: What to simulate.
-    """
+    """One LIBERO instance; its simulators are built on first use of a task, then kept."""
 
     def __init__(self, config: LiberoConfig) -> None:
         self.config = config

@@ -4,17 +4,8 @@
 The same physics, state, camera and instruction as LeRobot's own wrapper, but the image has the size a small
 policy needs, lights are cheap to draw in software, and nothing is rendered that no policy looks at.
 Importing this file loads neither MuJoCo nor metaworld.
-
-LeRobot's MetaWorld tables (instructions, difficulty groups, experts), read without importing LeRobot.
-
-They are one JSON file inside the LeRobot package; importing ``lerobot.envs`` to reach it would cost a rollout
-worker four seconds and several hundred megabytes.
-
-Differences between the world a policy was trained in and the one it must work in.
-
-An offscreen OpenGL for MuJoCo: pick a backend before the import, and say in one line what is missing.
-
-MuJoCo reads ``MUJOCO_GL`` once, when it is imported: call `import_mujoco` before importing what uses it.
+Also the offscreen OpenGL of every MuJoCo world: MuJoCo reads ``MUJOCO_GL`` once, when it is imported, so call
+`import_mujoco` before importing what uses it.
 """
 
 from __future__ import annotations
@@ -45,8 +36,10 @@ from accerl_lerobot.envs.base import (
     EnvConfig,
     World,
     WorldSpec,
+    check_cameras,
     check_episode,
     checked_actions,
+    names,
     task_code,
 )
 from accerl_lerobot.errors import InputError
@@ -58,6 +51,7 @@ if TYPE_CHECKING:
 
 @functools.cache
 def _tables() -> dict[str, Any]:
+    """LeRobot's MetaWorld tables: a JSON file in its package, as importing it costs seconds and memory."""
     spec = importlib.util.find_spec("lerobot")
     if spec is None or not spec.submodule_search_locations:
         raise ModuleNotFoundError("LeRobot is not installed: pip install lerobot[metaworld]", name="lerobot")
@@ -91,9 +85,6 @@ def resolve(text: str, field: str = "env.task") -> tuple[str, ...]:
     Example:
         >>> resolve("drawer-open-v3, door-open-v3")
         ('drawer-open-v3', 'door-open-v3')
-
-    Raises:
-        InputError: a name is neither a task nor a group, or there is none.
     """
     known, named = set(all_tasks()), groups()
     found: dict[str, None] = {}
@@ -125,10 +116,6 @@ class ShiftConfig(Section, section="env.shift"):
     """Deployment shift of a MetaWorld scene; the defaults change nothing.
 
     Scripted demonstrations are recorded without it, unless ``demos.shifted`` says otherwise.
-
-    Example:
-        >>> ShiftConfig(camera=(0.0, 0.05, 0.0), action_delay=2).action_delay
-        2
     """
 
     camera: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
@@ -144,12 +131,7 @@ class ShiftConfig(Section, section="env.shift"):
     some starts are out of reach."""
 
     def apply(self, simulator: Any, cameras: Sequence[str]) -> None:
-        """Changes a MetaWorld simulator that has just been built.
-
-        Args:
-            simulator: MetaWorld's own environment object.
-            cameras: names of those that are moved.
-        """
+        """Changes a MetaWorld simulator that has just been built, and moves these cameras of it."""
         from gymnasium.spaces import Box
 
         model = simulator.model
@@ -179,13 +161,9 @@ _open: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
 def choose_backend() -> str | None:
-    """Names the backend for a headless Linux machine: EGL where there is a GPU, else OSMesa, else EGL.
+    """The backend for a headless Linux machine: EGL where there is a GPU, else OSMesa, else EGL.
 
-    Returns:
-        ``"egl"``, ``"osmesa"``, or None where MuJoCo's own default is right (a display, or not Linux).
-
-    Raises:
-        InputError: neither library is installed.
+    None where MuJoCo's own default is right (a display, or not Linux).
     """
     if not _headless():
         return None
@@ -197,11 +175,7 @@ def choose_backend() -> str | None:
 
 
 def import_mujoco() -> ModuleType:
-    """Imports MuJoCo with a backend that works here; respects ``MUJOCO_GL`` if it is set.
-
-    Raises:
-        InputError: the backend's library is missing.
-    """
+    """Imports MuJoCo with a backend that works here; respects ``MUJOCO_GL`` if it is set."""
     imported = "mujoco" in sys.modules
     # One software-rendering thread per world: several worlds then share the cores without fighting.
     os.environ.setdefault("LP_NUM_THREADS", "1")
@@ -225,11 +199,7 @@ def import_mujoco() -> ModuleType:
 
 
 def new_renderer(model: Any, height: int, width: int) -> Any:
-    """A `mujoco.Renderer` whose framebuffer is exactly (height, width).
-
-    Raises:
-        InputError: no OpenGL context can be created here.
-    """
+    """A `mujoco.Renderer` whose framebuffer is exactly (height, width)."""
     mujoco = import_mujoco()
     model.vis.global_.offheight, model.vis.global_.offwidth = height, width
     try:
@@ -280,12 +250,7 @@ STEP_LIMIT = 500
 @EnvConfig.register_subclass("metaworld")
 @dataclass(frozen=True, kw_only=True)
 class MetaWorldConfig(EnvConfig):
-    """Which MetaWorld tasks, seen how.
-
-    Example:
-        >>> MetaWorldConfig(task="drawer-open-v3,door-open-v3").tasks
-        ('drawer-open-v3', 'door-open-v3')
-    """
+    """Which MetaWorld tasks, seen how."""
 
     task: str = "drawer-open-v3"
     """Task names separated by commas, or LeRobot's groups: easy, medium, hard, very_hard, all. A world keeps
@@ -311,8 +276,7 @@ class MetaWorldConfig(EnvConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         resolve(self.task)
-        if not self.cameras or len(set(self.cameras)) < len(self.cameras):
-            raise InputError("env.camera", self.camera, "name each camera once, separated by commas")
+        check_cameras(self.cameras, self.camera)
         if unknown := [name for name in self.cameras if name not in CAMERAS]:
             raise InputError("env.camera", self.camera, f"{unknown[0]!r} is none of: {', '.join(CAMERAS)}")
 
@@ -333,7 +297,7 @@ class MetaWorldConfig(EnvConfig):
     @property
     def cameras(self) -> tuple[str, ...]:
         """The camera names `camera` stands for."""
-        return tuple(name.strip() for name in self.camera.split(",") if name.strip())
+        return names(self.camera)
 
 
 class MetaWorld(World):
@@ -341,9 +305,6 @@ class MetaWorld(World):
 
     A simulator that diverges (non-finite state or reward, or MuJoCo had to reset it) ends the episode as
     truncated, with ``info["nonfinite"] == 1.0``: such a segment must not be trained on.
-
-    Args:
-        config: What to simulate.
     """
 
     def __init__(self, config: MetaWorldConfig) -> None:

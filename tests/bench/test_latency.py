@@ -12,7 +12,7 @@ import pytest
 from accerl_lerobot.bench.latency import BenchLatencyConfig, bench_latency, described, table
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.envs.simulated import read_trace
+from benchmarks.simulated_world import LatencyConfig, read_trace
 
 
 def test_durations_by_hand():
@@ -25,7 +25,7 @@ def test_durations_by_hand():
 def test_a_world_of_known_durations_is_timed(tmp_path: Path):
     """Chunks of two in episodes of four: a reset after each second decision."""
     config = BenchLatencyConfig(
-        env=SimulatedConfig(task="match,mirror", frame_ms=20.0, max_steps=4, tolerance=1e-6),
+        env=LatencyConfig(task="match,mirror", frame_ms=20.0, max_steps=4, tolerance=1e-6),
         chunk=2,
         decisions=10,
         output_dir=str(tmp_path),
