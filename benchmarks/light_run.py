@@ -16,7 +16,7 @@ import sys
 
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.stats import EvaluationConfig
+from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.replay import ReplayConfig

@@ -18,7 +18,7 @@ import pytest
 from accerl_lerobot.checkpoint.layout import PRETRAINED
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Progress
-from accerl_lerobot.evaluation.stats import evaluation_plans
+from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.replay import ReplayConfig, lag_bound
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.timeline.read import ABSENT, read_timeline

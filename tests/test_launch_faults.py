@@ -22,7 +22,7 @@ from accerl_lerobot.engine import launch, replicas
 from accerl_lerobot.engine.config import LaunchConfig
 from accerl_lerobot.engine.contract import Progress, WorkerError, pause_s
 from accerl_lerobot.engine.launch import RayEngine
-from accerl_lerobot.evaluation.stats import evaluation_plans
+from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import PolicyConfig

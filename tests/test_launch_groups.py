@@ -19,7 +19,7 @@ import pytest
 from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Progress
-from accerl_lerobot.evaluation.stats import evaluation_plans
+from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.replay import ReplayConfig, decisions_under_way, lag_bound
 from accerl_lerobot.rollout.groups import open_limit
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig

@@ -20,7 +20,7 @@ from accerl_lerobot.cli import main
 from accerl_lerobot.engine.config import LaunchConfig, encode
 from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.evaluation.stats import EvaluationConfig
+from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.runs import tiny_run

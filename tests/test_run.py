@@ -18,7 +18,7 @@ from accerl_lerobot.engine.config import LaunchConfig, RunConfig, parse
 from accerl_lerobot.engine.contract import Engine, Progress, Saved, WorkerError
 from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.stats import EvaluationConfig
+from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.trainer.config import TrainerConfig

@@ -19,7 +19,7 @@ from accerl_lerobot.engine import launch
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.contract import Progress
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.stats import evaluation_plans
+from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.inference.batcher import dealt, merge_metrics
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.replay import ReplayConfig

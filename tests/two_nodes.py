@@ -31,7 +31,7 @@ from accerl_lerobot.engine import placement as planning  # noqa: E402
 from accerl_lerobot.engine.config import LaunchConfig, PlacementConfig, RoleConfig  # noqa: E402
 from accerl_lerobot.engine.launch import RayEngine  # noqa: E402
 from accerl_lerobot.errors import InputError  # noqa: E402
-from accerl_lerobot.evaluation.stats import evaluation_plans  # noqa: E402
+from accerl_lerobot.evaluation import evaluation_plans  # noqa: E402
 from accerl_lerobot.inference import worker as inference_worker  # noqa: E402
 from accerl_lerobot.rollout.runner import RolloutConfig  # noqa: E402
 from accerl_lerobot.trainer import worker as trainer_worker  # noqa: E402

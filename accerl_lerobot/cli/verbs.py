@@ -34,7 +34,7 @@ from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engine.config import DatasetConfig, LaunchConfig, RunConfig, check_chunk, encode, parse
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
 from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, make_folder
-from accerl_lerobot.evaluation.stats import EvaluationConfig
+from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.hub.card import PullConfig, PushConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import Load, PolicyConfig
@@ -255,7 +255,7 @@ def evaluate(arguments: list[str]) -> int:
     if out is not None:
         check_absent(out)
     from accerl_lerobot.engine import run
-    from accerl_lerobot.evaluation.stats import summarise, table
+    from accerl_lerobot.evaluation import summarise, table
 
     sections = ("seed", "env", "policy", "rollout", "inference", "evaluation", "launch")
     whole = RunConfig(**{name: getattr(config, name) for name in sections})
@@ -419,7 +419,7 @@ CONFIGS: dict[str, type[Any]] = {
 
 
 def _write_evaluation(out: Path, summary: dict[str, Any], results: list[EpisodeResult]) -> None:
-    from accerl_lerobot.evaluation.pictures import write_video
+    from accerl_lerobot.evaluation import write_video
 
     make_folder(out, "output_dir")
     (out / "evaluation.json").write_text(json.dumps(summary, indent=2) + "\n")

@@ -25,7 +25,7 @@ from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.engine.preflight import check_start
 from accerl_lerobot.engine.stopping import locked, resumed_run
 from accerl_lerobot.errors import InputError, kept_traceback
-from accerl_lerobot.evaluation.stats import Rate
+from accerl_lerobot.evaluation import Rate
 from accerl_lerobot.experience import Observation, Request
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import EpisodeResult

@@ -31,8 +31,7 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.contract import Engine, Progress
 from accerl_lerobot.engine.stopping import Stopping, raise_if_stopped
-from accerl_lerobot.evaluation.pictures import before_after, success_curve
-from accerl_lerobot.evaluation.stats import evaluation_plans, summarise
+from accerl_lerobot.evaluation import before_after, evaluation_plans, success_curve, summarise
 from accerl_lerobot.metrics import MetricsLog, plain
 from accerl_lerobot.rollout.runner import EpisodeResult
 from accerl_lerobot.timeline import CHECKPOINT, EVALUATION, TIMELINE, TRAINING, Clock, NoClock

@@ -39,7 +39,7 @@ from accerl_lerobot.checkpoint.layout import (
     newest_whole,
     write_atomically,
 )
-from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import ray_session
 from accerl_lerobot.engine.config import RunConfig, encode, timeline_folder
@@ -54,7 +54,7 @@ from accerl_lerobot.engine.preflight import (
 )
 from accerl_lerobot.engine.stopping import LOCK, Stopping, raise_if_stopped
 from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, make_folder
-from accerl_lerobot.evaluation.stats import evaluation_plans
+from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.metrics import METRICS, MetricsLog
 from accerl_lerobot.policies.config import Load, loader
 from accerl_lerobot.replay.journal import EPISODES

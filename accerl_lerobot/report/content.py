@@ -27,7 +27,7 @@ from accerl_lerobot.report.read import (
     newest,
     unreadable,
 )
-from accerl_lerobot.timeline.clock import ROLES, STATES
+from accerl_lerobot.timeline import ROLES, STATES
 from accerl_lerobot.world_model.metrics import dataset_rows, has_several, per_dataset
 
 RECENT_S = 120.0

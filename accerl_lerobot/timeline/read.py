@@ -23,7 +23,7 @@ from accerl_lerobot.checkpoint.layout import CONFIG, write_atomically
 from accerl_lerobot.checkpoint.safety import Origin, check_folder
 from accerl_lerobot.config.ranges import NonNegative, Positive, Section
 from accerl_lerobot.errors import InputError, expanded
-from accerl_lerobot.timeline.clock import (
+from accerl_lerobot.timeline import (
     BITS,
     CHECKPOINT,
     FORMAT,

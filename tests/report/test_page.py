@@ -21,7 +21,7 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.engine import run
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig, parse
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.stats import EvaluationConfig
+from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.report import ReportConfig, write_report
 from accerl_lerobot.report.charts import Chart
 from accerl_lerobot.report.content import evaluated, exploring

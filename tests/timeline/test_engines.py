@@ -14,7 +14,7 @@ from accerl_lerobot.engine import launch
 from accerl_lerobot.engine.config import LaunchConfig
 from accerl_lerobot.engine.launch import RayEngine
 from accerl_lerobot.engine.local import LocalEngine
-from accerl_lerobot.evaluation.stats import evaluation_plans
+from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline import TIMELINE
