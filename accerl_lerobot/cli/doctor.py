@@ -248,7 +248,7 @@ def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
 
 def imagination_checks(config: RunConfig) -> Iterator[Check]:
     """Imagination settings against the environment and the policy."""
-    imagination, episodes = config.imagination, config.rollout.episodes
+    imagination = config.imagination
     if not imagination.share:
         return
     from accerl_lerobot.engine.imagination import check_imagination
@@ -258,14 +258,8 @@ def imagination_checks(config: RunConfig) -> Iterator[Check]:
     except InputError as error:
         yield Check("imagination", FAIL, str(error))
         return
-    yield Check(
-        "imagination", OK, f"{imagination.share:.0%} of every batch; world model: {imagination.model}"
-    )
-    least = imagination.guard.min_real_episodes
-    if imagination.start_at_reset_prob and 0 < episodes <= least:
-        why = f"that takes more real episodes than imagination.guard.min_real_episodes, {least}"
-        text = f"is hardly ever switched off where it flatters: {why}, and rollout.episodes is {episodes}"
-        yield Check("imagination", WARN, text)
+    text = f"{imagination.share:.0%} of every batch; world model: {imagination.model}"
+    yield Check("imagination", OK, text)
 
 
 def placement(config: RunConfig) -> Iterator[Check]:
@@ -293,12 +287,10 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
     tasks = len(getattr(config.env, "tasks", ("one",)))
     simulator = tasks * SIMULATOR_GIB.get(config.env.type, 0.0)
     pictures = history * observation_bytes(config) / GIB
+    loaded = 2 + config.trainer.ranks  # the driver, inference and the trainer each load torch
     frames = min(films.videos, films.episodes) * config.env.max_steps / films.video_every
     return {
-        # The driver, inference and the trainer each load torch.
-        "trainer.ranks": POLICY_PROCESS_GIB
-        if local
-        else RAY_GIB + (2 + config.trainer.ranks) * POLICY_PROCESS_GIB,
+        "trainer.ranks": POLICY_PROCESS_GIB if local else RAY_GIB + loaded * POLICY_PROCESS_GIB,
         "inference.workers": 0.0 if local else (config.inference.workers - 1) * POLICY_PROCESS_GIB,
         "rollout.workers": 0.0 if local else rollout.workers * ROLLOUT_PROCESS_GIB,
         "rollout.worlds": rollout.workers * rollout.worlds * simulator,

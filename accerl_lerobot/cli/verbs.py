@@ -3,8 +3,6 @@
 
 Results go to the standard output, everything else to the standard error: LeRobot prints while it loads, and
 results should stay readable for programs.
-
-Fields of the verbs' command lines, where they are not a whole run's.
 """
 
 from __future__ import annotations
@@ -143,12 +141,7 @@ NO_DATASET = "name a LeRobotDataset, on the Hub or with dataset.root"
 
 
 def train(arguments: list[str], load: Load | None = None) -> int:
-    """``accerl train``.
-
-    Args:
-        arguments: of the command line.
-        load: makes the policy's adapter; None: of LeRobot's checkpoint.
-    """
+    """``accerl train``; `load` makes the policy's adapter, of LeRobot's checkpoint by default."""
     config: RunConfig = parse(RunConfig, arguments)
     from accerl_lerobot import guardian
     from accerl_lerobot.engine import run

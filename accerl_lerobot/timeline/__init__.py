@@ -88,8 +88,6 @@ class Clock:
         folder: of the timeline; made if it is not there.
         worker: its name; the part before a number is its role.
         begins: when its process does; None: now.
-        part_bytes: after which another part begins.
-        now: the monotonic clock, in nanoseconds.
     """
 
     def __init__(

@@ -315,13 +315,25 @@ def test_a_long_run_makes_a_small_page_soon(pictures: None, tmp_path: Path) -> N
     assert "largest 9 → 9" in Seen(path.read_text()).text
 
 
+@pytest.mark.parametrize(
+    "summary",
+    ['{"success_after": 0.5, "ci95_after": [0.1]}', '{"success_after": "much", "ci95_after": [0, 1]}'],
+)
+def test_results_of_another_version_are_one_line(tmp_path: Path, summary: str) -> None:
+    folder = write_run(tmp_path / "run")
+    (folder / "summary.json").write_text(summary)
+    with pytest.raises(InputError, match="results in it are damaged, or of another version") as caught:
+        page_of(folder)
+    assert "\n" not in str(caught.value)
+
+
 class TestPlace:
     """Where the page goes; what is there already is not damaged."""
 
     def test_another_file_is_left_alone(self, tmp_path: Path) -> None:
         folder = write_run(tmp_path / "run")
         (folder / "report.html").write_text("<html>somebody's own</html>")
-        with pytest.raises(InputError, match="there is another file of this name; choose another"):
+        with pytest.raises(InputError, match="there is another file or folder of this name"):
             page_of(folder)
         assert (folder / "report.html").read_text() == "<html>somebody's own</html>"
 
@@ -336,7 +348,7 @@ class TestPlace:
         runs = [write_run(tmp_path / name) for name in ("a", "b")]
         with pytest.raises(InputError, match="there is no folder"):
             page_of(runs[0], output=str(tmp_path / "nowhere" / "page.html"))
-        with pytest.raises(InputError, match="a folder; name a file in it"):
+        with pytest.raises(InputError, match="there is another file or folder of this name"):
             page_of(runs[0], output=str(tmp_path))
         (tmp_path / "here").mkdir()
         monkeypatch.chdir(tmp_path / "here")
@@ -345,6 +357,6 @@ class TestPlace:
 
     def test_runs_of_different_kinds(self, tmp_path: Path) -> None:
         runs = write_run(tmp_path / "a"), write_world_model(tmp_path / "b")
-        with pytest.raises(InputError, match="of one kind; these are of accerl train and world-model"):
+        with pytest.raises(InputError, match="compares runs of accerl train, and one is"):
             page_of(*runs, output=str(tmp_path / "page.html"))
         assert not (tmp_path / "page.html").exists()
