@@ -39,7 +39,7 @@ def tiny_run(checkpoint: Path, **sections: Any) -> RunConfig:
         "rollout": RolloutConfig(worlds=4, segment_length=3),
         "replay": ReplayConfig(capacity=64, min_decisions=16, ahead=32, samples_per_insert=2.0),
         "trainer": TrainerConfig(updates=12, batch_decisions=16, warmup_updates=2, value_warmup_updates=2),
-        "evaluation": EvaluationConfig(episodes=6, videos=1, video_size=32),
+        "evaluation": EvaluationConfig(episodes=6, videos=1),
         "launch": LaunchConfig(stall_s=120),
     }
     return RunConfig(**{**defaults, **sections})

@@ -32,9 +32,7 @@ TIMES = ("wall_s", "wait_s", "update_s", "publish_s", "rl_s", "warm_start_s")
 def recipe(folder: Path, checkpoint: Path, **sections: Any) -> Path:
     defaults: dict[str, Any] = {
         "env": SimulatedConfig(max_steps=12, tolerance=0.4),
-        "evaluation": EvaluationConfig(
-            episodes=6, every_updates=4, episodes_during=5, videos=1, video_size=32, video_every=1
-        ),
+        "evaluation": EvaluationConfig(episodes=6, every_updates=4, episodes_during=5, videos=1),
         "trainer": TrainerConfig(
             updates=UPDATES, batch_decisions=16, lr=1e-3, warmup_updates=2, value_warmup_updates=2
         ),

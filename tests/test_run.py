@@ -35,9 +35,7 @@ class Finished:
 def local_run(checkpoint: Path, output_dir: Path | None, **sections: Any) -> RunConfig:
     defaults: dict[str, Any] = {
         "env": SimulatedConfig(max_steps=12, tolerance=0.4),
-        "evaluation": EvaluationConfig(
-            episodes=8, every_updates=4, episodes_during=4, videos=1, video_size=32, video_every=1
-        ),
+        "evaluation": EvaluationConfig(episodes=8, every_updates=4, episodes_during=4, videos=1),
         "trainer": TrainerConfig(updates=12, batch_decisions=16, warmup_updates=2, value_warmup_updates=2),
         "launch": LaunchConfig(engine="local"),
         "output_dir": None if output_dir is None else str(output_dir),

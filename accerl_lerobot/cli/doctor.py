@@ -282,13 +282,14 @@ def memory_estimate_gib(config: RunConfig, history: int = 1) -> float:
 def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
     """Field → rough memory of what it sizes."""
     from accerl_lerobot.engine.preflight import under_way
+    from accerl_lerobot.evaluation import FILM
 
     rollout, films, local = config.rollout, config.evaluation, config.launch.engine == "local"
     tasks = len(getattr(config.env, "tasks", ("one",)))
     simulator = tasks * SIMULATOR_GIB.get(config.env.type, 0.0)
     pictures = history * observation_bytes(config) / GIB
     loaded = 2 + config.trainer.ranks  # the driver, inference and the trainer each load torch
-    frames = min(films.videos, films.episodes) * config.env.max_steps / films.video_every
+    frames = min(films.videos, films.episodes) * config.env.max_steps / FILM[1]
     return {
         "trainer.ranks": POLICY_PROCESS_GIB if local else RAY_GIB + loaded * POLICY_PROCESS_GIB,
         "inference.workers": 0.0 if local else (config.inference.workers - 1) * POLICY_PROCESS_GIB,
@@ -297,7 +298,7 @@ def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
         "rollout.segment_length": under_way(config) * pictures,
         "replay.capacity": config.replay.capacity * pictures,
         **({"algorithm.memory": config.remembered * pictures} if config.remembered else {}),
-        "evaluation.videos": frames * 3 * films.video_size**2 / GIB,
+        "evaluation.videos": frames * 3 * FILM[0] ** 2 / GIB,
     }
 
 

@@ -325,9 +325,7 @@ class Loop:
     ) -> tuple[dict[str, Any], list[EpisodeResult]]:
         self.times.clock.enter(EVALUATION)
         seed, videos = self.config.seed, self.config.evaluation
-        self.engine.plan(
-            evaluation_plans(self.tasks, episodes, group, seed=seed, filmed=videos.videos, film=videos.film)
-        )
+        self.engine.plan(evaluation_plans(self.tasks, episodes, group, seed=seed, filmed=videos.videos))
         # An evaluation planned while training may end only now.
         results = run_plans(self.engine, episodes, group, self.console, self._meanwhile)
         return self._report(group, results, steps, results[0].versions[1]), results

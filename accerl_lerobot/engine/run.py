@@ -106,8 +106,8 @@ def evaluate(config: RunConfig, console: Console, filmed: int = 0) -> list[Episo
     spec = check_world(config.env)
     engine = make_engine(config, spec.tasks, check_policy(config, spec))
     with contextlib.closing(engine):
-        count, film = config.evaluation.episodes, config.evaluation.film
-        engine.plan(evaluation_plans(spec.tasks, count, "eval", seed=config.seed, filmed=filmed, film=film))
+        count = config.evaluation.episodes
+        engine.plan(evaluation_plans(spec.tasks, count, "eval", seed=config.seed, filmed=filmed))
         return run_plans(engine, count, "eval", console)
 
 

@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 import draccus
 import numpy as np
@@ -99,12 +99,81 @@ class World(ABC):
         """Frees the simulator. Safe to call twice."""
 
 
-def check_episode(spec: WorldSpec, seed: int, task: str) -> None:
-    """Refuses a task that there is not, and a seed that NumPy's former generator does not take."""
-    if task not in spec.tasks:
-        raise InputError("task", task, f"this world has: {', '.join(spec.tasks)}")
-    if not 0 <= seed < 2**32:
-        raise InputError("seed", seed, "use 0 to 2**32 - 1")
+class Step(NamedTuple):
+    """Outcome of one env step."""
+
+    success: bool
+    """True if the task is achieved now."""
+    ended: bool
+    """True if the task is over, which `success` alone need not mean."""
+    reward: float | None = None
+    """None: 1.0 at the first success, else 0.0."""
+    cut: bool = False
+    """True if the simulator itself ends the episode early."""
+    finite: bool = True
+    """False if the simulator diverged: the episode ends as truncated, and must not be trained on."""
+
+
+class EpisodeWorld(World):
+    """A world that is stepped one action at a time; counts steps and decides how an episode ends."""
+
+    _task = ""
+    _steps = 0
+    _success = False
+    _done = True
+
+    @abstractmethod
+    def _begin(self, seed: int, task: str) -> None:
+        """Resets the simulator."""
+
+    @abstractmethod
+    def _step(self, action: np.ndarray) -> Step:
+        """Steps the simulator."""
+
+    @abstractmethod
+    def _observe(self) -> Observation:
+        """Looks at the current state."""
+
+    @property
+    def late(self) -> float:
+        """Share of the time limit gone."""
+        return self._steps / self.spec.max_steps
+
+    def reset(self, seed: int, task: str) -> Observation:
+        if task not in self.spec.tasks:
+            raise InputError("task", task, f"this world has: {', '.join(self.spec.tasks)}")
+        if not 0 <= seed < 2**32:
+            raise InputError("seed", seed, "use 0 to 2**32 - 1")
+        self._done = True  # until the new episode stands: an error below leaves a world that must be reset
+        self._begin(seed, task)
+        self._task, self._steps, self._success, self._done = task, 0, False, False
+        return self._observe()
+
+    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
+        if self._done:
+            raise RuntimeError("the episode is over: call reset before step_chunk")
+        rewards = []
+        for action in checked_actions(actions, self.spec):
+            step = self._step(action)
+            self._steps += 1
+            succeeded = step.success and step.finite
+            first = succeeded and not self._success
+            rewards.append(float(first) if step.reward is None else step.reward)
+            self._success |= succeeded
+            terminated = step.ended and step.finite
+            limit = self._steps >= self.spec.max_steps
+            truncated = not terminated and (step.cut or limit or not step.finite)
+            self._done = terminated or truncated
+            if self._done:
+                break
+        return ChunkResult(
+            observation=self._observe(),
+            rewards=np.asarray(rewards, np.float32),
+            terminated=terminated,
+            truncated=truncated,
+            success=self._success,
+            info={} if step.finite else {"nonfinite": 1.0},
+        )
 
 
 def checked_actions(actions: np.ndarray, spec: WorldSpec) -> np.ndarray:

@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from accerl_lerobot.config.ranges import Range
-from accerl_lerobot.envs.base import ChunkResult, EnvConfig, World, WorldSpec, checked_actions
+from accerl_lerobot.envs.base import EnvConfig, EpisodeWorld, Step, WorldSpec
 from accerl_lerobot.envs.metaworld import close_at_exit, import_mujoco
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Observation
@@ -65,7 +65,7 @@ class LeRobotEnvConfig(EnvConfig):
             raise InputError("env.name", self.name, remedy)
 
 
-class LeRobotWorld(World):
+class LeRobotWorld(EpisodeWorld):
     """One of LeRobot's environments; a suite of several tasks has one simulator for each."""
 
     def __init__(self, config: LeRobotEnvConfig) -> None:
@@ -89,47 +89,21 @@ class LeRobotWorld(World):
                 self._lerobot_config, n_envs=1, trust_remote_code=config.trust_remote_code
             )
         self._envs = _single_envs(self._vectors)
-        self._task = ""
-        self._steps = 0
-        self._success = False
-        self._done = True
         self.spec = self._look()
         close_at_exit(self)
 
-    def reset(self, seed: int, task: str) -> Observation:
-        if task not in self._envs:
-            raise InputError("task", task, f"this world has: {', '.join(self._envs)}")
-        self._done = True
-        env = self._envs[task]
-        raw, _ = env.reset(seed=seed)
-        self._task, self._steps, self._success, self._done = task, 0, False, False
-        return self._observe(raw)
+    def _begin(self, seed: int, task: str) -> None:
+        self._raw, _ = self._envs[task].reset(seed=seed)
 
-    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-        if self._done:
-            raise RuntimeError("the episode is over: call reset before step_chunk")
-        actions = checked_actions(actions, self.spec)
-        env, rewards, nonfinite = self._envs[self._task], [], False
-        for action in self._processed(actions):
-            raw, reward, ended, cut, info = env.step(action)
-            self._steps += 1
-            nonfinite = not (math.isfinite(reward) and _finite(raw))
-            succeeded = not nonfinite and bool(info.get("is_success", False))
-            first = succeeded and not self._success
-            rewards.append(float(reward) if self.config.reward == "env" else float(first))
-            self._success |= succeeded
-            terminated = bool(ended) and not nonfinite
-            truncated = not terminated and (nonfinite or bool(cut) or self._steps >= self.config.max_steps)
-            self._done = terminated or truncated
-            if self._done:
-                break
-        return ChunkResult(
-            observation=self._observe(raw),
-            rewards=np.asarray(rewards, np.float32),
-            terminated=terminated,
-            truncated=truncated,
-            success=self._success,
-            info={"nonfinite": 1.0} if nonfinite else {},
+    def _step(self, action: np.ndarray) -> Step:
+        processed = self._processed(action[None])[0]
+        self._raw, reward, ended, cut, info = self._envs[self._task].step(processed)
+        return Step(
+            success=bool(info.get("is_success", False)),
+            ended=bool(ended),
+            reward=float(reward) if self.config.reward == "env" else None,
+            cut=bool(cut),
+            finite=math.isfinite(reward) and _finite(self._raw),
         )
 
     def render(self, height: int, width: int) -> np.ndarray:
@@ -148,7 +122,8 @@ class LeRobotWorld(World):
         """Learns shapes from a first observation."""
         task, env = next(iter(self._envs.items()))
         self._task = task
-        observation = self._observe(env.reset(seed=0)[0])
+        self._raw, _ = env.reset(seed=0)
+        observation = self._observe()
         images: dict[str, tuple[int, int, int]] = {
             key: (image.shape[0], image.shape[1], image.shape[2])
             for key, image in observation.items()
@@ -171,11 +146,11 @@ class LeRobotWorld(World):
             instructions=tuple(filter(None, map(self._instruction, self._envs))),
         )
 
-    def _observe(self, raw: dict[str, Any]) -> Observation:
+    def _observe(self) -> Observation:
         from lerobot.envs.utils import preprocess_observation
 
         text = self._instruction(self._task)
-        batch = self._before({**preprocess_observation(_batched(raw)), TASK: [text]})
+        batch = self._before({**preprocess_observation(_batched(self._raw)), TASK: [text]})
         observation: Observation = {TASK: text}
         for key, value in batch.items():
             if key == _STATE:

@@ -14,13 +14,11 @@ import numpy as np
 
 from accerl_lerobot.config.ranges import Range
 from accerl_lerobot.envs.base import (
-    ChunkResult,
     EnvConfig,
-    World,
+    EpisodeWorld,
+    Step,
     WorldSpec,
     check_cameras,
-    check_episode,
-    checked_actions,
     names,
     task_code,
 )
@@ -101,7 +99,7 @@ def image_key(camera: str) -> str:
     return f"observation.images.{CAMERAS.get(camera, camera)}"
 
 
-class LiberoWorld(World):
+class LiberoWorld(EpisodeWorld):
     """One LIBERO instance; its simulators are built on first use of a task, then kept."""
 
     def __init__(self, config: LiberoConfig) -> None:
@@ -119,49 +117,20 @@ class LiberoWorld(World):
             instructions=tuple(map(instruction, config.tasks)),
         )
         self._simulators: dict[str, Simulator] = {}
-        self._task = ""
-        self._steps = 0
-        self._success = False
-        self._done = True
 
     @property
     def simulator(self) -> Simulator:
         """That of the current task; for experts, not for policies."""
         return self._simulators[self._task]
 
-    def reset(self, seed: int, task: str) -> Observation:
-        check_episode(self.spec, seed, task)
-        self._done = True  # until the new episode stands: an error below leaves a world that must be reset
+    def _begin(self, seed: int, task: str) -> None:
         if task not in self._simulators:
             self._simulators[task] = Simulator(task, self.config.rendering, self.config.assets)
         self._simulators[task].reset(seed)
-        self._task, self._steps, self._success, self._done = task, 0, False, False
-        return self._observe()
 
-    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-        if self._done:
-            raise RuntimeError("the episode is over: call reset before step_chunk")
-        actions = checked_actions(actions, self.spec)
-        rewards, nonfinite = [], False
-        for action in actions:
-            succeeded = self.simulator.step(action)
-            self._steps += 1
-            nonfinite = diverged(self.simulator.data)
-            succeeded &= not nonfinite
-            rewards.append(1.0 if succeeded and not self._success else 0.0)
-            self._success |= succeeded
-            truncated = not self._success and (nonfinite or self._steps >= self.config.max_steps)
-            self._done = self._success or truncated
-            if self._done:
-                break
-        return ChunkResult(
-            observation=self._observe(),
-            rewards=np.asarray(rewards, np.float32),
-            terminated=self._success,
-            truncated=truncated,
-            success=self._success,
-            info={"nonfinite": 1.0} if nonfinite else {},
-        )
+    def _step(self, action: np.ndarray) -> Step:
+        success = self.simulator.step(action)
+        return Step(success=success, ended=success, finite=not diverged(self.simulator.data))
 
     def render(self, height: int, width: int) -> np.ndarray:
         if not self._task:
@@ -180,8 +149,7 @@ class LiberoWorld(World):
         }
         observation["observation.state"] = simulator.state()
         if self.config.environment_state:
-            late = self._steps / self.config.max_steps
-            state = simulator.everything(), [late], task_code(self.spec.tasks, self._task)
+            state = simulator.everything(), [self.late], task_code(self.spec.tasks, self._task)
             observation[ENVIRONMENT_STATE] = np.concatenate(state).astype(np.float32)
         observation[TASK] = instruction(self._task)
         return observation

@@ -32,13 +32,11 @@ import numpy as np
 
 from accerl_lerobot.config.ranges import Positive, Range, Section
 from accerl_lerobot.envs.base import (
-    ChunkResult,
     EnvConfig,
-    World,
+    EpisodeWorld,
+    Step,
     WorldSpec,
     check_cameras,
-    check_episode,
-    checked_actions,
     names,
     task_code,
 )
@@ -263,8 +261,6 @@ class MetaWorldConfig(EnvConfig):
     """Episode limit in env steps; reaching it truncates."""
     lighting: Literal["cheap", "default"] = "cheap"
     """``cheap`` (no shadows, reflections or multisampling: ten times faster in software) or ``default``."""
-    terminate_on_success: bool = True
-    """True if the first success ends the episode."""
     reward: Literal["success", "dense"] = "success"
     """``success`` (1.0 at the first success, else 0.0) or ``dense`` (MetaWorld's own, 0 to 10 a step)."""
     environment_state: bool = False
@@ -300,7 +296,7 @@ class MetaWorldConfig(EnvConfig):
         return names(self.camera)
 
 
-class MetaWorld(World):
+class MetaWorld(EpisodeWorld):
     """One MetaWorld instance; its simulators are built on first use of a task, then kept.
 
     A simulator that diverges (non-finite state or reward, or MuJoCo had to reset it) ends the episode as
@@ -327,11 +323,7 @@ class MetaWorld(World):
         self._sims: dict[str, Any] = {}
         self._eyes: dict[str, Any] = {}
         self._film: dict[str, Any] = {}
-        self._task = ""
         self._raw = np.zeros(0)
-        self._steps = 0
-        self._success = False
-        self._done = True
         self._delayed: deque[np.ndarray] = deque()
 
     @property
@@ -339,9 +331,7 @@ class MetaWorld(World):
         """MetaWorld's own 39 numbers, float64, objects and goal included: for experts, not for policies."""
         return self._raw
 
-    def reset(self, seed: int, task: str) -> Observation:
-        check_episode(self.spec, seed, task)
-        self._done = True  # until the new episode stands: an error below leaves a world that must be reset
+    def _begin(self, seed: int, task: str) -> None:
         if task not in self._sims:
             self._sims[task] = self._build(task)
         sim = self._sims[task]
@@ -350,39 +340,16 @@ class MetaWorld(World):
         # MetaWorld moves the goal marker after its last forward pass, so that the first frame would show an
         # older goal. This places the markers and leaves the physics as it is.
         import_mujoco().mj_kinematics(sim.model, sim.data)
-        self._task, self._steps, self._success, self._done = task, 0, False, False
         self._delayed = deque([np.zeros(ACTION_DIM, np.float32)] * self.config.shift.action_delay)
-        return self._observe()
 
-    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-        if self._done:
-            raise RuntimeError("the episode is over: call reset before step_chunk")
-        actions = checked_actions(actions, self.spec)
-        sim, rewards, nonfinite = self._sims[self._task], [], False
-        for action in actions:
-            self._delayed.append(action)
-            self._raw, shaped, _, _, info = sim.step(self._delayed.popleft())
-            self._steps += 1
-            nonfinite = not (math.isfinite(shaped) and np.isfinite(self._raw).all()) or diverged(sim.data)
-            succeeded = not nonfinite and bool(info["success"])
-            if self.config.reward == "dense":
-                rewards.append(shaped)
-            else:
-                rewards.append(1.0 if succeeded and not self._success else 0.0)
-            self._success |= succeeded
-            terminated = self._success and self.config.terminate_on_success
-            truncated = not terminated and (nonfinite or self._steps >= self.config.max_steps)
-            self._done = terminated or truncated
-            if self._done:
-                break
-        return ChunkResult(
-            observation=self._observe(),
-            rewards=np.asarray(rewards, np.float32),
-            terminated=terminated,
-            truncated=truncated,
-            success=self._success,
-            info={"nonfinite": 1.0} if nonfinite else {},
-        )
+    def _step(self, action: np.ndarray) -> Step:
+        self._delayed.append(action)
+        sim = self._sims[self._task]
+        self._raw, reward, _, _, info = sim.step(self._delayed.popleft())
+        finite = math.isfinite(reward) and np.isfinite(self._raw).all() and not diverged(sim.data)
+        success = bool(info["success"])
+        dense = reward if self.config.reward == "dense" else None
+        return Step(success=success, ended=success, reward=dense, finite=bool(finite))
 
     def render(self, height: int, width: int) -> np.ndarray:
         if not self._task:
@@ -432,8 +399,7 @@ class MetaWorld(World):
         }
         observation["observation.state"] = self._raw[:STATE_DIM].astype(np.float32)
         if self.config.environment_state:
-            late = self._steps / self.config.max_steps
-            state = self._raw, [late], task_code(self.spec.tasks, self._task)
+            state = self._raw, [self.late], task_code(self.spec.tasks, self._task)
             observation[ENVIRONMENT_STATE] = np.concatenate(state).astype(np.float32)
         observation[TASK] = description(self._task)
         return observation

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from accerl_lerobot.config.ranges import Positive, Range
-from accerl_lerobot.envs.base import ChunkResult, EnvConfig, World, WorldSpec, checked_actions, names
+from accerl_lerobot.envs.base import EnvConfig, EpisodeWorld, Step, WorldSpec, names
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 
@@ -70,7 +70,7 @@ class SimulatedConfig(EnvConfig):
         return tuple(dict.fromkeys(names(self.task)))
 
 
-class SimulatedWorld(World):
+class SimulatedWorld(EpisodeWorld):
     """One instance."""
 
     def __init__(self, config: SimulatedConfig) -> None:
@@ -87,53 +87,26 @@ class SimulatedWorld(World):
             tasks=config.tasks,
             instructions=tuple(INSTRUCTIONS[task] for task in config.tasks),
         )
-        self._task = ""
         self._target: np.ndarray = np.zeros(dims, np.float32)
         self._recent: collections.deque[np.ndarray] = collections.deque(maxlen=config.hold)
-        self._steps = 0
-        self._success = False
-        self._done = True
 
     @property
     def solution(self) -> np.ndarray:
         """float32 (A,): the action that solves this episode when it is held; for scripted experts."""
         return self._target * np.float32(_SIGN[self._task])
 
-    def reset(self, seed: int, task: str) -> Observation:
-        if task not in self.spec.tasks:
-            raise InputError("task", task, f"this world has: {', '.join(self.spec.tasks)}")
+    def _begin(self, seed: int, task: str) -> None:
         rng = np.random.default_rng((seed, 0))
-        self._task = task
         self._target = rng.uniform(-_REACH, _REACH, self.config.action_dim).astype(np.float32)
         self._recent.clear()
-        self._steps, self._success, self._done = 0, False, False
-        return self._observe()
 
-    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-        if self._done:
-            raise RuntimeError("the episode is over: call reset before step_chunk")
-        actions = checked_actions(actions, self.spec)
-        config, rewards = self.config, []
-        for action in actions:
-            self._steps += 1
-            self._recent.append(action)
-            distance = float(np.abs(self._mean() - self.solution).max())
-            succeeded = len(self._recent) == config.hold and distance <= config.tolerance
-            first = succeeded and not self._success
-            rewards.append(1.0 - distance if config.reward == "dense" else float(first))
-            self._success |= succeeded
-            terminated = self._success and config.terminate_on_success
-            truncated = not terminated and self._steps >= config.max_steps
-            self._done = terminated or truncated
-            if self._done:
-                break
-        return ChunkResult(
-            observation=self._observe(),
-            rewards=np.asarray(rewards, np.float32),
-            terminated=terminated,
-            truncated=truncated,
-            success=self._success,
-        )
+    def _step(self, action: np.ndarray) -> Step:
+        self._recent.append(action)
+        distance = float(np.abs(self._mean() - self.solution).max())
+        success = len(self._recent) == self.config.hold and distance <= self.config.tolerance
+        ended = (success or self._success) and self.config.terminate_on_success
+        dense = 1.0 - distance if self.config.reward == "dense" else None
+        return Step(success=success, ended=ended, reward=dense)
 
     def render(self, height: int, width: int) -> np.ndarray:
         image = np.full((height, width, 3), 40, np.uint8)
@@ -159,8 +132,7 @@ class SimulatedWorld(World):
             TASK: INSTRUCTIONS[self._task],
         }
         if self.config.environment_state:
-            late = self._steps / self.config.max_steps
-            observation[ENVIRONMENT_STATE] = np.append(state, late).astype(np.float32)
+            observation[ENVIRONMENT_STATE] = np.append(state, self.late).astype(np.float32)
         return observation
 
 

@@ -21,6 +21,9 @@ from accerl_lerobot.config.ranges import Range, Section, Steps
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seeds import eval_seed
 
+FILM = 128, 4
+"""Side in pixels and env steps per frame of videos, which show 20 frames a second; see `EpisodePlan.film`."""
+
 
 class Interval(NamedTuple):
     """Both ends as fractions."""
@@ -129,15 +132,6 @@ class EvaluationConfig(Section, section="evaluation"):
     """Episodes of each evaluation while training."""
     videos: Annotated[int, Range("[0, 1000]")] = 16
     """Episodes filmed, the same before and after."""
-    video_size: Annotated[int, Range("[16, 4096]")] = 128
-    """Side of the video in pixels."""
-    video_every: Annotated[int, Range("[1, 1000]")] = 4
-    """Env steps per video frame, of which 20 are shown in a second."""
-
-    @property
-    def film(self) -> tuple[int, int]:
-        """See `EpisodePlan.film`."""
-        return self.video_size, self.video_every
 
 
 def evaluation_plans(
@@ -147,7 +141,7 @@ def evaluation_plans(
     *,
     seed: int = 0,
     filmed: int = 0,
-    film: tuple[int, int] = (128, 4),
+    film: tuple[int, int] = FILM,
 ) -> list[EpisodePlan]:
     """`episodes` plans of an evaluation called `group`, spread evenly over `tasks`; the first are `filmed`.
 

@@ -19,10 +19,12 @@ from urllib.parse import quote
 
 from accerl_lerobot import __version__
 from accerl_lerobot.checkpoint.safety import brief
-from accerl_lerobot.config.ranges import NonNegative, Section
+from accerl_lerobot.config.ranges import Section
 from accerl_lerobot.errors import InputError, check_output, expanded
 
 NAME = "report.html"
+VIDEO_MB = 20
+"""Videos up to so many megabytes each are put into the page, larger ones are linked."""
 MARK = '<meta name="generator" content="accerl report'
 """Tells a page of ours from any other file; within its first 1000 characters."""
 
@@ -34,12 +36,10 @@ class ReportConfig(Section):
     BARE: ClassVar[str] = "runs"
 
     runs: tuple[str, ...] = ()
-    """Folders of runs; several of ``accerl train`` make a page that compares them. Bare arguments are runs."""
+    """Folders of runs; several of ``accerl train`` make a page that compares them. Bare ones are runs."""
     output: str | None = None
     """The page. None: ``report.html`` in the run's folder, or here if there are several. An older page of
     accerl is replaced; any other file is left alone."""
-    video_mb: NonNegative = 20.0
-    """Videos up to so many megabytes each are put into the page, larger ones are linked."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -83,7 +83,7 @@ def write_report(config: ReportConfig, recipes: Mapping[str, type[Any]]) -> Path
         **page,
         version=__version__,
         points=POINTS,
-        video_mb=config.video_mb,
+        video_mb=VIDEO_MB,
         base64=lambda path: base64.b64encode(path.read_bytes()).decode(),
         address=lambda path: quote(os.path.relpath(path.resolve(), folder)),
     )

@@ -62,9 +62,7 @@ def stand_in(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
 @pytest.fixture(scope="module")
 def real(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that was really made, in one process."""
-    evaluation = EvaluationConfig(
-        episodes=8, every_updates=6, episodes_during=4, videos=1, video_size=32, video_every=1
-    )
+    evaluation = EvaluationConfig(episodes=8, every_updates=6, episodes_during=4, videos=1)
     config = tiny_run(
         tiny_checkpoint,
         evaluation=evaluation,
@@ -299,11 +297,11 @@ def test_text_of_a_run_is_one_word_of_a_command(tmp_path: Path) -> None:
 
 def test_a_large_video_is_linked(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "a run")
-    (folder / "before_after.mp4").write_bytes(bytes(2_000_001))
-    seen = page_of(folder, video_mb=2.0, output=str(tmp_path / "elsewhere.html"))
+    (folder / "before_after.mp4").write_bytes(bytes(20_000_001))
+    seen = page_of(folder, output=str(tmp_path / "elsewhere.html"))
     assert seen.named("video") == []
     assert {"href": "a%20run/before_after.mp4"} in seen.named("a")
-    assert "before_after.mp4 is 2 MB, too large" in seen.text
+    assert "before_after.mp4 is 20 MB, too large" in seen.text
 
 
 def test_a_long_run_makes_a_small_page_soon(pictures: None, tmp_path: Path) -> None:
