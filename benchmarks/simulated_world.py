@@ -77,7 +77,7 @@ class LatencyWorld(SimulatedWorld):
         if 0 < crash <= result.steps:
             raise RuntimeError(f"simulated crash after {self.config.crash_after} env steps")
         if result.steps == nan:
-            state = np.full(self.config.state_dim, np.nan, np.float32)
+            state = np.full(self.spec.state_dim, np.nan, np.float32)
             result = replace(
                 result,
                 observation={**result.observation, "observation.state": state},

@@ -16,7 +16,7 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.engine import run
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig, parse
 from accerl_lerobot.engine.contract import Engine, Progress, Saved, WorkerError
-from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.config import PolicyConfig
@@ -143,7 +143,7 @@ def test_a_policy_that_does_not_fit_the_world_is_refused_before_any_worker_start
     tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(run, "make_engine", lambda *_: pytest.fail("a worker was started"))
-    config = local_run(tiny_checkpoint, tmp_path, env=SimulatedConfig(action_dim=3, state_dim=6))
+    config = local_run(tiny_checkpoint, tmp_path, env=MetaWorldConfig())
     with pytest.raises(InputError, match=r"policy.path"):
         run.train(config, tmp_path, Console())
 

@@ -15,6 +15,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 
 CAMERA = "front"
+ACTION_DIM, STATE_DIM = 2, 4
 INSTRUCTIONS = {"match": "Match the target", "mirror": "Mirror the target"}
 _SIGN = {"match": 1.0, "mirror": -1.0}
 _REACH = 0.8
@@ -25,15 +26,12 @@ _REACH = 0.8
 class SimulatedConfig(EnvConfig):
     """How hard.
 
-    The state holds a target; an episode succeeds as soon as the mean of the last `hold` actions is within
-    `tolerance` of it in every dimension.
+    The state holds a target and the mean of the last `hold` actions; an episode succeeds as soon as they are
+    within `tolerance` of each other in every dimension.
     """
 
     task: str = "match"
     """``match`` (the action is the target), ``mirror`` (its negative), or both separated by a comma."""
-    action_dim: Annotated[int, Range("[1, 32]")] = 2
-    state_dim: Annotated[int, Range("[2, 1024]")] = 4
-    """At least twice `action_dim`: the target, the mean of the last actions, then zeros."""
     image_size: Annotated[int, Range("[8, 480]")] = 32
     """Height and width of ``observation.images.front`` in pixels: target green, mean action red."""
     max_steps: Annotated[int, Range("[1, 1000000]")] = 40
@@ -53,14 +51,12 @@ class SimulatedConfig(EnvConfig):
     @property
     def state_size(self) -> int:
         """See the base class."""
-        return self.state_dim + 1 if self.environment_state else 0
+        return STATE_DIM + 1 if self.environment_state else 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.tasks or any(name not in INSTRUCTIONS for name in self.tasks):
             raise InputError("env.task", self.task, f"use names from: {', '.join(INSTRUCTIONS)}")
-        if self.state_dim < 2 * self.action_dim:
-            raise InputError("env.state_dim", self.state_dim, f"use at least {2 * self.action_dim}")
         if self.hold > self.max_steps:
             raise InputError("env.hold", self.hold, f"use 1 to env.max_steps ({self.max_steps})")
 
@@ -75,19 +71,19 @@ class SimulatedWorld(EpisodeWorld):
 
     def __init__(self, config: SimulatedConfig) -> None:
         self.config = config
-        size, dims = config.image_size, config.action_dim
+        size = config.image_size
         self.spec = WorldSpec(
             images={f"observation.images.{CAMERA}": (size, size, 3)},
-            state_dim=config.state_dim,
-            action_dim=dims,
-            action_low=np.full(dims, -1, np.float32),
-            action_high=np.full(dims, 1, np.float32),
+            state_dim=STATE_DIM,
+            action_dim=ACTION_DIM,
+            action_low=np.full(ACTION_DIM, -1, np.float32),
+            action_high=np.full(ACTION_DIM, 1, np.float32),
             fps=80,
             max_steps=config.max_steps,
             tasks=config.tasks,
             instructions=tuple(INSTRUCTIONS[task] for task in config.tasks),
         )
-        self._target: np.ndarray = np.zeros(dims, np.float32)
+        self._target: np.ndarray = np.zeros(ACTION_DIM, np.float32)
         self._recent: collections.deque[np.ndarray] = collections.deque(maxlen=config.hold)
 
     @property
@@ -97,7 +93,7 @@ class SimulatedWorld(EpisodeWorld):
 
     def _begin(self, seed: int, task: str) -> None:
         rng = np.random.default_rng((seed, 0))
-        self._target = rng.uniform(-_REACH, _REACH, self.config.action_dim).astype(np.float32)
+        self._target = rng.uniform(-_REACH, _REACH, ACTION_DIM).astype(np.float32)
         self._recent.clear()
 
     def _step(self, action: np.ndarray) -> Step:
@@ -111,7 +107,7 @@ class SimulatedWorld(EpisodeWorld):
     def render(self, height: int, width: int) -> np.ndarray:
         image = np.full((height, width, 3), 40, np.uint8)
         for channel, point in ((1, self._target), (0, self._mean())):
-            row, column = (_pixel(point[i % len(point)], size) for i, size in ((0, height), (1, width)))
+            row, column = _pixel(point[0], height), _pixel(point[1], width)
             radius = max(1, min(height, width) // 16)
             rows = slice(max(0, row - radius), row + radius + 1)
             image[rows, max(0, column - radius) : column + radius + 1, channel] = 255
@@ -123,9 +119,8 @@ class SimulatedWorld(EpisodeWorld):
         return np.asarray(np.mean(self._recent, axis=0, dtype=np.float32))
 
     def _observe(self) -> Observation:
-        size, dims = self.config.image_size, self.config.action_dim
-        state = np.zeros(self.config.state_dim, np.float32)
-        state[:dims], state[dims : 2 * dims] = self._target, self._mean()
+        size = self.config.image_size
+        state = np.concatenate([self._target, self._mean()])
         observation: Observation = {
             f"observation.images.{CAMERA}": self.render(size, size),
             "observation.state": state,
