@@ -28,12 +28,7 @@ class Stage:
         self._began: tuple[float, int] | None = None
 
     def update(self, done: int, status: str = "") -> None:
-        """Moves the bar.
-
-        Args:
-            done: how far it is.
-            status: shown beside it.
-        """
+        """Moves the bar, and shows `status` beside it."""
         now = time.monotonic()
         self._began = self._began or (now, done)
         share = f"{done}/{self._total} ({done / self._total:.0%})" if self._total else str(done)

@@ -8,7 +8,7 @@ import errno
 import os
 import re
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -54,6 +54,14 @@ def check_absent(path: Path, field: str = "output_dir") -> None:
     above = next(folder for folder in path.absolute().parents if folder.exists())
     if not os.access(above, os.W_OK | os.X_OK):
         raise InputError(field, str(path), f"{above} cannot be written to; name another folder")
+
+
+def check_output(path: Path, ours: Callable[[Path], bool]) -> None:
+    """Refuses an ``output`` in no folder, or over anything but an older file of ours."""
+    if not path.parent.is_dir():
+        raise InputError("output", str(path), f"there is no folder {path.parent}; make it first")
+    if path.is_dir() or (path.exists() and not ours(path)):
+        raise InputError("output", str(path), "there is another file or folder of this name; choose another")
 
 
 def is_full(error: BaseException | None) -> bool:

@@ -38,13 +38,7 @@ class WandBConfig(Section, section="wandb"):
 
 
 class MetricsLog:
-    """Appends records; `close` flushes them.
-
-    Args:
-        directory: the run's folder.
-        wandb: whether to log there too.
-        config: the resolved run config, for wandb.
-    """
+    """Appends records to files in a run's folder; `close` flushes them. wandb is given the run's config."""
 
     def __init__(self, directory: Path, wandb: WandBConfig, config: dict[str, Any]) -> None:
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
@@ -80,13 +74,10 @@ class MetricsLog:
         return time.monotonic() - self._started
 
     def write(self, kind: str, update: int, values: dict[str, Any]) -> None:
-        """Records numbers.
+        """Records numbers of one kind (train, rollout or evaluation), after so many updates.
 
-        Args:
-            kind: train, rollout or evaluation.
-            update: version of the weights.
-            values: numbers; anything else goes to the JSON lines only. NaN and infinity become null there,
-                which JSON does not know, and are left out elsewhere.
+        Anything else goes to the JSON lines only. NaN and infinity, which JSON does not know, become null
+        there and are left out elsewhere.
         """
         finite = plain(values)
         record = {"kind": kind, "wall_s": round(self.wall_s, 3), "update": update, **finite}

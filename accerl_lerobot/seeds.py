@@ -52,10 +52,7 @@ def _permuted(seeds: range, run_seed: int, index: int) -> int:
 def noise_seed(episode_seed: int, member: int, decision: int) -> int:
     """Seed of one decision's noise: of the episode and the decision, not of the slot or batch that runs it.
 
-    Args:
-        episode_seed: of the world, below 2**32.
-        member: which of the episodes with this seed, where several start alike; else 0.
-        decision: number within the episode, below 1,000,003.
+    `member` tells episodes apart that start alike; else it is 0.
     """
     return (member * _ALL_SEEDS + episode_seed) * _DECISIONS_PER_EPISODE + decision
 

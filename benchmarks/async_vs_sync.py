@@ -20,17 +20,17 @@ from typing import Annotated, Any
 
 from rich.console import Group
 
-from accerl_lerobot.bench.host import as_markdown, as_table, floors, host, ranged, spread, write
+from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.bench.latency import TRACE
-from accerl_lerobot.bench.throughput import ARMS, MOST_BUSY, Block, as_rows
+from accerl_lerobot.bench.throughput import ARMS, MOST_BUSY, Block
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Seed, Steps
 from accerl_lerobot.console import Console
-from accerl_lerobot.envs.simulated import read_trace
 from accerl_lerobot.errors import InputError, output_folder
-from accerl_lerobot.evaluation.pictures import drawing
-from accerl_lerobot.evaluation.stats import Rate, evaluation_plans
+from accerl_lerobot.evaluation import Rate, drawing, evaluation_plans
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule
 from benchmarks.machinery import MachineryConfig
+from benchmarks.records import as_markdown, floors, write
+from benchmarks.simulated_world import read_trace
 
 LEARNING = MachineryConfig(worlds=4, latency_ms=4.0, image_size=16, decide_ms=1.0, update_ms=8.0)
 """Small, as nothing is timed in it."""
@@ -121,7 +121,7 @@ def compare(config: MachineryConfig, blocks: list[Block]) -> dict[str, Any]:
         "largest_speed_up": config.bound / statistics.median(rates[SYNCHRONOUS]),
         "share_of_largest": spread(reached),
         "processor_bound": max(b.processors for b in blocks) > MOST_BUSY,
-        "blocks": as_rows(blocks),
+        "blocks": [asdict(block) for block in blocks],
     }
 
 

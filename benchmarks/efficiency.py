@@ -18,14 +18,12 @@ from typing import Annotated, Any
 
 from rich.table import Table
 
-from accerl_lerobot.bench.host import as_markdown, write
 from accerl_lerobot.checkpoint.layout import DEMOS
-from accerl_lerobot.config.dataset import DatasetConfig
-from accerl_lerobot.config.ranges import Choice, Range, Seed
+from accerl_lerobot.config.ranges import Choice, DatasetConfig, Range, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.dataset_files import open_metadata
 from accerl_lerobot.engine.config import RunConfig, parse
-from accerl_lerobot.evaluation.stats import mean_interval
+from benchmarks.records import as_markdown, mean_interval, write
 from benchmarks.study import (
     INTERVALS,
     Cell,

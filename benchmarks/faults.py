@@ -24,19 +24,19 @@ import numpy as np
 import yaml
 from rich.table import Table
 
-from accerl_lerobot.bench.host import as_markdown, as_table, host, write
+from accerl_lerobot.bench import as_table, host
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.config.ranges import Range, Repeats, Section, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, encode, parse
 from accerl_lerobot.engine.ray_session import RAY_PROCESSES
 from accerl_lerobot.errors import InputError, check_absent, make_folder
-from accerl_lerobot.evaluation.pictures import drawing
-from accerl_lerobot.evaluation.stats import Rate
+from accerl_lerobot.evaluation import Rate, drawing
 from accerl_lerobot.trainer.batch import MAX_NONFINITE
 from benchmarks.audit import audit_segments, audit_updates
 from benchmarks.hits import FAULTS, START_S, TIDY_S, places, strike
 from benchmarks.light_run import light_config
+from benchmarks.records import as_markdown, write
 from benchmarks.study import last_words
 from benchmarks.victims import CLASSES, DRIVER, EVERYTHING, LIGHT, TRAIN, Victim, alive
 

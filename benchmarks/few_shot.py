@@ -15,12 +15,12 @@ from typing import Any
 
 from rich.table import Table
 
-from accerl_lerobot.bench.host import as_markdown, as_table, write
+from accerl_lerobot.bench import as_table
 from accerl_lerobot.config.ranges import Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.errors import output_folder
-from accerl_lerobot.evaluation.pictures import drawing
-from accerl_lerobot.evaluation.stats import Rate, mean_interval
+from accerl_lerobot.evaluation import Rate, drawing
+from benchmarks.records import as_markdown, mean_interval, write
 from benchmarks.study import Cell, Study, StudyConfig, named
 
 COLUMNS = ("task", "seed", "algorithm", "SFT", "after", "real episodes", "env steps")

@@ -14,9 +14,9 @@ from typing import Any
 
 from rich.table import Table
 
-from accerl_lerobot.bench.host import as_markdown, write
 from accerl_lerobot.config.ranges import Steps
 from accerl_lerobot.console import Console
+from benchmarks.records import as_markdown, write
 from benchmarks.study import (
     INTERVALS,
     Cell,

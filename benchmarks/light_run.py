@@ -15,13 +15,13 @@ import os
 import sys
 
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.stats import EvaluationConfig
+from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.config import Load, PolicyConfig
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
+from benchmarks.simulated_world import LatencyConfig
 
 BATCH = 16
 """Decisions of an update."""
@@ -40,7 +40,7 @@ def light_config(
     """
     return RunConfig(
         job_name="light",
-        env=SimulatedConfig(max_steps=32, frame_ms=40.0, latency="lognormal", latency_cv=0.5),
+        env=LatencyConfig(max_steps=32, frame_ms=40.0, latency_cv=0.5),
         policy=PolicyConfig(path="made of time", device="cpu"),
         rollout=RolloutConfig(workers=2, worlds=4, segment_length=4),
         replay=ReplayConfig(capacity=512, min_decisions=32, ahead=64, samples_per_insert=1.0),

@@ -18,14 +18,13 @@ import numpy as np
 from accerl_lerobot.bench.throughput import Measured
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Section
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
-from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.envs.simulated import read_trace
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
+from benchmarks.simulated_world import LatencyConfig, read_trace
 
 EPISODE = 16
 """Decisions of an episode."""
@@ -107,13 +106,12 @@ class MachineryConfig(Section):
         batch, trace = self.batch, self.latency_trace
         return RunConfig(
             seed=seed,
-            env=SimulatedConfig(
+            env=LatencyConfig(
                 max_steps=EPISODE * CHUNK,
                 terminate_on_success=False,
                 reward="dense",
                 image_size=self.image_size,
                 frame_ms=self.latency_ms,
-                latency="trace" if trace else "lognormal" if self.latency_cv else "constant",
                 latency_cv=self.latency_cv,
                 latency_trace=trace and str(Path(trace).expanduser().resolve()),  # workers run elsewhere
             ),

@@ -20,8 +20,7 @@ from accerl_lerobot.config.ranges import Device, Range, Section, Threads
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
 from accerl_lerobot.errors import InputError, check_absent, make_folder
-from accerl_lerobot.evaluation.pictures import drawing
-from accerl_lerobot.evaluation.stats import Rate
+from accerl_lerobot.evaluation import Rate, drawing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +73,7 @@ def bench_ranking(config: BenchRankingConfig) -> dict[str, Any]:
     import torch
 
     from accerl_lerobot.envs import make_world
-    from accerl_lerobot.evaluation.stats import evaluation_plans
+    from accerl_lerobot.evaluation import evaluation_plans
     from accerl_lerobot.policies.config import PolicyConfig
     from accerl_lerobot.policies.loading import load_adapter, rehearsed_config, resolve_device
     from accerl_lerobot.world_model.registry import ImaginationModels, check_fit

@@ -18,7 +18,7 @@ from typing import Annotated, Any
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot.bench.host import as_table, floors, host, ranged, spread
+from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.checkpoint import snapshot
 from accerl_lerobot.checkpoint.layout import save_checkpoint
 from accerl_lerobot.config.ranges import Range, Repeats, Section
@@ -27,6 +27,7 @@ from accerl_lerobot.experience import Origin, Segment
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.replay.buffer import MixedReplay
 from accerl_lerobot.replay.journal import EPISODES, Journal
+from benchmarks.records import floors
 
 CAMERA = "observation.images.front"
 PLAIN, JOURNALLED, DRAWN = "insert", "insert with journal", "draw a batch"

@@ -16,15 +16,16 @@ from typing import Annotated, Any
 
 from rich.table import Table
 
-from accerl_lerobot.bench.host import as_markdown, as_table, floors, host, ranged, spread, write
-from accerl_lerobot.bench.throughput import MOST_BUSY, Block, as_rows
+from accerl_lerobot.bench import as_table, host, ranged, spread
+from accerl_lerobot.bench.throughput import MOST_BUSY, Block
 from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Repeats
 from accerl_lerobot.console import Console
-from accerl_lerobot.envs.simulated import read_trace
 from accerl_lerobot.errors import InputError, output_folder
-from accerl_lerobot.evaluation.pictures import drawing
+from accerl_lerobot.evaluation import drawing
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS
 from benchmarks.machinery import MachineryConfig
+from benchmarks.records import as_markdown, floors, write
+from benchmarks.simulated_world import read_trace
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +92,7 @@ def compare(config: BenchScalingConfig, blocks: dict[int, list[Block]]) -> list[
             "processors": max(b.processors for b in of),
             "processor_bound": max(b.processors for b in of) > MOST_BUSY,
             "batch_size": sum(b.batch_size for b in of) / len(of),
-            "blocks": as_rows(of),
+            "blocks": [asdict(block) for block in of],
         }
         for n, of in blocks.items()
     ]

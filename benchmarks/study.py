@@ -21,15 +21,15 @@ from typing import Annotated, Any, NamedTuple
 import yaml
 from rich.table import Table
 
-from accerl_lerobot.bench.host import as_table
+from accerl_lerobot.bench import as_table
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, DEMOS, LAST, PRETRAINED, SUMMARY
 from accerl_lerobot.config.ranges import Range, Section, Seed, Steps
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, encode, parse
 from accerl_lerobot.engine.stopping import locked
 from accerl_lerobot.errors import InputError, expanded
-from accerl_lerobot.evaluation.pictures import drawing
-from accerl_lerobot.evaluation.stats import Rate, mean_interval
+from accerl_lerobot.evaluation import Rate, drawing
+from benchmarks.records import mean_interval
 
 INTERVALS = "intervals are 95 %, over seeds where there are several"
 """For people, see `together`."""

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 from rich.table import Table
 
-from accerl_lerobot.bench.host import Memory, device_name, timed
+from accerl_lerobot.bench import Memory, device_name, timed
 from accerl_lerobot.config.parsing import encode
 from accerl_lerobot.config.ranges import Device, Range, Repeats, Section, Threads
 from accerl_lerobot.errors import InputError

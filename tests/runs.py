@@ -12,7 +12,7 @@ from accerl_lerobot.algorithms import AlgorithmConfig, RatioConfig
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.loop import Engine, Progress
 from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.evaluation.stats import EvaluationConfig
+from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
@@ -39,7 +39,7 @@ def tiny_run(checkpoint: Path, **sections: Any) -> RunConfig:
         "rollout": RolloutConfig(worlds=4, segment_length=3),
         "replay": ReplayConfig(capacity=64, min_decisions=16, ahead=32, samples_per_insert=2.0),
         "trainer": TrainerConfig(updates=12, batch_decisions=16, warmup_updates=2, value_warmup_updates=2),
-        "evaluation": EvaluationConfig(episodes=6, videos=1, video_size=32),
+        "evaluation": EvaluationConfig(episodes=6, videos=1),
         "launch": LaunchConfig(stall_s=120),
     }
     return RunConfig(**{**defaults, **sections})

@@ -196,13 +196,6 @@ def test_sizes_far_beyond_the_machine_are_refused(monkeypatch: pytest.MonkeyPatc
         preflight.check_machine(parse(RunConfig, ["--rollout.workers=100"]))
     with pytest.raises(InputError, match=r"replay\.capacity=50000000"):
         preflight.check_machine(parse(RunConfig, ["--replay.capacity=50000000"]))
-    with pytest.raises(InputError, match=r"evaluation\.videos=1000"):
-        preflight.check_machine(
-            parse(
-                RunConfig,
-                ["--evaluation.videos=1000", "--evaluation.video_size=4096", "--evaluation.episodes=1000"],
-            )
-        )
     preflight.check_machine(parse(RunConfig, ["--rollout.workers=100", "--launch.address=auto"]))
 
 

@@ -18,12 +18,12 @@ import pytest
 from accerl_lerobot.checkpoint.layout import PRETRAINED
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.loop import Progress
-from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.evaluation.stats import evaluation_plans
+from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.replay import ReplayConfig, lag_bound
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.timeline.read import ABSENT, read_timeline
 from accerl_lerobot.trainer.config import TrainerConfig
+from benchmarks.simulated_world import LatencyConfig
 from tests.runs import collect, polls, tiny_run
 
 UPDATES = 40
@@ -61,7 +61,7 @@ def story(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> It
 
     config = tiny_run(
         tiny_checkpoint,
-        env=SimulatedConfig(max_steps=16, step_ms=2.0),
+        env=LatencyConfig(max_steps=16, frame_ms=8.0),
         rollout=RolloutConfig(workers=2, worlds=3, segment_length=3),
         replay=ReplayConfig(capacity=96, min_decisions=16, ahead=32, samples_per_insert=2.0),
         trainer=TrainerConfig(

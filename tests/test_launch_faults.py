@@ -23,8 +23,7 @@ from accerl_lerobot.engine.config import LaunchConfig
 from accerl_lerobot.engine.launch import RayEngine
 from accerl_lerobot.engine.loop import Progress
 from accerl_lerobot.engine.stopping import WorkerError, pause_s
-from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.evaluation.stats import evaluation_plans
+from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import PolicyConfig
@@ -34,6 +33,7 @@ from accerl_lerobot.trainer import worker as trainer_worker
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.transport.endpoint import Transport
 from accerl_lerobot.transport.shared_memory import Address, this_node
+from benchmarks.simulated_world import LatencyConfig
 from benchmarks.victims import alive
 from tests.light_workers import (
     FULL,
@@ -48,8 +48,8 @@ from tests.runs import collect, drive, polls, tiny_run
 
 __all__ = ["light_ray"]
 
-SLOW = SimulatedConfig(max_steps=16, step_ms=1.0)
-HARD = SimulatedConfig(max_steps=16, tolerance=0.02, step_ms=5.0)
+SLOW = LatencyConfig(max_steps=16, frame_ms=4.0)
+HARD = LatencyConfig(max_steps=16, tolerance=0.02, frame_ms=20.0)
 TWO = RolloutConfig(workers=2, worlds=2, segment_length=3)
 ENDLESS = TrainerConfig(updates=1_000_000, batch_decisions=16)
 
@@ -172,7 +172,7 @@ def test_a_worker_that_does_not_start_is_an_error_and_the_others_are_ended(engin
 
 def test_a_world_that_keeps_crashing_ends_the_run_with_its_own_traceback(engine):
     one = engine(
-        env=SimulatedConfig(crash_after=30),
+        env=LatencyConfig(crash_after=30),
         rollout=RolloutConfig(worlds=2),
         launch=LaunchConfig(max_restarts=2),
     )
@@ -183,7 +183,7 @@ def test_a_world_that_keeps_crashing_ends_the_run_with_its_own_traceback(engine)
             restarts.append(progress.rollout["restarts"])
     assert max(restarts) == 2.0
     text = str(caught.value)
-    assert "simulated crash after 30 env steps" in text and "simulated.py" in text and "step_chunk" in text
+    assert "simulated crash after 30 env steps" in text and "simulated_world.py" in text
 
 
 def lose_a_rollout_worker(one: RayEngine, how: signal.Signals) -> None:
@@ -386,7 +386,7 @@ def test_a_worker_that_does_not_find_inference_is_replaced(engine, monkeypatch):
 
 @pytest.mark.slow
 def test_a_world_that_does_not_return_is_no_reason_to_wait_for_ever(engine):
-    endless = SimulatedConfig(max_steps=16, step_ms=1e6)
+    endless = LatencyConfig(max_steps=16, frame_ms=4e6)
     one = engine(
         env=endless, rollout=RolloutConfig(worlds=1), launch=LaunchConfig(stall_s=5.0, max_restarts=0)
     )

@@ -19,12 +19,12 @@ import pytest
 from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.loop import Progress
-from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.evaluation.stats import evaluation_plans
+from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.replay import ReplayConfig, decisions_under_way, lag_bound
 from accerl_lerobot.rollout.groups import open_limit
 from accerl_lerobot.rollout.runner import EpisodeResult, RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
+from benchmarks.simulated_world import LatencyConfig
 from tests.runs import collect, polls, tiny_run
 
 pytestmark = pytest.mark.slow
@@ -58,7 +58,7 @@ def story(tiny_checkpoint: Path) -> Iterator[Story]:
 
     config = tiny_run(
         tiny_checkpoint,
-        env=SimulatedConfig(task="match,mirror", max_steps=16, step_ms=2.0),
+        env=LatencyConfig(task="match,mirror", max_steps=16, frame_ms=8.0),
         rollout=RolloutConfig(
             workers=2,
             worlds=WORLDS,

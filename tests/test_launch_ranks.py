@@ -23,7 +23,7 @@ from accerl_lerobot.checkpoint.layout import PRETRAINED, STEP, TRAINING_STATE, W
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.launch import RayEngine
 from accerl_lerobot.engine.stopping import WorkerError
-from accerl_lerobot.evaluation.stats import evaluation_plans
+from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.runs import collect, drive, polls, tiny_run
 from tests.test_ray_session import LOOPBACK, listening

@@ -20,7 +20,7 @@ from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.engine.run import make_engine
 from accerl_lerobot.inference.batcher import BatcherStats
 from accerl_lerobot.metrics import MetricsLog, WandBConfig
-from accerl_lerobot.timeline.clock import ROLES, STATES
+from accerl_lerobot.timeline import ROLES, STATES
 
 ROOT = Path(__file__).parents[1]
 

@@ -20,7 +20,7 @@ from accerl_lerobot.cli import main
 from accerl_lerobot.engine.config import LaunchConfig, encode
 from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.evaluation.stats import EvaluationConfig
+from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from tests.runs import tiny_run
@@ -32,9 +32,7 @@ TIMES = ("wall_s", "wait_s", "update_s", "publish_s", "rl_s", "warm_start_s")
 def recipe(folder: Path, checkpoint: Path, **sections: Any) -> Path:
     defaults: dict[str, Any] = {
         "env": SimulatedConfig(max_steps=12, tolerance=0.4),
-        "evaluation": EvaluationConfig(
-            episodes=6, every_updates=4, episodes_during=5, videos=1, video_size=32, video_every=1
-        ),
+        "evaluation": EvaluationConfig(episodes=6, every_updates=4, episodes_during=5, videos=1),
         "trainer": TrainerConfig(
             updates=UPDATES, batch_decisions=16, lr=1e-3, warmup_updates=2, value_warmup_updates=2
         ),
@@ -216,7 +214,7 @@ def test_an_asynchronous_run_that_was_killed_and_stopped_goes_on(tiny_checkpoint
         tmp_path,
         tiny_checkpoint,
         launch=LaunchConfig(stall_s=120),
-        env=SimulatedConfig(max_steps=12, tolerance=0.4, step_ms=2.0),
+        env=SimulatedConfig(max_steps=12, tolerance=0.4),
         rollout=RolloutConfig(workers=2, worlds=2, segment_length=3),
         trainer=TrainerConfig(updates=150, batch_decisions=16, lr=1e-3),
         save_every_updates=4,

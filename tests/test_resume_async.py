@@ -20,14 +20,14 @@ from accerl_lerobot.engine import launch
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.launch import RayEngine
 from accerl_lerobot.engine.loop import Progress
-from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.stats import evaluation_plans
+from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
 from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer import worker as trainer_worker
 from accerl_lerobot.trainer.config import TrainerConfig
+from benchmarks.simulated_world import LatencyConfig
 from tests.light_workers import LightInference, LightTrainer, light_ray
 from tests.runs import drive, polls, tiny_run
 
@@ -55,7 +55,7 @@ def engine(light_ray: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
 
 def run_of(**sections: Any) -> RunConfig:
     defaults: dict[str, Any] = {
-        "env": SimulatedConfig(max_steps=16, step_ms=1.0),
+        "env": LatencyConfig(max_steps=16, frame_ms=4.0),
         "rollout": TWO,
         "replay": ReplayConfig(capacity=160, min_decisions=16, ahead=48, samples_per_insert=2.0, max_lag=40),
         "trainer": TrainerConfig(updates=UPDATES, batch_decisions=16),

@@ -17,9 +17,9 @@ from accerl_lerobot.engine import run, stopping
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig, parse
 from accerl_lerobot.engine.loop import Engine, Progress, Saved
 from accerl_lerobot.engine.stopping import WorkerError
-from accerl_lerobot.envs import SimulatedConfig
+from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.stats import EvaluationConfig
+from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.config import PolicyConfig
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.trainer.config import TrainerConfig
@@ -36,9 +36,7 @@ class Finished:
 def local_run(checkpoint: Path, output_dir: Path | None, **sections: Any) -> RunConfig:
     defaults: dict[str, Any] = {
         "env": SimulatedConfig(max_steps=12, tolerance=0.4),
-        "evaluation": EvaluationConfig(
-            episodes=8, every_updates=4, episodes_during=4, videos=1, video_size=32, video_every=1
-        ),
+        "evaluation": EvaluationConfig(episodes=8, every_updates=4, episodes_during=4, videos=1),
         "trainer": TrainerConfig(updates=12, batch_decisions=16, warmup_updates=2, value_warmup_updates=2),
         "launch": LaunchConfig(engine="local"),
         "output_dir": None if output_dir is None else str(output_dir),
@@ -146,7 +144,7 @@ def test_a_policy_that_does_not_fit_the_world_is_refused_before_any_worker_start
     tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(run, "make_engine", lambda *_: pytest.fail("a worker was started"))
-    config = local_run(tiny_checkpoint, tmp_path, env=SimulatedConfig(action_dim=3, state_dim=6))
+    config = local_run(tiny_checkpoint, tmp_path, env=MetaWorldConfig())
     with pytest.raises(InputError, match=r"policy.path"):
         run.execute(config, tmp_path, Console())
 

@@ -18,9 +18,8 @@ import pytest
 from accerl_lerobot.engine import launch
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.engine.loop import Progress
-from accerl_lerobot.envs import SimulatedConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.stats import evaluation_plans
+from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.inference.batcher import dealt, merge_metrics
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.replay import ReplayConfig
@@ -29,6 +28,7 @@ from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import ImaginationConfig
 from benchmarks.simulated_policy import SimulatedPolicyConfig, load_simulated
+from benchmarks.simulated_world import LatencyConfig
 from tests.light_workers import light_ray
 from tests.replay.segments import make_segment
 from tests.replay.test_worker import BATCH, play, start, waits
@@ -114,7 +114,7 @@ def test_those_kept_waiting_go_when_the_schedule_changes_or_the_run_ends():
 
 def run_of(schedule: Any, updates: int = 6) -> RunConfig:
     return RunConfig(
-        env=SimulatedConfig(max_steps=16, terminate_on_success=False, frame_ms=3.0, latency="lognormal"),
+        env=LatencyConfig(max_steps=16, terminate_on_success=False, frame_ms=3.0, latency_cv=0.5),
         rollout=RolloutConfig(workers=2, worlds=2, segment_length=4, decision_cost=0.0),
         inference=InferenceConfig(max_batch=3),
         replay=ReplayConfig(capacity=256, min_decisions=16, ahead=16, samples_per_insert=1.0),

@@ -37,12 +37,10 @@ def test_recipes_are_found_by_name(installed: Path):
 
 def test_everything_that_is_not_code_comes_too(installed: Path):
     package = installed / "accerl_lerobot"
-    here = {
-        p.relative_to(ROOT / "accerl_lerobot")
-        for p in (ROOT / "accerl_lerobot").rglob("*")
-        if p.is_file() and "__pycache__" not in p.parts
-    }
-    there = {p.relative_to(package) for p in package.rglob("*") if p.is_file() and "__pycache__" not in p.parts}
+    here, there = (
+        {p.relative_to(folder) for p in folder.rglob("*") if p.is_file() and "__pycache__" not in p.parts}
+        for folder in (ROOT / "accerl_lerobot", package)
+    )
     recipes = {Path("recipes") / p.name for p in (ROOT / "recipes").iterdir()}
     assert there == here | recipes
     assert {p.name for p in installed.iterdir()} >= {"accerl_lerobot"}

@@ -18,15 +18,16 @@ from typing import Annotated, Any
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot.bench.host import as_markdown, as_table, host, write
+from accerl_lerobot.bench import as_table, host
 from accerl_lerobot.config.ranges import Range, Section, Seed
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig, World, make_world
-from accerl_lerobot.envs.simulated import RESET
 from accerl_lerobot.errors import output_folder
 from accerl_lerobot.seeds import train_seed
 
 TRACE = "trace.txt"
+RESET = "reset"
+"""First word of a trace's lines about resets."""
 QUANTILES = (0.5, 0.95, 0.99)
 
 
@@ -43,7 +44,7 @@ class BenchLatencyConfig(Section):
     seed: Seed = 0
     """Seed of the actions and episodes."""
     output_dir: str = "outputs/latency"
-    """Folder for trace.txt (a duration on each line), latency.json and .md."""
+    """Folder for trace.txt, a duration on each line."""
 
 
 def bench_latency(config: BenchLatencyConfig) -> dict[str, Any]:
@@ -75,8 +76,7 @@ def bench_latency(config: BenchLatencyConfig) -> dict[str, Any]:
     }
     text = "".join(f"{RESET + ' ' if reset else ''}{1000 * s:.4f}\n" for s, reset in lines)
     (root / TRACE).write_text(f"# {tasks}, chunks of {config.chunk}, ms\n{text}")
-    write(root, "latency", result, as_markdown(_COLUMNS, _rows(result)))
-    console.say(f"wrote {TRACE}, latency.json and .md into {root}")
+    console.say(f"wrote {root / TRACE}")
     return result
 
 
@@ -120,16 +120,10 @@ def described(seconds: np.ndarray) -> dict[str, float]:
 
 def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
-    return as_table("from a decision to the next observation", _COLUMNS, _rows(result))
-
-
-_COLUMNS = ("", "mean", "p50", "p95", "p99", "longest", "CV", "how many")
-
-
-def _rows(result: dict[str, Any]) -> list[list[str]]:
+    columns = ("", "mean", "p50", "p95", "p99", "longest", "CV", "how many")
     rows = []
     for name in ("decision", "reset"):
         if (of := result[f"{name}_ms"]) is not None:
             durations = [f"{of[key]:.1f} ms" for key in ("mean", "p50", "p95", "p99", "longest")]
             rows.append([name, *durations, f"{of['cv']:.2f}", str(of["n"])])
-    return rows
+    return as_table("from a decision to the next observation", columns, rows)

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 
 from rich.table import Table
 
-from accerl_lerobot.bench.host import Memory, as_table, device_name, ranged, timed
+from accerl_lerobot.bench import Memory, as_table, device_name, ranged, timed
 from accerl_lerobot.config.ranges import Device, Range, Repeats, Section
 from accerl_lerobot.policies.config import TuningConfig
 

@@ -3,8 +3,6 @@
 
 Environments, policy and engine are those of the run. Each decision is accounted for: it is in the replay
 buffer, was dropped for a reason that is counted, or is under way.
-
-Measurement of a running training engine, one block of time after another.
 """
 
 from __future__ import annotations
@@ -13,19 +11,16 @@ import math
 import statistics
 import time
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.table import Table
 
-from accerl_lerobot.bench.host import Processors, as_markdown, as_table, host, ranged, spread, write
+from accerl_lerobot.bench import Processors, as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Positive, Repeats, Section
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig, parse
 from accerl_lerobot.engine.loop import Progress
-from accerl_lerobot.errors import InputError, expanded, make_folder
-from accerl_lerobot.evaluation.pictures import drawing
+from accerl_lerobot.errors import InputError
 from accerl_lerobot.policies.config import Load
 from accerl_lerobot.replay.pacing import ASYNCHRONOUS, OVERLAP, SYNCHRONOUS, Schedule, decisions_under_way
 
@@ -128,11 +123,6 @@ class Measured:
                 raise RuntimeError("the measured run has ended: its number of episodes is limited")
 
 
-def as_rows(blocks: list[Block]) -> list[dict[str, Any]]:
-    """For JSON."""
-    return [asdict(block) for block in blocks]
-
-
 def _seconds(update: dict[str, float]) -> float:
     return update["wait_s"] + update["update_s"] + update["publish_s"]
 
@@ -160,8 +150,6 @@ class BenchThroughputConfig(Section):
     """Shortest duration of a block."""
     rounds: Repeats = 3
     """Times each schedule is measured twice, forth and back."""
-    output_dir: str = "outputs/throughput"
-    """Folder for throughput.json, .md and .png."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -178,14 +166,10 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
     Returns:
         ``schedules``: for each, env steps, decisions and updates per second and the rest of `Block`;
         ``books``: what became of all decisions; ``config`` and ``host``.
-
-    Raises:
-        InputError: the recipe or the checkpoint cannot be used.
-        RuntimeError: the books do not add up.
     """
     from accerl_lerobot.engine.preflight import check_policy, check_world
 
-    console, root = Console(), expanded(config.output_dir, "output_dir")
+    console = Console()
     fixed = ["--sft.steps=0", "--trainer.updates=1000000", "--trainer.schedule=constant"]
     named = [f"--config_path={config.recipe}", f"--policy.path={config.policy_path}"]
     run: RunConfig = parse(RunConfig, named + fixed)
@@ -193,7 +177,6 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
         replace(run, launch=replace(run.launch, schedule=schedule))
     spec = check_world(run.env)
     tasks, history = spec.tasks, check_policy(run, spec)
-    make_folder(root, "output_dir", again=True)
     result: dict[str, Any] = {"config": asdict(config), "host": host()}
     order = config.rounds * (*config.schedules, *reversed(config.schedules))
     blocks: list[Block] = []
@@ -207,17 +190,11 @@ def bench_throughput(config: BenchThroughputConfig) -> dict[str, Any]:
     schedules = {name: [b for b in blocks if b.schedule == name] for name in config.schedules}
     result["schedules"] = {name: _summarised(own) for name, own in schedules.items()}
     result["host_after"] = host()
-    write(root, "throughput", result, f"{_books(result)}\n\n{as_markdown(_COLUMNS, _rows(result))}", _draw)
-    console.say(f"wrote throughput.json, .md and .png into {root}")
     return result
 
 
 def books(run: RunConfig, rollout: dict[str, float], replay: dict[str, float]) -> dict[str, float]:
-    """Accounts for all decisions that were made.
-
-    Raises:
-        RuntimeError: fewer are under way than none, or more than there can be.
-    """
+    """Accounts for all decisions that were made; fails where more are under way than can be."""
     dropped = rollout["dropped_nonfinite"] + rollout["groups_dropped_decisions"]
     found = {
         "generated": rollout["decisions"],
@@ -235,47 +212,18 @@ def books(run: RunConfig, rollout: dict[str, float], replay: dict[str, float]) -
 
 def table(result: dict[str, Any]) -> Table:
     """`result` for people."""
-    return as_table(_books(result), _COLUMNS, _rows(result))
-
-
-_COLUMNS = ("schedule", "env steps/s", "decisions/s learned from", "updates/s", "lag", "trainer waits",
-            "inference busy", "processors")  # fmt: skip
-
-
-def _books(result: dict[str, Any]) -> str:
-    books = result["books"]
-    return (
-        f"{books['generated']:.0f} decisions generated = {books['committed']:.0f} committed + "
-        f"{books['under_way']:.0f} under way + {books['dropped']:.0f} dropped"
+    found = result["books"]
+    title = (
+        f"{found['generated']:.0f} decisions generated = {found['committed']:.0f} committed + "
+        f"{found['under_way']:.0f} under way + {found['dropped']:.0f} dropped"
     )
-
-
-def _rows(result: dict[str, Any]) -> list[list[str]]:
+    columns = ("schedule", "env steps/s", "decisions/s learned from", "updates/s", "lag", "trainer waits")
     rows = []
-    for name, found in result["schedules"].items():
-        counts = (ranged(found[key], ".0f") for key in ("env_steps_per_s", "decisions_per_s"))
-        shares = (f"{found[key]:.0%}" for key in ("trainer_waits", "inference_busy", "processors"))
-        rows.append([name, *counts, f"{found['updates_per_s']:.2f}", f"{found['lag_mean']:.1f}", *shares])
-    return rows
-
-
-def _draw(path: Path, result: dict[str, Any]) -> None:
-    """Draws env steps and decisions per second of each schedule; whiskers are ranges of blocks."""
-    schedules = result["schedules"]
-    with drawing(path) as axes:
-        for offset, key, label in (
-            (-0.2, "env_steps_per_s", "env steps"),
-            (0.2, "decisions_per_s", "decisions learned from"),
-        ):
-            middle, low, high = (
-                [f[key][end] for f in schedules.values()] for end in ("median", "min", "max")
-            )
-            ends = np.abs(np.array([low, high]) - middle)
-            axes.bar(np.arange(len(middle)) + offset, middle, 0.4, yerr=ends, capsize=3, label=label)
-        names = [f"{name}\ntrainer waits {f['trainer_waits']:.0%}" for name, f in schedules.items()]
-        axes.set_xticks(range(len(names)), names)
-        axes.set(ylabel="per second", title=Path(result["config"]["recipe"]).name)
-        axes.legend()
+    for name, one in result["schedules"].items():
+        counts = (ranged(one[key], ".0f") for key in ("env_steps_per_s", "decisions_per_s"))
+        shares = (f"{one[key]:.0%}" for key in ("trainer_waits", "inference_busy", "processors"))
+        rows.append([name, *counts, f"{one['updates_per_s']:.2f}", f"{one['lag_mean']:.1f}", *shares])
+    return as_table(title, (*columns, "inference busy", "processors"), rows)
 
 
 def _summarised(blocks: list[Block]) -> dict[str, Any]:
@@ -287,5 +235,5 @@ def _summarised(blocks: list[Block]) -> dict[str, Any]:
         "env_steps_per_s": spread([b.env_steps_per_s for b in blocks]),
         "decisions_per_s": spread([b.decisions_per_s for b in blocks]),
         "updates_per_s": statistics.median(b.updates / b.seconds for b in blocks),
-        "blocks": as_rows(blocks),
+        "blocks": [asdict(block) for block in blocks],
     }

@@ -24,7 +24,7 @@ import draccus
 import numpy as np
 from rich.table import Table
 
-from accerl_lerobot.bench.host import as_table, host, ranged, spread
+from accerl_lerobot.bench import as_table, host, ranged, spread
 from accerl_lerobot.config.ranges import Positive, Range, Repeats, Section
 from accerl_lerobot.demos.writing import simulators
 from accerl_lerobot.envs import EnvConfig, LiberoConfig, MetaWorldConfig, make_world
@@ -83,9 +83,8 @@ def bench_world(config: BenchWorldConfig) -> dict[str, Any]:
         machine = pools[OURS].submit(_host).result()
     arms = {}
     for name, values in blocks.items():
-        steps, decisions = (
-            spread(list(rates)) for rates in zip(*values[1:], strict=True)
-        )  # the first: warm-up
+        counted = zip(*values[1:], strict=True)  # the first warms up
+        steps, decisions = (spread(list(rates)) for rates in counted)
         arms[name] = {"env_steps_per_s": steps, "decisions_per_s": decisions}
     ours, stock = (arms[name]["env_steps_per_s"]["blocks"] for name in (OURS, STOCK))
     ratio = spread([own / other for own, other in zip(ours, stock, strict=True)])
@@ -116,13 +115,10 @@ def _start(arm: str, config: BenchWorldConfig) -> None:
     if arm == STOCK:
         del os.environ["LP_NUM_THREADS"]  # ours draws with one thread, LeRobot's by default with all
     chunk = config.chunk if arm == OURS else 1
-    actions = np.random.default_rng(0).uniform(-1, 1, (997, chunk, _action_dim(config.env)))
+    dims = make_world(config.env).spec.action_dim  # no simulator is built before the first reset
+    actions = np.random.default_rng(0).uniform(-1, 1, (997, chunk, dims))
     chunks = itertools.cycle(actions.astype(np.float32))
     _decide = _stock(config, chunks) if arm == STOCK else _ours(config, chunks)
-
-
-def _action_dim(env: EnvConfig) -> int:
-    return make_world(env).spec.action_dim  # no simulator is built before the first reset
 
 
 def _ours(config: BenchWorldConfig, chunks: Iterator[np.ndarray]) -> Decide:

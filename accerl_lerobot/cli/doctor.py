@@ -248,7 +248,7 @@ def resources(config: RunConfig | None, history: int = 1) -> Iterator[Check]:
 
 def imagination_checks(config: RunConfig) -> Iterator[Check]:
     """Imagination settings against the environment and the policy."""
-    imagination, episodes = config.imagination, config.rollout.episodes
+    imagination = config.imagination
     if not imagination.share:
         return
     from accerl_lerobot.engine.imagination import check_imagination
@@ -258,14 +258,8 @@ def imagination_checks(config: RunConfig) -> Iterator[Check]:
     except InputError as error:
         yield Check("imagination", FAIL, str(error))
         return
-    yield Check(
-        "imagination", OK, f"{imagination.share:.0%} of every batch; world model: {imagination.model}"
-    )
-    least = imagination.min_real_episodes
-    if imagination.start_at_reset_prob and 0 < episodes <= least:
-        why = f"that takes more than {least} real episodes"
-        text = f"is hardly ever switched off where it flatters: {why}, and rollout.episodes is {episodes}"
-        yield Check("imagination", WARN, text)
+    text = f"{imagination.share:.0%} of every batch; world model: {imagination.model}"
+    yield Check("imagination", OK, text)
 
 
 def placement(config: RunConfig) -> Iterator[Check]:
@@ -288,24 +282,23 @@ def memory_estimate_gib(config: RunConfig, history: int = 1) -> float:
 def memory_parts_gib(config: RunConfig, history: int = 1) -> dict[str, float]:
     """Field → rough memory of what it sizes."""
     from accerl_lerobot.engine.preflight import under_way
+    from accerl_lerobot.evaluation import FILM
 
     rollout, films, local = config.rollout, config.evaluation, config.launch.engine == "local"
     tasks = len(getattr(config.env, "tasks", ("one",)))
     simulator = tasks * SIMULATOR_GIB.get(config.env.type, 0.0)
     pictures = history * observation_bytes(config) / GIB
-    frames = min(films.videos, films.episodes) * config.env.max_steps / films.video_every
+    loaded = 2 + config.trainer.ranks  # the driver, inference and the trainer each load torch
+    frames = min(films.videos, films.episodes) * config.env.max_steps / FILM[1]
     return {
-        # The driver, inference and the trainer each load torch.
-        "trainer.ranks": POLICY_PROCESS_GIB
-        if local
-        else RAY_GIB + (2 + config.trainer.ranks) * POLICY_PROCESS_GIB,
+        "trainer.ranks": POLICY_PROCESS_GIB if local else RAY_GIB + loaded * POLICY_PROCESS_GIB,
         "inference.workers": 0.0 if local else (config.inference.workers - 1) * POLICY_PROCESS_GIB,
         "rollout.workers": 0.0 if local else rollout.workers * ROLLOUT_PROCESS_GIB,
         "rollout.worlds": rollout.workers * rollout.worlds * simulator,
         "rollout.segment_length": under_way(config) * pictures,
         "replay.capacity": config.replay.capacity * pictures,
         **({"algorithm.memory": config.remembered * pictures} if config.remembered else {}),
-        "evaluation.videos": frames * 3 * films.video_size**2 / GIB,
+        "evaluation.videos": frames * 3 * FILM[0] ** 2 / GIB,
     }
 
 

@@ -77,9 +77,6 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
 
     Returns:
         ``episodes``, ``frames``, ``successes``, and ``unlike``, those that differed and were left out.
-
-    Raises:
-        InputError: the folder exists, there is no run or no whole episode in it, or none can be repeated.
     """
     run, root = Path(str(config.path)).expanduser(), check_free(config.root)
     if not (run / CONFIG).is_file():
@@ -88,43 +85,30 @@ def export_episodes(config: ExportConfig, console: Console) -> dict[str, Any]:
     settings = _settings(run, config.hub_path)
     chosen = _picked(whole_episodes(read_journal(run / EPISODES)), config)
     if not chosen:
-        raise InputError(
-            "path", str(run), f"no whole episode in its {EPISODES} of those asked for ({config.pick})"
-        )
+        remedy = f"no whole episode in its {EPISODES} of those asked for ({config.pick})"
+        raise InputError("path", str(run), remedy)
     with appearing(root) as partial:
         tally = _write(settings, config, chosen, partial, console)
         if not tally["episodes"]:
             remedy = "none of its episodes could be repeated: this environment is not deterministic"
             raise InputError("path", str(run), remedy)
-        _write_sidecar(config, run, settings, tally, partial)
+        about = {"export": asdict(config) | {"path": run.name}, "seed": settings.seed, **tally}
+        (partial / SIDECAR).write_text(json.dumps(about, indent=2) + "\n")
     return tally
 
 
 def _settings(run: Path, hub_path: str | None) -> RunConfig:
-    """The run's config, in which nothing but `hub_path` lets code run.
-
-    Raises:
-        InputError: it cannot be read, or its environment is on the Hub and `hub_path` does not allow that.
-    """
+    """The run's config, in which nothing but `hub_path` lets code run."""
     tree = read_recipe(run / CONFIG)
     wanted = drop_consents(tree).get("env.kwargs.hub_path")
     if wanted is not None and hub_path is None:
-        remedy = (
-            f"the run's environment is code of {wanted}, which would run with your rights: if you trust it, "
-        )
-        raise InputError("hub_path", None, f"{remedy}name that here")
+        remedy = f"the run's environment is code of {wanted}, which would run with your rights"
+        raise InputError("hub_path", None, f"{remedy}: if you trust it, name that here")
     if hub_path is not None:
         env = tree["env"] = dict(tree.get("env") or {})
         env |= {"trust_remote_code": True, "kwargs": dict(env.get("kwargs") or {}) | {"hub_path": hub_path}}
     settings: RunConfig = decode(RunConfig, tree)
     return settings
-
-
-def _write_sidecar(
-    config: ExportConfig, run: Path, settings: RunConfig, tally: dict[str, Any], root: Path
-) -> None:
-    about = {"export": asdict(config) | {"path": run.name}, "seed": settings.seed, **tally}
-    (root / SIDECAR).write_text(json.dumps(about, indent=2) + "\n")
 
 
 def _picked(episodes: Iterable[list[Done]], config: ExportConfig) -> list[list[Done]]:
@@ -140,9 +124,8 @@ def _write(
     spec = world.spec
     world.close()
     tally = {"episodes": 0, "frames": 0, "successes": 0, "unlike": 0}
-    table = features(spec, settings.env.state_size) | {
-        VERSION: {"dtype": "int64", "shape": (1,), "names": None}
-    }
+    version = {VERSION: {"dtype": "int64", "shape": (1,), "names": None}}
+    table = features(spec, settings.env.state_size) | version
     cost = settings.rollout.decision_cost
     with (
         console.stage("replaying episodes", total=len(chosen)) as stage,

@@ -3,8 +3,6 @@
 
 Results go to the standard output, everything else to the standard error: LeRobot prints while it loads, and
 results should stay readable for programs.
-
-Fields of the verbs' command lines, where they are not a whole run's.
 """
 
 from __future__ import annotations
@@ -34,7 +32,7 @@ from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.engine.config import DatasetConfig, LaunchConfig, RunConfig, check_chunk, encode, parse
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
 from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, make_folder
-from accerl_lerobot.evaluation.stats import EvaluationConfig
+from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.hub.card import PullConfig, PushConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.policies.config import Load, PolicyConfig
@@ -143,12 +141,7 @@ NO_DATASET = "name a LeRobotDataset, on the Hub or with dataset.root"
 
 
 def train(arguments: list[str], load: Load | None = None) -> int:
-    """``accerl train``.
-
-    Args:
-        arguments: of the command line.
-        load: makes the policy's adapter; None: of LeRobot's checkpoint.
-    """
+    """``accerl train``; `load` makes the policy's adapter, of LeRobot's checkpoint by default."""
     config: RunConfig = parse(RunConfig, arguments)
     from accerl_lerobot.engine import run
     from accerl_lerobot.engine.stopping import StoppedError
@@ -230,7 +223,7 @@ def evaluate(arguments: list[str]) -> int:
     if out is not None:
         check_absent(out)
     from accerl_lerobot.engine import run
-    from accerl_lerobot.evaluation.stats import summarise, table
+    from accerl_lerobot.evaluation import summarise, table
 
     sections = ("seed", "env", "policy", "rollout", "inference", "evaluation", "launch")
     whole = RunConfig(**{name: getattr(config, name) for name in sections})
@@ -394,7 +387,7 @@ CONFIGS: dict[str, type[Any]] = {
 
 
 def _write_evaluation(out: Path, summary: dict[str, Any], results: list[EpisodeResult]) -> None:
-    from accerl_lerobot.evaluation.pictures import write_video
+    from accerl_lerobot.evaluation import write_video
 
     make_folder(out, "output_dir")
     (out / "evaluation.json").write_text(json.dumps(summary, indent=2) + "\n")

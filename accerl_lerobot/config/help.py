@@ -40,11 +40,7 @@ COMMON = (
 def help_text(command: str, config_class: type[Any], what: str, section: str = "") -> str:
     """The text of ``--help``: all fields if they fit a page, otherwise those that people change.
 
-    Args:
-        command: as it is typed.
-        config_class: its config.
-        what: what it does, one line.
-        section: ``--help=SECTION``: all fields of a section, or ``all``.
+    `what` says in one line what the command does; `section` is that of ``--help=SECTION``, or ``all``.
     """
     lines = [
         f"usage: {command} {_bare(config_class)} [--section.field=value …]",

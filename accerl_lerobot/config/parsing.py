@@ -1,16 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Command lines and recipes into configs, and every mistake in them into one line.
 
-LeRobot's conventions, decoded by LeRobot's own draccus::
-
-    accerl train --config_path=recipes/quickstart.yaml --trainer.lr=1e-5 --env.task=drawer-open-v3
-
-Reading and merging is done here and not by draccus's argument parser, for four reasons: a field of a choice
-(``--algorithm.sigma``) needs no second ``--algorithm.type``, unknown keys are named together with what they
-resemble, a key that stands twice in a file is refused instead of winning silently, and every verb can read
-the recipe of a whole run and take the sections it needs.
-
-Imports by name at the time of need: entries of our own tables, and packages that a user names.
+LeRobot's conventions, decoded by LeRobot's own draccus. Reading and merging is done here and not by draccus's
+argument parser, for four reasons: a field of a choice (``--algorithm.sigma``) needs no second
+``--algorithm.type``, unknown keys are named together with what they resemble, a key that stands twice in a
+file is refused instead of winning silently, and every verb can read the recipe of a whole run and take the
+sections it needs.
 """
 
 from __future__ import annotations
@@ -146,12 +141,9 @@ def drop_consents(tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def consents(tree: Any, given: Any = None, *, drop: bool = False) -> dict[str, Any]:
-    """Dotted field → value, of the fields in `CONSENT` that a tree sets at any depth.
+    """Dotted field → value, of the fields in `CONSENT` that a tree, read from a file, sets at any depth.
 
-    Args:
-        tree: plain values, as they were read from a file.
-        given: what the command line says of the same fields; what it sets is left out.
-        drop: remove them from `tree`.
+    Fields that the command line sets as well, in `given`, are left out. `drop` removes them from `tree`.
     """
     found: dict[str, Any] = {}
     seen: set[int] = set()  # YAML's aliases can make a small file a tree without end
@@ -246,8 +238,9 @@ def read_recipe(path: Path) -> dict[str, Any]:
         hint = f"did you mean {' or '.join(near)}" if near else f"this package has {', '.join(shipped)}"
         raise InputError("config_path", str(path), f"no such file; {hint}")
     try:
-        check_recipe_size(path, "config_path")
-        tree = load_yaml(path.read_text())
+        if (size := path.stat().st_size) > LARGEST_RECIPE:
+            raise InputError("config_path", str(path), f"{size:,} bytes; a recipe has a few thousand")
+        tree = _load_yaml(path.read_text())
     except InputError:
         raise
     except (yaml.YAMLError, ValueError) as error:
@@ -311,23 +304,8 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def check_recipe_size(path: Path, field: str) -> None:
-    """Refuses a recipe of more than `LARGEST_RECIPE` bytes, which is never read.
-
-    Raises:
-        InputError: names `field` and the size.
-        OSError: the file cannot be looked at.
-    """
-    if (size := path.stat().st_size) > LARGEST_RECIPE:
-        raise InputError(field, str(path), f"{size:,} bytes; a recipe has a few thousand")
-
-
-def load_yaml(text: str) -> Any:
-    """The value in a YAML text, within `DEEPEST` and `MOST_NODES`.
-
-    Raises:
-        yaml.YAMLError: it is not good YAML, or beyond these bounds.
-    """
+def _load_yaml(text: str) -> Any:
+    """The value in a YAML text, within `DEEPEST` and `MOST_NODES`."""
     try:
         return yaml.load(text, _Loader)
     except yaml.YAMLError:
@@ -353,7 +331,7 @@ def _value(text: str) -> Any:
     if text == "":
         return text
     try:
-        return load_yaml(text)
+        return _load_yaml(text)
     except yaml.YAMLError:
         return text
 

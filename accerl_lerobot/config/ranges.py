@@ -21,6 +21,7 @@ import re
 import types
 import typing
 from collections.abc import Collection, Hashable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -118,6 +119,24 @@ class Section:
     def __post_init__(self) -> None:
         for name, hint in hints_of(type(self)).items():
             check(hint, getattr(self, name), f"{self.SECTION}.{name}" if self.SECTION else name)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetConfig(Section, section="dataset"):
+    """A LeRobotDataset, on the Hub or in a folder."""
+
+    repo_id: str | None = None
+    """Hub id, or a label for `root`. None: the run records its own demonstrations."""
+    root: str | None = None
+    """Local folder; None uses the Hub and its cache."""
+    revision: str | None = None
+    """Hub revision."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.root is not None and self.repo_id is None:
+            remedy = "name the dataset in dataset.root; any owner/name will do"
+            raise InputError("dataset.repo_id", None, remedy)
 
 
 def hints_of(cls: type[Any]) -> dict[str, Any]:

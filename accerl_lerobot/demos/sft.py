@@ -23,8 +23,7 @@ from typing import Annotated, Any, Literal
 
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, LAST, PRETRAINED, displaced, relocate
 from accerl_lerobot.checkpoint.safety import Origin, check_remote_code, read_json
-from accerl_lerobot.config.dataset import DatasetConfig
-from accerl_lerobot.config.ranges import LearningRate, Range, Section, Steps, Threads
+from accerl_lerobot.config.ranges import DatasetConfig, LearningRate, Range, Section, Steps, Threads
 from accerl_lerobot.demos.backbone import BackboneConfig, write_backbone
 from accerl_lerobot.errors import InputError, check_absent
 from accerl_lerobot.experience import SUCCESS

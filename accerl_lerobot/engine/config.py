@@ -18,14 +18,22 @@ from accerl_lerobot.algorithms import (
     OffPolicyConfig,
     RatioConfig,
 )
-from accerl_lerobot.config.dataset import DatasetConfig
 from accerl_lerobot.config.parsing import decode, encode, parse
-from accerl_lerobot.config.ranges import NonNegative, Positive, Range, Section, Seed, Steps, check
+from accerl_lerobot.config.ranges import (
+    DatasetConfig,
+    NonNegative,
+    Positive,
+    Range,
+    Section,
+    Seed,
+    Steps,
+    check,
+)
 from accerl_lerobot.demos.record import DemosConfig
 from accerl_lerobot.demos.sft import SFTConfig
 from accerl_lerobot.envs import EnvConfig, MetaWorldConfig
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.stats import EvaluationConfig
+from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.inference.worker import InferenceConfig
 from accerl_lerobot.metrics import WandBConfig
 from accerl_lerobot.policies.config import PolicyConfig

@@ -36,10 +36,9 @@ from accerl_lerobot.fault_points import fault_point
 from accerl_lerobot.policies.loading import load_lerobot_config
 from accerl_lerobot.timeline import CHECKPOINT, COMPUTE, TRANSPORT, WAIT_IN, WAIT_OUT, WEIGHT_SYNC, open_clock
 from accerl_lerobot.transport.endpoint import Endpoint, ReconnectingClient
-from accerl_lerobot.world_model.config import VIDEOS, OnlineLearnConfig
+from accerl_lerobot.world_model.config import IMAGINATION, VIDEOS, WORLD_LEARNING, OnlineLearnConfig
 from accerl_lerobot.world_model.contract import WorldModelSpec
 from accerl_lerobot.world_model.data import fingerprint, load_episodes
-from accerl_lerobot.world_model.config import IMAGINATION, WORLD_LEARNING
 from accerl_lerobot.world_model.online import OnlineLearner, PretrainingEpisodes, Promotion
 from accerl_lerobot.world_model.registry import (
     ImaginationModels,

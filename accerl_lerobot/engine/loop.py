@@ -31,8 +31,7 @@ from accerl_lerobot.checkpoint.layout import (
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine.config import RunConfig
 from accerl_lerobot.engine.stopping import Stopping, raise_if_stopped
-from accerl_lerobot.evaluation.pictures import before_after, success_curve
-from accerl_lerobot.evaluation.stats import evaluation_plans, summarise
+from accerl_lerobot.evaluation import before_after, evaluation_plans, success_curve, summarise
 from accerl_lerobot.metrics import MetricsLog, plain
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.timeline import CHECKPOINT, EVALUATION, TIMELINE, TRAINING, Clock, NoClock
@@ -402,9 +401,7 @@ class Loop:
     ) -> tuple[dict[str, Any], list[EpisodeResult]]:
         self.times.clock.enter(EVALUATION)
         seed, videos = self.config.seed, self.config.evaluation
-        self.engine.plan(
-            evaluation_plans(self.tasks, episodes, group, seed=seed, filmed=videos.videos, film=videos.film)
-        )
+        self.engine.plan(evaluation_plans(self.tasks, episodes, group, seed=seed, filmed=videos.videos))
         # An evaluation planned while training may end only now.
         results = run_plans(self.engine, episodes, group, self.console, self._meanwhile)
         return self._report(group, results, steps, results[0].versions[1]), results

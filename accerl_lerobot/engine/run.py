@@ -47,7 +47,7 @@ from accerl_lerobot.checkpoint.layout import (
     go_back_to,
     write_atomically,
 )
-from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.engine import ray_session
 from accerl_lerobot.engine.config import RunConfig, encode, parse, timeline_folder
@@ -75,7 +75,7 @@ from accerl_lerobot.engine.stopping import (
     resumed_run,
 )
 from accerl_lerobot.errors import InputError, check_absent, expanded, is_full, kept_traceback, make_folder
-from accerl_lerobot.evaluation.stats import Rate, evaluation_plans
+from accerl_lerobot.evaluation import Rate, evaluation_plans
 from accerl_lerobot.experience import Observation, Request
 from accerl_lerobot.metrics import MetricsLog
 from accerl_lerobot.policies.config import Load, PolicyConfig, loader
@@ -159,8 +159,8 @@ def play_evaluation(config: RunConfig, console: Console, filmed: int = 0) -> lis
     spec = check_world(config.env)
     engine = make_engine(config, spec.tasks, check_policy(config, spec))
     with contextlib.closing(engine):
-        count, film = config.evaluation.episodes, config.evaluation.film
-        engine.plan(evaluation_plans(spec.tasks, count, "eval", seed=config.seed, filmed=filmed, film=film))
+        count = config.evaluation.episodes
+        engine.plan(evaluation_plans(spec.tasks, count, "eval", seed=config.seed, filmed=filmed))
         return run_plans(engine, count, "eval", console)
 
 

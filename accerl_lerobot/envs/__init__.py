@@ -38,12 +38,7 @@ __all__ = [
 def make_world(config: EnvConfig, history: int = 1) -> World:
     """Builds the world that `config` describes.
 
-    Args:
-        config: of one of the kinds of world.
-        history: how many env steps an observation holds; above 1, arrays begin with that dimension.
-
-    Raises:
-        InputError: its simulator is not installed; what the world itself refuses.
+    An observation holds `history` env steps; above 1, arrays begin with that dimension.
     """
     try:
         discover(config.discover_packages_path, "env")

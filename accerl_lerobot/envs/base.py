@@ -3,13 +3,6 @@
 
 Episode limits, auto-reset and task text are ours, because simulators disagree on them: a world never resets
 itself, `terminated` means the task is over (bootstrap 0), `truncated` that only time ran out (bootstrap V).
-
-The root of all environment configs: ``--env.type=metaworld`` picks one.
-
-Observation history for policies that look back: the last observations of any world, oldest first.
-
-LeRobot's ``n_obs_steps`` counts env steps, not decisions, so the last states of a chunk are looked at one by
-one; all before them are passed without a picture, as always.
 """
 
 from __future__ import annotations
@@ -19,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import draccus
 import numpy as np
@@ -82,32 +75,19 @@ class World(ABC):
         >>> world = make_world(MetaWorldConfig(task="drawer-open-v3"))
         >>> observation = world.reset(seed=3, task="drawer-open-v3")
         >>> result = world.step_chunk(np.zeros((10, 4), np.float32))
-        >>> result.steps, result.done, result.success
-        (10, False, False)
     """
 
     spec: WorldSpec
 
     @abstractmethod
     def reset(self, seed: int, task: str) -> Observation:
-        """Starts an episode. Equal (seed, task) give bit-equal episodes under equal actions, in any process.
-
-        Raises:
-            InputError: `task` is not in ``spec.tasks``.
-        """
+        """Starts an episode; equal (seed, task) and actions give bit-equal episodes, in any process."""
 
     @abstractmethod
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-        """Executes up to K actions and observes once, after the last.
+        """Executes up to K of the actions, float32 (K, A), and observes once, after the last.
 
         Gives the same states, rewards and successes as K calls with one action each.
-
-        Args:
-            actions: float32 (K, A).
-
-        Raises:
-            RuntimeError: the episode is over; call `reset`.
-            ValueError: wrong shape or a non-finite action.
         """
 
     @abstractmethod
@@ -118,24 +98,85 @@ class World(ABC):
         """Frees the simulator. Safe to call twice."""
 
 
-def check_episode(spec: WorldSpec, seed: int, task: str) -> None:
-    """Refuses an episode that a MuJoCo world cannot begin.
+class Step(NamedTuple):
+    """Outcome of one env step."""
 
-    Raises:
-        InputError: no such task, or a seed that NumPy's former generator does not take.
-    """
-    if task not in spec.tasks:
-        raise InputError("task", task, f"this world has: {', '.join(spec.tasks)}")
-    if not 0 <= seed < 2**32:
-        raise InputError("seed", seed, "use 0 to 2**32 - 1")
+    success: bool
+    """True if the task is achieved now."""
+    ended: bool
+    """True if the task is over, which `success` alone need not mean."""
+    reward: float | None = None
+    """None: 1.0 at the first success, else 0.0."""
+    cut: bool = False
+    """True if the simulator itself ends the episode early."""
+    finite: bool = True
+    """False if the simulator diverged: the episode ends as truncated, and must not be trained on."""
+
+
+class EpisodeWorld(World):
+    """A world that is stepped one action at a time; counts steps and decides how an episode ends."""
+
+    _task = ""
+    _steps = 0
+    _success = False
+    _done = True
+
+    @abstractmethod
+    def _begin(self, seed: int, task: str) -> None:
+        """Resets the simulator."""
+
+    @abstractmethod
+    def _step(self, action: np.ndarray) -> Step:
+        """Steps the simulator."""
+
+    @abstractmethod
+    def _observe(self) -> Observation:
+        """Looks at the current state."""
+
+    @property
+    def late(self) -> float:
+        """Share of the time limit gone."""
+        return self._steps / self.spec.max_steps
+
+    def reset(self, seed: int, task: str) -> Observation:
+        if task not in self.spec.tasks:
+            raise InputError("task", task, f"this world has: {', '.join(self.spec.tasks)}")
+        if not 0 <= seed < 2**32:
+            raise InputError("seed", seed, "use 0 to 2**32 - 1")
+        self._done = True  # until the new episode stands: an error below leaves a world that must be reset
+        self._begin(seed, task)
+        self._task, self._steps, self._success, self._done = task, 0, False, False
+        return self._observe()
+
+    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
+        if self._done:
+            raise RuntimeError("the episode is over: call reset before step_chunk")
+        rewards = []
+        for action in checked_actions(actions, self.spec):
+            step = self._step(action)
+            self._steps += 1
+            succeeded = step.success and step.finite
+            first = succeeded and not self._success
+            rewards.append(float(first) if step.reward is None else step.reward)
+            self._success |= succeeded
+            terminated = step.ended and step.finite
+            limit = self._steps >= self.spec.max_steps
+            truncated = not terminated and (step.cut or limit or not step.finite)
+            self._done = terminated or truncated
+            if self._done:
+                break
+        return ChunkResult(
+            observation=self._observe(),
+            rewards=np.asarray(rewards, np.float32),
+            terminated=terminated,
+            truncated=truncated,
+            success=self._success,
+            info={} if step.finite else {"nonfinite": 1.0},
+        )
 
 
 def checked_actions(actions: np.ndarray, spec: WorldSpec) -> np.ndarray:
-    """The chunk as float32 within the world's bounds.
-
-    Raises:
-        ValueError: not (K ≥ 1, A), or a value is not finite.
-    """
+    """The chunk as float32 within the world's bounds; refuses other shapes than (K ≥ 1, A), and NaN."""
     actions = np.asarray(actions, np.float32)
     if actions.ndim != 2 or len(actions) == 0 or actions.shape[1] != spec.action_dim:
         raise ValueError(f"actions have shape {actions.shape}; expected (K >= 1, {spec.action_dim})")
@@ -146,12 +187,7 @@ def checked_actions(actions: np.ndarray, spec: WorldSpec) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
-    """Base of every environment config; subclasses register under the name given on the command line.
-
-    Example:
-        >>> draccus.decode(EnvConfig, {"type": "metaworld", "task": "door-open-v3"}).type
-        'metaworld'
-    """
+    """Base of every environment config; subclasses register the name that ``--env.type`` takes."""
 
     world: ClassVar[str]
     """``module:class`` of the world, made from the config."""
@@ -180,6 +216,17 @@ class EnvConfig(Section, draccus.ChoiceRegistry, section="env"):
         return self
 
 
+def names(text: str) -> tuple[str, ...]:
+    """Names separated by commas."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def check_cameras(cameras: Sequence[str], text: str) -> None:
+    """Refuses `text` of ``env.camera`` where it names none, or one twice."""
+    if not cameras or len(set(cameras)) < len(cameras):
+        raise InputError("env.camera", text, "name each camera once, separated by commas")
+
+
 def task_code(tasks: Sequence[str], task: str) -> np.ndarray:
     """Part of ``observation.environment_state`` that tells tasks apart: one-hot, or empty for one task."""
     return np.eye(len(tasks))[tasks.index(task)] if len(tasks) > 1 else np.zeros(0)
@@ -193,11 +240,7 @@ _FIELDS_OF_PLUGIN = {
 
 
 def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
-    """``--env.…`` and seed of the stock ``lerobot-eval`` for an environment; none if LeRobot cannot have it.
-
-    Args:
-        env: a config's ``env``, as recipes and checkpoints hold it.
-    """
+    """``--env.…`` and seed of stock ``lerobot-eval`` for an environment; none if LeRobot cannot have it."""
     if (kind := env.get("type")) in _FIELDS_OF_PLUGIN:
         fields: dict[str, Any] = {"discover_packages_path": _PLUGIN, "type": f"accerl_{kind}"}
         fields |= {name: env[name] for name in _FIELDS_OF_PLUGIN[kind] if name in env}
@@ -212,12 +255,10 @@ def lerobot_eval_arguments(env: Mapping[str, Any]) -> list[str]:
 class HistoryWorld(World):
     """A world whose observations hold its last states, in a dimension of `length` in front of each array.
 
-    An episode begins with copies of its first observation, as in LeRobot's own queues. Should the world cut
-    an episode short of ``spec.max_steps``, the last observation stands for those that were not looked at.
-
-    Args:
-        world: what is observed; closed with this one.
-        length: observations, at least 2.
+    LeRobot's ``n_obs_steps`` counts env steps, not decisions, so the last states of a chunk are looked at one
+    by one; all before them are passed without a picture. An episode begins with copies of its first
+    observation, as in LeRobot's own queues. Should the world cut an episode short of ``spec.max_steps``, the
+    last observation stands for those that were not looked at.
     """
 
     def __init__(self, world: World, length: int) -> None:
@@ -226,13 +267,11 @@ class HistoryWorld(World):
         self._length, self._left = length, 0
 
     def reset(self, seed: int, task: str) -> Observation:
-        """See the base class."""
         self._seen.extend([self._world.reset(seed, task)] * self._length)
         self._left = self.spec.max_steps
         return self._observation()
 
     def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-        """See the base class."""
         actions = checked_actions(actions, self.spec)
         steps = min(len(actions), self._left) or len(actions)  # after the end, the world itself complains
         unseen = max(0, steps - self._length + 1)
@@ -257,18 +296,14 @@ class HistoryWorld(World):
         )
 
     def render(self, height: int, width: int) -> np.ndarray:
-        """See the base class."""
         return self._world.render(height, width)
 
     def close(self) -> None:
-        """See the base class."""
         self._world.close()
 
     def _observation(self) -> Observation:
-        newest = self._seen[-1]
-        return {
-            key: np.stack([np.asarray(o[key]) for o in self._seen])
-            if isinstance(value, np.ndarray)
-            else value
-            for key, value in newest.items()
-        }
+        observation = dict(self._seen[-1])
+        for key, value in observation.items():
+            if isinstance(value, np.ndarray):
+                observation[key] = np.stack([np.asarray(o[key]) for o in self._seen])
+        return observation

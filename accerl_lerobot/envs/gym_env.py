@@ -11,15 +11,13 @@ from __future__ import annotations
 import functools
 import json
 import math
-from abc import abstractmethod
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from accerl_lerobot.config.ranges import Range
-from accerl_lerobot.envs.base import ChunkResult, EnvConfig, World, WorldSpec, checked_actions
+from accerl_lerobot.envs.base import EnvConfig, EpisodeWorld, Step, WorldSpec
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import ENVIRONMENT_STATE, TASK, Observation
 
@@ -93,64 +91,7 @@ def _state_size(config: str) -> int:
         world.close()
 
 
-class SteppedWorld(World):
-    """A world around an environment with Gymnasium's ``step``; episode limit and success are kept here.
-
-    Args:
-        max_steps: episode limit.
-        reward: ``success``, or ``env`` for the environment's own.
-        ends_with_success: True if the first success ends an episode.
-    """
-
-    def __init__(self, max_steps: int, reward: str, *, ends_with_success: bool) -> None:
-        self._max_steps, self._reward, self._ends_with_success = max_steps, reward, ends_with_success
-        self._steps, self._success, self._done = 0, False, True
-
-    @abstractmethod
-    def _step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, bool]:
-        """Observation, reward, terminated, truncated, and True where the task is achieved."""
-
-    @abstractmethod
-    def _observe(self, raw: Any) -> Observation:
-        """The environment's observation as LeRobot's features."""
-
-    def _processed(self, actions: np.ndarray) -> Iterable[np.ndarray]:
-        """Actions (K, A) as the environment takes them."""
-        return actions
-
-    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-        """See the base class."""
-        if self._done:
-            raise RuntimeError("the episode is over: call reset before step_chunk")
-        actions = checked_actions(actions, self.spec)
-        rewards, nonfinite = [], False
-        for action in self._processed(actions):
-            raw, reward, ended, cut, achieved = self._step(action)
-            self._steps += 1
-            nonfinite = not (math.isfinite(reward) and _finite(raw))
-            achieved = achieved and not nonfinite
-            first = achieved and not self._success
-            rewards.append(float(reward) if self._reward == "env" else float(first))
-            self._success |= achieved
-            terminated = not nonfinite and (ended or (self._success and self._ends_with_success))
-            truncated = not terminated and (nonfinite or cut or self._steps >= self._max_steps)
-            self._done = terminated or truncated
-            if self._done:
-                break
-        return ChunkResult(
-            observation=self._observe(raw),
-            rewards=np.asarray(rewards, np.float32),
-            terminated=terminated,
-            truncated=truncated,
-            success=self._success,
-            info={"nonfinite": 1.0} if nonfinite else {},
-        )
-
-    def _begin(self) -> None:
-        self._steps, self._success, self._done = 0, False, False
-
-
-class GymWorld(SteppedWorld):
+class GymWorld(EpisodeWorld):
     """One Gymnasium environment.
 
     Args:
@@ -164,7 +105,6 @@ class GymWorld(SteppedWorld):
     def __init__(self, config: GymConfig) -> None:
         import gymnasium
 
-        super().__init__(config.max_steps, config.reward, ends_with_success=True)
         self.config = config
         self._pictures: dict[str, np.ndarray] = {}
         """Images of the last observation, by camera."""
@@ -178,8 +118,8 @@ class GymWorld(SteppedWorld):
         space = self._env.action_space
         if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1 or not space.is_bounded():
             raise InputError("env.id", config.id, f"actions must be a bounded vector, they are {space}")
-        raw, _ = self._env.reset(seed=0)
-        observation = self._observe(raw)
+        self._raw, _ = self._env.reset(seed=0)
+        observation = self._observe()
         self.spec = WorldSpec(
             images={f"observation.images.{name}": picture.shape for name, picture in self._pictures.items()},
             state_dim=len(observation["observation.state"]),
@@ -192,14 +132,8 @@ class GymWorld(SteppedWorld):
             instructions=(config.task,) if config.task else (),
         )
 
-    def reset(self, seed: int, task: str) -> Observation:
-        """See the base class."""
-        if task not in self.spec.tasks:
-            raise InputError("task", task, f"this world has: {', '.join(self.spec.tasks)}")
-        self._done = True
-        raw, _ = self._env.reset(seed=seed)
-        self._begin()
-        return self._observe(raw)
+    def _begin(self, seed: int, task: str) -> None:
+        self._raw, _ = self._env.reset(seed=seed)
 
     def render(self, height: int, width: int) -> np.ndarray:
         """See the base class."""
@@ -213,12 +147,20 @@ class GymWorld(SteppedWorld):
         self._env.close()
         self._done = True
 
-    def _step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, bool]:
-        raw, reward, ended, cut, info = self._env.step(action)
-        achieved = bool(info.get(self.config.success, False)) if self.config.success else bool(ended)
-        return raw, float(reward), bool(ended), bool(cut), achieved
+    def _step(self, action: np.ndarray) -> Step:
+        self._raw, reward, ended, cut, info = self._env.step(action)
+        finite = math.isfinite(reward) and finite_numbers(self._raw)
+        success = bool(info.get(self.config.success, False)) if self.config.success else bool(ended)
+        return Step(
+            success=success,
+            ended=bool(ended) or success,
+            reward=float(reward) if self.config.reward == "env" else None,
+            cut=bool(cut),
+            finite=finite,
+        )
 
-    def _observe(self, raw: Any) -> Observation:
+    def _observe(self) -> Observation:
+        raw = self._raw
         config, size = self.config, self.config.image_size
         state = self._vector("state", raw, config.state)
         observation: Observation = {TASK: config.task, "observation.state": state}
@@ -235,7 +177,7 @@ class GymWorld(SteppedWorld):
             privileged = state
             if config.environment_state != ("state",):
                 privileged = self._vector("environment_state", raw, config.environment_state)
-            observation[ENVIRONMENT_STATE] = np.append(privileged, self._steps / self._max_steps).astype(
+            observation[ENVIRONMENT_STATE] = np.append(privileged, self._steps / config.max_steps).astype(
                 np.float32
             )
         return observation
@@ -280,8 +222,9 @@ def _at(raw: Any, key: str, name: str) -> Any:
     return value
 
 
-def _finite(raw: Any) -> bool:
+def finite_numbers(raw: Any) -> bool:
+    """True if no number of a nested observation is NaN or infinite."""
     if isinstance(raw, dict):
-        return all(_finite(value) for value in raw.values())
+        return all(finite_numbers(value) for value in raw.values())
     array = np.asarray(raw)
     return array.dtype.kind != "f" or bool(np.isfinite(array).all())

@@ -10,6 +10,7 @@ Importing this file loads no LeRobot; making the world does.
 from __future__ import annotations
 
 import io
+import math
 import re
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
@@ -18,8 +19,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from accerl_lerobot.config.ranges import Range
-from accerl_lerobot.envs.base import EnvConfig, WorldSpec
-from accerl_lerobot.envs.gym_env import SteppedWorld, resized
+from accerl_lerobot.envs.base import EnvConfig, EpisodeWorld, Step, WorldSpec
+from accerl_lerobot.envs.gym_env import finite_numbers, resized
 from accerl_lerobot.envs.metaworld import close_at_exit, import_mujoco
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import TASK, Observation
@@ -67,15 +68,8 @@ class LeRobotEnvConfig(EnvConfig):
             raise InputError("env.name", self.name, remedy)
 
 
-class LeRobotWorld(SteppedWorld):
-    """One of LeRobot's environments; a suite of several tasks has one simulator for each.
-
-    Args:
-        config: Which one.
-
-    Raises:
-        InputError: LeRobot does not know the name or a field, or the environment shows no image and state.
-    """
+class LeRobotWorld(EpisodeWorld):
+    """One of LeRobot's environments; a suite of several tasks has one simulator for each."""
 
     def __init__(self, config: LeRobotEnvConfig) -> None:
         if config.name in _NEEDS_MUJOCO:
@@ -84,7 +78,6 @@ class LeRobotWorld(SteppedWorld):
         from lerobot.envs.factory import make_env
         from lerobot.utils.import_utils import register_third_party_plugins
 
-        super().__init__(config.max_steps, config.reward, ends_with_success=False)
         self.config = config
         register_third_party_plugins()
         known = LeRobotConfig.get_known_choices()
@@ -98,29 +91,25 @@ class LeRobotWorld(SteppedWorld):
         self._before, self._after = self._lerobot_config.get_env_processors()
         with redirect_stdout(io.StringIO()):  # LeRobot prints, and results go there
             self._vectors = make_env(
-                self._lerobot_config,
-                n_envs=1,
-                use_async_envs=False,
-                trust_remote_code=config.trust_remote_code,
+                self._lerobot_config, n_envs=1, trust_remote_code=config.trust_remote_code
             )
         self._envs = _single_envs(self._vectors)
-        self._task = ""
         self.spec = self._look()
         close_at_exit(self)
 
-    def reset(self, seed: int, task: str) -> Observation:
-        if task not in self._envs:
-            raise InputError("task", task, f"this world has: {', '.join(self._envs)}")
-        self._done = True
-        env = self._envs[task]
-        raw, _ = env.reset(seed=seed)
-        self._task = task
-        self._begin()
-        return self._observe(raw)
+    def _begin(self, seed: int, task: str) -> None:
+        self._raw, _ = self._envs[task].reset(seed=seed)
 
-    def _step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, bool]:
-        raw, reward, ended, cut, info = self._envs[self._task].step(action)
-        return raw, float(reward), bool(ended), bool(cut), bool(info.get("is_success", False))
+    def _step(self, action: np.ndarray) -> Step:
+        processed = self._processed(action[None])[0]
+        self._raw, reward, ended, cut, info = self._envs[self._task].step(processed)
+        return Step(
+            success=bool(info.get("is_success", False)),
+            ended=bool(ended),
+            reward=float(reward) if self.config.reward == "env" else None,
+            cut=bool(cut),
+            finite=math.isfinite(reward) and finite_numbers(self._raw),
+        )
 
     def render(self, height: int, width: int) -> np.ndarray:
         return resized(np.asarray(self._envs[self._task].render(), np.uint8), height, width)
@@ -135,7 +124,8 @@ class LeRobotWorld(SteppedWorld):
         """Learns shapes from a first observation."""
         task, env = next(iter(self._envs.items()))
         self._task = task
-        observation = self._observe(env.reset(seed=0)[0])
+        self._raw, _ = env.reset(seed=0)
+        observation = self._observe()
         images: dict[str, tuple[int, int, int]] = {
             key: (image.shape[0], image.shape[1], image.shape[2])
             for key, image in observation.items()
@@ -143,12 +133,8 @@ class LeRobotWorld(SteppedWorld):
         }
         if not images or _STATE not in observation:
             shown = ", ".join(k for k in observation if k != TASK) or "neither"
-            raise InputError(
-                "env.kwargs",
-                self.config.kwargs,
-                f"a policy needs images and a state, {self.config.name} shows {shown}; try "
-                "obs_type=pixels_agent_pos",
-            )
+            remedy = f"a policy needs images and a state, {self.config.name} shows {shown}"
+            raise InputError("env.kwargs", self.config.kwargs, f"{remedy}; try obs_type=pixels_agent_pos")
         space = env.action_space
         return WorldSpec(
             images=images,
@@ -162,11 +148,11 @@ class LeRobotWorld(SteppedWorld):
             instructions=tuple(filter(None, map(self._instruction, self._envs))),
         )
 
-    def _observe(self, raw: dict[str, Any]) -> Observation:
+    def _observe(self) -> Observation:
         from lerobot.envs.utils import preprocess_observation
 
         text = self._instruction(self._task)
-        batch = self._before({**preprocess_observation(_batched(raw)), TASK: [text]})
+        batch = self._before({**preprocess_observation(_batched(self._raw)), TASK: [text]})
         observation: Observation = {TASK: text}
         for key, value in batch.items():
             if key == _STATE:
@@ -192,21 +178,16 @@ class LeRobotWorld(SteppedWorld):
 
 
 def _check_hub(config: LeRobotEnvConfig, hub_path: str | None) -> None:
-    """Refuses code from the Hub that nobody asked for, or whose version is not named.
-
-    Raises:
-        InputError: see above.
-    """
+    """Refuses code from the Hub that nobody asked for, or whose version is not named."""
+    if hub_path is None and config.trust_remote_code:
+        remedy = f"{config.name} is no environment on the Hub; leave it out"
+        raise InputError("env.trust_remote_code", True, remedy)
     if hub_path is None:
-        if config.trust_remote_code:
-            remedy = f"{config.name} is no environment on the Hub; leave it out"
-            raise InputError("env.trust_remote_code", True, remedy)
         return
     if not config.trust_remote_code:
         remedy = f"{config.name} is code of {hub_path} on the Hub, which would run with your rights; read it,"
-        raise InputError(
-            "env.trust_remote_code", False, f"{remedy} then set this, and its commit in hub_path"
-        )
+        remedy += " then set this, and its commit in hub_path"
+        raise InputError("env.trust_remote_code", False, remedy)
     if not _PINNED.fullmatch(hub_path) or ".." in hub_path:
         remedy = "name a commit, owner/name@COMMIT or owner/name@COMMIT:file.py with 40 hexadecimal digits"
         raise InputError("env.kwargs.hub_path", hub_path, f"{remedy}: branches can be moved to other code")

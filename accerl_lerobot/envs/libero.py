@@ -14,12 +14,12 @@ import numpy as np
 
 from accerl_lerobot.config.ranges import Range
 from accerl_lerobot.envs.base import (
-    ChunkResult,
     EnvConfig,
-    World,
+    EpisodeWorld,
+    Step,
     WorldSpec,
-    check_episode,
-    checked_actions,
+    check_cameras,
+    names,
     task_code,
 )
 from accerl_lerobot.envs.libero_simulator import FPS, MAX_OBJECTS, OBJECT_NUMBERS, ROBOT_NUMBERS, Simulator
@@ -75,8 +75,7 @@ class LiberoConfig(EnvConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         resolve(self.task)
-        if not self.cameras or len(set(self.cameras)) < len(self.cameras):
-            raise InputError("env.camera", self.camera, "name each camera once, separated by commas")
+        check_cameras(self.cameras, self.camera)
         if self.assets and not (expanded(self.assets, "env.assets") / "scenes").is_dir():
             raise InputError("env.assets", self.assets, "no folder of LIBERO's assets: it holds no scenes/")
 
@@ -95,7 +94,7 @@ class LiberoConfig(EnvConfig):
     @property
     def cameras(self) -> tuple[str, ...]:
         """The camera names that `camera` stands for."""
-        return tuple(name.strip() for name in self.camera.split(",") if name.strip())
+        return names(self.camera)
 
 
 def image_key(camera: str) -> str:
@@ -103,12 +102,8 @@ def image_key(camera: str) -> str:
     return f"observation.images.{CAMERAS.get(camera, camera)}"
 
 
-class LiberoWorld(World):
-    """One LIBERO instance; its simulators are built on first use of a task, then kept.
-
-    Args:
-        config: What to simulate.
-    """
+class LiberoWorld(EpisodeWorld):
+    """One LIBERO instance; its simulators are built on first use of a task, then kept."""
 
     def __init__(self, config: LiberoConfig) -> None:
         self.config = config
@@ -125,49 +120,20 @@ class LiberoWorld(World):
             instructions=tuple(map(instruction, config.tasks)),
         )
         self._simulators: dict[str, Simulator] = {}
-        self._task = ""
-        self._steps = 0
-        self._success = False
-        self._done = True
 
     @property
     def simulator(self) -> Simulator:
         """That of the current task; for experts, not for policies."""
         return self._simulators[self._task]
 
-    def reset(self, seed: int, task: str) -> Observation:
-        check_episode(self.spec, seed, task)
-        self._done = True  # until the new episode stands: an error below leaves a world that must be reset
+    def _begin(self, seed: int, task: str) -> None:
         if task not in self._simulators:
             self._simulators[task] = Simulator(task, self.config.rendering, self.config.assets)
         self._simulators[task].reset(seed)
-        self._task, self._steps, self._success, self._done = task, 0, False, False
-        return self._observe()
 
-    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-        if self._done:
-            raise RuntimeError("the episode is over: call reset before step_chunk")
-        actions = checked_actions(actions, self.spec)
-        rewards, nonfinite = [], False
-        for action in actions:
-            succeeded = self.simulator.step(action)
-            self._steps += 1
-            nonfinite = diverged(self.simulator.data)
-            succeeded &= not nonfinite
-            rewards.append(1.0 if succeeded and not self._success else 0.0)
-            self._success |= succeeded
-            truncated = not self._success and (nonfinite or self._steps >= self.config.max_steps)
-            self._done = self._success or truncated
-            if self._done:
-                break
-        return ChunkResult(
-            observation=self._observe(),
-            rewards=np.asarray(rewards, np.float32),
-            terminated=self._success,
-            truncated=truncated,
-            success=self._success,
-            info={"nonfinite": 1.0} if nonfinite else {},
-        )
+    def _step(self, action: np.ndarray) -> Step:
+        success = self.simulator.step(action)
+        return Step(success=success, ended=success, finite=not diverged(self.simulator.data))
 
     def render(self, height: int, width: int) -> np.ndarray:
         if not self._task:
@@ -186,8 +152,7 @@ class LiberoWorld(World):
         }
         observation["observation.state"] = simulator.state()
         if self.config.environment_state:
-            late = self._steps / self.config.max_steps
-            state = simulator.everything(), [late], task_code(self.spec.tasks, self._task)
+            state = simulator.everything(), [self.late], task_code(self.spec.tasks, self._task)
             observation[ENVIRONMENT_STATE] = np.concatenate(state).astype(np.float32)
         observation[TASK] = instruction(self._task)
         return observation

@@ -4,17 +4,8 @@
 The same physics, state, camera and instruction as LeRobot's own wrapper, but the image has the size a small
 policy needs, lights are cheap to draw in software, and nothing is rendered that no policy looks at.
 Importing this file loads neither MuJoCo nor metaworld.
-
-LeRobot's MetaWorld tables (instructions, difficulty groups, experts), read without importing LeRobot.
-
-They are one JSON file inside the LeRobot package; importing ``lerobot.envs`` to reach it would cost a rollout
-worker four seconds and several hundred megabytes.
-
-Differences between the world a policy was trained in and the one it must work in.
-
-An offscreen OpenGL for MuJoCo: pick a backend before the import, and say in one line what is missing.
-
-MuJoCo reads ``MUJOCO_GL`` once, when it is imported: call `import_mujoco` before importing what uses it.
+Also the offscreen OpenGL of every MuJoCo world: MuJoCo reads ``MUJOCO_GL`` once, when it is imported, so call
+`import_mujoco` before importing what uses it.
 """
 
 from __future__ import annotations
@@ -41,12 +32,12 @@ import numpy as np
 
 from accerl_lerobot.config.ranges import Positive, Range, Section
 from accerl_lerobot.envs.base import (
-    ChunkResult,
     EnvConfig,
-    World,
+    EpisodeWorld,
+    Step,
     WorldSpec,
-    check_episode,
-    checked_actions,
+    check_cameras,
+    names,
     task_code,
 )
 from accerl_lerobot.errors import InputError
@@ -58,6 +49,7 @@ if TYPE_CHECKING:
 
 @functools.cache
 def _tables() -> dict[str, Any]:
+    """LeRobot's MetaWorld tables: a JSON file in its package, as importing it costs seconds and memory."""
     spec = importlib.util.find_spec("lerobot")
     if spec is None or not spec.submodule_search_locations:
         raise ModuleNotFoundError("LeRobot is not installed: pip install lerobot[metaworld]", name="lerobot")
@@ -91,9 +83,6 @@ def resolve(text: str, field: str = "env.task") -> tuple[str, ...]:
     Example:
         >>> resolve("drawer-open-v3, door-open-v3")
         ('drawer-open-v3', 'door-open-v3')
-
-    Raises:
-        InputError: a name is neither a task nor a group, or there is none.
     """
     known, named = set(all_tasks()), groups()
     found: dict[str, None] = {}
@@ -125,10 +114,6 @@ class ShiftConfig(Section, section="env.shift"):
     """Deployment shift of a MetaWorld scene; the defaults change nothing.
 
     Scripted demonstrations are recorded without it, unless ``demos.shifted`` says otherwise.
-
-    Example:
-        >>> ShiftConfig(camera=(0.0, 0.05, 0.0), action_delay=2).action_delay
-        2
     """
 
     camera: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
@@ -144,12 +129,7 @@ class ShiftConfig(Section, section="env.shift"):
     some starts are out of reach."""
 
     def apply(self, simulator: Any, cameras: Sequence[str]) -> None:
-        """Changes a MetaWorld simulator that has just been built.
-
-        Args:
-            simulator: MetaWorld's own environment object.
-            cameras: names of those that are moved.
-        """
+        """Changes a MetaWorld simulator that has just been built, and moves these cameras of it."""
         from gymnasium.spaces import Box
 
         model = simulator.model
@@ -179,13 +159,9 @@ _open: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
 def choose_backend() -> str | None:
-    """Names the backend for a headless Linux machine: EGL where there is a GPU, else OSMesa, else EGL.
+    """The backend for a headless Linux machine: EGL where there is a GPU, else OSMesa, else EGL.
 
-    Returns:
-        ``"egl"``, ``"osmesa"``, or None where MuJoCo's own default is right (a display, or not Linux).
-
-    Raises:
-        InputError: neither library is installed.
+    None where MuJoCo's own default is right (a display, or not Linux).
     """
     if not _headless():
         return None
@@ -197,11 +173,7 @@ def choose_backend() -> str | None:
 
 
 def import_mujoco() -> ModuleType:
-    """Imports MuJoCo with a backend that works here; respects ``MUJOCO_GL`` if it is set.
-
-    Raises:
-        InputError: the backend's library is missing.
-    """
+    """Imports MuJoCo with a backend that works here; respects ``MUJOCO_GL`` if it is set."""
     imported = "mujoco" in sys.modules
     # One software-rendering thread per world: several worlds then share the cores without fighting.
     os.environ.setdefault("LP_NUM_THREADS", "1")
@@ -225,11 +197,7 @@ def import_mujoco() -> ModuleType:
 
 
 def new_renderer(model: Any, height: int, width: int) -> Any:
-    """A `mujoco.Renderer` whose framebuffer is exactly (height, width).
-
-    Raises:
-        InputError: no OpenGL context can be created here.
-    """
+    """A `mujoco.Renderer` whose framebuffer is exactly (height, width)."""
     mujoco = import_mujoco()
     model.vis.global_.offheight, model.vis.global_.offwidth = height, width
     try:
@@ -280,12 +248,7 @@ STEP_LIMIT = 500
 @EnvConfig.register_subclass("metaworld")
 @dataclass(frozen=True, kw_only=True)
 class MetaWorldConfig(EnvConfig):
-    """Which MetaWorld tasks, seen how.
-
-    Example:
-        >>> MetaWorldConfig(task="drawer-open-v3,door-open-v3").tasks
-        ('drawer-open-v3', 'door-open-v3')
-    """
+    """Which MetaWorld tasks, seen how."""
 
     expert = "accerl_lerobot.demos.expert:metaworld_expert"
     world = "accerl_lerobot.envs.metaworld:MetaWorld"
@@ -301,8 +264,6 @@ class MetaWorldConfig(EnvConfig):
     """Episode limit in env steps; reaching it truncates."""
     lighting: Literal["cheap", "default"] = "cheap"
     """``cheap`` (no shadows, reflections or multisampling: ten times faster in software) or ``default``."""
-    terminate_on_success: bool = True
-    """True if the first success ends the episode."""
     reward: Literal["success", "dense"] = "success"
     """``success`` (1.0 at the first success, else 0.0) or ``dense`` (MetaWorld's own, 0 to 10 a step)."""
     environment_state: bool = False
@@ -314,8 +275,7 @@ class MetaWorldConfig(EnvConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         resolve(self.task)
-        if not self.cameras or len(set(self.cameras)) < len(self.cameras):
-            raise InputError("env.camera", self.camera, "name each camera once, separated by commas")
+        check_cameras(self.cameras, self.camera)
         if unknown := [name for name in self.cameras if name not in CAMERAS]:
             raise InputError("env.camera", self.camera, f"{unknown[0]!r} is none of: {', '.join(CAMERAS)}")
 
@@ -336,17 +296,14 @@ class MetaWorldConfig(EnvConfig):
     @property
     def cameras(self) -> tuple[str, ...]:
         """The camera names `camera` stands for."""
-        return tuple(name.strip() for name in self.camera.split(",") if name.strip())
+        return names(self.camera)
 
 
-class MetaWorld(World):
+class MetaWorld(EpisodeWorld):
     """One MetaWorld instance; its simulators are built on first use of a task, then kept.
 
     A simulator that diverges (non-finite state or reward, or MuJoCo had to reset it) ends the episode as
     truncated, with ``info["nonfinite"] == 1.0``: such a segment must not be trained on.
-
-    Args:
-        config: What to simulate.
     """
 
     def __init__(self, config: MetaWorldConfig) -> None:
@@ -369,11 +326,7 @@ class MetaWorld(World):
         self._sims: dict[str, Any] = {}
         self._eyes: dict[str, Any] = {}
         self._film: dict[str, Any] = {}
-        self._task = ""
         self._raw = np.zeros(0)
-        self._steps = 0
-        self._success = False
-        self._done = True
         self._delayed: deque[np.ndarray] = deque()
 
     @property
@@ -381,9 +334,7 @@ class MetaWorld(World):
         """MetaWorld's own 39 numbers, float64, objects and goal included: for experts, not for policies."""
         return self._raw
 
-    def reset(self, seed: int, task: str) -> Observation:
-        check_episode(self.spec, seed, task)
-        self._done = True  # until the new episode stands: an error below leaves a world that must be reset
+    def _begin(self, seed: int, task: str) -> None:
         if task not in self._sims:
             self._sims[task] = self._build(task)
         sim = self._sims[task]
@@ -392,39 +343,16 @@ class MetaWorld(World):
         # MetaWorld moves the goal marker after its last forward pass, so that the first frame would show an
         # older goal. This places the markers and leaves the physics as it is.
         import_mujoco().mj_kinematics(sim.model, sim.data)
-        self._task, self._steps, self._success, self._done = task, 0, False, False
         self._delayed = deque([np.zeros(ACTION_DIM, np.float32)] * self.config.shift.action_delay)
-        return self._observe()
 
-    def step_chunk(self, actions: np.ndarray) -> ChunkResult:
-        if self._done:
-            raise RuntimeError("the episode is over: call reset before step_chunk")
-        actions = checked_actions(actions, self.spec)
-        sim, rewards, nonfinite = self._sims[self._task], [], False
-        for action in actions:
-            self._delayed.append(action)
-            self._raw, shaped, _, _, info = sim.step(self._delayed.popleft())
-            self._steps += 1
-            nonfinite = not (math.isfinite(shaped) and np.isfinite(self._raw).all()) or diverged(sim.data)
-            succeeded = not nonfinite and bool(info["success"])
-            if self.config.reward == "dense":
-                rewards.append(shaped)
-            else:
-                rewards.append(1.0 if succeeded and not self._success else 0.0)
-            self._success |= succeeded
-            terminated = self._success and self.config.terminate_on_success
-            truncated = not terminated and (nonfinite or self._steps >= self.config.max_steps)
-            self._done = terminated or truncated
-            if self._done:
-                break
-        return ChunkResult(
-            observation=self._observe(),
-            rewards=np.asarray(rewards, np.float32),
-            terminated=terminated,
-            truncated=truncated,
-            success=self._success,
-            info={"nonfinite": 1.0} if nonfinite else {},
-        )
+    def _step(self, action: np.ndarray) -> Step:
+        self._delayed.append(action)
+        sim = self._sims[self._task]
+        self._raw, reward, _, _, info = sim.step(self._delayed.popleft())
+        finite = math.isfinite(reward) and np.isfinite(self._raw).all() and not diverged(sim.data)
+        success = bool(info["success"])
+        dense = reward if self.config.reward == "dense" else None
+        return Step(success=success, ended=success, reward=dense, finite=bool(finite))
 
     def render(self, height: int, width: int) -> np.ndarray:
         if not self._task:
@@ -474,8 +402,7 @@ class MetaWorld(World):
         }
         observation["observation.state"] = self._raw[:STATE_DIM].astype(np.float32)
         if self.config.environment_state:
-            late = self._steps / self.config.max_steps
-            state = self._raw, [late], task_code(self.spec.tasks, self._task)
+            state = self._raw, [self.late], task_code(self.spec.tasks, self._task)
             observation[ENVIRONMENT_STATE] = np.concatenate(state).astype(np.float32)
         observation[TASK] = description(self._task)
         return observation

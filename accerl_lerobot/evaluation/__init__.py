@@ -1,2 +1,324 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Success rates on fixed seeds with their intervals, and pictures of them."""
+"""Success rates on fixed seeds with their intervals, and pictures of them.
+
+A rate is never reported without n and an interval.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import NormalDist
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from rich.table import Table
+
+from accerl_lerobot.config.ranges import Range, Section, Steps
+from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
+from accerl_lerobot.seeds import eval_seed
+
+FILM = 128, 4
+"""Side in pixels and env steps per frame of videos, which show 20 frames a second; see `EpisodePlan.film`."""
+
+
+class Interval(NamedTuple):
+    """Both ends as fractions."""
+
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rate:
+    """Successes out of n.
+
+    Example:
+        >>> str(Rate(successes=93, n=100))
+        '93.0 % [86.3, 96.6] n=100'
+    """
+
+    successes: int
+    n: int
+
+    @property
+    def value(self) -> float:
+        """The observed fraction; NaN for n = 0."""
+        return self.successes / self.n if self.n else math.nan
+
+    def interval(self, confidence: float = 0.95) -> Interval:
+        """`wilson_interval` of this rate."""
+        return wilson_interval(self.successes, self.n, confidence)
+
+    def __str__(self) -> str:
+        if self.n == 0:
+            return "no episodes"
+        low, high = self.interval()
+        return f"{100 * self.value:.1f} % [{100 * low:.1f}, {100 * high:.1f}] n={self.n}"
+
+
+def wilson_interval(successes: int, n: int, confidence: float = 0.95) -> Interval:
+    """Wilson's score interval of a proportion (Wilson 1927; Brown, Cai and DasGupta 2001, section 3.1.1).
+
+        z = Φ⁻¹((1 + confidence) / 2),  p = successes / n
+        (p + z²/2n ± z √(p(1 − p)/n + z²/4n²)) / (1 + z²/n)
+
+    Unlike p ± z√(p(1 − p)/n) it has width at 0 and at n successes and stays inside [0, 1]. For n = 0 it is
+    [0, 1], as nothing is known.
+    """
+    if not 0 <= successes <= n:
+        raise ValueError(f"{successes} successes in {n} episodes")
+    if n == 0:
+        return Interval(0.0, 1.0)
+    z = NormalDist().inv_cdf((1 + confidence) / 2)
+    p, share = successes / n, z * z / n
+    centre = (p + share / 2) / (1 + share)
+    half = z * math.sqrt(p * (1 - p) / n + share / (4 * n)) / (1 + share)
+    return Interval(0.0 if successes == 0 else centre - half, 1.0 if successes == n else centre + half)
+
+
+def summarise(results: Sequence[EpisodeResult]) -> dict[str, Any]:
+    """Success with its 95 % Wilson interval, in all and per task, as plain JSON types.
+
+    Each task has the first and the last of its ``seeds``, and the ``failed_seeds`` among them.
+    """
+    if not results:
+        raise ValueError("nothing to summarise: no episodes")
+    outcomes = {(r.plan.task, r.plan.seed): r.success for r in results}
+    tasks = {}
+    for name in sorted({task for task, _ in outcomes}):
+        seeds = {seed: success for (task, seed), success in outcomes.items() if task == name}
+        failed = sorted(seed for seed, success in seeds.items() if not success)
+        tasks[name] = {**_rate(seeds.values()), "seeds": [min(seeds), max(seeds)], "failed_seeds": failed}
+    return {
+        **_rate(outcomes.values()),
+        "return_mean": float(np.mean([r.episode_return for r in results])),
+        "steps_mean": float(np.mean([r.steps for r in results])),
+        "version_min": min(r.versions[0] for r in results),
+        "version_max": max(r.versions[1] for r in results),
+        "tasks": tasks,
+    }
+
+
+def table(summary: dict[str, Any], title: str) -> Table:
+    """`summarise`'s numbers for the terminal."""
+    out = Table("task", "success [95 % Wilson]", title=title)
+    rows = list(summary["tasks"].items())
+    for name, entry in [*rows, ("all", summary)] if len(rows) > 1 else rows:
+        out.add_row(name, str(Rate(successes=round(entry["success"] * entry["n"]), n=entry["n"])))
+    return out
+
+
+def _rate(successes: Any) -> dict[str, Any]:
+    rate = Rate(successes=sum(map(bool, successes)), n=len(successes))
+    return {"success": rate.value, "n": rate.n, "ci95": list(rate.interval())}
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationConfig(Section, section="evaluation"):
+    """Success rates before, during and after training; always with LeRobot's own sampler."""
+
+    episodes: Annotated[int, Range("[1, 10000]")] = 100
+    """Episodes before and after training, over all tasks; the same starts both times, chosen by the run's
+    seed and never trained on."""
+    before: bool = True
+    """Evaluate before training too; without it there is no video of before and after."""
+    every_updates: Steps = 0
+    """Evaluate while training, every so many updates; 0 does not."""
+    episodes_during: Annotated[int, Range("[1, 1000000]")] = 20
+    """Episodes of each evaluation while training."""
+    videos: Annotated[int, Range("[0, 1000]")] = 16
+    """Episodes filmed, the same before and after."""
+
+
+def evaluation_plans(
+    tasks: Sequence[str],
+    episodes: int,
+    group: str,
+    *,
+    seed: int = 0,
+    filmed: int = 0,
+    film: tuple[int, int] = FILM,
+) -> list[EpisodePlan]:
+    """`episodes` plans of an evaluation called `group`, spread evenly over `tasks`; the first are `filmed`.
+
+    The run's `seed` decides on the starts, see `eval_seed`.
+    """
+    return [
+        EpisodePlan(
+            task=tasks[i % len(tasks)],
+            seed=eval_seed(seed, i // len(tasks)),
+            explore=False,
+            index=i,
+            group=group,
+            film=film if i < filmed else None,
+        )
+        for i in range(episodes)
+    ]
+
+
+GAP = 4
+"""Pixels of white between two clips."""
+BORDER = 5
+"""Width, in pixels, of the frame that tells how an episode ended."""
+
+
+@contextmanager
+def drawing(path: Path, size: tuple[float, float] = (7, 4)) -> Iterator[Any]:
+    """Axes to draw on, with a grid, which are a PNG when the context is left; `size` in inches."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, dpi=120, layout="tight")
+    axes = figure.subplots()
+    axes.grid(alpha=0.3)
+    yield axes
+    figure.savefig(path)
+
+
+def success_curve(
+    path: Path, evaluations: Sequence[dict[str, Any]], training: Sequence[tuple[float, float]]
+) -> None:
+    """Draws evaluation success with intervals over env steps, and the exploring policy's success behind it.
+
+    Evaluations are `summarise` results with an ``env_steps`` entry, `training` is pairs of env steps and the
+    share of successful exploring episodes.
+    """
+    with drawing(path) as axes:
+        if training:
+            steps, share = zip(*training, strict=True)
+            axes.plot(steps, share, color="0.7", lw=1.5, label="while exploring")
+        evaluations = sorted(evaluations, key=lambda e: e["env_steps"])
+        x = [e["env_steps"] for e in evaluations]
+        y = [e["success"] for e in evaluations]
+        # Rounding may leave the rate a hair outside its interval, and matplotlib refuses negative lengths.
+        low = [max(0.0, e["success"] - e["ci95"][0]) for e in evaluations]
+        high = [max(0.0, e["ci95"][1] - e["success"]) for e in evaluations]
+        axes.errorbar(
+            x, y, yerr=[low, high], marker="o", capsize=3, color="C0", label="evaluation, 95 % Wilson"
+        )
+        for e in (evaluations[0], evaluations[-1]):
+            place = (e["env_steps"], e["success"])
+            axes.annotate(f"n={e['n']}", place, textcoords="offset points", xytext=(6, -12), fontsize=8)
+        axes.set(xlabel="env steps of online experience", ylabel="success", ylim=(-0.02, 1.02))
+        axes.legend(loc="lower right")
+
+
+def write_video(
+    path: Path,
+    rows: Sequence[Sequence[Sequence[np.ndarray]]],
+    fps: int,
+    above: Callable[[int], np.ndarray] | None = None,
+) -> None:
+    """Writes a grid of clips; one that ends early holds its last frame.
+
+    Args:
+        path: .mp4 to write.
+        rows: rows of clips, as many in each; frames of a clip are uint8 (H, W, 3), all of one size in a row.
+        fps: frames per second.
+        above: number of a frame → what is put above the grid in it, as wide as that.
+    """
+    import imageio.v2 as imageio
+
+    length = max(len(clip) for row in rows for clip in row)
+    # The pixel format every player knows, at the price of even sides: an odd last row or column is left out.
+    writer: Any = imageio.get_writer(
+        path, fps=fps, macro_block_size=1, codec="libx264", pixelformat="yuv420p"
+    )
+    with writer:
+        for i in range(length + fps):
+            lines = [_joined([clip[min(i, len(clip) - 1)] for clip in row], axis=1) for row in rows]
+            picture = _joined([*([] if above is None else [above(i)]), *lines], axis=0)
+            writer.append_data(picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2])
+
+
+def before_after(
+    path: Path,
+    before: tuple[Sequence[EpisodeResult], dict[str, Any] | None],
+    after: tuple[Sequence[EpisodeResult], dict[str, Any] | None],
+    fps: int,
+) -> None:
+    """Films the same episodes twice, before training on the left and after it on the right.
+
+    Above each half stand the evaluation's numbers, and how many of the filmed episodes have succeeded so far;
+    the frame of an episode that has ended is green for a success and red for a failure. Nothing is written
+    when no episode was filmed. `before` and `after` are results of the same plans, and their summaries.
+    """
+    filmed = [{r.plan.index: r for r in results if r.frames} for results, _ in (before, after)]
+    both = sorted(filmed[0].keys() & filmed[1].keys())
+    if not both:
+        return
+    columns = math.ceil(math.sqrt(len(both)))
+    blank = np.full_like(filmed[0][both[0]].frames[0], 255)
+    gap = np.full((len(blank), 2 * GAP, 3), 255, np.uint8)
+    halves = [
+        [captioned(half[i].frames, "", half[i].success) for i in both]
+        + [[blank]] * (-len(both) % columns)
+        for half in filmed
+    ]  # fmt: skip
+    left, right = ([half[i : i + columns] for i in range(0, len(half), columns)] for half in halves)
+    rows = [[*one, [gap], *two] for one, two in zip(left, right, strict=True)]
+    width = columns * (blank.shape[1] + GAP) - GAP
+
+    def above(number: int) -> np.ndarray:
+        lines = []
+        for name, half, (_, summary) in zip(("before", "after"), filmed, (before, after), strict=True):
+            ended = sum(half[i].success and number >= len(half[i].frames) for i in both)
+            count = f"{ended} of these {len(both)} succeeded"
+            lines.append([f"{name} RL: {_rate_text(summary)}", count])
+        return _caption(lines, width, gap.shape[1] + 2 * GAP)
+
+    write_video(path, rows, fps, above)
+
+
+def _rate_text(summary: dict[str, Any] | None) -> str:
+    if summary is None:
+        return "not evaluated"
+    low, high = summary["ci95"]
+    return f"{summary['success']:.0%} success [{low:.0%}, {high:.0%}], n = {summary['n']}"
+
+
+def _caption(halves: Sequence[Sequence[str]], width: int, gap: int) -> np.ndarray:
+    """Lines of black text over each half of a picture, 8 to 20 pixels high, as large as they fit.
+
+    Width of a half, and the gap between them, are in pixels.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    longest = max((line for lines in halves for line in lines), key=len)
+    size = 20
+    while size > 8 and ImageFont.load_default(size).getlength(longest) > width - 8:
+        size -= 1
+    step, font = size + 6, ImageFont.load_default(size)
+    image = Image.new("RGB", (len(halves) * (width + gap) - gap, step * len(halves[0]) + 6), "white")
+    draw = ImageDraw.Draw(image)
+    for half, lines in enumerate(halves):
+        for i, line in enumerate(lines):
+            draw.text((half * (width + gap) + 4, 4 + step * i), line, fill="black", font=font)
+    return np.asarray(image)
+
+
+def captioned(frames: Sequence[np.ndarray], name: str, success: bool) -> list[np.ndarray]:
+    """Frames uint8 (H, W, 3) under a name, and one more that tells the end by the colour of its frame."""
+    from PIL import Image, ImageDraw
+
+    told = []
+    for i in range(len(frames) + 1):
+        image = Image.fromarray(frames[min(i, len(frames) - 1)])
+        draw = ImageDraw.Draw(image)
+        draw.text((6, 4), name, fill=(255, 255, 255), stroke_width=1, stroke_fill=(0, 0, 0))
+        if i == len(frames):
+            colour = (40, 160, 60) if success else (200, 40, 40)
+            draw.rectangle((0, 0, image.width - 1, image.height - 1), outline=colour, width=BORDER)
+        told.append(np.asarray(image))
+    return told
+
+
+def _joined(pictures: Sequence[np.ndarray], axis: int) -> np.ndarray:
+    """Pictures beside (axis 1) or below (axis 0) each other, white between them."""
+    shape = list(pictures[0].shape)
+    shape[axis] = GAP
+    gap = np.full(shape, 255, np.uint8)
+    return np.concatenate([part for picture in pictures for part in (picture, gap)][:-1], axis=axis)

@@ -3,14 +3,12 @@
 
 A number goes with a policy only if it was measured on it: a run's summary is about its last checkpoint, and
 an evaluation names its policy.
-
-Types of artifacts that are pushed and pulled, told by their files, and the fields of the two verbs.
-
-Free of the Hub's client, which takes a second to import.
+Also the types of artifacts that are pushed and pulled, and the fields of the two verbs.
 """
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shlex
 from collections.abc import Mapping
@@ -18,13 +16,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from huggingface_hub import DatasetCard, EvalResult, ModelCard, ModelCardData
 
 from accerl_lerobot.checkpoint import safety
 from accerl_lerobot.checkpoint.layout import AWAY, BACKBONE, CHECKPOINTS, PREPROCESSOR, PRETRAINED, SUMMARY
 from accerl_lerobot.checkpoint.layout import CONFIG as RECIPE
-from accerl_lerobot.config.parsing import DISCOVER
+from accerl_lerobot.config.parsing import DISCOVER, read_recipe
 from accerl_lerobot.config.ranges import NewFolder, Pattern, Section
 from accerl_lerobot.envs.base import lerobot_eval_arguments
 from accerl_lerobot.errors import InputError
@@ -213,7 +210,9 @@ def _known(folder: Path, artifact: str) -> tuple[dict[str, Any], dict[str, Path]
     is_last = number.isdigit() and int(number) == summary.get("updates")
     measured = own is not None or artifact != POLICY or is_last
     names = KEPT.get(artifact, ()) if measured else (RECIPE,)
-    known = {"recipe": _read_recipe(home / RECIPE), "validation": read_json(home / VALIDATION)}
+    known = {"validation": read_json(home / VALIDATION)}
+    with contextlib.suppress(InputError):
+        known["recipe"] = read_recipe(home / RECIPE)
     if measured and artifact in (POLICY, RUN):
         known["summary"] = summary
     if own is not None:  # an evaluation is there only if one was given to an earlier push
@@ -232,14 +231,6 @@ def _run_of(folder: Path, artifact: str) -> Path | None:
     else:
         return None
     return home if (home / sign).is_file() else None
-
-
-def _read_recipe(path: Path) -> dict[str, Any]:
-    try:
-        tree = yaml.safe_load(path.read_text()) if path.is_file() else None
-    except (OSError, ValueError, yaml.YAMLError):
-        return {}
-    return tree if isinstance(tree, dict) else {}
 
 
 def _read_evaluation(path: Path, policy: Path) -> dict[str, Any]:
@@ -272,9 +263,10 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenan
         model_name=local,
         eval_results=_results(measurements, env.get("type", "simulation")) or None,
     )
-    is_policy = artifact in (POLICY, RUN)
     policy = f"{local}/{LAST}" if artifact == RUN else local
     shown = sorted(name for name in files if name.startswith(f"{FOLDER}/") or "/" not in name)
+    # With one of its own, LeRobot finds the backbone only once a pull has set its place.
+    has_backbone = str(config.get("vlm_model_name") or "").startswith(("/", BACKBONE))
     own_recipe = files.get(RECIPE if artifact == RUN else f"{FOLDER}/{RECIPE}", b"")
     card = ModelCard.from_template(
         data,
@@ -293,10 +285,8 @@ def model_card(repo_id: str, artifact: str, folder: Path, files: Files, provenan
         pictures=[name for name in shown if name.endswith((".png", ".gif", ".svg", ".jpg"))],
         videos=[name for name in shown if name.endswith(".mp4")],
         commands=_commands(repo_id, artifact, config, recipe),
-        stock=_stock(policy, config, env) if is_policy else None,
-        # Otherwise LeRobot finds the backbone only once a pull has set its place.
-        from_hub=artifact == POLICY
-        and not str(config.get("vlm_model_name") or "").startswith(("/", BACKBONE)),
+        stock=_stock(policy, config, env) if artifact in (POLICY, RUN) else None,
+        from_hub=artifact == POLICY and not has_backbone,
         is_success_model=artifact == SUCCESS_MODEL,
         repo_id=repo_id,
         recipe=own_recipe.decode() if isinstance(own_recipe, bytes) else "",

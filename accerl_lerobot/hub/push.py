@@ -64,20 +64,9 @@ RECORDS = (".json", ".jsonl", ".yaml", ".yml", ".md", ".txt", ".log", ".csv", ".
 VOCABULARIES = ("tokenizer.json", "vocab.json", "merges.txt", "added_tokens.json", "special_tokens_map.json")
 PATH = re.compile(r"(?<![\w:/.~}>\-])(?:~|)(?:/[\w.+@%,\-]+){2,}/?")
 """At least two names after a slash that nothing precedes which would make it a URL or a quotient."""
-ROOTS = [
-    "home",
-    "Users",
-    "root",
-    "tmp",
-    "mnt",
-    "data",
-    "workspace",
-    "var",
-    "srv",
-    "opt",
-    "private",
-    "scratch",
-]
+ROOTS = (
+    "home", "Users", "root", "tmp", "mnt", "data", "workspace", "var", "srv", "opt", "private", "scratch",
+)  # fmt: skip
 """Top folders of other machines, from where a file may have come here."""
 
 

@@ -18,31 +18,28 @@ from typing import Any, ClassVar
 from urllib.parse import quote
 
 from accerl_lerobot import __version__
-from accerl_lerobot.config.ranges import NonNegative, Section
-from accerl_lerobot.errors import InputError, expanded
+from accerl_lerobot.checkpoint.safety import brief
+from accerl_lerobot.config.ranges import Section
+from accerl_lerobot.errors import InputError, check_output, expanded
 
 NAME = "report.html"
+VIDEO_MB = 20
+"""Videos up to so many megabytes each are put into the page, larger ones are linked."""
 MARK = '<meta name="generator" content="accerl report'
 """Tells a page of ours from any other file; within its first 1000 characters."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReportConfig(Section):
-    """Fields of ``accerl report``.
-
-    Example:
-        >>> ReportConfig(runs=("outputs/a", "outputs/b"), output="both.html")
-    """
+    """Fields of ``accerl report``."""
 
     BARE: ClassVar[str] = "runs"
 
     runs: tuple[str, ...] = ()
-    """Folders of runs, of one kind; several make one page that compares them. Bare arguments are runs."""
+    """Folders of runs; several of ``accerl train`` make a page that compares them. Bare ones are runs."""
     output: str | None = None
     """The page. None: ``report.html`` in the run's folder, or here if there are several. An older page of
     accerl is replaced; any other file is left alone."""
-    video_mb: NonNegative = 20.0
-    """Videos up to so many megabytes each are put into the page, larger ones are linked."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -51,15 +48,7 @@ class ReportConfig(Section):
 
 
 def write_report(config: ReportConfig, recipes: Mapping[str, type[Any]]) -> Path:
-    """Reads the runs and writes the page.
-
-    Args:
-        config: which runs, and where to.
-        recipes: verb → class of its config.
-
-    Raises:
-        InputError: a run cannot be read, runs are of different kinds, or the page cannot be written there.
-    """
+    """Reads the runs and writes the page; `recipes` has the config class of each verb."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     from accerl_lerobot.report.charts import POINTS
@@ -70,15 +59,21 @@ def write_report(config: ReportConfig, recipes: Mapping[str, type[Any]]) -> Path
     runs = [read_run(Path(name).expanduser()) for name in config.runs]
     if len({run.path.resolve() for run in runs}) < len(runs):
         raise InputError("runs", ",".join(config.runs), "name each run once")
-    verbs = dict.fromkeys(run.verb for run in runs)
-    if len(verbs) > 1:
-        remedy = f"a page compares runs of one kind; these are of accerl {' and '.join(verbs)}"
+    if len(runs) > 1 and (other := next((run.verb for run in runs if run.verb != "train"), None)):
+        remedy = f"a page compares runs of accerl train, and one is of accerl {other}"
         raise InputError("runs", ",".join(config.runs), remedy)
     if output is None:
         output = runs[0].path / NAME if len(runs) == 1 else Path(NAME)
-    _check_output(output)
+    check_output(output, _is_ours)
     now = time.time()
-    page = comparison_page(runs, now) if len(runs) > 1 else run_page(runs[0], recipes[runs[0].verb], now)
+    try:
+        page = comparison_page(runs, now) if len(runs) > 1 else run_page(runs[0], recipes[runs[0].verb], now)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        why = f"{type(error).__name__}: {brief(error)}"
+        remedy = f"results in it are damaged, or of another version ({why}); restore them, or remove them"
+        raise InputError("runs", ",".join(config.runs), remedy) from error
     folder = output.resolve().parent
     template = Environment(
         loader=PackageLoader("accerl_lerobot", "report"), autoescape=True, undefined=StrictUndefined,
@@ -88,7 +83,7 @@ def write_report(config: ReportConfig, recipes: Mapping[str, type[Any]]) -> Path
         **page,
         version=__version__,
         points=POINTS,
-        video_mb=config.video_mb,
+        video_mb=VIDEO_MB,
         base64=lambda path: base64.b64encode(path.read_bytes()).decode(),
         address=lambda path: quote(os.path.relpath(path.resolve(), folder)),
     )
@@ -103,13 +98,6 @@ def write_report(config: ReportConfig, recipes: Mapping[str, type[Any]]) -> Path
     return output
 
 
-def _check_output(output: Path) -> None:
-    """Refuses to write over anything but an older page."""
-    if output.is_dir():
-        raise InputError("output", str(output), f"a folder; name a file in it, such as {output / NAME}")
-    if not output.parent.is_dir():
-        raise InputError("output", str(output), f"there is no folder {output.parent}; make it first")
-    if output.exists():
-        with output.open(encoding="utf-8", errors="replace") as file:
-            if MARK not in file.read(1000):
-                raise InputError("output", str(output), "there is another file of this name; choose another")
+def _is_ours(path: Path) -> bool:
+    with path.open(encoding="utf-8", errors="replace") as file:
+        return MARK in file.read(1000)

@@ -27,7 +27,7 @@ from accerl_lerobot.report.read import (
     newest,
     unreadable,
 )
-from accerl_lerobot.timeline.clock import ROLES, STATES
+from accerl_lerobot.timeline import ROLES, STATES
 from accerl_lerobot.world_model.metrics import dataset_rows, has_several, per_dataset
 
 RECENT_S = 120.0
@@ -144,13 +144,7 @@ class Section:
 
 
 def run_page(run: Run, config_class: type[Any], now: float) -> dict[str, Any]:
-    """Values for the template: the page of one run.
-
-    Args:
-        run: of any verb.
-        config_class: of its recipe.
-        now: in seconds since 1970.
-    """
+    """Values for the template: the page of one run, at `now`, in seconds since 1970."""
     trained, why = run.verb == "train", unreadable(config_class, run.config)
     bound = lag_bound(config_class, run.config) if trained else None
     changes = [(name, shown(v), shown(default)) for name, v, default in differences(config_class, run.config)]
@@ -175,23 +169,22 @@ def run_page(run: Run, config_class: type[Any], now: float) -> dict[str, Any]:
 
 
 def comparison_page(runs: Sequence[Run], now: float) -> dict[str, Any]:
-    """Values for the template: several runs of one verb. No winner is named, as their intervals overlap."""
-    trained, names = runs[0].verb == "train", [run.name for run in runs]
+    """Values for the template: several runs of ``accerl train``. No winner is named."""
+    names = [run.name for run in runs]
     names = [name if names.count(name) == 1 else str(run.path) for name, run in zip(names, runs, strict=True)]
     each = dict(zip(names, runs, strict=True))
     rows = [(name, *map(shown, values)) for name, values in apart([run.config for run in runs])]
     tables = [("Fields that are not the same in all of them", ("field", *names), rows)] if rows else []
-    depths = {name: (run.result or {}).get("depths", []) for name, run in each.items()}
     sections = [
-        Section("Runs", tables=[(_run_table if trained else _check_table)(each, now)]),
-        Section("Curves", charts=_curves(each) if trained else _side_by_side(depths)),
+        Section("Runs", tables=[_run_table(each, now)]),
+        Section("Curves", charts=_curves(each)),
         Section("Differences", "" if rows else "Their recipes are the same.", tables=tables),
     ]
     return {
         "title": f"{len(runs)} runs",
         "verb": runs[0].verb,
         "status": f"{sum(run.result is not None for run in runs)} of {len(runs)} finished",
-        "headline": count(len(runs), "training run" if trained else "world model"),
+        "headline": count(len(runs), "training run"),
         "tiles": (),
         "warnings": [f"{name}: {text}" for name, run in each.items() for text in warnings(run, None, now)],
         "sections": [section for section in sections if not section.empty],
@@ -457,10 +450,10 @@ def _world_model_sections(run: Run) -> list[Section]:
             text += f" on {count(sum(one['episodes'] for one in every), 'episode')} it had not learned from"
         text += ", each imagined from a real frame on, with the executed actions, and with others."
     if has_several(found):
-        datasets = {str(one.get("name")): one["depths"] for one in every}
+        datasets = [str(one.get("name")) for one in every]
         rows = [(name, *(cell or ABSENT for cell in cells)) for name, cells in dataset_rows(every)]
         table = ("The same on episodes of each dataset", ("", *datasets), rows)
-        by_dataset = Section("By dataset", tables=[table], charts=_side_by_side(datasets))
+        by_dataset = Section("By dataset", tables=[table])
     checks = [(k, c["value"], str(c.get("wanted")), c["holds"]) for k, c in found.get("checks", {}).items()]
     by_depth = []
     for title, note, metrics, options in BY_DEPTH:
@@ -484,18 +477,6 @@ def estimates(depths: Sequence[Record], key: str, name: str, colour: int) -> Ser
     low, high = (np.where(np.isfinite(end), end, y) for end in (low, high))
     x, y, low, high = (values[np.isfinite(y)] for values in (x, y, low, high))
     return Series(name, x, y, colour, low, high, points=True)
-
-
-def _side_by_side(depths: Mapping[str, Sequence[Record]]) -> list[Chart]:
-    """Estimates by depth of several models, or of one model on several datasets."""
-    charts = []
-    for title, key in (
-        ("Skill where pixels changed", "skill_changed"),
-        ("Sensitivity to another episode's actions", "sensitivity_shuffled"),
-    ):
-        series = [estimates(rows, key, name, i) for i, (name, rows) in enumerate(depths.items())]
-        charts.append(Chart(title, "", DEPTH, series))
-    return charts
 
 
 def _loss_charts(run: Run) -> list[Chart]:
@@ -526,15 +507,11 @@ def _verdict(run: Run) -> str:
 
 
 def _world_model_tiles(found: Record) -> list[tuple[str, str, str]]:
-    tiles = [
-        (
-            name,
-            count(found[key].get("episodes", 0), "episode"),
-            f"{number(found[key].get('env_steps'))} env steps",
-        )
-        for key, name in (("learnt", "learned from"), ("held_out", "held out"))
-        if isinstance(found.get(key), dict)
-    ]
+    tiles = []
+    for key, name in (("learnt", "learned from"), ("held_out", "held out")):
+        if isinstance(part := found.get(key), dict):
+            steps = f"{number(part.get('env_steps'))} env steps"
+            tiles.append((name, count(part.get("episodes", 0), "episode"), steps))
     for row in found.get("depths", [])[-1:]:
         skill = (row.get("skill_changed") or {}).get("value")
         tiles.append(("skill", number(skill, 2), f"after {count(row['depth'], 'chunk')}"))
@@ -555,17 +532,6 @@ def _run_table(runs: Mapping[str, Run], now: float) -> Table:
         rows.append((name, *success, *numbers, status(run, now)))
     columns = ("run", "before", "newest", "algorithm", "seed", "env steps", "mean lag", "wall time", "")
     return "Success before training and in the newest evaluation, with 95 % Wilson intervals", columns, rows
-
-
-def _check_table(runs: Mapping[str, Run], now: float) -> Table:
-    every = {name: (run.result or {}).get("checks", {}) for name, run in runs.items()}
-    checks = list(dict.fromkeys(name for found in every.values() for name in found))
-    rows = []
-    for name, found in every.items():
-        own = [found.get(check, {"value": None, "holds": True}) for check in checks]
-        cells = (f"{number(check['value'], 2)}{'' if check['holds'] else ', fails'}" for check in own)
-        rows.append((name, status(runs[name], now), *cells))
-    return "Checks of the validation", ("run", "", *checks), rows
 
 
 def _curves(runs: Mapping[str, Run]) -> list[Chart]:

@@ -11,27 +11,26 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shlex
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
-import yaml
 
 from accerl_lerobot.checkpoint.layout import CHECKPOINTS, CONFIG, LAST, PRETRAINED, SUMMARY
-from accerl_lerobot.checkpoint.safety import Origin, check_folder
+from accerl_lerobot.checkpoint.safety import Origin, brief, check_folder
 from accerl_lerobot.config.parsing import (
     TYPE,
-    check_recipe_size,
     choices_of,
     decode,
     encode,
-    load_yaml,
+    read_recipe,
     section_of,
 )
+from accerl_lerobot.console import ABSENT
 from accerl_lerobot.engine.preflight import lag_limits
 from accerl_lerobot.engine.stopping import resume_command
 from accerl_lerobot.envs.base import lerobot_eval_arguments
@@ -40,35 +39,11 @@ from accerl_lerobot.metrics import METRICS
 from accerl_lerobot.world_model.config import VIDEOS
 
 Record = dict[str, Any]
-Schema = dict[str, Any]
-"""Required field → its type, or a dict or list of such; ``*`` stands for every field."""
 
 VALIDATION = "validation.json"
 COUNTERS = ("env_steps", "decisions", "episodes")
 """Counters of workers, which may restart at 0 when a run is resumed."""
 
-NUMBER = (int, float)
-SUMMARY_SCHEMA: Schema = {
-    "success_after": NUMBER, "ci95_after": [NUMBER, NUMBER], "n_after": NUMBER, "success_before": NUMBER,
-    "ci95_before": [NUMBER, NUMBER], "env_steps": NUMBER, "wall_s": NUMBER, "seed": NUMBER, "tasks": [str],
-    "episodes": NUMBER, "updates": NUMBER, "warm_start_s": NUMBER, "rl_s": NUMBER,
-}  # fmt: skip
-VALIDATION_SCHEMA: Schema = {
-    "passed": bool,
-    "windows": NUMBER,
-    "episodes": NUMBER,
-    "seconds": NUMBER,
-    "checks": {"*": {"value": (*NUMBER, type(None)), "wanted": object, "holds": bool}},
-    "depths": [{"depth": NUMBER}],
-}
-VALIDATION_SCHEMA["datasets"] = {"*": {"name": str, **VALIDATION_SCHEMA}}
-RATE: Schema = {"success": NUMBER, "ci95": [NUMBER, NUMBER], "n": NUMBER}
-EVALUATION_SCHEMA: Schema = {**RATE, "env_steps": NUMBER, "steps_mean": NUMBER, "tasks": {"*": RATE}}
-OPTIONAL = (
-    "success_before", "ci95_before", "datasets", "tasks", "episodes", "updates", "warm_start_s", "rl_s",
-    "seconds",
-)  # fmt: skip
-"""Fields that may be null or missing."""
 VERBS = {
     "train": {"algorithm", "trainer"},
     "world-model": {"world_model"},
@@ -147,11 +122,7 @@ class Run:
 
 
 def read_run(path: Path) -> Run:
-    """Reads a folder.
-
-    Raises:
-        InputError: not a folder, no run in it, or a file of it is damaged.
-    """
+    """Reads a folder."""
     if not path.is_dir():
         remedy = "no such folder" if not path.exists() else "a file; name the folder of a run"
         raise InputError("runs", str(path), remedy)
@@ -160,24 +131,22 @@ def read_run(path: Path) -> Run:
         remedy = f"no run in it: there is no {CONFIG}, which every run writes first"
         raise InputError("runs", str(path), remedy)
     check_folder(path, Origin("runs", str(path)))
-    check_recipe_size(config_path, "runs")
-    text = _text(config_path)
-    config = _mapping(config_path, text)
+    config = read_recipe(config_path)
     verb = next((verb for verb, keys in VERBS.items() if keys <= config.keys()), None)
     if verb is None:
         remedy = "no run in it: its config.yaml is not one of accerl train, world-model or world-model-eval"
         raise InputError("runs", str(path), remedy)
     lines, truncated = _lines(path / METRICS)
     records, sessions = _continuous(lines)
-    result = (SUMMARY, SUMMARY_SCHEMA) if verb == "train" else (VALIDATION, VALIDATION_SCHEMA)
+    result = path / (SUMMARY if verb == "train" else VALIDATION)
     checkpoint = path / CHECKPOINTS / LAST / PRETRAINED
     return Run(
         path=path,
         verb=verb,
         config=config,
-        config_text=text,
+        config_text=config_path.read_text(),
         records=records,
-        result=_result(path / result[0], result[1]),
+        result=_mapping(result) if result.is_file() else None,
         truncated=truncated,
         sessions=sessions,
         written=max(file.stat().st_mtime for file in path.iterdir() if file.suffix != ".html"),
@@ -200,54 +169,12 @@ def newest(records: Sequence[Record], name: str) -> float | None:
     return float(finite[-1]) if len(finite) else None
 
 
-def _text(path: Path) -> str:
+def _mapping(path: Path) -> Record:
+    """The content of a JSON file."""
     try:
-        return path.read_text()
-    except UnicodeDecodeError as error:
-        raise _damaged(path, f"not text, at byte {error.start}") from error
-
-
-def _mapping(path: Path, text: str) -> Record:
-    """The content of a YAML or JSON file."""
-    try:
-        tree = json.loads(text) if path.suffix == ".json" else load_yaml(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise _damaged(path, str(error).splitlines()[0]) from error
-    if not isinstance(tree, dict):
-        raise _damaged(path, "not a mapping")
-    return tree
-
-
-def _result(path: Path, schema: Schema) -> Record | None:
-    if not path.is_file():
-        return None
-    result = _mapping(path, _text(path))
-    if field := _invalid(result, schema):
-        raise _damaged(path, f"it has no good {field}")
-    return result
-
-
-def _damaged(path: Path, why: str) -> InputError:
-    remedy = f"damaged, or of another version ({why}); restore it, or remove it"
-    return InputError("runs", str(path), remedy)
-
-
-def _invalid(record: Record, schema: Schema) -> str:
-    """The first field that is missing or of another type; empty if there is none."""
-    for key, form in schema.items():
-        values = record.values() if key == "*" else [record.get(key)]
-        if not all(_matches(value, form) or (value is None and key in OPTIONAL) for value in values):
-            return key
-    return ""
-
-
-def _matches(value: Any, form: Any) -> bool:
-    if isinstance(form, dict):
-        return isinstance(value, dict) and not _invalid(value, form)
-    if isinstance(form, list):
-        fits = isinstance(value, list) and len(form) in (1, len(value))
-        return fits and all(_matches(item, form[0]) for item in value)
-    return isinstance(value, form)
+        return dict(json.loads(path.read_text()))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError("runs", str(path), f"damaged ({brief(error)}); restore it, or remove it") from error
 
 
 def _lines(path: Path) -> tuple[list[Record], bool]:
@@ -270,9 +197,7 @@ def _record(line: bytes) -> Record | None:
         record = json.loads(line)
     except (ValueError, RecursionError):
         return None
-    if not isinstance(record, dict) or not isinstance(record.get("kind"), str):
-        return None
-    return None if record["kind"] == "evaluation" and _invalid(record, EVALUATION_SCHEMA) else record
+    return record if isinstance(record, dict) and isinstance(record.get("kind"), str) else None
 
 
 def _continuous(lines: list[Record]) -> tuple[dict[str, list[Record]], int]:
@@ -311,18 +236,13 @@ def _number(record: Record, name: str, default: float) -> float:
     return value if isinstance(value, (int, float)) else default
 
 
-Flat = dict[str, Any]
-"""Dotted field → value."""
-
-ABSENT = "–"
-"""Stands where a recipe has no such field."""
 PLACES = ("output_dir", "job_name")
 """Fields that say where results go, which are never shown as differences."""
 
 
-def flat(tree: Mapping[str, Any], prefix: str = "") -> Flat:
+def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """A tree of sections as dotted fields; an empty mapping is a value."""
-    fields: Flat = {}
+    fields: dict[str, Any] = {}
     for key, value in tree.items():
         name = f"{prefix}{key}"
         fields |= flat(value, f"{name}.") if isinstance(value, dict) and value else {name: value}
@@ -372,10 +292,7 @@ def unreadable(config_class: type[Any], tree: dict[str, Any]) -> str:
 def _defaults(instance: Any, config_class: type[Any], tree: dict[str, Any]) -> dict[str, Any]:
     """Default of every field where `tree` chooses types; unchecked, as some sections have no default.
 
-    Args:
-        instance: whose fields are the defaults; None: those of the class.
-        config_class: of the section.
-        tree: what was chosen in it.
+    The fields of an `instance` are the defaults, if there is one.
     """
     defaults: dict[str, Any] = {}
     hints = typing.get_type_hints(config_class)
@@ -400,24 +317,19 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 
 def commands(run: Run) -> list[tuple[str, str]]:
     """Purpose and line of each command to type next; those that need a checkpoint only where there is one."""
-    recipe = _quoted(run.path / CONFIG)
-    again = f"accerl {run.verb} --config_path={recipe} --output_dir={_quoted(Path(f'{run.path}-again'))}"
+    recipe = quote(str(run.path / CONFIG))
+    again = f"accerl {run.verb} --config_path={recipe} --output_dir={quote(f'{run.path}-again')}"
     lines = [("Run it again; choose a folder that does not exist yet", again)]
     if run.verb == "train" and run.result is None:
         lines.insert(0, ("Resume it, if it has stopped", resume_command(run.path)))
     if run.checkpoint is None:
         return lines
-    policy = f"--policy.path={_quoted(run.checkpoint)}"
+    policy = f"--policy.path={quote(str(run.checkpoint))}"
     episodes = run.section("evaluation").get("episodes", 100)
-    evaluate = f"accerl eval --config_path={recipe} {policy} --evaluation.episodes={_quoted(episodes)}"
+    evaluate = f"accerl eval --config_path={recipe} {policy} --evaluation.episodes={quote(str(episodes))}"
     lines.append(("Evaluate its policy on the seeds of this page", evaluate))
     if env := lerobot_eval_arguments(run.section("env")):
         stock = f"lerobot-eval {policy} {' '.join(env)} --eval.n_episodes=50 --eval.batch_size=5"
         lines.append(("Evaluate it with LeRobot itself", stock))
-    share = f"accerl push --path={_quoted(run.checkpoint)} --repo_id=USER/NAME"
+    share = f"accerl push --path={quote(str(run.checkpoint))} --repo_id=USER/NAME"
     return [*lines, ("Share it on the Hub", share)]
-
-
-def _quoted(value: Any) -> str:
-    """A value from a run as one word of a shell command, whatever is in it."""
-    return shlex.quote(str(value))

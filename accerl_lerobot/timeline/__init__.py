@@ -1,23 +1,207 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The timeline: every worker's activity over time, recorded by each, read and drawn afterwards."""
+"""The timeline: every worker's activity over time, recorded by each, read and drawn afterwards.
 
-from accerl_lerobot.timeline.clock import (
-    CHECKPOINT,
-    COMPUTE,
-    EVALUATION,
-    RECOVERY,
-    TIMELINE,
-    TRAINING,
-    TRANSPORT,
-    WAIT_IN,
-    WAIT_OUT,
-    WEIGHT_SYNC,
-    Clock,
-    NoClock,
-    open_clock,
+Entering a state ends the one before, so states exclude each other and their times add up to the time of the
+process by construction. Time is that of the monotonic clock, which processes of one machine share; the
+calendar time at which a process began is noted too.
+
+``RUN/timeline/rollout-0.1.3.bin`` is part 3 of the second process (1) of ``rollout 0``: a line of JSON, then
+8 bytes per entry, nanoseconds since the process began << 4 | state, little-endian. The newest two parts are
+kept. A part's first line has the totals before it, so those are exact although older parts are gone. Nothing
+is overwritten: a killed process leaves at worst half an entry, which is not read.
+
+The states of a worker, which is in exactly one at any time; see ``docs/performance.md``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from array import array
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from accerl_lerobot.fault_points import fault_point
+
+STATES = (
+    "compute", "wait_in", "wait_out", "transport", "weights", "checkpoint", "recovery", "training",
+    "evaluation",
+)  # fmt: skip
+"""Names, at the numbers that stand for them on disk: append only. The last two are the driver's."""
+(COMPUTE, WAIT_IN, WAIT_OUT, TRANSPORT, WEIGHT_SYNC, CHECKPOINT, RECOVERY, TRAINING, EVALUATION) = range(
+    len(STATES)
 )
+ROLES = ("driver", "local", "rollout", "imagination", "inference", "replay", "trainer", "world learning")
+"""In the order in which they are shown."""
+TIMELINE = "timeline"
+"""Name of the folder in a run's."""
 
-__all__ = [
-    "CHECKPOINT", "COMPUTE", "EVALUATION", "RECOVERY", "TIMELINE", "TRAINING", "TRANSPORT", "WAIT_IN",
-    "WAIT_OUT", "WEIGHT_SYNC", "Clock", "NoClock", "open_clock",
-]  # fmt: skip
+
+def role_of(worker: str) -> str:
+    """``rollout`` of ``rollout 3``."""
+    return worker.rstrip("0123456789").rstrip()
+
+
+def bubble(shares: Mapping[str, float]) -> float:
+    """Share of its time that a worker waits for others, of its shares by state."""
+    return shares.get("wait_in", 0.0) + shares.get("wait_out", 0.0)
+
+
+FORMAT = 1
+BITS = 4
+"""Bits of an entry that hold the state."""
+BATCH = 512
+"""Entries that are written at once."""
+FLUSH_NS = 1_000_000_000
+"""An entry is on its way to the disk after so long, if another follows or `Clock.beat` is called."""
+PART_BYTES = 4_000_000
+SUFFIX = ".bin"
+BOOT = Path("/proc/sys/kernel/random/boot_id")
+"""Tells one machine's monotonic clock from another's; without such a file all are taken for one."""
+
+
+class Moment(NamedTuple):
+    """A moment by two clocks."""
+
+    node: str
+    """Whose monotonic clock it is."""
+    clock_ns: int
+    """By that."""
+    wall_ns: int
+    """By the calendar, in nanoseconds since 1970."""
+
+
+class Clock:
+    """One worker's recorder; begins in the state `RECOVERY`, which is to get ready for work.
+
+    Example:
+        >>> clock = open_clock(folder, "trainer")
+        >>> clock.enter(WAIT_IN)         # from one thread
+        >>> clock.beat()                 # from any: entries so far are written, up to now
+        >>> clock.totals_ns()["wait_in"]
+
+    Args:
+        folder: of the timeline; made if it is not there.
+        worker: its name; the part before a number is its role.
+        begins: when its process does; None: now.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        worker: str,
+        *,
+        begins: Moment | None = None,
+        part_bytes: int = PART_BYTES,
+        now: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        if begins is None:
+            node = BOOT.read_text().strip() if BOOT.is_file() else ""
+            begins = Moment(node, time.monotonic_ns(), time.time_ns())
+        self._now, self._lock = now, threading.Lock()
+        self._state, self._origin = RECOVERY, begins.clock_ns
+        self._since, self._due = self._origin, self._origin + FLUSH_NS
+        self._totals = [0] * len(STATES)
+        self._entries = array("Q")
+        self._head = {"timeline": FORMAT, "worker": worker, "pid": os.getpid(), **begins._asdict()}
+        self._point = f"{role_of(worker).split()[-1]}.timeline"
+        folder.mkdir(parents=True, exist_ok=True)
+        slug = worker.replace(" ", "-")
+        earlier = [path.name.split(".") for path in folder.glob(f"{slug}.*.*{SUFFIX}")]
+        process = 1 + max((int(number) for _, number, *_ in earlier), default=-1)
+        self._stem, self._part, self._part_bytes = folder / f"{slug}.{process}", -1, part_bytes
+        self._file = self._next_part()
+
+    def enter(self, state: int) -> None:
+        """Ends the state before, unless it is the same."""
+        if state != self._state:
+            with self._lock:
+                self._note(state)
+                if len(self._entries) >= BATCH or self._since >= self._due:
+                    self._write()
+
+    @contextmanager
+    def during(self, state: int) -> Iterator[None]:
+        """Is in a state for a while, and then in the one before again."""
+        before = self._state
+        self.enter(state)
+        try:
+            yield
+        finally:
+            self.enter(before)
+
+    def beat(self) -> None:
+        """Notes that the worker is still in its state, and writes all entries."""
+        with self._lock:
+            self._note(self._state)
+            self._write()
+
+    def totals_ns(self) -> dict[str, int]:
+        """Nanoseconds in each state, up to the last entry or beat."""
+        with self._lock:
+            return dict(zip(STATES, self._totals, strict=True))
+
+    def close(self) -> None:
+        """Ends the timeline of this worker; safe to call twice."""
+        if not self._file.closed:
+            self.beat()
+            self._file.close()
+
+    def _note(self, state: int) -> None:
+        now = self._now()
+        self._totals[self._state] += now - self._since
+        self._entries.append((now - self._origin) << BITS | state)
+        self._state, self._since = state, now
+
+    def _write(self) -> None:
+        """Appends to the file; the entries survive this process when this returns."""
+        entries, self._entries = self._entries, array("Q")
+        fault_point(self._point)
+        self._file.write(entries.tobytes())
+        self._file.flush()
+        self._due = self._since + FLUSH_NS
+        if self._file.tell() >= self._part_bytes:
+            self._file.close()
+            self._file = self._next_part()
+
+    def _next_part(self) -> BinaryIO:
+        """Opens a new file and removes the one before the last."""
+        self._part += 1
+        head = {**self._head, "at_ns": self._since - self._origin, "state": STATES[self._state]}
+        head["totals_ns"] = dict(zip(STATES, self._totals, strict=True))
+        file = self._path(self._part).open("xb")
+        file.write((json.dumps(head) + "\n").encode())
+        file.flush()
+        self._path(self._part - 2).unlink(missing_ok=True)
+        return file
+
+    def _path(self, part: int) -> Path:
+        return self._stem.with_name(f"{self._stem.name}.{part}{SUFFIX}")
+
+
+class NoClock(Clock):
+    """Records nothing: of runs without a timeline."""
+
+    def __init__(self) -> None:
+        self._state = RECOVERY
+
+    def enter(self, state: int) -> None:
+        pass
+
+    def beat(self) -> None:
+        pass
+
+    def totals_ns(self) -> dict[str, int]:
+        return {}
+
+    def close(self) -> None:
+        pass
+
+
+def open_clock(folder: Path | None, worker: str) -> Clock:
+    """The clock of a worker; one that records nothing where there is no folder of the timeline."""
+    return NoClock() if folder is None else Clock(folder, worker)

@@ -22,8 +22,8 @@ from rich.table import Table
 from accerl_lerobot.checkpoint.layout import CONFIG, write_atomically
 from accerl_lerobot.checkpoint.safety import Origin, check_folder
 from accerl_lerobot.config.ranges import NonNegative, Positive, Section
-from accerl_lerobot.errors import InputError, expanded
-from accerl_lerobot.timeline.clock import (
+from accerl_lerobot.errors import InputError, check_output, expanded
+from accerl_lerobot.timeline import (
     BITS,
     CHECKPOINT,
     FORMAT,
@@ -65,14 +65,7 @@ class Row:
         return role_of(self.worker)
 
     def until(self, at: np.ndarray) -> np.ndarray:
-        """Time in each state up to so many nanoseconds since the timeline began, of what is kept.
-
-        Args:
-            at: (m,).
-
-        Returns:
-            float64 (m, states).
-        """
+        """float64 (m, states): time in each state up to nanoseconds `at` (m,) since the timeline began."""
         spent = np.diff(self.times)
         found = np.empty((len(at), len(STATES)))
         for state in range(len(STATES)):
@@ -109,11 +102,7 @@ class Timeline:
         return found or [(0.0, self.seconds)]
 
     def shares(self, windows: Sequence[Window] | None = None) -> Shares:
-        """How the time of each role divides.
-
-        Args:
-            windows: of which parts, of what is kept of them; None: all, exactly.
-        """
+        """How the time of each role divides: in `windows`, of what is kept of them; None: in all, exactly."""
         spent: dict[str, np.ndarray] = {}
         for row in self.rows:
             if windows is None:
@@ -130,25 +119,16 @@ def divided(spent: np.ndarray) -> dict[str, float]:
 
 
 def shares(run_directory: Path, *, training: bool = False) -> Shares:
-    """How the time of each role of a run divides among the states; `clock.bubble` adds up the waiting.
+    """How the time of each role of a run divides among the states; `bubble` adds up the waiting.
 
-    Args:
-        run_directory: the run's folder.
-        training: only of the training, if the driver has recorded any, as far as it is kept.
-
-    Raises:
-        InputError: there is no timeline, or it is damaged.
+    If `training`, only that of the training, if the driver has recorded any, as far as it is kept.
     """
     timeline = read_timeline(run_directory)
     return timeline.shares(timeline.training() if training else None)
 
 
 def read_timeline(run_directory: Path) -> Timeline:
-    """Reads what the workers of a run have left.
-
-    Raises:
-        InputError: it is no run, has no timeline, or this is damaged.
-    """
+    """Reads what the workers of a run have left."""
     folder = run_directory / TIMELINE
     if not run_directory.is_dir():
         remedy = "a file; name the folder of a run" if run_directory.exists() else "no such folder"
@@ -200,11 +180,7 @@ def part_paths(folder: Path) -> dict[tuple[str, int], list[Path]]:
 
 
 def read_processes(folder: Path) -> list[Process]:
-    """All that is kept, in no order.
-
-    Raises:
-        InputError: a file is damaged, but for an incomplete end.
-    """
+    """All that is kept, in no order."""
     processes = []
     for paths in part_paths(folder).values():
         parts = []
@@ -221,11 +197,7 @@ def read_processes(folder: Path) -> list[Process]:
 
 
 def read_head(path: Path) -> Head | None:
-    """A part's first line; None if it is incomplete.
-
-    Raises:
-        InputError: it is damaged.
-    """
+    """A part's first line; None if it is incomplete."""
     with path.open("rb") as file:
         line = file.readline()
     if not line.endswith(b"\n"):
@@ -247,16 +219,7 @@ def read_head(path: Path) -> Head | None:
 
 
 def read_entries(path: Path, start: int, after_ns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times and states of the whole entries of a part.
-
-    Args:
-        path: of the part.
-        start: byte to begin at.
-        after_ns: time of the entry before.
-
-    Raises:
-        InputError: they are no entries.
-    """
+    """Times and states of the whole entries of a part, from byte `start` on, later than `after_ns`."""
     with path.open("rb") as file:
         file.seek(start)
         data = file.read()
@@ -322,11 +285,7 @@ def _place(row: Row) -> tuple[int, int, str]:
 
 
 class Watch:
-    """Shares of a run that is still going, for its metrics; reads on where it stopped.
-
-    Args:
-        folder: of the timeline; need not be there.
-    """
+    """Shares of a run that is still going, for its metrics; reads on where it stopped."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -388,11 +347,7 @@ COLUMNS = 1600
 
 @dataclass(frozen=True, kw_only=True)
 class TimelineConfig(Section):
-    """Fields of ``accerl timeline``.
-
-    Example:
-        >>> TimelineConfig(runs=("outputs/synchronous", "outputs/asynchronous"), seconds=5.0)
-    """
+    """Fields of ``accerl timeline``."""
 
     BARE: ClassVar[str] = "runs"
 
@@ -420,15 +375,14 @@ def show_timelines(config: TimelineConfig) -> dict[str, Any]:
     Returns:
         ``picture``, and for each run, in ``runs``, ``run``, ``trace``, ``window_s`` (what is drawn),
         ``training_s`` (when it trained, for each start), ``shares`` and ``bubble`` of the training by role.
-
-    Raises:
-        InputError: a run has no timeline, the window is not within one, or the picture has no place.
     """
     picture = None if config.output is None else expanded(config.output, "output")
     timelines = [read_timeline(Path(name).expanduser()) for name in config.runs]
     if picture is None:
         picture = timelines[0].run / PICTURE if len(timelines) == 1 else Path(PICTURE)
-    _check_output(picture)
+    if picture.suffix != ".png":
+        raise InputError("output", str(picture), "the picture is a PNG; use a name that ends with .png")
+    check_output(picture, _is_ours)
     windows = [choose_window(timeline, config.start_s, config.seconds) for timeline in timelines]
     part = picture.with_name(f".{picture.stem}.part.png")
     draw(part, list(zip(timelines, windows, strict=True)))
@@ -446,11 +400,7 @@ def show_timelines(config: TimelineConfig) -> dict[str, Any]:
 
 
 def choose_window(timeline: Timeline, start_s: float | None, seconds: float) -> Window:
-    """The part of a timeline that is drawn: from `start_s` on, or in the middle of the longest training.
-
-    Raises:
-        InputError: `start_s` is not within the run.
-    """
+    """The part of a timeline that is drawn: from `start_s` on, or in the middle of the longest training."""
     whole = timeline.seconds
     if start_s is not None and not start_s < whole:
         remedy = f"use 0 or more, below {whole:.1f}, the seconds of {timeline.run}"
@@ -543,19 +493,11 @@ def columns(row: Row, start: float, end: float) -> np.ndarray:
     return shares
 
 
-def _check_output(picture: Path) -> None:
-    """Refuses to write over anything but an older picture of ours."""
-    from PIL import Image, UnidentifiedImageError
+def _is_ours(picture: Path) -> bool:
+    from PIL import Image
 
-    if picture.suffix != ".png":
-        raise InputError("output", str(picture), "the picture is a PNG; use a name that ends with .png")
-    if not picture.parent.is_dir():
-        raise InputError("output", str(picture), f"there is no folder {picture.parent}; make it first")
-    if picture.exists():
-        try:
-            with Image.open(picture) as image:
-                ours = image.info.get("Software") == MARK
-        except (UnidentifiedImageError, OSError):
-            ours = False
-        if not ours:
-            raise InputError("output", str(picture), "there is another file of this name; choose another")
+    try:
+        with Image.open(picture) as image:
+            return image.info.get("Software") == MARK
+    except OSError:
+        return False

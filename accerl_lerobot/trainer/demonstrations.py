@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import frames_of, open_metadata, opened, pixels_of
 from accerl_lerobot.experience import REWARD, SUCCESS, Origin, Segment
 from accerl_lerobot.policies.config import Load, PolicyConfig

@@ -9,9 +9,9 @@ from typing import Annotated, ClassVar
 
 import draccus
 
-from accerl_lerobot.config.dataset import DatasetConfig
 from accerl_lerobot.config.ranges import (
     Choice,
+    DatasetConfig,
     LearningRate,
     NonNegative,
     Positive,

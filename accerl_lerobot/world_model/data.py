@@ -25,7 +25,7 @@ from accerl_lerobot.errors import InputError
 from accerl_lerobot.experience import SUCCESS, TASK, Observation
 
 if TYPE_CHECKING:
-    from accerl_lerobot.config.dataset import DatasetConfig
+    from accerl_lerobot.config.ranges import DatasetConfig
     from accerl_lerobot.envs.base import WorldSpec
     from accerl_lerobot.world_model.contract import WorldModelSpec
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import torch
 
-from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.console import Console
 from accerl_lerobot.envs import EnvConfig, make_world
 from accerl_lerobot.errors import InputError

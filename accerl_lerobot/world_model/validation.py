@@ -36,7 +36,7 @@ import numpy as np
 from accerl_lerobot.console import Console
 from accerl_lerobot.demos.dataset_files import open_metadata
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.pictures import captioned, write_video
+from accerl_lerobot.evaluation import captioned, write_video
 from accerl_lerobot.policies.loading import resolve_device
 from accerl_lerobot.world_model import metrics
 from accerl_lerobot.world_model.config import ValidationConfig
@@ -77,7 +77,7 @@ from accerl_lerobot.world_model.success_plugin.modeling_success_pairs import (
 
 if TYPE_CHECKING:
     from accerl_lerobot.cli.verbs import WorldModelEvalRun, WorldModelRun
-    from accerl_lerobot.config.dataset import DatasetConfig
+    from accerl_lerobot.config.ranges import DatasetConfig
     from accerl_lerobot.world_model.contract import WorldModelSpec
 
 

@@ -11,7 +11,7 @@ import yaml
 
 from accerl_lerobot.engine.config import RunConfig, encode, parse
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.stats import Rate
+from accerl_lerobot.evaluation import Rate
 from benchmarks import efficiency as bench
 from benchmarks.efficiency import ARMS, BenchEfficiencyConfig, cells
 from benchmarks.study import Results, Study, together

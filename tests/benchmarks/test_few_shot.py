@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+import random
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ import pytest
 
 from benchmarks import study as studies
 from benchmarks.few_shot import BenchFewShotConfig, bench_few_shot, means
+from benchmarks.records import mean_interval
 from benchmarks.study import Results, Study
 
 
@@ -56,3 +59,17 @@ def test_runs_of_a_task_share_its_policy_and_its_episodes(tmp_path: Path, monkey
 def test_one_policy_has_no_interval():
     rows = [{"algorithm": "sft", "success": 0.5}]
     assert means(rows) == {"sft": {"success": 0.5, "policies": 1}}
+
+
+def test_a_mean_over_runs_is_as_unsure_as_they_differ():
+    """t at 97.5 %: 2.776445 of four degrees of freedom, 12.706205 of one (Student's table)."""
+    policies = [0.71, 0.47, 0.64, 0.33, 0.56]  # mean 0.542, s² = 0.08828 / 4
+    half = 2.776445 * math.sqrt(0.08828 / 4 / 5)
+    found = mean_interval(policies)
+    assert found == pytest.approx((0.542 - half, 0.542 + half), abs=1e-6)
+    assert mean_interval([0.9, 1.0])[0] == pytest.approx(0.95 - 12.706205 * 0.05, abs=1e-6)
+    assert mean_interval([0.3, 0.3])[0] == pytest.approx(0.3)
+    rng = random.Random(0)
+    draws = [[rng.gauss(1.0, 2.0) for _ in range(5)] for _ in range(4000)]
+    ends = [mean_interval(values, 0.9) for values in draws]
+    assert sum(low <= 1.0 <= high for low, high in ends) / 4000 == pytest.approx(0.9, abs=0.02)

@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 from accerl_lerobot.checkpoint.safety import Origin, read_json
-from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import (
     check_data,
     check_info,

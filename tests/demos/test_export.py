@@ -14,7 +14,7 @@ from accerl_lerobot.cli import main
 from accerl_lerobot.demos.dataset_files import open_metadata
 from accerl_lerobot.engine.config import DatasetConfig, LaunchConfig, RunConfig, encode, parse
 from accerl_lerobot.envs import SimulatedConfig, make_world
-from accerl_lerobot.evaluation.stats import EvaluationConfig
+from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.features import check_features, dataset_features, env_features
 from accerl_lerobot.replay.journal import read_journal, whole_episodes
 from tests.runs import tiny_run

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos import guarded_train, sft
 from accerl_lerobot.demos.sft import CODE_REVISION, REFUSED, SFTConfig, run_sft, sft_command
 from accerl_lerobot.errors import InputError

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 
-from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos import guarded_train, sft
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.record import DemosConfig, record_demos

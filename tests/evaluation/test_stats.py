@@ -6,19 +6,11 @@ from __future__ import annotations
 import io
 import json
 import math
-import random
 
 import pytest
 from rich.console import Console
 
-from accerl_lerobot.evaluation.stats import (
-    Rate,
-    evaluation_plans,
-    mean_interval,
-    summarise,
-    table,
-    wilson_interval,
-)
+from accerl_lerobot.evaluation import Rate, evaluation_plans, summarise, table, wilson_interval
 from accerl_lerobot.rollout.runner import EpisodePlan, EpisodeResult
 from accerl_lerobot.seeds import DEMO_SEEDS, EVAL_SEEDS, TRAIN_SEEDS
 
@@ -75,32 +67,10 @@ def test_a_rate_as_text(successes: int, n: int, text: str) -> None:
     assert str(Rate(successes=successes, n=n)) == f"{text} n={n}"
 
 
-def test_a_mean_over_runs_is_as_unsure_as_they_differ() -> None:
-    """t at 97.5 %: 2.776445 of four degrees of freedom, 12.706205 of one (Student's table)."""
-    policies = [0.71, 0.47, 0.64, 0.33, 0.56]  # mean 0.542, s² = 0.08828 / 4
-    half = 2.776445 * math.sqrt(0.08828 / 4 / 5)
-    found = mean_interval(policies)
-    assert (found.low, found.high) == pytest.approx((0.542 - half, 0.542 + half), abs=1e-6)
-    assert mean_interval([0.9, 1.0]).low == pytest.approx(0.95 - 12.706205 * 0.05, abs=1e-6)
-    assert mean_interval([0.3, 0.3]).low == pytest.approx(0.3)
-    rng = random.Random(0)
-    draws = [[rng.gauss(1.0, 2.0) for _ in range(5)] for _ in range(4000)]
-    ends = [mean_interval(values, 0.9) for values in draws]
-    assert sum(low <= 1.0 <= high for low, high in ends) / 4000 == pytest.approx(0.9, abs=0.02)
-    for values, confidence in (([0.5], 0.95), ([], 0.95), ([0.1, 0.2], 1.0)):
-        with pytest.raises(ValueError):
-            mean_interval(values, confidence)
-
-
 def test_nonsense_is_refused() -> None:
     for successes, n in [(-1, 5), (6, 5)]:
         with pytest.raises(ValueError, match="episodes"):
             wilson_interval(successes, n)
-        with pytest.raises(ValueError, match="episodes"):
-            Rate(successes=successes, n=n)
-    for confidence in (0.0, 1.0, 95.0, math.nan):
-        with pytest.raises(ValueError, match="confidence"):
-            wilson_interval(1, 2, confidence)
 
 
 def result(task: str, seed: int, success: bool, versions: tuple[int, int] = (3, 3)) -> EpisodeResult:
@@ -143,11 +113,9 @@ class TestSummarise:
         task = summarise(RESULTS)["tasks"]["door"]
         assert task["seeds"] == [0, 9] and task["failed_seeds"] == [8, 9]
 
-    def test_is_json_and_of_something(self) -> None:
+    def test_is_json(self) -> None:
         summary = summarise(RESULTS)
         assert json.loads(json.dumps(summary)) == summary
-        with pytest.raises(ValueError, match="no episodes"):
-            summarise([])
 
 
 def test_a_table_has_a_row_per_task_and_one_for_all() -> None:

@@ -21,7 +21,7 @@ from accerl_lerobot import cli
 from accerl_lerobot.checkpoint.layout import defect, save_checkpoint
 from accerl_lerobot.engine.config import LaunchConfig, encode
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.stats import EvaluationConfig
+from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.policies.config import PolicyConfig, TuningConfig
 from accerl_lerobot.policies.loading import load_adapter, load_lerobot_config
 from accerl_lerobot.policies.saving import save_pretrained

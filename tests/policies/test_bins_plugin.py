@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from accerl_lerobot.checkpoint.layout import BACKBONE, PRETRAINED
-from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.backbone import BackboneConfig
 from accerl_lerobot.demos.sft import SFTConfig, run_sft, sft_command
 from accerl_lerobot.engine.preflight import check_sft_policy

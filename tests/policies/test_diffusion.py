@@ -18,7 +18,7 @@ from accerl_lerobot.engine import run
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig
 from accerl_lerobot.envs import SimulatedConfig, make_world
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.stats import EvaluationConfig
+from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.experience import TASK, Request
 from accerl_lerobot.policies import diffusion
 from accerl_lerobot.policies.adapter import LeRobotAdapter, stack_observations

@@ -20,7 +20,7 @@ from accerl_lerobot.algorithms import GIPOConfig
 from accerl_lerobot.engine.local import LocalEngine
 from accerl_lerobot.engine.loop import Engine
 from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.evaluation.stats import evaluation_plans
+from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.policies.config import (
     POLICIES,
     DiffusionSamplerConfig,

@@ -14,10 +14,10 @@ import yaml
 
 from accerl_lerobot.algorithms import PPOConfig
 from accerl_lerobot.cli.verbs import WorldModelRun
-from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.engine.config import RunConfig, encode
 from accerl_lerobot.envs import MetaWorldConfig, SimulatedConfig
-from accerl_lerobot.evaluation.stats import wilson_interval
+from accerl_lerobot.evaluation import wilson_interval
 from accerl_lerobot.trainer.config import TrainerConfig
 from accerl_lerobot.world_model.config import ImaginationConfig
 

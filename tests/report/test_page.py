@@ -21,7 +21,7 @@ from accerl_lerobot.console import Console
 from accerl_lerobot.engine import run
 from accerl_lerobot.engine.config import LaunchConfig, RunConfig, parse
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.evaluation.stats import EvaluationConfig
+from accerl_lerobot.evaluation import EvaluationConfig
 from accerl_lerobot.report import ReportConfig, write_report
 from accerl_lerobot.report.charts import Chart
 from accerl_lerobot.report.content import evaluated, exploring
@@ -62,9 +62,7 @@ def stand_in(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
 @pytest.fixture(scope="module")
 def real(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that was really made, in one process."""
-    evaluation = EvaluationConfig(
-        episodes=8, every_updates=6, episodes_during=4, videos=1, video_size=32, video_every=1
-    )
+    evaluation = EvaluationConfig(episodes=8, every_updates=6, episodes_during=4, videos=1)
     config = tiny_run(
         tiny_checkpoint,
         evaluation=evaluation,
@@ -299,11 +297,11 @@ def test_text_of_a_run_is_one_word_of_a_command(tmp_path: Path) -> None:
 
 def test_a_large_video_is_linked(tmp_path: Path) -> None:
     folder = write_run(tmp_path / "a run")
-    (folder / "before_after.mp4").write_bytes(bytes(2_000_001))
-    seen = page_of(folder, video_mb=2.0, output=str(tmp_path / "elsewhere.html"))
+    (folder / "before_after.mp4").write_bytes(bytes(20_000_001))
+    seen = page_of(folder, output=str(tmp_path / "elsewhere.html"))
     assert seen.named("video") == []
     assert {"href": "a%20run/before_after.mp4"} in seen.named("a")
-    assert "before_after.mp4 is 2 MB, too large" in seen.text
+    assert "before_after.mp4 is 20 MB, too large" in seen.text
 
 
 def test_a_long_run_makes_a_small_page_soon(pictures: None, tmp_path: Path) -> None:
@@ -315,13 +313,25 @@ def test_a_long_run_makes_a_small_page_soon(pictures: None, tmp_path: Path) -> N
     assert "largest 9 → 9" in Seen(path.read_text()).text
 
 
+@pytest.mark.parametrize(
+    "summary",
+    ['{"success_after": 0.5, "ci95_after": [0.1]}', '{"success_after": "much", "ci95_after": [0, 1]}'],
+)
+def test_results_of_another_version_are_one_line(tmp_path: Path, summary: str) -> None:
+    folder = write_run(tmp_path / "run")
+    (folder / "summary.json").write_text(summary)
+    with pytest.raises(InputError, match="results in it are damaged, or of another version") as caught:
+        page_of(folder)
+    assert "\n" not in str(caught.value)
+
+
 class TestPlace:
     """Where the page goes; what is there already is not damaged."""
 
     def test_another_file_is_left_alone(self, tmp_path: Path) -> None:
         folder = write_run(tmp_path / "run")
         (folder / "report.html").write_text("<html>somebody's own</html>")
-        with pytest.raises(InputError, match="there is another file of this name; choose another"):
+        with pytest.raises(InputError, match="there is another file or folder of this name"):
             page_of(folder)
         assert (folder / "report.html").read_text() == "<html>somebody's own</html>"
 
@@ -336,7 +346,7 @@ class TestPlace:
         runs = [write_run(tmp_path / name) for name in ("a", "b")]
         with pytest.raises(InputError, match="there is no folder"):
             page_of(runs[0], output=str(tmp_path / "nowhere" / "page.html"))
-        with pytest.raises(InputError, match="a folder; name a file in it"):
+        with pytest.raises(InputError, match="there is another file or folder of this name"):
             page_of(runs[0], output=str(tmp_path))
         (tmp_path / "here").mkdir()
         monkeypatch.chdir(tmp_path / "here")
@@ -345,6 +355,6 @@ class TestPlace:
 
     def test_runs_of_different_kinds(self, tmp_path: Path) -> None:
         runs = write_run(tmp_path / "a"), write_world_model(tmp_path / "b")
-        with pytest.raises(InputError, match="of one kind; these are of accerl train and world-model"):
+        with pytest.raises(InputError, match="compares runs of accerl train, and one is"):
             page_of(*runs, output=str(tmp_path / "page.html"))
         assert not (tmp_path / "page.html").exists()

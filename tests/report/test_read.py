@@ -12,7 +12,7 @@ import pytest
 
 from accerl_lerobot.errors import InputError
 from accerl_lerobot.report.read import column, newest, read_run
-from tests.report.folders import rollout_record, train_record, write_run, write_world_model
+from tests.report.folders import rollout_record, train_record, write_run
 
 
 def append(folder: Path, *records: dict[str, Any]) -> None:
@@ -39,7 +39,7 @@ def test_a_run_that_is_not_finished_or_did_not_come_to_its_metrics(tmp_path: Pat
     assert run.records == {} and not run.truncated and run.outcomes == []
 
 
-@pytest.mark.parametrize("tail", [b'{"kind": "tra', b"\xff\xfe", b'{"kind": "evaluation", "n": 3}', b"7"])
+@pytest.mark.parametrize("tail", [b'{"kind": "tra', b"\xff\xfe", b"7"])
 def test_a_last_line_that_is_no_record_is_left_out(tmp_path: Path, tail: bytes) -> None:
     folder = write_run(tmp_path / "run")
     with (folder / "metrics.jsonl").open("ab") as file:
@@ -76,12 +76,10 @@ def test_what_is_no_run(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("config.yaml", b"a: [1,", "damaged"),
-        ("config.yaml", b"- a\n", "not a mapping"),
-        ("config.yaml", b"\xff\xff", "not text, at byte 0"),
+        ("config.yaml", b"a: [1,", "not good YAML"),
+        ("config.yaml", b"- a\n", "a recipe is a mapping"),
+        ("config.yaml", b"\xff\xff", "not good YAML"),
         ("summary.json", b'{"success_before": null', "damaged"),
-        ("summary.json", b'{"success_after": 0.5, "ci95_after": [0.1]}', "no good ci95_after"),
-        ("summary.json", b'{"success_after": "much"}', "no good success_after"),
     ],
 )
 def test_damaged_files_are_named(tmp_path: Path, name: str, content: bytes, said: str) -> None:
@@ -90,14 +88,6 @@ def test_damaged_files_are_named(tmp_path: Path, name: str, content: bytes, said
     with pytest.raises(InputError, match=said) as caught:
         read_run(folder)
     assert name in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_a_damaged_trial_is_named(tmp_path: Path) -> None:
-    folder = write_world_model(tmp_path / "model")
-    assert read_run(folder).verb == "world-model"
-    (folder / "validation.json").write_text('{"passed": true, "windows": 3, "checks": {"recall": 1}}')
-    with pytest.raises(InputError, match="no good checks"):
-        read_run(folder)
 
 
 def test_a_resumed_run_reads_as_one(tmp_path: Path) -> None:

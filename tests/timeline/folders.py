@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from accerl_lerobot.timeline.clock import TIMELINE, Clock, Moment
+from accerl_lerobot.timeline import TIMELINE, Clock, Moment
 
 SECOND = 10**9
 UP = 10**15

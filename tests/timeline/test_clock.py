@@ -13,8 +13,18 @@ import numpy as np
 import pytest
 
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.timeline import COMPUTE, RECOVERY, TIMELINE, WAIT_IN, WAIT_OUT, Clock, NoClock, open_clock
-from accerl_lerobot.timeline.clock import PART_BYTES, STATES
+from accerl_lerobot.timeline import (
+    COMPUTE,
+    PART_BYTES,
+    RECOVERY,
+    STATES,
+    TIMELINE,
+    WAIT_IN,
+    WAIT_OUT,
+    Clock,
+    NoClock,
+    open_clock,
+)
 from accerl_lerobot.timeline.read import read_processes, read_timeline
 from tests.timeline.folders import UP, a_clock, write_worker
 

@@ -14,13 +14,13 @@ from accerl_lerobot.engine import launch
 from accerl_lerobot.engine.config import LaunchConfig
 from accerl_lerobot.engine.launch import RayEngine
 from accerl_lerobot.engine.local import LocalEngine
-from accerl_lerobot.envs import SimulatedConfig
-from accerl_lerobot.evaluation.stats import evaluation_plans
+from accerl_lerobot.evaluation import evaluation_plans
 from accerl_lerobot.inference import worker as inference_worker
 from accerl_lerobot.rollout.runner import RolloutConfig
 from accerl_lerobot.timeline import TIMELINE
 from accerl_lerobot.timeline.read import ABSENT, Timeline, read_head, read_timeline, shares
 from accerl_lerobot.trainer import worker as trainer_worker
+from benchmarks.simulated_world import LatencyConfig
 from tests.light_workers import LightInference, LightTrainer, light_ray
 from tests.runs import collect, drive, tiny_run
 
@@ -47,7 +47,7 @@ def test_the_asynchronous_engine(light: None, tmp_path: Path) -> None:
     """Its rollout and replay workers are real; one is started again."""
     config = tiny_run(
         Path("nowhere"),
-        env=SimulatedConfig(max_steps=16, step_ms=1.0),
+        env=LatencyConfig(max_steps=16, frame_ms=4.0),
         rollout=RolloutConfig(workers=2, worlds=2, segment_length=3),
         output_dir=str(tmp_path),
     )

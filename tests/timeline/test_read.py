@@ -18,8 +18,9 @@ from accerl_lerobot.timeline import (
     TRAINING,
     WAIT_IN,
     WAIT_OUT,
+    Moment,
+    bubble,
 )  # fmt: skip
-from accerl_lerobot.timeline.clock import Moment, bubble
 from accerl_lerobot.timeline.read import ABSENT, Watch, read_timeline, shares
 from tests.timeline.folders import SECOND, UP, a_clock, write_worker
 

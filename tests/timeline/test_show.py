@@ -16,8 +16,7 @@ from rich.console import Console
 
 from accerl_lerobot.cli import main
 from accerl_lerobot.errors import InputError
-from accerl_lerobot.timeline import COMPUTE, RECOVERY, TRAINING, WAIT_IN
-from accerl_lerobot.timeline.clock import STATES
+from accerl_lerobot.timeline import COMPUTE, RECOVERY, STATES, TRAINING, WAIT_IN
 from accerl_lerobot.timeline.read import (
     COLOURS,
     COLUMNS,

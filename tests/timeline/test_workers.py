@@ -23,7 +23,7 @@ from accerl_lerobot.replay import ReplayConfig
 from accerl_lerobot.replay.worker import ReplayWorker
 from accerl_lerobot.rollout import worker as rollout
 from accerl_lerobot.rollout.runner import RolloutConfig
-from accerl_lerobot.timeline.clock import STATES, TIMELINE
+from accerl_lerobot.timeline import STATES, TIMELINE
 from accerl_lerobot.timeline.read import read_timeline
 from accerl_lerobot.trainer import worker as trainer
 from accerl_lerobot.trainer.config import TrainerConfig

@@ -13,7 +13,7 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from accerl_lerobot.algorithms import AlgorithmConfig, ChunkCriticConfig, SelfImitationConfig
-from accerl_lerobot.config.dataset import DatasetConfig
+from accerl_lerobot.config.ranges import DatasetConfig
 from accerl_lerobot.demos.dataset_files import open_metadata
 from accerl_lerobot.demos.record import DemosConfig, record_demos
 from accerl_lerobot.demos.sft import SFTConfig, run_sft

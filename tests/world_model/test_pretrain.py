@@ -138,7 +138,6 @@ def test_a_saved_one_is_tried_on_another_dataset(
             "--world_model.validation.depth=20",
             "world_model.validation.depth=20: held-out episodes have at most",
         ),
-        ("--env.state_dim=6", "observation.state has shape (4,), the world's has (6,)"),
         ("--env.task=mirror", "env.task='mirror': an episode's task is"),
     ],
 )
@@ -147,6 +146,14 @@ def test_what_is_refused_before_anything_is_learnt(
 ):
     assert cli.main(replacing(arguments(demos, tmp_path / "out"), option)) == 2
     assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_another_robots_dataset_is_refused(
+    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("accerl_lerobot.envs.simulated.STATE_DIM", 6)
+    assert cli.main(arguments(demos, tmp_path / "out")) == 2
+    assert "observation.state has shape (4,), the world's has (6,)" in capsys.readouterr().err
 
 
 def test_one_success_is_not_enough_to_learn_from_and_be_classified_on():

@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from accerl_lerobot.evaluation.pictures import GAP
+from accerl_lerobot.evaluation import GAP
 from accerl_lerobot.world_model.config import SuccessLearnConfig, ValidationConfig
 from accerl_lerobot.world_model.contract import ActionHistory, Context, Prediction, State, WorldModel
 from accerl_lerobot.world_model.data import Episode

@@ -15,6 +15,7 @@ Example:
 from __future__ import annotations
 
 import abc
+import dataclasses
 import functools
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -35,12 +36,7 @@ VIDEO_SIZE = 256
 
 
 class AccerlEnv(gym.Env):
-    """One task of a `World` as a Gymnasium environment; it never resets itself.
-
-    Args:
-        config: What to simulate.
-        task: One of the config's tasks.
-    """
+    """One task of a `World` as a Gymnasium environment; it never resets itself."""
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}
     render_mode = "rgb_array"
@@ -113,6 +109,11 @@ class AccerlEnvConfig(EnvConfig):
     def world_config(self) -> WorldConfig:
         """The world behind every environment made from this config."""
 
+    def _filled[T](self, world: type[T], **sections: Any) -> T:
+        """A config of ours with the fields that this one has too."""
+        names = (own.name for own in dataclasses.fields(world))  # type: ignore[arg-type]
+        return world(**{name: getattr(self, name) for name in names if hasattr(self, name)} | sections)
+
     @property
     def gym_kwargs(self) -> dict[str, Any]:
         return {}
@@ -149,14 +150,7 @@ class AccerlMetaWorldEnvConfig(AccerlEnvConfig):
     @property
     def world_config(self) -> MetaWorldConfig:
         """See the base class."""
-        return MetaWorldConfig(
-            task=self.task or "",
-            camera=self.camera,
-            image_size=self.image_size,
-            max_steps=self.max_steps,
-            lighting=self.lighting,
-            shift=ShiftConfig(**self.shift),
-        )
+        return self._filled(MetaWorldConfig, shift=ShiftConfig(**self.shift))
 
 
 @EnvConfig.register_subclass("accerl_libero")
@@ -175,14 +169,7 @@ class AccerlLiberoEnvConfig(AccerlEnvConfig):
     @property
     def world_config(self) -> LiberoConfig:
         """See the base class."""
-        return LiberoConfig(
-            task=self.task or "",
-            camera=self.camera,
-            image_size=self.image_size,
-            max_steps=self.max_steps,
-            rendering=self.rendering,
-            assets=self.assets,
-        )
+        return self._filled(LiberoConfig)
 
 
 def _camera(key: str) -> str:

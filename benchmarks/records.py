@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What studies share: floors of a machine, intervals over runs, and the files that results are kept in."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from accerl_lerobot.evaluation import Interval
+
+MEMCPY_BYTES = 64 << 20
+
+
+def floors() -> dict[str, float]:
+    """Lower bounds of all measurements: copying memory, waking up, a byte through a pipe and back."""
+    source = np.ones(MEMCPY_BYTES, np.uint8)
+    target = np.empty_like(source)
+    copies = [_seconds(lambda: np.copyto(target, source)) for _ in range(9)][1:]
+    sleeps = [_seconds(lambda: time.sleep(0.005)) - 0.005 for _ in range(40)]
+    read, write = os.pipe()
+    try:
+        tokens = [_seconds(lambda: (os.write(write, b"x"), os.read(read, 1))) for _ in range(200)]
+    finally:
+        os.close(read)
+        os.close(write)
+    return {
+        "memcpy_gb_per_s": MEMCPY_BYTES / statistics.median(copies) / 1e9,
+        "sleep_overshoot_us": 1e6 * statistics.median(sleeps),
+        "pipe_us": 1e6 * statistics.median(tokens),
+    }
+
+
+def _seconds(work: Any) -> float:
+    started = time.perf_counter()
+    work()
+    return time.perf_counter() - started
+
+
+def mean_interval(values: Sequence[float], confidence: float = 0.95) -> Interval:
+    """Interval of the mean over runs, by Student's t (1908).
+
+        m ± t · s / √k,  s² = Σ (x − m)² / (k − 1),  t of k − 1 degrees of freedom
+
+    Policies of several seeds differ by more than their episodes do, so treating all their episodes as those
+    of one policy would claim too much.
+    """
+    from scipy.special import stdtrit
+
+    mean, error = float(np.mean(values)), float(np.std(values, ddof=1)) / math.sqrt(len(values))
+    half = float(stdtrit(len(values) - 1, (1 + confidence) / 2)) * error
+    return Interval(mean - half, mean + half)
+
+
+def as_markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Rows for the docs."""
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def write(
+    root: Path,
+    name: str,
+    result: dict[str, Any],
+    markdown: str,
+    draw: Callable[[Path, dict[str, Any]], object] | None = None,
+) -> None:
+    """Into a folder that is there: the numbers, the table and the picture, if any, under one name."""
+    (root / f"{name}.json").write_text(json.dumps(result, indent=2) + "\n")
+    (root / f"{name}.md").write_text(markdown)
+    if draw is not None:
+        draw(root / f"{name}.png", result)
