@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shared parts of studies: floors of a machine, intervals over runs, and the files that results are kept in."""
+"""Shared by studies: floors of a machine, intervals over runs, and the files that results are kept in."""
 
 from __future__ import annotations
 

@@ -25,10 +25,11 @@ from accerl_lerobot.algorithms.contract import (
     SelfImitationConfig,
     check_level,
 )
-from accerl_lerobot.algorithms.losses import GIPOConfig, PPOConfig
+from accerl_lerobot.algorithms.losses import AWRConfig, GIPOConfig, PPOConfig
 from accerl_lerobot.algorithms.objective import LossOutput
 
 __all__ = [
+    "AWRConfig",
     "AlgorithmConfig",
     "ChunkCriticConfig",
     "GIPOConfig",
