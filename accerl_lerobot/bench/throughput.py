@@ -42,15 +42,10 @@ class Block:
     """Decisions learned from, repetitions included."""
     env_steps_per_s: float
     lag_mean: float
-    lag_max: float
     trainer_waits: float
     """Share of its time in which the trainer had no batch."""
-    publishing: float
-    """Share of its time in which it published weights."""
     batch_size: float
     """Observations of a forward pass."""
-    request_wait_ms: float
-    """Mean time from the arrival of a request to its forward pass."""
     inference_busy: float
     """Share of its time in which the inference worker decided."""
     processors: float
@@ -99,11 +94,8 @@ class Measured:
             decisions_per_s=sum(u["decisions"] for u in updates) / total,
             env_steps_per_s=steps / wall,
             lag_mean=sum(u["lag_mean"] for u in updates) / len(updates),
-            lag_max=max(u["lag_max"] for u in updates),
             trainer_waits=sum(u["wait_s"] for u in updates) / total,
-            publishing=sum(u["publish_s"] for u in updates) / total,
             batch_size=requests / batches if batches else 0.0,
-            request_wait_ms=1000 * (_waited(after) - _waited(before)) / requests if requests else 0.0,
             inference_busy=sum(p.inference["busy_share"] for p in polls) / len(polls),
             processors=processors.share(),
         )
@@ -130,10 +122,6 @@ def _seconds(update: dict[str, float]) -> float:
 def _observations(inference: dict[str, float]) -> int:
     """Requests so far; rounded, as a mean times its divisor need not be whole."""
     return round(inference["batches"] * inference["batch_size_mean"])
-
-
-def _waited(inference: dict[str, float]) -> float:
-    return inference["wait_mean_s"] * _observations(inference)
 
 
 @dataclass(frozen=True, kw_only=True)

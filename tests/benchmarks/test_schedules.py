@@ -37,11 +37,8 @@ def block(schedule: str, rate: float, processors: float = 0.2, waits: float = 0.
         decisions_per_s=rate,
         env_steps_per_s=4 * rate,
         lag_mean=1.0,
-        lag_max=2.0,
         trainer_waits=waits,
-        publishing=0.0,
         batch_size=2.0,
-        request_wait_ms=1.0,
         inference_busy=0.5,
         processors=processors,
     )
