@@ -262,7 +262,7 @@ def imagination_checks(config: RunConfig) -> Iterator[Check]:
         "imagination", OK, f"{imagination.share:.0%} of every batch; world model: {imagination.model}"
     )
     least = imagination.min_real_episodes
-    if imagination.start_at_reset_prob and 0 < episodes <= least:
+    if 0 < episodes <= least:
         why = f"that takes more than {least} real episodes"
         text = f"is hardly ever switched off where it flatters: {why}, and rollout.episodes is {episodes}"
         yield Check("imagination", WARN, text)
